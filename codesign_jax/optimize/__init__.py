@@ -1,0 +1,21 @@
+"""Optimisers behind ``init``, ``ask`` and ``tell``; they know arrays and costs, no physics."""
+
+from codesign_jax.optimize.bounds import Space, reflect, strictly_below
+from codesign_jax.optimize.particle_filter import Info, ParticleFilter, State
+from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
+from codesign_jax.optimize.schedule import schedule
+from codesign_jax.optimize.seeding import candidates, rejection_sample
+
+__all__ = [
+    "MAX_PARTICLES",
+    "Info",
+    "ParticleFilter",
+    "Space",
+    "State",
+    "candidates",
+    "reflect",
+    "rejection_sample",
+    "schedule",
+    "stochastic_universal",
+    "strictly_below",
+]

@@ -1,0 +1,89 @@
+"""Seed particles by rejection sampling."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from codesign_jax.optimize.bounds import Space
+
+STREAM_SEED = 0x73656564
+"""Stream of the candidates ("seed")."""
+
+
+def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
+    """Uniform particles of the box, projected; candidate j depends on ``key`` and j alone.
+
+    Args:
+        key: Typed key from ``jax.random.key``.
+        space: Bounds and constraint of the parameters.
+        indices: Numbers of the candidates, int, shape (particle,).
+
+    Returns:
+        Particles, shape (particle, parameter).
+    """
+    low, high = jnp.asarray(space.low, float), jnp.asarray(space.high, float)
+    key = jax.random.fold_in(key, STREAM_SEED)
+
+    def draw(index: jax.Array) -> jax.Array:
+        return jax.random.uniform(jax.random.fold_in(key, index), low.shape, low.dtype)
+
+    unit = jax.vmap(draw)(jnp.asarray(indices))
+    return space.constrain(jnp.clip(low + unit * (high - low), low, high))
+
+
+def rejection_sample(
+    key: jax.Array,
+    space: Space,
+    evaluate: Callable[[jax.Array], jax.Array],
+    num_seeds: int,
+    *,
+    threshold: float = 2.0,
+    batch: int = 64,
+    max_batches: int = 100,
+) -> tuple[jax.Array, jax.Array, int]:
+    """Draw seed particles that are not solutions yet.
+
+    Deimel et al. (2017), section VI.4: seeds are drawn with cost > 2.0 to avoid runs whose initial
+    particles already contain a solution. Candidates are accepted in the order of their number, so
+    the result is the same for every ``batch`` as far as ``evaluate`` treats particles alone.
+
+    Args:
+        key: Typed key from ``jax.random.key``.
+        space: Bounds and constraint of the parameters.
+        evaluate: Costs of particles, (particle, parameter) -> (particle,). Always called with
+            ``batch`` particles. A cost that is not finite is never accepted.
+        num_seeds: Number of seed particles to find.
+        threshold: Cost above which a candidate is accepted.
+        batch: Candidates evaluated at once.
+        max_batches: Evaluations after which to give up.
+
+    Returns:
+        Seeds, shape (seed, parameter), their costs, shape (seed,), and the number of candidates
+        drawn up to and with the last seed.
+
+    Raises:
+        ValueError: If a count is below 1 or ``evaluate`` returns another shape.
+        RuntimeError: If ``max_batches`` did not hold enough seeds.
+    """
+    if min(num_seeds, batch, max_batches) < 1:
+        raise ValueError(f"counts must be at least 1: {num_seeds=}, {batch=}, {max_batches=}")
+    drawn, costs = [], np.empty(0)
+    accepted = np.empty(0, int)
+    for start in range(0, batch * max_batches, batch):
+        drawn.append(candidates(key, space, np.arange(start, start + batch)))
+        cost = np.asarray(evaluate(drawn[-1]))
+        if cost.shape != (batch,):
+            raise ValueError(f"evaluate returned shape {cost.shape} for {batch} particles")
+        costs = np.concatenate([costs, cost])
+        accepted = np.flatnonzero(np.isfinite(costs) & (costs > threshold))[:num_seeds]
+        if accepted.size == num_seeds:
+            seeds = jnp.concatenate(drawn)[accepted]
+            return seeds, jnp.asarray(costs[accepted], float), int(accepted[-1]) + 1
+    raise RuntimeError(
+        f"accepted {accepted.size} of {num_seeds} seed particles (cost > {threshold}) from "
+        f"{costs.size} candidates; the highest finite cost was "
+        f"{np.max(costs, initial=-np.inf, where=np.isfinite(costs)):g}"
+    )

@@ -1,0 +1,67 @@
+"""Open-loop key frames: pressures and the pose of the arm frame X_D over a grasp (paper Fig. 3)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.scene import Scene
+from codesign_jax.types import Params, Trial
+
+
+def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
+    """Returns the controls of one grasp, shape (time, nu).
+
+    The columns are the actuators' order: arm frame x, y, z [m], roll, yaw, pitch [rad] (the order of the
+    wrist hinges, see `model`), then one pressure [Pa] a finger.  Row k is held from time k h to (k+1) h.
+
+    Args:
+      scene: The scene.
+      params: Parameters of one hand.
+      trial: Its trial; the arm frame carries the trial's roll and pitch noise.
+    """
+    time = np.arange(scene.num_steps) * scene.discretization.timestep
+    arm, p = params.arm, scene.phases
+    start, grasp = scene.arm.start_height, scene.arm.zero_height + arm[2]
+    # The approach is vertical: lateral position and orientation are the grasp's from the start [ours].
+    frames = jnp.stack([jnp.asarray(start, arm.dtype), grasp, grasp, jnp.asarray(start, arm.dtype)])
+    height = jnp.interp(time, np.array([0.0, p.approach, p.inflate, p.lift]), frames)
+    roll, pitch = _shake(scene, time)
+    ones = jnp.ones_like(height)
+    pose = [
+        arm[0] * ones,
+        arm[1] * ones,
+        height,
+        arm[3] + trial.arm_tilt[0] + roll,
+        arm[5] * ones,
+        arm[4] + trial.arm_tilt[1] + pitch,
+    ]
+    pressure = params.pressure[:, None] * _inflation(scene, time)
+    return jnp.concatenate([jnp.stack(pose), pressure]).T
+
+
+def _inflation(scene: Scene, time: np.ndarray) -> np.ndarray:
+    """Fraction of the nominal pressure, shape (time,)."""
+    p = scene.phases
+    keys, values = [p.approach, p.inflate], [0.0, 1.0]
+    if scene.effects.ungrasp:
+        end = scene.window[1]
+        keys, values = [*keys, end, end + p.deflate_time], [*values, 1.0, 0.0]
+    return np.interp(time, keys, values)
+
+
+def _shake(scene: Scene, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Roll and pitch that the disturbance adds [rad], each of shape (time,).
+
+    A sine whose amplitude grows linearly over the phase; whole periods alternate between roll and pitch.
+    Afterwards the arm returns linearly to its nominal pose while the chambers deflate.
+    """
+    if not scene.effects.disturb:
+        return np.zeros_like(time), np.zeros_like(time)
+    p, arm = scene.phases, scene.arm
+    inside = np.clip(time, p.lift, p.disturb) - p.lift
+    growth = np.deg2rad(arm.shake_amplitude) * inside / (p.disturb - p.lift)
+    period = arm.shake_frequency * inside
+    angle = growth * np.sin(2 * np.pi * period)
+    angle = angle * np.clip(1 - (time - p.disturb) / p.deflate_time, 0, 1)
+    odd = np.floor(period).astype(int) % 2 == 1
+    return np.where(odd, 0.0, angle), np.where(odd, angle, 0.0)

@@ -1,0 +1,87 @@
+"""Trace to cost and status (paper Sec. VI.1, Fig. 3)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.scene import Scene
+from codesign_jax.types import Outcome, Status, Trace
+
+
+def outcome(scene: Scene, trace: Trace) -> Outcome:
+    """Returns cost and status of one trial from its trace.
+
+    c = c_max (t_end - t_lost) / (t_end - t_0), where t_lost is the first time in [t_0, t_end) at which the
+    object is `lost_distance` or more from the hand centre; 0 if it is kept.  A trial is decided once it is
+    lost: what happens later neither fails it nor needs simulating.
+
+    Args:
+      scene: The scene.
+      trace: Trace of one world, arrays of shape (time,).
+    """
+    steps = trace.distance.shape[0]
+    time = np.arange(steps) * scene.discretization.timestep
+    (start, end), dtype = scene.window, trace.distance.dtype
+    # Half a step of slack: k * timestep is not exactly the phase's end in floating point.
+    slack = scene.discretization.timestep / 2
+    window = (time >= start - slack) & (time < end - slack)
+    lost_step = _first(window & (trace.distance >= scene.cost.lost_distance))
+    bits = _failures(scene, trace)
+    bad_step = _first(bits != 0)
+    failed = bad_step < lost_step
+    lost = (lost_step < steps) & ~failed
+    lost_time = jnp.where(lost, lost_step * scene.discretization.timestep, jnp.inf).astype(dtype)
+    cost = scene.cost.maximum * (end - jnp.where(lost, lost_time, end)) / (end - start)
+    status = jnp.where(failed, bits[jnp.minimum(bad_step, steps - 1)], 0)
+    status = jnp.where(_stuck(scene, trace) & ~lost & ~failed, int(Status.STUCK), status)
+    return Outcome(cost.astype(dtype), status, lost_time, jnp.where(failed, bad_step, -1))
+
+
+def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
+    """Mean cost over a particle's trials by the scene's rule for failed ones.
+
+    "exclude" (the paper's) averages the trials that did not fail, the maximum if all did; "worst" scores
+    each failed trial with the maximum.
+
+    Args:
+      scene: The scene.
+      trials: Outcomes with the trial as the last axis.
+
+    Returns:
+      Costs without the trial axis.
+    """
+    good = trials.status == 0
+    if scene.cost.failure == "worst":
+        return jnp.where(good, trials.cost, scene.cost.maximum).mean(-1)
+    count = good.sum(-1)
+    mean = jnp.where(good, trials.cost, 0.0).sum(-1) / jnp.maximum(count, 1)
+    return jnp.where(count > 0, mean, scene.cost.maximum)
+
+
+def _first(condition: jax.Array) -> jax.Array:
+    """Index of the first true entry along time, or the number of entries, as int32."""
+    steps = condition.shape[0]
+    return jnp.where(condition.any(), jnp.argmax(condition), steps).astype(jnp.int32)
+
+
+def _failures(scene: Scene, trace: Trace) -> jax.Array:
+    """Status bits of every step, shape (time,) int32."""
+    finite = jnp.isfinite(trace.speed) & jnp.isfinite(trace.distance)
+    bits = jnp.where(finite, 0, int(Status.NONFINITE))
+    bits |= jnp.where(trace.speed > scene.limits.speed, int(Status.SPEED), 0)
+    below = trace.height < -scene.limits.penetration
+    return (bits | jnp.where(below, int(Status.PENETRATION), 0)).astype(jnp.int32)
+
+
+def _stuck(scene: Scene, trace: Trace) -> jax.Array:
+    """Whether the released object neither left the hand nor rests on the table."""
+    if not scene.effects.ungrasp:
+        return jnp.zeros((), bool)
+    # A resting object's centre is at most its bounding radius above the table, whatever side it lies on.
+    radius = max(np.linalg.norm(_half_extents(s.type, s.size)) for s in scene.objects.object)
+    resting = trace.height[-1] < radius * (1 + 4 * scene.objects.noise.size)
+    return (trace.distance[-1] <= scene.cost.lost_distance) & ~resting
+
+
+def _half_extents(kind: str, size: tuple[float, ...]) -> tuple[float, ...]:
+    return {"box": size, "cylinder": size, "sphere": size[:1]}[kind]

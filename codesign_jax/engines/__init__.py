@@ -1,0 +1,33 @@
+"""Engines by name; each advances batches of worlds behind the interface in `base`."""
+
+from codesign_jax import schema
+from codesign_jax.engines.base import Engine
+from codesign_jax.scene import Scene
+
+# The structured engine of docs/roadmap takes its place here and becomes the default.
+NAMES = ("mjx", "mujoco")
+DEFAULT = "mujoco"
+
+
+def make_engine(name: str, scene: Scene) -> Engine:
+    """Builds an engine for a scene.
+
+    Args:
+      name: One of `NAMES`.
+      scene: The scene.
+
+    Raises:
+      SceneError: if there is no such engine.
+    """
+    if name == "mjx":
+        from codesign_jax.engines.mjx import MjxEngine
+
+        return MjxEngine(scene)
+    if name == "mujoco":
+        from codesign_jax.engines.mujoco import MujocoEngine
+
+        return MujocoEngine(scene)
+    raise schema.SceneError([f"engine {name!r} unknown; {schema.nearest(name, NAMES)}"])
+
+
+__all__ = ["DEFAULT", "NAMES", "Engine", "make_engine"]

@@ -1,0 +1,32 @@
+"""The interface behind which every engine stands."""
+
+from typing import Protocol
+
+import jax
+
+from codesign_jax.model import ModelFields
+from codesign_jax.types import Trace
+
+
+class Engine(Protocol):
+    """Steps batches of worlds; engines solve the same discrete equations and differ in how.
+
+    Attributes:
+      name: Name on the command line and in results.
+    """
+
+    name: str
+
+    def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
+        """Simulates one grasp in each world; traceable, with the batch as leading axis.
+
+        Args:
+          fields: Model fields and start states, every array with a leading world axis.
+          ctrl: Controls, shape (world, time, nu).
+          trajectory: Whether to return qpos of every step.
+
+        Returns:
+          The trace of every world, every array with a leading world axis.  A world that fails is frozen
+          at its last good state; its trace shows the failure at the failing step and stays there.
+        """
+        ...

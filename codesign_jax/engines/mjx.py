@@ -1,0 +1,64 @@
+"""Stock MJX: the same model and equations in JAX, on any platform, in the caller's float type."""
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax.scene import Scene
+from codesign_jax.types import Trace
+
+
+class MjxEngine:
+    """Steps every world with `mjx.step` under vmap and scan."""
+
+    name = "mjx"
+
+    def __init__(self, scene: Scene):
+        """Puts the scene's template on the device; the float type is jax's at this moment."""
+        self.scene = scene
+        self.template = mjx.put_model(compile_template(scene))
+        self.data = mjx.make_data(self.template)
+
+    def model(self, fields: ModelFields) -> mjx.Model:
+        """Returns the template with the fields of one world."""
+        changed = {k: v for k, v in fields._asdict().items() if k != "start"}
+        return self.template.tree_replace(changed)  # type: ignore[arg-type]
+
+    def reset(self, fields: ModelFields) -> mjx.Data:
+        """Returns the start state of one world."""
+        return self.data.replace(qpos=fields.start)
+
+    def step(self, fields: ModelFields, data: mjx.Data, ctrl: jax.Array) -> mjx.Data:
+        """Advances one world by one time step under controls of shape (nu,)."""
+        return mjx.step(self.model(fields), data.replace(ctrl=ctrl))
+
+    def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
+        """See `Engine.rollout`."""
+        with jax.default_matmul_precision("highest"):  # TF32 would spoil the solver on a GPU
+            return jax.vmap(lambda f, c: self._world(f, c, trajectory))(fields, ctrl)
+
+    def _world(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
+        lay, limits = layout(self.scene), self.scene.limits
+        weights = jnp.asarray(lay.centre_weights, ctrl.dtype)
+
+        def body(carry, u):
+            data, speed = carry
+            new = self.step(fields, data, u)
+            # Positions computed by a step belong to the state before it.
+            centre, middle = weights @ new.xipos, new.xipos[lay.object]
+            entry = Trace(
+                jnp.linalg.norm(middle - centre),
+                middle[2],
+                speed,
+                data.qpos if trajectory else data.qpos[:0],
+            )
+            new_speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()  # not finite if any state is not
+            good = jnp.isfinite(new_speed) & (new_speed <= limits.speed)
+            good &= (speed <= limits.speed) & (middle[2] >= -limits.penetration)
+            data = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, data)
+            failed_before = ~(speed <= limits.speed)
+            return (data, jnp.where(failed_before, speed, new_speed)), entry
+
+        start = (self.reset(fields), jnp.zeros((), ctrl.dtype))
+        return jax.lax.scan(body, start, ctrl)[1]

@@ -1,0 +1,128 @@
+"""MuJoCo C in float64, the oracle: `mujoco.batch` on all cores, called from jitted programs."""
+
+import threading
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.batch
+import numpy as np
+
+from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax.scene import Scene
+from codesign_jax.types import Trace
+
+# Steps between looking at the worlds: a lost object or a failed world stops being simulated at this grain.
+_CHUNK = 25
+
+
+class MujocoEngine:
+    """Runs worlds with MuJoCo C, whatever the float type of the caller.
+
+    Worlds that are decided (the object is lost inside the cost window, or the world failed) are not
+    simulated further; their remaining trace repeats its last entry.
+    """
+
+    name = "mujoco"
+
+    def __init__(self, scene: Scene, *, num_threads: int = 0):
+        """Prepares the engine.
+
+        Args:
+          scene: The scene.
+          num_threads: Threads to use; 0 for all cores.
+        """
+        self.scene = scene
+        self.template = compile_template(scene)
+        self.num_threads = num_threads
+        self._batches: dict[int, mujoco.batch.Batch] = {}
+        self._lock = threading.Lock()  # a Batch must not be used from several threads
+
+    def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
+        """See `Engine.rollout`."""
+        worlds, steps = ctrl.shape[:2]
+        like = jax.ShapeDtypeStruct((worlds, steps), ctrl.dtype)
+        nq = self.template.nq if trajectory else 0
+        shapes = Trace(like, like, like, jax.ShapeDtypeStruct((worlds, steps, nq), ctrl.dtype))
+        return jax.pure_callback(
+            lambda f, c: self._run(f, c, trajectory), shapes, fields, ctrl, vmap_method="sequential"
+        )
+
+    def _run(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
+        dtype = np.asarray(ctrl).dtype
+        fields = ModelFields(*(np.asarray(v, np.float64) for v in fields))
+        with self._lock:
+            trace = self._simulate(fields, np.asarray(ctrl, np.float64), trajectory)
+        return Trace(*(v.astype(dtype) for v in trace))
+
+    def _batch(self, num_worlds: int) -> mujoco.batch.Batch:
+        if num_worlds not in self._batches:
+            self._batches[num_worlds] = mujoco.batch.Batch(self.template, num_worlds, self.num_threads)
+        return self._batches[num_worlds]
+
+    def _simulate(self, fields: ModelFields, ctrl: np.ndarray, trajectory: bool) -> Trace:
+        (worlds, steps), scene, nq = ctrl.shape[:2], self.scene, self.template.nq
+        batch = self._batch(worlds)
+        write_fields(batch, fields)
+        trace = Trace(*(np.zeros((worlds, steps)) for _ in range(3)), np.zeros((worlds, steps, nq * trajectory)))
+        start, end = (round(t / scene.discretization.timestep) for t in scene.window)
+        going = np.arange(worlds)
+        for first in range(0, steps, _CHUNK):
+            part = slice(first, min(first + _CHUNK, steps))
+            new = self._advance(batch, going, ctrl[going, part], trajectory)
+            for array, values in zip(trace, new, strict=True):
+                array[going, part] = values
+            # The cost window's end counts as lost only strictly inside it, as in `cost.outcome`.
+            time = np.arange(part.start, part.stop)
+            lost = (new.distance >= scene.cost.lost_distance) & (time >= start) & (time < end)
+            failed = ~np.isfinite(new.speed) | (new.speed > scene.limits.speed)
+            done = lost.any(1) | failed.any(1) | (new.height < -scene.limits.penetration).any(1)
+            for array in trace:
+                array[going[done], part.stop :] = array[going[done], part.stop - 1][:, None]
+            going = going[~done]
+            if not going.size:
+                break
+        return trace
+
+    def _advance(self, batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool) -> Trace:
+        """Steps the given worlds through a chunk; entry k describes the state before step k."""
+        lay = layout(self.scene)
+        before = batch.bind("qvel")[ids][:, None], batch.bind("qpos")[ids][:, None]
+        record = batch.rollout(
+            ctrl.shape[1],
+            ctrl,
+            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+            record=("xipos", "qvel", *(("qpos",) if trajectory else ())),
+            ids=ids,
+        )
+        xipos = record["xipos"]
+        centre = np.tensordot(xipos, lay.centre_weights, axes=(2, 0))
+        middle = xipos[:, :, lay.object]
+        # Records of state follow the step, derived fields precede it: shift the former by one.
+        qvel = np.concatenate([before[0], record["qvel"][:, :-1]], 1)
+        with np.errstate(invalid="ignore"):
+            speed = np.abs(qvel).max(-1)
+        qpos = np.concatenate([before[1], record["qpos"][:, :-1]], 1) if trajectory else xipos[:, :, 0, :0]
+        return Trace(np.linalg.norm(middle - centre, axis=-1), middle[..., 2], speed, qpos)
+
+
+def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:
+    """Gives every simulation of a batch its model fields and start state."""
+    batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+    for name in ModelFields._fields:
+        if name == "start":
+            batch.bind("qpos")[:] = fields.start
+        else:
+            batch.expand(name)[:] = getattr(fields, name)
+    batch.bind("qacc_warmstart")[:] = 0.0
+
+
+def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:
+    """Returns a model of MuJoCo C with the fields of one world, for a viewer or any mj_ function."""
+    import copy
+
+    model = copy.deepcopy(compile_template(scene))
+    for name in ModelFields._fields:
+        if name != "start":
+            getattr(model, name)[:] = np.asarray(jnp.asarray(getattr(fields, name)), np.float64)
+    return model

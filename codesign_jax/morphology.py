@@ -1,0 +1,86 @@
+"""Beam theory of a PneuFlex finger: cross-section and pressure to stiffness, mass and actuation moment.
+
+Section frame: y = height above the inextensible bottom layer, z = width, x along the finger.  The outer
+section is width x height with walls of equal thickness around one air chamber.  Formulas follow from
+elementary beam theory (Euler-Bernoulli bending, Bredt torsion) for a neo-Hookean wall of shear modulus G
+that the hoop threads hold in plane strain, hence the modulus 4 G in bending; they model the actuator of
+Deimel and Brock (2016) that the paper refers to as [2].
+"""
+
+from typing import NamedTuple
+
+import jax
+
+from codesign_jax.hand import Hand
+from codesign_jax.types import Params
+
+
+class Beam(NamedTuple):
+    """Properties of a finger as a beam; every entry has the shape of the section's dimensions.
+
+    Attributes:
+      bending: Stiffness EI_b about the inextensible bottom layer [N m^2].
+      lateral: Stiffness EI_lat about the side that carries no tension [N m^2].
+      torsion: Stiffness G J [N m^2].
+      line_density: Mass per length [kg/m].
+      moment_per_pressure: Bending moment per gauge pressure A_c y_c [m^3].
+    """
+
+    bending: jax.Array
+    lateral: jax.Array
+    torsion: jax.Array
+    line_density: jax.Array
+    moment_per_pressure: jax.Array
+
+
+def beam(
+    height: jax.Array, wall: jax.Array, *, width: float, shear_modulus: float, density: float
+) -> Beam:
+    """Returns the beam properties of a rectangular hollow section.
+
+    Args:
+      height: Outer height h [m], any shape; h > 2 wall.
+      wall: Wall thickness d [m], same shape.
+      width: Outer width w [m]; w > 2 wall.
+      shear_modulus: G of the silicone [Pa].
+      density: rho of the silicone [kg/m^3].
+
+    Returns:
+      The properties, with
+        EI_b = 4 G [w h^3 - w_c ((h-d)^3 - d^3)] / 3: second moment about the bottom layer,
+        EI_lat = 4 G [I_z + A (w/2)^2]: the fabric resists tension only, so the neutral axis is the side,
+        G J with J = 4 A_m^2 d / U (Bredt, thin wall; thick walls are up to 25 % stiffer),
+        M_p / p = A_c h/2 by virtual work, independent of curvature and load.
+    """
+    h, d, w = height, wall, width
+    chamber_width, chamber_height = w - 2 * d, h - 2 * d
+    chamber_area = chamber_width * chamber_height
+    area = w * h - chamber_area
+    second_moment = (w * h**3 - chamber_width * ((h - d) ** 3 - d**3)) / 3
+    lateral_centroid = (h * w**3 - chamber_height * chamber_width**3) / 12
+    lateral_moment = lateral_centroid + area * (w / 2) ** 2
+    middle_area, perimeter = (w - d) * (h - d), 2 * (w + h - 2 * d)
+    torsion_constant = 4 * middle_area**2 * d / perimeter
+    return Beam(
+        bending=4 * shear_modulus * second_moment,
+        lateral=4 * shear_modulus * lateral_moment,
+        torsion=shear_modulus * torsion_constant,
+        line_density=density * area,
+        moment_per_pressure=chamber_area * h / 2,
+    )
+
+
+def finger_beams(hand: Hand, params: Params) -> Beam:
+    """Returns the beam properties of every finger of a hand, shape (finger,)."""
+    return beam(
+        params.height,
+        params.wall,
+        width=hand.section.width,
+        shear_modulus=hand.material.shear_modulus,
+        density=hand.material.density,
+    )
+
+
+def block_inertia(mass: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array) -> tuple[jax.Array, ...]:
+    """Principal inertia of a solid block with edges x, y, z [m] about its centre [kg m^2]."""
+    return mass * (y**2 + z**2) / 12, mass * (x**2 + z**2) / 12, mass * (x**2 + y**2) / 12

@@ -1,0 +1,191 @@
+"""Flat parameter vectors: names, units, bounds, presets and the pressure limit (Table I).
+
+A *full* vector holds every parameter of the hand's table in the table's order, one entry a finger where the
+row says so, in SI units and radians.  A *design* vector holds a preset's free parameters only.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import schema
+from codesign_jax.hand import Hand, Parameter, Preset
+from codesign_jax.types import Params
+
+# Unit of a file -> (SI unit, factor).
+UNITS = {
+    "mm": ("m", 1e-3),
+    "m": ("m", 1.0),
+    "deg": ("rad", np.pi / 180.0),
+    "rad": ("rad", 1.0),
+    "kPa": ("Pa", 1e3),
+    "Pa": ("Pa", 1.0),
+}
+# The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
+_STRICT = 1.0 - 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class DesignSpace:
+    """The free parameters of a preset and how they fill the full vector.
+
+    Attributes:
+      hand: The hand.
+      names: Names of the free parameters, e.g. "length[2]" or "length" where tied.
+      units: Units in which the hand file states them.
+      scale: Factor from that unit to SI, shape (parameter,).
+      low: Lower bounds [SI], shape (parameter,).
+      high: Upper bounds [SI], shape (parameter,).
+      is_morphology: True for morphology, False for control, shape (parameter,).
+      base: Full vector with the fixed values and defaults [SI], shape (full,).
+      source: For each full entry the design entry that fills it, or -1, shape (full,).
+    """
+
+    hand: Hand
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    scale: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    is_morphology: tuple[bool, ...]
+    base: tuple[float, ...]
+    source: tuple[int, ...]
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of free parameters."""
+        return len(self.names)
+
+    def expand(self, design: jax.Array) -> jax.Array:
+        """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,)."""
+        source = np.asarray(self.source)
+        filled = design[np.maximum(source, 0)]
+        return jnp.where(source >= 0, filled, jnp.asarray(self.base, design.dtype))
+
+    def params(self, design: jax.Array) -> Params:
+        """Returns the named parameters of a design vector [SI], shape (parameter,)."""
+        return unflatten(self.hand, self.expand(design))
+
+    def project(self, design: jax.Array) -> jax.Array:
+        """Lowers free pressures under their limit p_i < per_wall * d_i (Table I).
+
+        Args:
+          design: Design vector [SI], shape (parameter,).
+
+        Returns:
+          The projected vector, shape (parameter,).
+        """
+        full = self.expand(design)
+        offsets = _offsets(self.hand)
+        wall = full[offsets["wall"] : offsets["wall"] + len(self.hand.finger)]
+        caps = self.hand.pressure_limit.per_wall * wall * _STRICT
+        start = offsets["pressure"]
+        for i in range(len(self.hand.finger)):
+            j = self.source[start + i]
+            if j >= 0:
+                design = design.at[j].min(caps[i])
+        return design
+
+    def default(self) -> np.ndarray:
+        """Returns the table's default design, shape (parameter,), inside the bounds [SI]."""
+        base = _defaults(self.hand)
+        first = [self.source.index(j) for j in range(self.num_parameters)]
+        return np.clip(base[first], self.low, self.high)
+
+    def in_units(self, design: np.ndarray) -> np.ndarray:
+        """Converts design vectors from SI to the hand file's units, shape (..., parameter)."""
+        return np.asarray(design) / np.asarray(self.scale)
+
+    def from_units(self, design: np.ndarray) -> np.ndarray:
+        """Converts design vectors from the hand file's units to SI, shape (..., parameter)."""
+        return np.asarray(design, float) * np.asarray(self.scale)
+
+
+def unflatten(hand: Hand, full: jax.Array) -> Params:
+    """Splits a full vector [SI], shape (full,), into named parameters."""
+    n, offsets = len(hand.finger), _offsets(hand)
+
+    def take(name: str) -> jax.Array:
+        start = offsets[name]
+        return full[start : start + n] if _row(hand, name).per == "finger" else full[start]
+
+    arm = [take(f"arm_{axis}") for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
+    return Params(
+        length=take("length"),
+        height=take("height"),
+        wall=take("wall"),
+        spread=take("spread"),
+        arm=jnp.stack(arm),
+        pressure=take("pressure"),
+    )
+
+
+def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
+    """Builds the design space of a preset.
+
+    Args:
+      hand: The hand.
+      preset: Name of a preset of the hand, or "full" for the whole table (the paper's 23D; "23d" for a
+        table of 23 parameters).
+
+    Raises:
+      SceneError: if the hand has no such preset.
+    """
+    total = sum(_width(hand, p) for p in hand.parameter)
+    if preset in ("full", f"{total}d"):
+        chosen = Preset(preset, ())
+    else:
+        known = {p.name: p for p in hand.preset}
+        if preset not in known:
+            hint = schema.nearest(preset, [*known, "full", f"{total}d"])
+            raise schema.SceneError([f"preset {preset!r} unknown for hand {hand.name}; {hint}"])
+        chosen = known[preset]
+    return _build(hand, chosen, everything=not chosen.free)
+
+
+def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
+    base, offsets = _defaults(hand), _offsets(hand)
+    source = np.full(base.shape, -1)
+    for name, value in preset.fixed.items():
+        row = _row(hand, name)
+        base[offsets[name] : offsets[name] + _width(hand, row)] = value * UNITS[row.unit][1]
+    free = {f.name: f for f in preset.free}
+    columns: list[tuple[str, str, float, float, float, bool]] = []
+    for row in hand.parameter:
+        if not everything and row.name not in free:
+            continue
+        spec, factor, width = free.get(row.name), UNITS[row.unit][1], _width(hand, row)
+        low = row.low if spec is None or spec.low is None else spec.low
+        high = row.high if spec is None or spec.high is None else spec.high
+        count = 1 if (spec is not None and spec.tied) or row.per == "hand" else width
+        for k in range(width):
+            source[offsets[row.name] + k] = len(columns) + (k if count > 1 else 0)
+        for k in range(count):
+            name = f"{row.name}[{k}]" if count > 1 else row.name
+            morphology = row.domain == "morphology"
+            columns.append((name, row.unit, factor, low * factor, high * factor, morphology))
+    names, units, scale, low, high, domain = zip(*columns, strict=True)
+    return DesignSpace(hand, names, units, scale, low, high, domain, tuple(base), tuple(source.tolist()))
+
+
+def _width(hand: Hand, row: Parameter) -> int:
+    return len(hand.finger) if row.per == "finger" else 1
+
+
+def _row(hand: Hand, name: str) -> Parameter:
+    return next(p for p in hand.parameter if p.name == name)
+
+
+@functools.cache
+def _offsets(hand: Hand) -> dict[str, int]:
+    widths = [_width(hand, p) for p in hand.parameter]
+    starts = np.concatenate([[0], np.cumsum(widths)])
+    return {p.name: int(s) for p, s in zip(hand.parameter, starts[:-1], strict=True)}
+
+
+def _defaults(hand: Hand) -> np.ndarray:
+    values = [[p.default * UNITS[p.unit][1]] * _width(hand, p) for p in hand.parameter]
+    return np.concatenate(values).astype(float)

@@ -1,0 +1,215 @@
+"""The scene: hand, objects, effects, phases, contact and discretization, frozen and hashable.
+
+A scene is static: changing it costs one compile; sweeping over parameters, seeds or masks costs none.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from codesign_jax import files, hand, objects, schema
+from codesign_jax.schema import choice, quantity
+
+
+@dataclasses.dataclass(frozen=True)
+class Effects:
+    """What is simulated; an effect that is off has no joint, no contact and no branch in the program."""
+
+    lateral_bending: bool = True
+    twist: bool = True
+    finger_object: bool = True
+    finger_table: bool = True
+    palm_contact: bool = True
+    disturb: bool = True
+    ungrasp: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Phases:
+    """End times of the phases of one grasp (paper Fig. 3) [s]."""
+
+    approach: float = quantity("s", 0.01, 60)
+    inflate: float = quantity("s", 0.01, 60)
+    lift: float = quantity("s", 0.01, 60)
+    disturb: float = quantity("s", 0.01, 60)
+    ungrasp: float = quantity("s", 0.01, 60)
+    deflate_time: float = quantity("s", 0.001, 60)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """Start pose, reference height and disturbance of the arm frame X_D."""
+
+    start_height: float = quantity("m", 0.05, 2)
+    zero_height: float = quantity("m", 0, 1)
+    shake_frequency: float = quantity("Hz", 0, 20)
+    shake_amplitude: float = quantity("deg", 0, 90)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """Cost of a trial (paper Fig. 3): `maximum` if lost when the lift begins, 0 if kept to the end."""
+
+    maximum: float = quantity("", 0.1, 100)
+    lost_distance: float = quantity("m", 0.001, 1)
+    failure: str = choice("exclude", "worst")
+
+
+@dataclasses.dataclass(frozen=True)
+class Contact:
+    """MuJoCo's soft contact, declared as the rubber skin's own numbers; see `model.contact_invweight`."""
+
+    normal_stiffness: float = quantity("N/m", 10, 1e6)
+    time_constant: float = quantity("s", 1e-4, 1)
+    impedance: float = quantity("", 0.01, 0.9999)
+    friction_ratio: float = quantity("", 0.01, 1000)
+    finger_table_friction: float = quantity("", 0, 5)
+
+
+@dataclasses.dataclass(frozen=True)
+class Discretization:
+    """Time step, segments a finger (the paper's ten links) and contact spheres on each link."""
+
+    timestep: float = quantity("s", 1e-5, 0.05)
+    links: int = quantity("", 1, 200)
+    spheres_per_link: int = quantity("", 1, 20)
+
+
+@dataclasses.dataclass(frozen=True)
+class Solver:
+    """Limits of the contact solver: Newton and line-search iterations, MuJoCo's scaled tolerance."""
+
+    iterations: int = quantity("", 1, 1000)
+    ls_iterations: int = quantity("", 1, 1000)
+    tolerance: float = quantity("", 0, 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Bounds beyond which a world has failed although its numbers are finite."""
+
+    speed: float = quantity("rad/s or m/s", 1, 1e9)
+    penetration: float = quantity("m", 1e-4, 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Everything static about a simulation; built by `load`, changed by `dataclasses.replace`."""
+
+    name: str
+    description: str
+    hand: hand.Hand
+    objects: objects.ObjectSet
+    gravity: float
+    effects: Effects
+    phases: Phases
+    arm: Arm
+    cost: Cost
+    contact: Contact
+    discretization: Discretization
+    solver: Solver
+    limits: Limits
+
+    @property
+    def num_fingers(self) -> int:
+        """Number of fingers of the hand."""
+        return len(self.hand.finger)
+
+    @property
+    def num_steps(self) -> int:
+        """Time steps of one grasp, up to the end of the last phase that is on."""
+        return round(self.end_time / self.discretization.timestep)
+
+    @property
+    def end_time(self) -> float:
+        """End of the last phase that is on [s]."""
+        if self.effects.ungrasp:
+            return self.phases.ungrasp
+        return self.phases.disturb if self.effects.disturb else self.phases.lift
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """Times t_0 and t_end between which losing the object costs: lift to end of disturb [s]."""
+        return self.phases.inflate, self.phases.disturb if self.effects.disturb else self.phases.lift
+
+
+@dataclasses.dataclass(frozen=True)
+class _SceneFile:
+    """Schema of a scene file: as `Scene`, with hand and objects by name."""
+
+    name: str
+    description: str
+    hand: str
+    objects: str
+    effects: Effects
+    phases: Phases
+    arm: Arm
+    cost: Cost
+    contact: Contact
+    discretization: Discretization
+    solver: Solver
+    limits: Limits
+    gravity: float = quantity("m/s^2", 0, 100)
+
+
+def load(
+    name: str | Path = "paper",
+    *,
+    hand_name: str | Path | None = None,
+    object_set: str | Path | None = None,
+    overrides: dict[str, dict[str, Any]] | None = None,
+) -> Scene:
+    """Reads a scene with its hand and objects.
+
+    Args:
+      name: Name of a built-in scene, or a path ending in .toml.
+      hand_name: Hand to use instead of the scene's.
+      object_set: Object set to use instead of the scene's.
+      overrides: Values by table and key that replace the file's, e.g. {"discretization": {"links": 5}}.
+
+    Raises:
+      SceneError: with every problem of the scene, the hand and the objects.
+    """
+    path = files.find("scenes", name)
+    table = files.read(path)
+    for group, values in (overrides or {}).items():
+        if isinstance(values, dict):
+            table[group] = {**table.get(group, {}), **values}
+        else:
+            table[group] = values
+    problems: list[str] = []
+    parsed = schema.parse(_SceneFile, table, path.name, problems)
+    parts = {}
+    for key, loader, chosen in (("hand", hand.load, hand_name), ("objects", objects.load, object_set)):
+        try:
+            parts[key] = loader(_beside(path, chosen or table.get(key, "")))
+        except schema.SceneError as error:
+            problems += error.problems
+    if parsed is not None:
+        _check(parsed, path.name, problems)
+    if problems or parsed is None:
+        raise schema.SceneError(problems)
+    names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
+    return Scene(**parts, **{n: getattr(parsed, n) for n in names})
+
+
+def _beside(path: Path, name: str | Path) -> str | Path:
+    """Paths inside a scene file are relative to that file."""
+    relative = Path(name)
+    if relative.suffix == ".toml" and not relative.is_absolute() and not relative.is_file():
+        return path.parent / relative
+    return name
+
+
+def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
+    p, h = scene.phases, scene.discretization.timestep
+    times = [("approach", p.approach), ("inflate", p.inflate), ("lift", p.lift)]
+    times += [("disturb", p.disturb), ("ungrasp", p.ungrasp)]
+    for (first, a), (second, b) in zip(times, times[1:], strict=False):
+        if not a < b:
+            problems.append(f"{where}.phases.{second} = {b:g} s must come after {first} = {a:g} s")
+    if scene.contact.time_constant < 2 * h:
+        problems.append(
+            f"{where}.contact.time_constant = {scene.contact.time_constant:g} s must be at least two "
+            f"time steps ({2 * h:g} s): a stiffer contact is unstable (MuJoCo's refsafe)"
+        )

@@ -11,8 +11,9 @@ from codesign_jax.types import Params, Trial
 def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     """Returns the controls of one grasp, shape (time, nu).
 
-    The columns are the actuators' order: arm frame x, y, z [m], roll, yaw, pitch [rad] (the order of the
-    wrist hinges, see `model`), then one pressure [Pa] a finger.  Row k is held from time k h to (k+1) h.
+    The columns are the actuators' order: arm frame x, y, z [m], roll, yaw, pitch [rad] (the order
+    of the wrist hinges, see `model`), then one pressure [Pa] a finger.  Row k is held from time k h
+    to (k+1) h.
 
     Args:
       scene: The scene.
@@ -22,7 +23,8 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     time = np.arange(scene.num_steps) * scene.discretization.timestep
     arm, p = params.arm, scene.phases
     start, grasp = scene.arm.start_height, scene.arm.zero_height + arm[2]
-    # The approach is vertical: lateral position and orientation are the grasp's from the start [ours].
+    # The approach is vertical: lateral position and orientation are the grasp's from the start
+    # [ours].
     frames = jnp.stack([jnp.asarray(start, arm.dtype), grasp, grasp, jnp.asarray(start, arm.dtype)])
     height = jnp.interp(time, np.array([0.0, p.approach, p.inflate, p.lift]), frames)
     roll, pitch = _shake(scene, time)
@@ -52,8 +54,8 @@ def _inflation(scene: Scene, time: np.ndarray) -> np.ndarray:
 def _shake(scene: Scene, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Roll and pitch that the disturbance adds [rad], each of shape (time,).
 
-    A sine whose amplitude grows linearly over the phase; whole periods alternate between roll and pitch.
-    Afterwards the arm returns linearly to its nominal pose while the chambers deflate.
+    A sine whose amplitude grows linearly over the phase; whole periods alternate between roll and
+    pitch. Afterwards the arm returns linearly to its nominal pose while the chambers deflate.
     """
     if not scene.effects.disturb:
         return np.zeros_like(time), np.zeros_like(time)

@@ -11,8 +11,9 @@ from codesign_jax.types import Outcome, Status, Trace
 def outcome(scene: Scene, trace: Trace) -> Outcome:
     """Returns cost and status of one trial from its trace.
 
-    c = c_max (t_end - t_lost) / (t_end - t_0), where t_lost is the first time in [t_0, t_end) at which the
-    object is `lost_distance` or more from the hand centre; 0 if it is kept.  A trial is decided once it is
+    c = c_max (t_end - t_lost) / (t_end - t_0), where t_lost is the first time in [t_0, t_end) at
+    which the object is `lost_distance` or more from the hand centre; 0 if it is kept.  A trial is
+    decided once it is
     lost: what happens later neither fails it nor needs simulating.
 
     Args:
@@ -40,8 +41,8 @@ def outcome(scene: Scene, trace: Trace) -> Outcome:
 def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
     """Mean cost over a particle's trials by the scene's rule for failed ones.
 
-    "exclude" (the paper's) averages the trials that did not fail, the maximum if all did; "worst" scores
-    each failed trial with the maximum.
+    "exclude" (the paper's) averages the trials that did not fail, the maximum if all did; "worst"
+    scores each failed trial with the maximum.
 
     Args:
       scene: The scene.
@@ -77,7 +78,8 @@ def _stuck(scene: Scene, trace: Trace) -> jax.Array:
     """Whether the released object neither left the hand nor rests on the table."""
     if not scene.effects.ungrasp:
         return jnp.zeros((), bool)
-    # A resting object's centre is at most its bounding radius above the table, whatever side it lies on.
+    # A resting object's centre is at most its bounding radius above the table, whatever side it
+    # lies on.
     radius = max(np.linalg.norm(_half_extents(s.type, s.size)) for s in scene.objects.object)
     resting = trace.height[-1] < radius * (1 + 4 * scene.objects.noise.size)
     return (trace.distance[-1] <= scene.cost.lost_distance) & ~resting

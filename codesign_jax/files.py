@@ -1,4 +1,4 @@
-"""Finds and reads the hand, object and scene files: the user's, the checkout's or the installed wheel's."""
+"""Finds and reads hand, object and scene files: the user's, the checkout's or the wheel's."""
 
 import tomllib
 from pathlib import Path
@@ -38,7 +38,9 @@ def find(kind: str, name: str | Path) -> Path:
     built_in = available(kind)
     if str(name) in built_in:
         return built_in[str(name)]
-    raise schema.SceneError([f"{kind}: {str(name)!r} unknown; {schema.nearest(str(name), built_in)}"])
+    raise schema.SceneError(
+        [f"{kind}: {str(name)!r} unknown; {schema.nearest(str(name), built_in)}"]
+    )
 
 
 def read(path: Path) -> dict[str, Any]:

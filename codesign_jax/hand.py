@@ -1,4 +1,4 @@
-"""A hand as data: fingers, section, material, palm, wrist and the parameter table (paper Sec. VI.2, Table I)."""
+"""A hand as data: fingers, material, palm, wrist and the parameter table (paper Table I)."""
 
 import dataclasses
 from pathlib import Path
@@ -24,7 +24,7 @@ PARAMETERS = {
 
 @dataclasses.dataclass(frozen=True)
 class Finger:
-    """Mount of a finger on the palm: it leaves at azimuth + spread * gamma, `tilt` below the horizontal."""
+    """Mount of a finger, which leaves the palm at azimuth + spread * gamma, tilted downwards."""
 
     azimuth: float = quantity("deg", -360, 360)
     spread: float = quantity("", -1, 1)
@@ -91,7 +91,7 @@ class PressureLimit:
 
 @dataclasses.dataclass(frozen=True)
 class Free:
-    """A parameter that a preset leaves free, optionally one value for all fingers and other bounds."""
+    """A parameter that a preset leaves free, optionally tied over fingers, with other bounds."""
 
     name: str = choice(*PARAMETERS)
     tied: bool = False
@@ -156,13 +156,19 @@ def _check_table(hand: Hand, where: str, problems: list[str]) -> None:
         problems.append(f"{where}.finger must name at least one finger")
     for name in PARAMETERS:
         if names.count(name) != 1:
-            problems.append(f"{where}.parameter {name!r} must be given once, not {names.count(name)} times")
+            problems.append(
+                f"{where}.parameter {name!r} must be given once, not {names.count(name)} times"
+            )
     for p in hand.parameter:
         if p.per != PARAMETERS[p.name]:
             problems.append(f"{where}.parameter {p.name}.per must be {PARAMETERS[p.name]!r}")
         if not p.low < p.high:
-            problems.append(f"{where}.parameter {p.name}: low {p.low:g} must be below high {p.high:g} {p.unit}")
-        problem = schema.range_problem(f"{where}.parameter {p.name}.default", p.default, p.unit, p.low, p.high)
+            problems.append(
+                f"{where}.parameter {p.name}: low {p.low:g} must be below high {p.high:g} {p.unit}"
+            )
+        problem = schema.range_problem(
+            f"{where}.parameter {p.name}.default", p.default, p.unit, p.low, p.high
+        )
         if problem:
             problems.append(problem)
 
@@ -173,7 +179,9 @@ def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
         path = f"{where}.preset {preset.name}"
         for key, value in preset.fixed.items():
             if key not in table:
-                problems.append(f"{path}.fixed.{key} is not a parameter; {schema.nearest(key, table)}")
+                problems.append(
+                    f"{path}.fixed.{key} is not a parameter; {schema.nearest(key, table)}"
+                )
                 continue
             p = table[key]
             problem = schema.range_problem(f"{path}.fixed.{key}", value, p.unit, p.low, p.high)
@@ -189,7 +197,7 @@ def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
 
 
 def _check_chamber(hand: Hand, where: str, problems: list[str]) -> None:
-    """The section must keep an air chamber at the table's corners (physics.md: h - 2d > 0, w - 2d > 0)."""
+    """The section must keep an air chamber at the table's corners: h - 2d > 0, w - 2d > 0."""
     from codesign_jax.parameters import UNITS
 
     table = {p.name: p for p in hand.parameter}
@@ -198,5 +206,6 @@ def _check_chamber(hand: Hand, where: str, problems: list[str]) -> None:
     for name, size in (("height.low", height), ("section.width", hand.section.width)):
         if size <= 2 * wall:
             problems.append(
-                f"{where}: {name} = {size:g} m leaves no air chamber between walls of up to {wall:g} m"
+                f"{where}: {name} = {size:g} m leaves no air chamber "
+                f"between walls of up to {wall:g} m"
             )

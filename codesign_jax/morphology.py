@@ -1,10 +1,10 @@
-"""Beam theory of a PneuFlex finger: cross-section and pressure to stiffness, mass and actuation moment.
+"""Beam theory of a PneuFlex finger: section and pressure to stiffness, mass and moment.
 
-Section frame: y = height above the inextensible bottom layer, z = width, x along the finger.  The outer
-section is width x height with walls of equal thickness around one air chamber.  Formulas follow from
-elementary beam theory (Euler-Bernoulli bending, Bredt torsion) for a neo-Hookean wall of shear modulus G
-that the hoop threads hold in plane strain, hence the modulus 4 G in bending; they model the actuator of
-Deimel and Brock (2016) that the paper refers to as [2].
+Section frame: y = height above the inextensible bottom layer, z = width, x along the finger.  The
+outer section is width x height with walls of equal thickness around one air chamber.  Formulas
+follow from elementary beam theory (Euler-Bernoulli bending, Bredt torsion) for a neo-Hookean wall
+of shear modulus G that the hoop threads hold in plane strain, hence the modulus 4 G in bending;
+they model the actuator of Deimel and Brock (2016) that the paper refers to as [2].
 """
 
 from typing import NamedTuple
@@ -48,8 +48,8 @@ def beam(
     Returns:
       The properties, with
         EI_b = 4 G [w h^3 - w_c ((h-d)^3 - d^3)] / 3: second moment about the bottom layer,
-        EI_lat = 4 G [I_z + A (w/2)^2]: the fabric resists tension only, so the neutral axis is the side,
-        G J with J = 4 A_m^2 d / U (Bredt, thin wall; thick walls are up to 25 % stiffer),
+        EI_lat = 4 G [I_z + A (w/2)^2]: the fabric resists tension only, so the neutral axis is the
+        side, G J with J = 4 A_m^2 d / U (Bredt, thin wall; thick walls are up to 25 % stiffer),
         M_p / p = A_c h/2 by virtual work, independent of curvature and load.
     """
     h, d, w = height, wall, width
@@ -81,6 +81,8 @@ def finger_beams(hand: Hand, params: Params) -> Beam:
     )
 
 
-def block_inertia(mass: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array) -> tuple[jax.Array, ...]:
+def block_inertia(
+    mass: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array
+) -> tuple[jax.Array, ...]:
     """Principal inertia of a solid block with edges x, y, z [m] about its centre [kg m^2]."""
     return mass * (y**2 + z**2) / 12, mass * (x**2 + z**2) / 12, mass * (x**2 + y**2) / 12

@@ -1,4 +1,4 @@
-"""Object sets as data: primitive shapes, masses, friction and the noise of a trial (paper Sec. VI.2)."""
+"""Object sets as data: shapes, masses, friction and the noise of a trial (paper Sec. VI.2)."""
 
 import dataclasses
 from pathlib import Path
@@ -28,7 +28,7 @@ class Table:
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A primitive: half sizes of a box, radius and half height of a cylinder, radius of a sphere."""
+    """A primitive: half sizes of a box; radius, half height of a cylinder; radius of a sphere."""
 
     name: str
     type: str = choice(*SIZES)

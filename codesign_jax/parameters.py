@@ -1,7 +1,8 @@
 """Flat parameter vectors: names, units, bounds, presets and the pressure limit (Table I).
 
-A *full* vector holds every parameter of the hand's table in the table's order, one entry a finger where the
-row says so, in SI units and radians.  A *design* vector holds a preset's free parameters only.
+A *full* vector holds every parameter of the hand's table in the table's order, one entry a finger
+where the row says so, in SI units and radians.  A *design* vector holds a preset's free parameters
+only.
 """
 
 import dataclasses
@@ -128,8 +129,8 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
 
     Args:
       hand: The hand.
-      preset: Name of a preset of the hand, or "full" for the whole table (the paper's 23D; "23d" for a
-        table of 23 parameters).
+      preset: Name of a preset of the hand, or "full" for the whole table (the paper's 23D; "23d"
+        for a table of 23 parameters).
 
     Raises:
       SceneError: if the hand has no such preset.
@@ -168,7 +169,9 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
             morphology = row.domain == "morphology"
             columns.append((name, row.unit, factor, low * factor, high * factor, morphology))
     names, units, scale, low, high, domain = zip(*columns, strict=True)
-    return DesignSpace(hand, names, units, scale, low, high, domain, tuple(base), tuple(source.tolist()))
+    return DesignSpace(
+        hand, names, units, scale, low, high, domain, tuple(base), tuple(source.tolist())
+    )
 
 
 def _width(hand: Hand, row: Parameter) -> int:

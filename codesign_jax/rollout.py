@@ -11,11 +11,12 @@ from codesign_jax.types import Outcome, Params, Trace, Trial
 
 
 def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
-    """Draws the objects and noise of trials (paper Sec. VI.2); shapes take turns in the set's order.
+    """Draws objects and noise of trials (paper Sec. VI.2); shapes take turns in the set's order.
 
     Args:
       scene: The scene.
-      key: Typed key; trial t draws from fold_in(key, t), so that more trials do not change earlier ones.
+      key: Typed key; trial t draws from fold_in(key, t), so that more trials do not change earlier
+        ones.
       num_trials: Number of trials.
 
     Returns:
@@ -75,7 +76,8 @@ def evaluate(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Out
       scene: The scene.
       engine: The engine.
       params: Parameters with leading axis (particle,).
-      trials: Trials with leading axis (trial,): common random numbers, every particle meets the same ones.
+      trials: Trials with leading axis (trial,): common random numbers, every particle meets the
+        same ones.
 
     Returns:
       Outcomes, every array of shape (particle, trial).

@@ -1,6 +1,7 @@
 """The scene: hand, objects, effects, phases, contact and discretization, frozen and hashable.
 
-A scene is static: changing it costs one compile; sweeping over parameters, seeds or masks costs none.
+A scene is static: changing it costs one compile; sweeping over parameters, seeds or masks costs
+none.
 """
 
 import dataclasses
@@ -13,7 +14,7 @@ from codesign_jax.schema import choice, quantity
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """What is simulated; an effect that is off has no joint, no contact and no branch in the program."""
+    """What is simulated; an effect that is off has no joint, contact or branch in the program."""
 
     lateral_bending: bool = True
     twist: bool = True
@@ -48,7 +49,7 @@ class Arm:
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
-    """Cost of a trial (paper Fig. 3): `maximum` if lost when the lift begins, 0 if kept to the end."""
+    """Cost of a trial (paper Fig. 3): `maximum` if lost as the lift begins, 0 if kept."""
 
     maximum: float = quantity("", 0.1, 100)
     lost_distance: float = quantity("m", 0.001, 1)
@@ -57,7 +58,7 @@ class Cost:
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """MuJoCo's soft contact, declared as the rubber skin's own numbers; see `model.contact_invweight`."""
+    """MuJoCo's soft contact as the rubber skin's own numbers; see `model.contact_invweight`."""
 
     normal_stiffness: float = quantity("N/m", 10, 1e6)
     time_constant: float = quantity("s", 1e-4, 1)
@@ -77,7 +78,7 @@ class Discretization:
 
 @dataclasses.dataclass(frozen=True)
 class Solver:
-    """Limits of the contact solver: Newton and line-search iterations, MuJoCo's scaled tolerance."""
+    """Limits of the contact solver: Newton and line-search iterations, scaled tolerance."""
 
     iterations: int = quantity("", 1, 1000)
     ls_iterations: int = quantity("", 1, 1000)
@@ -130,7 +131,10 @@ class Scene:
     @property
     def window(self) -> tuple[float, float]:
         """Times t_0 and t_end between which losing the object costs: lift to end of disturb [s]."""
-        return self.phases.inflate, self.phases.disturb if self.effects.disturb else self.phases.lift
+        return (
+            self.phases.inflate,
+            self.phases.disturb if self.effects.disturb else self.phases.lift,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,7 +169,8 @@ def load(
       name: Name of a built-in scene, or a path ending in .toml.
       hand_name: Hand to use instead of the scene's.
       object_set: Object set to use instead of the scene's.
-      overrides: Values by table and key that replace the file's, e.g. {"discretization": {"links": 5}}.
+      overrides: Values by table and key that replace the file's, e.g. {"discretization": {"links":
+        5}}.
 
     Raises:
       SceneError: with every problem of the scene, the hand and the objects.
@@ -180,7 +185,10 @@ def load(
     problems: list[str] = []
     parsed = schema.parse(_SceneFile, table, path.name, problems)
     parts = {}
-    for key, loader, chosen in (("hand", hand.load, hand_name), ("objects", objects.load, object_set)):
+    for key, loader, chosen in (
+        ("hand", hand.load, hand_name),
+        ("objects", objects.load, object_set),
+    ):
         try:
             parts[key] = loader(_beside(path, chosen or table.get(key, "")))
         except schema.SceneError as error:
@@ -210,6 +218,6 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
             problems.append(f"{where}.phases.{second} = {b:g} s must come after {first} = {a:g} s")
     if scene.contact.time_constant < 2 * h:
         problems.append(
-            f"{where}.contact.time_constant = {scene.contact.time_constant:g} s must be at least two "
-            f"time steps ({2 * h:g} s): a stiffer contact is unstable (MuJoCo's refsafe)"
+            f"{where}.contact.time_constant = {scene.contact.time_constant:g} s "
+            f"must be at least two time steps ({2 * h:g} s): a stiffer contact is unstable (MuJoCo's refsafe)"
         )

@@ -1,8 +1,8 @@
 """TOML tables to frozen dataclasses, with every error found at once.
 
-A dataclass field made by `quantity` carries its unit and allowed range; `parse` checks types, ranges and
-names and reports the key path, the value, the unit, the range and, where one fits, the unit slip that
-would explain it.
+A dataclass field made by `quantity` carries its unit and allowed range; `parse` checks types,
+ranges and names and reports the key path, the value, the unit, the range and, where one fits, the
+unit slip that would explain it.
 """
 
 import dataclasses
@@ -77,7 +77,8 @@ def parse(cls: type[T], table: Any, path: str, problems: list[str]) -> T | None:
     """Builds a frozen dataclass from a TOML table, appending every problem to `problems`.
 
     Args:
-      cls: Dataclass to build; fields may be numbers, strings, booleans, dataclasses or tuples of these.
+      cls: Dataclass to build; fields may be numbers, strings, booleans, dataclasses or tuples of
+        these.
       table: The parsed TOML value.
       path: Key path of the table, for messages.
       problems: List that collects the messages.

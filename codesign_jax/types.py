@@ -1,6 +1,7 @@
 """Named data that passes between the modules: parameters, trials, traces and the status bits.
 
-Axis order of the public API is (particle, trial, time, feature).  Failure is data: nothing raises inside jit.
+Axis order of the public API is (particle, trial, time, feature).  Failure is data: nothing raises
+inside jit.
 """
 
 import enum
@@ -70,7 +71,8 @@ class Trace(NamedTuple):
       height: Object centre above the table [m], shape (time,).
       speed: Largest absolute generalized velocity [rad/s or m/s], shape (time,); not finite if any
         state is not.
-      qpos: Generalized positions if trajectories were asked for, shape (time, nq), else shape (time, 0).
+      qpos: Generalized positions if trajectories were asked for, shape (time, nq), else shape
+        (time, 0).
     """
 
     distance: jax.Array

@@ -26,7 +26,8 @@ class Engine(Protocol):
           trajectory: Whether to return qpos of every step.
 
         Returns:
-          The trace of every world, every array with a leading world axis.  A world that fails is frozen
-          at its last good state; its trace shows the failure at the failing step and stays there.
+          The trace of every world, every array with a leading world axis.  A world that fails is
+          frozen at its last good state; its trace shows the failure at the failing step and stays
+          there.
         """
         ...

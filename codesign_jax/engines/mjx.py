@@ -53,7 +53,9 @@ class MjxEngine:
                 speed,
                 data.qpos if trajectory else data.qpos[:0],
             )
-            new_speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()  # not finite if any state is not
+            new_speed = (
+                jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()
+            )  # not finite if any state is not
             good = jnp.isfinite(new_speed) & (new_speed <= limits.speed)
             good &= (speed <= limits.speed) & (middle[2] >= -limits.penetration)
             data = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, data)

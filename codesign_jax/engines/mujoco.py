@@ -12,7 +12,8 @@ from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
 
-# Steps between looking at the worlds: a lost object or a failed world stops being simulated at this grain.
+# Steps between looking at the worlds: a lost object or a failed world stops being simulated at this
+# grain.
 _CHUNK = 25
 
 
@@ -57,14 +58,19 @@ class MujocoEngine:
 
     def _batch(self, num_worlds: int) -> mujoco.batch.Batch:
         if num_worlds not in self._batches:
-            self._batches[num_worlds] = mujoco.batch.Batch(self.template, num_worlds, self.num_threads)
+            self._batches[num_worlds] = mujoco.batch.Batch(
+                self.template, num_worlds, self.num_threads
+            )
         return self._batches[num_worlds]
 
     def _simulate(self, fields: ModelFields, ctrl: np.ndarray, trajectory: bool) -> Trace:
         (worlds, steps), scene, nq = ctrl.shape[:2], self.scene, self.template.nq
         batch = self._batch(worlds)
         write_fields(batch, fields)
-        trace = Trace(*(np.zeros((worlds, steps)) for _ in range(3)), np.zeros((worlds, steps, nq * trajectory)))
+        trace = Trace(
+            *(np.zeros((worlds, steps)) for _ in range(3)),
+            np.zeros((worlds, steps, nq * trajectory)),
+        )
         start, end = (round(t / scene.discretization.timestep) for t in scene.window)
         going = np.arange(worlds)
         for first in range(0, steps, _CHUNK):
@@ -102,7 +108,11 @@ class MujocoEngine:
         qvel = np.concatenate([before[0], record["qvel"][:, :-1]], 1)
         with np.errstate(invalid="ignore"):
             speed = np.abs(qvel).max(-1)
-        qpos = np.concatenate([before[1], record["qpos"][:, :-1]], 1) if trajectory else xipos[:, :, 0, :0]
+        qpos = (
+            np.concatenate([before[1], record["qpos"][:, :-1]], 1)
+            if trajectory
+            else xipos[:, :, 0, :0]
+        )
         return Trace(np.linalg.norm(middle - centre, axis=-1), middle[..., 2], speed, qpos)
 
 
@@ -118,7 +128,7 @@ def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:
 
 
 def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:
-    """Returns a model of MuJoCo C with the fields of one world, for a viewer or any mj_ function."""
+    """Returns an MjModel with the fields of one world, for a viewer or any mj_ function."""
     import copy
 
     model = copy.deepcopy(compile_template(scene))

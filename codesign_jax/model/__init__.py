@@ -1,0 +1,31 @@
+"""Scene to MuJoCo model, once a scene; parameters to batched model fields, as a pure function.
+
+One MjSpec template a scene fixes the topology.  Each finger is a chain of `links` equal segments
+with its joints at the segments' midpoints, so the first half segment is welded to the palm.  A ball
+joint is three hinges on one body in the order bend (y), lateral (z), twist (x): the middle angle
+stays far from 90 degrees and each axis has its own stiffness.  Link frames have x along the finger,
+y across (the bend axis) and z up from the inextensible bottom layer; positive bending curls the tip
+towards that layer.
+
+Springs are integrated linearly implicitly in every engine by the same substitution for diagonal
+stiffness K and damping D and time step h: dof_damping = D + h K and dof_armature = h (D + h K),
+integrator Euler with eulerdamp disabled.  MuJoCo then solves (M + h D + h^2 K) a = tau - K q - (D +
+h K) v.
+"""
+
+from codesign_jax.model.fields import ModelFields, joint_springs, model_fields
+from codesign_jax.model.layout import Layout, contact_invweight, joint_axes, layout
+from codesign_jax.model.spec import build_spec, compile_model, compile_template
+
+__all__ = [
+    "Layout",
+    "ModelFields",
+    "build_spec",
+    "compile_model",
+    "compile_template",
+    "contact_invweight",
+    "joint_axes",
+    "joint_springs",
+    "layout",
+    "model_fields",
+]

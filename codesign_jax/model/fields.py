@@ -1,0 +1,189 @@
+"""Parameters to batched model fields, as a pure function: one topology, no recompile."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import morphology
+from codesign_jax.model.layout import Layout, geom_bounds, layout, mounts, object_size
+from codesign_jax.model.spec import compile_template
+from codesign_jax.scene import Scene
+from codesign_jax.types import Params, Trial
+
+
+class ModelFields(NamedTuple):
+    """The fields of mjModel that depend on parameters and trial, and the start state.
+
+    Every array has MuJoCo's name and shape for one world; `start` is the initial qpos, shape (nq,).
+    """
+
+    body_pos: jax.Array
+    body_quat: jax.Array
+    body_ipos: jax.Array
+    body_mass: jax.Array
+    body_subtreemass: jax.Array
+    body_inertia: jax.Array
+    geom_pos: jax.Array
+    geom_size: jax.Array
+    geom_rbound: jax.Array
+    geom_aabb: jax.Array
+    jnt_stiffness: jax.Array
+    dof_damping: jax.Array
+    dof_armature: jax.Array
+    actuator_gainprm: jax.Array
+    start: jax.Array
+
+
+def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
+    """Returns physical stiffness [N m/rad] and damping [N m s/rad] of every dof, (nv,) each.
+
+    Finger joints have k = EI / l and GJ / l for a segment of length l and damping beta k
+    (Kelvin-Voigt); the six wrist dofs those of the hand file; the object's are free.
+    """
+    lay, hand = layout(scene), scene.hand
+    beam = morphology.finger_beams(hand, params)
+    segment = params.length / lay.links
+    by_axis = {"bend": beam.bending, "lateral": beam.lateral, "twist": beam.torsion}
+    finger = jnp.stack([by_axis[name] / segment for name in lay.axes], -1)
+    finger = jnp.broadcast_to(finger[:, None, :], lay.dofs.shape).reshape(-1)
+    w = hand.wrist
+    wrist = jnp.array([w.linear_stiffness] * 3 + [w.angular_stiffness] * 3, finger.dtype)
+    wrist_damping = jnp.array([w.linear_damping] * 3 + [w.angular_damping] * 3, finger.dtype)
+    free = jnp.zeros(6, finger.dtype)
+    stiffness = jnp.concatenate([wrist, finger, free])
+    return stiffness, jnp.concatenate([wrist_damping, hand.material.damping_time * finger, free])
+
+
+def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
+    """Returns the batched model fields and the start state of one world; pure, vmap it for batches.
+
+    Args:
+      scene: The scene (static).
+      params: Parameters of the hand; all physics in the float type of these.
+      trial: The trial's object and noise.
+    """
+    template, lay = compile_template(scene), layout(scene)
+    beam = morphology.finger_beams(scene.hand, params)
+    dtype = params.length.dtype
+
+    def base(name: str) -> jax.Array:
+        return jnp.asarray(getattr(template, name), dtype)
+
+    segment = params.length / lay.links
+    extents = _extents(segment, lay)
+    masses = beam.line_density[:, None] * extents
+    size, object_mass, object_inertia, rest = object_size(scene, trial)
+    bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
+    mount_pos, mount_quat = mounts(scene, params.spread)
+    offsets = jnp.concatenate(
+        [segment[:, None] / 2, jnp.broadcast_to(segment[:, None], masses[:, 2:].shape)], 1
+    )
+    mass = base("body_mass").at[bodies].set(masses).at[lay.object].set(object_mass)
+    h = scene.discretization.timestep
+    stiffness, damping = joint_springs(scene, params)
+    implicit = damping + h * stiffness
+    geom_size, rbound, aabb = _geom_fields(scene, params, size, base)
+    return ModelFields(
+        body_pos=base("body_pos").at[lay.stubs].set(mount_pos).at[lay.bodies, 0].set(offsets),
+        body_quat=base("body_quat").at[lay.stubs].set(mount_quat),
+        body_ipos=_centres(base("body_ipos"), bodies, extents, params.height),
+        body_mass=mass,
+        body_subtreemass=_subtree_mass(lay, mass, masses, base("body_subtreemass")),
+        body_inertia=_link_inertia(scene, params, base("body_inertia"), bodies, masses, extents)
+        .at[lay.object]
+        .set(object_inertia),
+        geom_pos=_sphere_positions(scene, params, extents, base("geom_pos")),
+        geom_size=geom_size,
+        geom_rbound=rbound,
+        geom_aabb=aabb,
+        # The wrist's springs are its position actuators; only the fingers have passive ones.
+        jnt_stiffness=base("jnt_stiffness").at[lay.dofs].set(stiffness[lay.dofs]),
+        dof_damping=implicit,
+        dof_armature=h * implicit,
+        actuator_gainprm=base("actuator_gainprm").at[6:, 0].set(beam.moment_per_pressure),
+        start=_start(scene, params, trial, rest),
+    )
+
+
+def _extents(segment: jax.Array, lay: Layout) -> jax.Array:
+    """Length of each body of a finger, shape (finger, N + 1): half segments at both ends."""
+    factor = np.ones(lay.links + 1)
+    factor[[0, -1]] = 0.5
+    return segment[:, None] * factor
+
+
+def _centres(
+    ipos: jax.Array, bodies: np.ndarray, extents: jax.Array, height: jax.Array
+) -> jax.Array:
+    ipos = ipos.at[bodies, 0].set(extents / 2)
+    return ipos.at[bodies, 2].set(jnp.broadcast_to(height[:, None] / 2, bodies.shape))
+
+
+def _link_inertia(
+    scene: Scene,
+    params: Params,
+    inertia: jax.Array,
+    bodies: np.ndarray,
+    masses: jax.Array,
+    extents: jax.Array,
+) -> jax.Array:
+    """Inertia of each link as the block extent x width x height."""
+    width, height = jnp.asarray(scene.hand.section.width), params.height[:, None]
+    return inertia.at[bodies].set(
+        jnp.stack(morphology.block_inertia(masses, extents, width, height), -1)
+    )
+
+
+def _subtree_mass(lay: Layout, mass: jax.Array, masses: jax.Array, subtree: jax.Array) -> jax.Array:
+    tails = jnp.cumsum(masses[:, ::-1], 1)[:, ::-1]
+    hand = mass[1] + tails[:, 0].sum()
+    subtree = subtree.at[lay.stubs].set(tails[:, 0]).at[lay.bodies].set(tails[:, 1:])
+    total = hand + mass[lay.object]
+    return subtree.at[0].set(total).at[1].set(hand).at[lay.object].set(mass[lay.object])
+
+
+def _sphere_positions(
+    scene: Scene, params: Params, extents: jax.Array, geom_pos: jax.Array
+) -> jax.Array:
+    """Spheres spread evenly over each moving link, tangent to the bottom layer."""
+    lay = layout(scene)
+    if not lay.spheres.size:
+        return geom_pos
+    k = lay.spheres.shape[2]
+    along = extents[:, 1:, None] * (np.arange(k) + 0.5) / k
+    up = jnp.broadcast_to(params.height[:, None, None] / 2, lay.spheres.shape)
+    return geom_pos.at[lay.spheres, 0].set(along).at[lay.spheres, 2].set(up)
+
+
+def _geom_fields(
+    scene: Scene, params: Params, size: jax.Array, base
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    lay = layout(scene)
+    geom_size, rbound, aabb = base("geom_size"), base("geom_rbound"), base("geom_aabb")
+    if lay.spheres.size:
+        radius = jnp.broadcast_to(params.height[:, None, None] / 2, lay.spheres.shape)
+        geom_size = geom_size.at[lay.spheres, 0].set(radius)
+        rbound = rbound.at[lay.spheres].set(radius)
+        aabb = aabb.at[lay.spheres, 3:].set(radius[..., None])
+    for i, shape in enumerate(scene.objects.object):
+        g = lay.object_geoms[i]
+        r, half = geom_bounds(shape.type, size[i])
+        geom_size, rbound, aabb = (
+            geom_size.at[g].set(size[i]),
+            rbound.at[g].set(r),
+            aabb.at[g, 3:].set(half),
+        )
+    return geom_size, rbound, aabb
+
+
+def _start(scene: Scene, params: Params, trial: Trial, rest: jax.Array) -> jax.Array:
+    """Start state: palm at the arm's first pose, straight fingers, object at rest."""
+    arm, tilt, dtype = params.arm, trial.arm_tilt, params.arm.dtype
+    height = jnp.asarray(scene.arm.start_height, dtype)
+    wrist = jnp.stack([arm[0], arm[1], height, arm[3] + tilt[0], arm[5], arm[4] + tilt[1]])
+    zero = jnp.zeros((), dtype)
+    quat = jnp.stack([jnp.cos(trial.yaw / 2), zero, zero, jnp.sin(trial.yaw / 2)])
+    fingers = jnp.zeros(layout(scene).dofs.size, dtype)
+    return jnp.concatenate([wrist, fingers, trial.position, rest[None], quat]).astype(dtype)

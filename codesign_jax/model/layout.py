@@ -1,0 +1,144 @@
+"""Where a scene's parts lie in the model's arrays, and the numbers its geometry shares.
+
+Both ways to a model use it: `spec` compiles one hand with MuJoCo, `fields` computes batches of
+them.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import morphology
+from codesign_jax.scene import Scene
+from codesign_jax.types import Trial
+
+# An object body carries one geom for each shape of the set; those that a trial does not use shrink
+# to this fraction, deep inside the one in use, where nothing touches them.
+INACTIVE = 1e-3
+# Wrist hinges turn in the order roll (x), yaw (z), pitch (y).  Yaw is in the middle, where +-90
+# degrees is singular, because the disturbance adds up to 40 degrees to roll and pitch but nothing
+# to yaw.
+WRIST = ("x", "y", "z", "roll", "yaw", "pitch")
+AXES = {"bend": (0, 1, 0), "lateral": (0, 0, 1), "twist": (1, 0, 0)}
+
+
+class Layout(NamedTuple):
+    """Where a scene's parts lie in the model's arrays.
+
+    Attributes:
+      links: Number of segments N of a finger.
+      axes: Names of the joint axes that are on, in hinge order.
+      stubs: Body ids of the half segments at the palm, shape (finger,).
+      bodies: Body ids of the moving links, shape (finger, N).
+      object: Body id of the object.
+      dofs: Dof (and joint) ids of the finger hinges, shape (finger, N, axis).
+      spheres: Geom ids of the finger spheres, shape (finger, N, k); empty without finger contacts.
+      object_geoms: Geom ids of the object's shapes, shape (shape,).
+      centre_weights: Weight of each body in the hand centre, the mean position of the segments,
+        (nbody,).
+    """
+
+    links: int
+    axes: tuple[str, ...]
+    stubs: np.ndarray
+    bodies: np.ndarray
+    object: int
+    dofs: np.ndarray
+    spheres: np.ndarray
+    object_geoms: np.ndarray
+    centre_weights: np.ndarray
+
+
+def joint_axes(scene: Scene) -> tuple[str, ...]:
+    """Names of the finger joints' axes that the scene's effects call for, in hinge order."""
+    on = {"bend": True, "lateral": scene.effects.lateral_bending, "twist": scene.effects.twist}
+    return tuple(name for name in AXES if on[name])
+
+
+@functools.cache
+def layout(scene: Scene) -> Layout:
+    """Returns the index layout of a scene's model."""
+    n, links, axes = scene.num_fingers, scene.discretization.links, joint_axes(scene)
+    stubs = 2 + np.arange(n) * (links + 1)
+    bodies = stubs[:, None] + 1 + np.arange(links)
+    dofs = 6 + np.arange(n * links * len(axes)).reshape(n, links, len(axes))
+    touching = scene.effects.finger_object or scene.effects.finger_table
+    k = scene.discretization.spheres_per_link if touching else 0
+    first = 1 + (len(palm_points(scene)) if scene.effects.palm_contact else 0)
+    spheres = first + np.arange(n * links * k).reshape(n, links, k)
+    shapes = first + n * links * k + np.arange(len(scene.objects.object))
+    weights = np.zeros(3 + n * (links + 1))
+    weights[bodies] = 1.0 / (n * links)
+    weights[[*stubs, *bodies[:, -1]]] = 0.5 / (n * links)
+    return Layout(links, axes, stubs, bodies, len(weights) - 1, dofs, spheres, shapes, weights)
+
+
+def contact_invweight(scene: Scene) -> float:
+    """Inverse weight declared for every body in contact [1/kg].
+
+    MuJoCo's soft contact has normal stiffness k_n = k d / ((1 - d) sum(invweight)) with
+    k = 1 / (d timeconst)^2 at damping ratio 1.  Declaring invweight instead of deriving it from
+    masses makes k_n a material number in N/m, independent of finger size and time step.  A
+    finger-object contact sums two bodies; a contact with the table has one and is twice as stiff.
+    """
+    c = scene.contact
+    k = 1.0 / (c.impedance * c.time_constant) ** 2
+    return k * c.impedance / ((1.0 - c.impedance) * 2.0 * c.normal_stiffness)
+
+
+def palm_points(scene: Scene) -> np.ndarray:
+    """Centres of the palm's contact spheres in the palm frame, whose origin is on the underside."""
+    p = scene.hand.palm
+    ring = p.contact_ring * np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
+    return np.column_stack([ring, np.full(len(ring), p.contact_radius)])
+
+
+def mounts(scene: Scene, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Base position (finger, 3) and orientation (finger, 4) of the fingers in the palm frame."""
+    fingers = scene.hand.finger
+    azimuth = jnp.deg2rad(np.array([f.azimuth for f in fingers]))
+    azimuth = azimuth + np.array([f.spread for f in fingers]) * spread
+    radius, tilt = (np.array([getattr(f, k) for f in fingers]) for k in ("radius", "tilt"))
+    zero, tilt = jnp.zeros_like(azimuth), np.deg2rad(tilt)
+    position = jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), zero], -1)
+    # Rotation about z by the azimuth, then about y by the tilt: x leaves the palm outwards and
+    # down.
+    ca, sa, ct, st = jnp.cos(azimuth / 2), jnp.sin(azimuth / 2), np.cos(tilt / 2), np.sin(tilt / 2)
+    return position, jnp.stack([ca * ct, -sa * st, ca * st, sa * ct], -1)
+
+
+def object_size(scene: Scene, trial: Trial) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Geom sizes (shape, 3), mass, principal inertia (3,) and rest height of the object."""
+    shapes = scene.objects.object
+    full = np.array([[*s.size, 0.0, 0.0][:3] for s in shapes])
+    size = trial.size * full
+    mass = trial.mass * jnp.array([s.mass for s in shapes])[trial.shape]
+    unit = jnp.stack([_unit_inertia(s.type, size[i]) for i, s in enumerate(shapes)])[trial.shape]
+    rest = {"box": 2, "cylinder": 1, "sphere": 0}
+    height = jnp.stack([size[i, rest[s.type]] for i, s in enumerate(shapes)])[trial.shape]
+    active = jnp.arange(len(shapes)) == trial.shape
+    return jnp.where(active[:, None], size, INACTIVE * size), mass, mass * unit, height
+
+
+def _unit_inertia(kind: str, size: jax.Array) -> jax.Array:
+    """Principal inertia per mass of a solid primitive [m^2], shape (3,)."""
+    if kind == "box":
+        return jnp.stack(
+            morphology.block_inertia(jnp.ones(()), 2 * size[0], 2 * size[1], 2 * size[2])
+        )
+    if kind == "cylinder":
+        across = size[0] ** 2 / 4 + size[1] ** 2 / 3
+        return jnp.stack([across, across, size[0] ** 2 / 2])
+    return jnp.full((3,), 0.4) * size[0] ** 2
+
+
+def geom_bounds(kind: str, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Bounding radius () and axis-aligned half extents (3,) of a primitive."""
+    if kind == "box":
+        return jnp.linalg.norm(size), size
+    if kind == "cylinder":
+        return jnp.hypot(size[0], size[1]), jnp.stack([size[0], size[0], size[1]])
+    return size[0], jnp.full((3,), 1.0) * size[0]

@@ -1,0 +1,227 @@
+"""Scene to MjSpec and MjModel: the template once a scene, and fresh compiles of single hands."""
+
+import functools
+
+import jax
+import mujoco
+import numpy as np
+
+from codesign_jax import morphology, parameters
+from codesign_jax.model.layout import (
+    AXES,
+    WRIST,
+    contact_invweight,
+    layout,
+    mounts,
+    object_size,
+    palm_points,
+)
+from codesign_jax.morphology import Beam
+from codesign_jax.scene import Scene
+from codesign_jax.types import Params, Trial
+
+_GEOM = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+}
+
+
+@functools.cache
+def compile_template(scene: Scene) -> mujoco.MjModel:
+    """Compiles the scene's template model, once a scene."""
+    space = parameters.design_space(scene.hand)
+    with jax.ensure_compile_time_eval():  # also when first asked for inside a traced function
+        params = jax.tree.map(np.asarray, space.params(jax.numpy.asarray(space.default())))
+        one = np.ones(())
+        trial = Trial(np.int32(0), np.zeros(2), 0 * one, np.zeros(2), one, one)
+        return compile_model(scene, params, trial)
+
+
+def compile_model(
+    scene: Scene, params: Params, trial: Trial, *, visual: bool = False
+) -> mujoco.MjModel:
+    """Compiles a fresh MuJoCo model of one hand and one trial from concrete values.
+
+    Args:
+      scene: The scene.
+      params: Parameters as concrete arrays.
+      trial: The trial as concrete arrays.
+      visual: Adds geoms that only a renderer needs (finger blocks, palm disc).
+    """
+    model = build_spec(scene, params, trial, visual=visual).compile()
+    # Declared, not derived; see contact_invweight.  The world keeps zero.
+    model.body_invweight0[1:] = contact_invweight(scene)
+    return model
+
+
+def build_spec(
+    scene: Scene, params: Params, trial: Trial, *, visual: bool = False
+) -> mujoco.MjSpec:
+    """Builds the MjSpec of one hand and one trial; arguments as `compile_model`."""
+    spec = mujoco.MjSpec()
+    _options(scene, spec)
+    world = spec.worldbody
+    world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.05], **_PASSIVE)
+    _add_palm(scene, spec, visual)
+    beams = morphology.finger_beams(scene.hand, jax.tree.map(np.asarray, params))
+    for f in range(scene.num_fingers):
+        beam = Beam(*(float(np.asarray(v)[f]) for v in beams))
+        _add_finger(scene, spec, params, f, beam, visual)
+    _add_object(scene, spec, trial, visual)
+    _add_pairs(scene, spec)
+    return spec
+
+
+_PASSIVE = {"contype": 0, "conaffinity": 0}  # contacts come from explicit pairs only
+_COLORS = {
+    "object": (0.85, 0.55, 0.2, 1),
+    "finger": (0.35, 0.55, 0.75, 1),
+    "palm": (0.3, 0.3, 0.35, 1),
+}
+
+
+def _options(scene: Scene, spec: mujoco.MjSpec) -> None:
+    o = spec.option
+    o.timestep, o.gravity = scene.discretization.timestep, [0, 0, -scene.gravity]
+    o.integrator, o.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_ELLIPTIC
+    o.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    o.iterations, o.ls_iterations = scene.solver.iterations, scene.solver.ls_iterations
+    o.tolerance, o.impratio = scene.solver.tolerance, scene.contact.friction_ratio
+    bits = mujoco.mjtDisableBit
+    # Without autoreset a world that went bad stays bad, so that it is seen.
+    o.disableflags = bits.mjDSBL_EULERDAMP | bits.mjDSBL_AUTORESET | bits.mjDSBL_ISLAND
+
+
+def _hinge(
+    body: mujoco.MjsBody,
+    name: str,
+    axis: tuple[int, ...],
+    kind=mujoco.mjtJoint.mjJNT_HINGE,
+    **kwargs,
+):
+    return body.add_joint(name=name, type=kind, axis=axis, pos=[0, 0, 0], **kwargs)
+
+
+def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
+    p, w, h = scene.hand.palm, scene.hand.wrist, scene.discretization.timestep
+    body = spec.worldbody.add_body(name="palm")
+    body.explicitinertial, body.mass, body.ipos = True, p.mass, [0, 0, p.thickness / 2]
+    across = p.mass * (p.radius**2 / 4 + p.thickness**2 / 12)
+    body.inertia = [across, across, p.mass * p.radius**2 / 2]
+    axes = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+    axes |= {"roll": axes["x"], "yaw": axes["z"], "pitch": axes["y"]}
+    for name in WRIST:
+        linear = len(name) == 1
+        stiffness = w.linear_stiffness if linear else w.angular_stiffness
+        damping = w.linear_damping if linear else w.angular_damping
+        kind = mujoco.mjtJoint.mjJNT_SLIDE if linear else mujoco.mjtJoint.mjJNT_HINGE
+        implicit = damping + h * stiffness
+        _hinge(body, f"wrist_{name}", axes[name], kind, damping=implicit, armature=h * implicit)
+        actuator = spec.add_actuator(
+            name=f"arm_{name}", target=f"wrist_{name}", trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        actuator.gainprm[0], actuator.biasprm[1] = stiffness, -stiffness
+    if scene.effects.palm_contact:
+        for i, point in enumerate(palm_points(scene)):
+            _sphere(body, f"palm_{i}", point, p.contact_radius)
+    if visual:
+        kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, [p.radius, p.thickness / 2, 0]
+        pos = [0, 0, p.thickness / 2]
+        body.add_geom(
+            name="palm_disc", type=kind, size=size, pos=pos, rgba=_COLORS["palm"], **_PASSIVE
+        )
+
+
+def _sphere(body: mujoco.MjsBody, name: str, pos, radius: float) -> None:
+    kind = mujoco.mjtGeom.mjGEOM_SPHERE
+    body.add_geom(name=name, type=kind, size=[radius, 0, 0], pos=pos, group=3, **_PASSIVE)
+
+
+def _add_finger(
+    scene: Scene, spec: mujoco.MjSpec, params: Params, f: int, beam: Beam, visual: bool
+) -> None:
+    lay, width, h = layout(scene), scene.hand.section.width, scene.discretization.timestep
+    length, height = float(params.length[f]), float(params.height[f])
+    segment = length / lay.links
+    mount_pos, mount_quat = mounts(scene, np.asarray(params.spread))
+    tendon = spec.add_tendon(name=f"chamber_{f}")
+    body = spec.body("palm")
+    by_axis = {"bend": beam.bending, "lateral": beam.lateral, "twist": beam.torsion}
+    for i in range(lay.links + 1):
+        body = body.add_body(name=f"finger_{f}_link_{i}")
+        if i == 0:
+            body.pos, body.quat = np.asarray(mount_pos)[f], np.asarray(mount_quat)[f]
+        else:
+            body.pos = [segment / 2 if i == 1 else segment, 0, 0]
+        extent = segment / 2 if i in (0, lay.links) else segment
+        body.explicitinertial, body.mass = True, beam.line_density * extent
+        body.ipos = [extent / 2, 0, height / 2]
+        body.inertia = np.array(morphology.block_inertia(body.mass, extent, width, height))
+        if visual:
+            kind, half = mujoco.mjtGeom.mjGEOM_BOX, [extent / 2, width / 2, height / 2]
+            name = f"finger_{f}_block_{i}"
+            body.add_geom(
+                name=name, type=kind, size=half, pos=body.ipos, rgba=_COLORS["finger"], **_PASSIVE
+            )
+        if i == 0:
+            continue
+        for name in lay.axes:
+            stiffness = by_axis[name] / segment
+            implicit = scene.hand.material.damping_time * stiffness + h * stiffness
+            joint = f"finger_{f}_{name}_{i}"
+            _hinge(
+                body,
+                joint,
+                AXES[name],
+                stiffness=stiffness,
+                damping=implicit,
+                armature=h * implicit,
+            )
+        tendon.wrap_joint(f"finger_{f}_bend_{i}", 1.0)
+        for j in range(lay.spheres.shape[2]):
+            x = extent * (j + 0.5) / lay.spheres.shape[2]
+            _sphere(body, f"finger_{f}_sphere_{i}_{j}", [x, 0, height / 2], height / 2)
+    actuator = spec.add_actuator(
+        name=f"pressure_{f}", target=f"chamber_{f}", trntype=mujoco.mjtTrn.mjTRN_TENDON
+    )
+    # Pressure [Pa] in, bending moment [N m] at every joint out: a constant torque, not a moving
+    # rest angle.
+    actuator.gainprm[0] = beam.moment_per_pressure
+
+
+def _add_object(scene: Scene, spec: mujoco.MjSpec, trial: Trial, visual: bool) -> None:
+    sizes, mass, inertia, rest = (
+        np.asarray(v) for v in object_size(scene, jax.tree.map(np.asarray, trial))
+    )
+    body = spec.worldbody.add_body(name="object", pos=[*np.asarray(trial.position), float(rest)])
+    yaw = float(trial.yaw) / 2
+    body.quat = [np.cos(yaw), 0, 0, np.sin(yaw)]
+    body.explicitinertial, body.mass, body.inertia = True, float(mass), inertia
+    body.ipos, body.iquat = [0, 0, 0], [1, 0, 0, 0]
+    body.add_freejoint(name="object")
+    for i, shape in enumerate(scene.objects.object):
+        color = _COLORS["object"] if i == int(trial.shape) or not visual else (0, 0, 0, 0)
+        size = np.asarray(sizes[i])
+        body.add_geom(name=f"object_{i}", type=_GEOM[shape.type], size=size, rgba=color, **_PASSIVE)
+
+
+def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
+    """Explicit contact pairs: the contact list is the scene's, not a filter's."""
+    e, c, lay = scene.effects, scene.contact, layout(scene)
+    fingers = [f"finger_{f}_sphere_{i + 1}_{j}" for f, i, j in np.ndindex(lay.spheres.shape)]
+    palm = [f"palm_{i}" for i in range(len(palm_points(scene)))] if e.palm_contact else []
+
+    def add(first: str, second: str, friction: float) -> None:
+        pair = spec.add_pair(geomname1=first, geomname2=second, condim=3)
+        pair.friction = [friction, friction, 0.005, 0.0001, 0.0001]
+        pair.solref = [c.time_constant, 1.0]
+        pair.solimp = [c.impedance, c.impedance, 0.001, 0.5, 2.0]
+
+    for i, shape in enumerate(scene.objects.object):
+        add("table", f"object_{i}", scene.objects.table.friction)
+        for name in [*(fingers if e.finger_object else []), *palm]:
+            add(name, f"object_{i}", shape.friction)
+    for name in [*(fingers if e.finger_table else []), *palm]:
+        add("table", name, c.finger_table_friction)

@@ -356,12 +356,12 @@ def test_seeds_do_not_depend_on_the_batch_size():
     key, space = jax.random.key(9), FILTER.space
     results = [
         rejection_sample(key, space, quadratic, 5, threshold=0.6, batch=batch, max_batches=500)
-        for batch in (7, 64)
+        for batch in (8, 64)
     ]
     seeds, costs, drawn = results[0]
     assert seeds.shape == (5, 5) and np.all(costs > 0.6) and drawn >= 5
     np.testing.assert_allclose(quadratic(seeds), costs, rtol=1e-6)
-    everything = quadratic(draw(key, space, np.arange(drawn)))
+    everything = np.asarray(quadratic(draw(key, space, np.arange(2000))))[:drawn]
     assert (everything > 0.6).sum() == 5 and everything[-1] > 0.6
     for other in results[1:]:
         np.testing.assert_array_equal(other[0], seeds)

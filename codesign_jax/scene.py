@@ -219,5 +219,6 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
     if scene.contact.time_constant < 2 * h:
         problems.append(
             f"{where}.contact.time_constant = {scene.contact.time_constant:g} s "
-            f"must be at least two time steps ({2 * h:g} s): a stiffer contact is unstable (MuJoCo's refsafe)"
+            f"must be at least two time steps ({2 * h:g} s): "
+            "a stiffer contact is unstable (MuJoCo's refsafe)"
         )

@@ -69,7 +69,7 @@ class Wrist:
     angular_damping: float = quantity("N m s/rad", 0, 1e3)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Parameter:
     """A row of the parameter table, in the row's own unit."""
 
@@ -184,6 +184,9 @@ def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
                 )
                 continue
             p = table[key]
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                problems.append(f"{path}.fixed.{key} = {value!r} must be a number [{p.unit}]")
+                continue
             problem = schema.range_problem(f"{path}.fixed.{key}", value, p.unit, p.low, p.high)
             if problem:
                 problems.append(problem)

@@ -189,8 +189,11 @@ def load(
         ("hand", hand.load, hand_name),
         ("objects", objects.load, object_set),
     ):
+        named = table.get(key)
+        if chosen is None and not isinstance(named, str):
+            continue  # missing or of the wrong type: `parse` has said so
         try:
-            parts[key] = loader(_beside(path, chosen or table.get(key, "")))
+            parts[key] = loader(_beside(path, named) if chosen is None else chosen)
         except schema.SceneError as error:
             problems += error.problems
     if parsed is not None:
@@ -201,12 +204,9 @@ def load(
     return Scene(**parts, **{n: getattr(parsed, n) for n in names})
 
 
-def _beside(path: Path, name: str | Path) -> str | Path:
-    """Paths inside a scene file are relative to that file."""
-    relative = Path(name)
-    if relative.suffix == ".toml" and not relative.is_absolute() and not relative.is_file():
-        return path.parent / relative
-    return name
+def _beside(path: Path, name: str) -> str | Path:
+    """Paths inside a scene file are relative to that file, whatever the working directory holds."""
+    return path.parent / name if name.endswith(".toml") else name
 
 
 def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:

@@ -123,6 +123,8 @@ def _value(hint: Any, value: Any, path: str, field: dataclasses.Field, problems:
     if dataclasses.is_dataclass(hint):
         return parse(hint, value, path, problems)  # type: ignore[arg-type]
     if hint is dict:
+        if not isinstance(value, dict):
+            problems.append(f"{path} must be a table, not {type(value).__name__}")
         return value
     return _scalar(hint, value, path, field, problems)
 

@@ -67,10 +67,8 @@ class MujocoEngine:
         (worlds, steps), scene, nq = ctrl.shape[:2], self.scene, self.template.nq
         batch = self._batch(worlds)
         write_fields(batch, fields)
-        trace = Trace(
-            *(np.zeros((worlds, steps)) for _ in range(3)),
-            np.zeros((worlds, steps, nq * trajectory)),
-        )
+        distance, height, speed = np.zeros((3, worlds, steps))
+        trace = Trace(distance, height, speed, np.zeros((worlds, steps, nq * trajectory)))
         start, end = (round(t / scene.discretization.timestep) for t in scene.window)
         going = np.arange(worlds)
         for first in range(0, steps, _CHUNK):

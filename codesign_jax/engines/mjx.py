@@ -1,5 +1,7 @@
 """Stock MJX: the same model and equations in JAX, on any platform, in the caller's float type."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
@@ -7,6 +9,15 @@ from mujoco import mjx
 from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
+
+
+class _Carry(NamedTuple):
+    """What passes from step to step; the rest of mjx.Data follows from it."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+    warmstart: jax.Array
+    speed: jax.Array
 
 
 class MjxEngine:
@@ -42,25 +53,27 @@ class MjxEngine:
         lay, limits = layout(self.scene), self.scene.limits
         weights = jnp.asarray(lay.centre_weights, ctrl.dtype)
 
-        def body(carry, u):
-            data, speed = carry
+        def body(carry: _Carry, u: jax.Array) -> tuple[_Carry, Trace]:
+            data = self.reset(fields).replace(
+                qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart
+            )
             new = self.step(fields, data, u)
             # Positions computed by a step belong to the state before it.
             centre, middle = weights @ new.xipos, new.xipos[lay.object]
             entry = Trace(
                 jnp.linalg.norm(middle - centre),
                 middle[2],
-                speed,
-                data.qpos if trajectory else data.qpos[:0],
+                carry.speed,
+                carry.qpos if trajectory else carry.qpos[:0],
             )
-            new_speed = (
-                jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()
-            )  # not finite if any state is not
-            good = jnp.isfinite(new_speed) & (new_speed <= limits.speed)
-            good &= (speed <= limits.speed) & (middle[2] >= -limits.penetration)
-            data = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, data)
-            failed_before = ~(speed <= limits.speed)
-            return (data, jnp.where(failed_before, speed, new_speed)), entry
+            # The sum makes the speed not finite if any position is not.
+            speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()
+            failed = ~(carry.speed <= limits.speed) | ~(middle[2] >= -limits.penetration)
+            good = ~failed & (speed <= limits.speed)
+            state = _Carry(new.qpos, new.qvel, new.qacc_warmstart, speed)
+            kept = carry._replace(speed=jnp.where(failed, carry.speed, speed))
+            return jax.tree.map(lambda a, b: jnp.where(good, a, b), state, kept), entry
 
-        start = (self.reset(fields), jnp.zeros((), ctrl.dtype))
+        zero = jnp.zeros(self.template.nv, ctrl.dtype)
+        start = _Carry(fields.start, zero, zero, jnp.zeros((), ctrl.dtype))
         return jax.lax.scan(body, start, ctrl)[1]

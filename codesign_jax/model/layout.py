@@ -80,13 +80,13 @@ def contact_invweight(scene: Scene) -> float:
     """Inverse weight declared for every body in contact [1/kg].
 
     MuJoCo's soft contact has normal stiffness k_n = k d / ((1 - d) sum(invweight)) with
-    k = 1 / (d timeconst)^2 at damping ratio 1.  Declaring invweight instead of deriving it from
-    masses makes k_n a material number in N/m, independent of finger size and time step.  A
-    finger-object contact sums two bodies; a contact with the table has one and is twice as stiff.
+    k = d / (d timeconst)^2 for a constant impedance d and damping ratio 1 (MuJoCo multiplies its
+    reference stiffness by d).  Declaring invweight instead of deriving it from masses makes k_n a
+    material number in N/m, independent of finger size and time step.  A finger-object contact sums
+    two bodies; a contact with the table has one and is twice as stiff.
     """
     c = scene.contact
-    k = 1.0 / (c.impedance * c.time_constant) ** 2
-    return k * c.impedance / ((1.0 - c.impedance) * 2.0 * c.normal_stiffness)
+    return 1.0 / ((1.0 - c.impedance) * c.time_constant**2 * 2.0 * c.normal_stiffness)
 
 
 def palm_points(scene: Scene) -> np.ndarray:

@@ -1,24 +1,46 @@
 """A hand as data: fingers, material, palm, wrist and the parameter table (paper Table I)."""
 
 import dataclasses
+import math
 from pathlib import Path
+from typing import NamedTuple
 
 from codesign_jax import files, schema
 from codesign_jax.schema import choice, quantity
 
-# Every parameter that the hand model understands, and whether it has one value a finger.
+# Unit of a file -> (SI unit, factor).
+UNITS = {
+    "mm": ("m", 1e-3),
+    "m": ("m", 1.0),
+    "deg": ("rad", math.pi / 180.0),
+    "rad": ("rad", 1.0),
+    "kPa": ("Pa", 1e3),
+    "Pa": ("Pa", 1.0),
+}
+
+
+class Kind(NamedTuple):
+    """What a parameter is: per finger or hand, its SI unit and the range that makes sense."""
+
+    per: str
+    unit: str
+    low: float
+    high: float
+
+
+# Every parameter that the hand model understands.
 PARAMETERS = {
-    "length": "finger",
-    "height": "finger",
-    "wall": "finger",
-    "spread": "hand",
-    "arm_roll": "hand",
-    "arm_yaw": "hand",
-    "arm_pitch": "hand",
-    "arm_z": "hand",
-    "arm_x": "hand",
-    "arm_y": "hand",
-    "pressure": "finger",
+    "length": Kind("finger", "m", 1e-3, 1.0),
+    "height": Kind("finger", "m", 1e-3, 0.1),
+    "wall": Kind("finger", "m", 1e-4, 0.05),
+    "spread": Kind("hand", "rad", -2 * math.pi, 2 * math.pi),
+    "arm_roll": Kind("hand", "rad", -math.pi, math.pi),
+    "arm_yaw": Kind("hand", "rad", -math.pi, math.pi),
+    "arm_pitch": Kind("hand", "rad", -math.pi, math.pi),
+    "arm_z": Kind("hand", "m", -1.0, 1.0),
+    "arm_x": Kind("hand", "m", -1.0, 1.0),
+    "arm_y": Kind("hand", "m", -1.0, 1.0),
+    "pressure": Kind("finger", "Pa", 0.0, 1e6),
 }
 
 
@@ -76,7 +98,7 @@ class Parameter:
     name: str = choice(*PARAMETERS)
     per: str = choice("finger", "hand")
     domain: str = choice("morphology", "control")
-    unit: str = choice("mm", "m", "deg", "rad", "kPa", "Pa")
+    unit: str = choice(*UNITS)
     low: float
     high: float
     default: float
@@ -144,7 +166,7 @@ def load(name: str | Path) -> Hand:
         _check_table(hand, path.name, problems)
         _check_presets(hand, path.name, problems)
         if not problems:
-            _check_chamber(hand, path.name, problems)
+            _check_sections(hand, path.name, problems)
     if problems or hand is None:
         raise schema.SceneError(problems)
     return hand
@@ -160,23 +182,38 @@ def _check_table(hand: Hand, where: str, problems: list[str]) -> None:
                 f"{where}.parameter {name!r} must be given once, not {names.count(name)} times"
             )
     for p in hand.parameter:
-        if p.per != PARAMETERS[p.name]:
-            problems.append(f"{where}.parameter {p.name}.per must be {PARAMETERS[p.name]!r}")
-        if not p.low < p.high:
-            problems.append(
-                f"{where}.parameter {p.name}: low {p.low:g} must be below high {p.high:g} {p.unit}"
-            )
-        problem = schema.range_problem(
-            f"{where}.parameter {p.name}.default", p.default, p.unit, p.low, p.high
-        )
+        path, kind = f"{where}.parameter {p.name}", PARAMETERS[p.name]
+        unit, factor = UNITS[p.unit]
+        if p.per != kind.per:
+            problems.append(f"{path}.per must be {kind.per!r}")
+        if unit != kind.unit:
+            fitting = ", ".join(repr(u) for u, (si, _) in UNITS.items() if si == kind.unit)
+            problems.append(f"{path}.unit = {p.unit!r} does not fit; valid: {fitting}")
+            continue
+        for name in ("low", "high"):
+            _check_range(f"{path}.{name}", getattr(p, name), p.unit, kind, factor, problems)
+        if p.low >= p.high:
+            problems.append(f"{path}: low {p.low:g} must be below high {p.high:g} {p.unit}")
+        problem = schema.range_problem(f"{path}.default", p.default, p.unit, p.low, p.high)
         if problem:
             problems.append(problem)
 
 
+def _check_range(
+    path: str, value: float, unit: str, kind: Kind, factor: float, problems: list[str]
+) -> None:
+    problem = schema.range_problem(path, value, unit, kind.low / factor, kind.high / factor)
+    if problem:
+        problems.append(problem)
+
+
 def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
     table = {p.name: p for p in hand.parameter}
+    names = [p.name for p in hand.preset]
     for preset in hand.preset:
         path = f"{where}.preset {preset.name}"
+        if names.count(preset.name) > 1 or preset.name == "full":
+            problems.append(f"{path}: the name is taken")
         for key, value in preset.fixed.items():
             if key not in table:
                 problems.append(
@@ -190,25 +227,65 @@ def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
             problem = schema.range_problem(f"{path}.fixed.{key}", value, p.unit, p.low, p.high)
             if problem:
                 problems.append(problem)
-        for free in preset.free:
-            if free.name in preset.fixed:
-                problems.append(f"{path}: {free.name} is both free and fixed")
-            low = table[free.name].low if free.low is None else free.low
-            high = table[free.name].high if free.high is None else free.high
-            if not low < high:
-                problems.append(f"{path}.free {free.name}: low {low:g} must be below high {high:g}")
+        free = [f.name for f in preset.free]
+        if not free:
+            problems.append(f"{path} leaves no parameter free")
+        for f in preset.free:
+            if f.name in preset.fixed:
+                problems.append(f"{path}: {f.name} is both free and fixed")
+            if free.count(f.name) > 1:
+                problems.append(f"{path}: {f.name} is free more than once")
+            if f.name in table:
+                _check_free(f, table[f.name], path, problems)
 
 
-def _check_chamber(hand: Hand, where: str, problems: list[str]) -> None:
-    """The section must keep an air chamber at the table's corners: h - 2d > 0, w - 2d > 0."""
-    from codesign_jax.parameters import UNITS
-
-    table = {p.name: p for p in hand.parameter}
-    wall = table["wall"].high * UNITS[table["wall"].unit][1]
-    height = table["height"].low * UNITS[table["height"].unit][1]
-    for name, size in (("height.low", height), ("section.width", hand.section.width)):
-        if size <= 2 * wall:
-            problems.append(
-                f"{where}: {name} = {size:g} m leaves no air chamber "
-                f"between walls of up to {wall:g} m"
+def _check_free(free: Free, row: Parameter, path: str, problems: list[str]) -> None:
+    """A preset may go beyond the table's bounds (the paper's 2D one does) but must make sense."""
+    factor = UNITS[row.unit][1]
+    for name, value in (("low", free.low), ("high", free.high)):
+        if value is not None:
+            _check_range(
+                f"{path}.free {free.name}.{name}",
+                value,
+                row.unit,
+                PARAMETERS[free.name],
+                factor,
+                problems,
             )
+    low = row.low if free.low is None else free.low
+    high = row.high if free.high is None else free.high
+    if low >= high:
+        problems.append(f"{path}.free {free.name}: low {low:g} must be below high {high:g}")
+
+
+def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
+    """Every section that the table or a preset allows needs an air chamber and a legal pressure."""
+    everything = Preset("full", tuple(Free(p.name) for p in hand.parameter))
+    for preset in (everything, *hand.preset):
+        path = where if preset is everything else f"{where}.preset {preset.name}"
+        lowest = {p.name: _bounds(p, preset)[0] for p in hand.parameter}
+        wall = next(_bounds(p, preset)[1] for p in hand.parameter if p.name == "wall")
+        for name, size in (("height", lowest["height"]), ("section.width", hand.section.width)):
+            if size <= 2 * wall:
+                problems.append(
+                    f"{path}: a {name} of {size:g} m leaves no air chamber "
+                    f"between walls of {wall:g} m"
+                )
+        limit = hand.pressure_limit.per_wall * lowest["wall"]
+        if not lowest["pressure"] < limit:
+            problems.append(
+                f"{path}: a pressure of {lowest['pressure']:g} Pa is not below the limit of "
+                f"{limit:g} Pa for walls of {lowest['wall']:g} m"
+            )
+
+
+def _bounds(row: Parameter, preset: Preset) -> tuple[float, float]:
+    """Lowest and highest value [SI] that a preset gives a parameter."""
+    factor = UNITS[row.unit][1]
+    free = next((f for f in preset.free if f.name == row.name), None)
+    if free is None:
+        value = preset.fixed.get(row.name, row.default) * factor
+        return value, value
+    low = row.low if free.low is None else free.low
+    high = row.high if free.high is None else free.high
+    return low * factor, high * factor

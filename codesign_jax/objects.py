@@ -11,12 +11,15 @@ SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """Standard deviations of a trial's Gaussian noise: metres, degrees and two relative values."""
+    """Standard deviations of a trial's Gaussian noise: metres, degrees and two relative values.
+
+    The upper bounds of the relative ones keep every factor 1 + sigma z positive.
+    """
 
     position: float = quantity("m", 0, 0.1)
     orientation: float = quantity("deg", 0, 90)
-    mass: float = quantity("", 0, 0.3)
-    size: float = quantity("", 0, 0.2)
+    mass: float = quantity("", 0, 0.15)
+    size: float = quantity("", 0, 0.15)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +66,11 @@ def load(name: str | Path) -> ObjectSet:
     if objects is not None:
         if not objects.object:
             problems.append(f"{path.name}.object must name at least one object")
+        names = [shape.name for shape in objects.object]
+        for name in sorted({n for n in names if names.count(n) > 1}):
+            problems.append(
+                f"{path.name}.object {name}: the name is given {names.count(name)} times"
+            )
         for shape in objects.object:
             if len(shape.size) != SIZES[shape.type]:
                 problems.append(

@@ -13,18 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import schema
-from codesign_jax.hand import Hand, Parameter, Preset
+from codesign_jax.hand import UNITS, Hand, Parameter, Preset
 from codesign_jax.types import Params
 
-# Unit of a file -> (SI unit, factor).
-UNITS = {
-    "mm": ("m", 1e-3),
-    "m": ("m", 1.0),
-    "deg": ("rad", np.pi / 180.0),
-    "rad": ("rad", 1.0),
-    "kPa": ("Pa", 1e3),
-    "Pa": ("Pa", 1.0),
-}
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
 _STRICT = 1.0 - 1e-6
 
@@ -62,6 +53,7 @@ class DesignSpace:
 
     def expand(self, design: jax.Array) -> jax.Array:
         """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,)."""
+        design = jnp.asarray(design)
         source = np.asarray(self.source)
         filled = design[np.maximum(source, 0)]
         return jnp.where(source >= 0, filled, jnp.asarray(self.base, design.dtype))
@@ -79,6 +71,7 @@ class DesignSpace:
         Returns:
           The projected vector, shape (parameter,).
         """
+        design = jnp.asarray(design)
         full = self.expand(design)
         offsets = _offsets(self.hand)
         wall = full[offsets["wall"] : offsets["wall"] + len(self.hand.finger)]

@@ -216,6 +216,11 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
     for (first, a), (second, b) in zip(times, times[1:], strict=False):
         if not a < b:
             problems.append(f"{where}.phases.{second} = {b:g} s must come after {first} = {a:g} s")
+    if p.ungrasp < p.disturb + p.deflate_time:
+        problems.append(
+            f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
+            f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
+        )
     if scene.contact.time_constant < 2 * h:
         problems.append(
             f"{where}.contact.time_constant = {scene.contact.time_constant:g} s "

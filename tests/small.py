@@ -1,0 +1,53 @@
+"""Small scenes and states for the tests: two fingers, few links, one object a scene."""
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import parameters, rollout, scene
+
+DATA = Path(__file__).parent / "data"
+# Shapes of the paper's object set, which are also the names of the one-object sets in data/.
+SHAPES = ("box", "cylinder", "sphere")
+
+
+@functools.cache
+def pinch(shape="box", links=3, **settings):
+    """Two opposed fingers and one object; settings as table__key=value."""
+    overrides = {"discretization": {"links": links}}
+    for key, value in settings.items():
+        table, name = key.split("__")
+        overrides.setdefault(table, {})[name] = value
+    return scene.load(
+        "paper",
+        hand_name=DATA / "pinch.toml",
+        object_set=DATA / f"{shape}.toml",
+        overrides=overrides,
+    )
+
+
+def random_designs(space, seed, count):
+    """Uniform designs inside the bounds and under the pressure limit, (count, parameter)."""
+    low, high = np.array(space.low), np.array(space.high)
+    designs = low + (high - low) * np.random.default_rng(seed).random((count, len(low)))
+    return jax.vmap(space.project)(jnp.asarray(designs))
+
+
+def random_worlds(the_scene, seed, count):
+    """Params and trials of random hands, both with leading axis (world,)."""
+    space = parameters.design_space(the_scene.hand)
+    params = jax.vmap(space.params)(random_designs(space, seed, count))
+    return params, rollout.sample_trials(the_scene, jax.random.key(seed), count)
+
+
+def nth(tree, index):
+    """Entry of every array of a batch, as NumPy arrays."""
+    return jax.tree.map(lambda v: np.asarray(v)[index], tree)
+
+
+def stack(*trees):
+    """Batches single worlds."""
+    return jax.tree.map(lambda *v: jnp.stack([jnp.asarray(x) for x in v]), *trees)

@@ -1,0 +1,291 @@
+"""Scene, hand and object files: every problem is found, said once, and said helpfully."""
+
+import dataclasses
+import math
+import tomllib
+
+import jax
+import numpy as np
+import pytest
+from small import DATA, nth, stack
+
+from codesign_jax import control, files, hand, model, objects, parameters, rollout, scene, schema
+from codesign_jax.engines import make_engine
+
+HANDS, OBJECTS = sorted(files.available("hands")), sorted(files.available("objects"))
+
+
+def text_of(kind, name):
+    return files.available(kind)[name].read_text()
+
+
+def problems_of(loader, path):
+    with pytest.raises(schema.SceneError) as caught:
+        loader(path)
+    assert str(caught.value).splitlines() == caught.value.problems
+    return caught.value.problems
+
+
+def edited(tmp_path, kind, name, *edits):
+    """Copy of a built-in file with (old, new) replacements, each of which must apply."""
+    text = text_of(kind, name)
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = tmp_path / f"{kind}.toml"
+    path.write_text(text)
+    return path
+
+
+def hand_problems(tmp_path, *edits):
+    return problems_of(hand.load, edited(tmp_path, "hands", "pneuflex4", *edits))
+
+
+def object_problems(tmp_path, *edits):
+    return problems_of(objects.load, edited(tmp_path, "objects", "paper", *edits))
+
+
+def scene_problems(**overrides):
+    return problems_of(lambda name: scene.load(name, overrides=overrides), "paper")
+
+
+# --- messages ------------------------------------------------------------------------------------
+
+
+def test_unknown_key_names_the_nearest(tmp_path):
+    (problem, missing) = hand_problems(tmp_path, ("density = 1070.0", "densty = 1070.0"))
+    assert problem == "hands.toml.material.densty is not a known key; did you mean 'density'?"
+    assert missing == "hands.toml.material.density is missing (unit kg/m^3)"
+
+
+def test_unknown_key_in_a_scene_override():
+    (problem,) = scene_problems(solver={"iteration": 3})
+    assert "paper.toml.solver.iteration is not a known key; did you mean 'iterations'?" in problem
+
+
+def test_missing_table(tmp_path):
+    (problem,) = object_problems(tmp_path, ("[table]\nfriction = 0.5", ""))
+    assert problem == "objects.toml.table is missing"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("width = 0.020", 'width = "20 mm"', "section.width = '20 mm' must be of type float"),
+        ("width = 0.020", "width = true", "section.width = True must be of type float"),
+        ("width = 0.020", "width = [0.02]", "section.width = [0.02] must be of type float"),
+        ('domain = "morphology"', 'domain = "shape"', "domain = 'shape' is not valid; "),
+        ("[section]", "[[section]]", "hands.toml.section must be a table, not list"),
+        ("tied = true", "tied = 1", "preset[0].free[0].tied = 1 must be of type bool"),
+    ],
+)
+def test_wrong_type(tmp_path, old, new, expected):
+    problems = hand_problems(tmp_path, (old, new))
+    assert len(problems) == 1 and expected in problems[0]
+
+
+def test_an_integer_is_a_number_but_a_number_is_not_an_integer():
+    assert scene.load("paper", overrides={"cost": {"maximum": 3}}).cost.maximum == 3.0
+    (problem,) = scene_problems(discretization={"links": 10.0})
+    assert "discretization.links = 10.0 must be of type int" in problem
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "suggested"),
+    [
+        ("size = [0.030]", "size = [30]", "0.03"),  # millimetres for metres
+        ("mass = 0.1", "mass = 100", "0.1"),  # grams for kilograms
+        ("position = 0.005", "position = 5", "0.005"),
+    ],
+)
+def test_unit_slip_suggests_the_factor(tmp_path, old, new, suggested):
+    problems = object_problems(tmp_path, (old, new))
+    assert any(f"did you mean {suggested}?" in p for p in problems)
+
+
+def test_eighteen_for_a_width_of_0_018_m(tmp_path):
+    (problem,) = hand_problems(tmp_path, ("width = 0.020", "width = 18"))
+    assert problem == (
+        "hands.toml.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? "
+        "(milli-unit given where the base unit is expected)"
+    )
+
+
+@pytest.mark.parametrize("bad", ["nan", "inf", "-inf"])
+def test_not_finite_values_are_refused(tmp_path, bad):
+    (problem,) = hand_problems(tmp_path, ("density = 1070.0", f"density = {bad}"))
+    assert "material.density" in problem and "did you mean" not in problem
+    problems = hand_problems(tmp_path, ("high = 180\ndefault", f"high = {bad}\ndefault"))
+    assert any("high" in p and "length" in p for p in problems)
+    problems = hand_problems(tmp_path, ("low = 10\nhigh = 180\n\n", f"low = {bad}\nhigh = 180\n\n"))
+    assert any("low" in p and "length" in p for p in problems)
+
+
+def test_phases_out_of_order():
+    problems = scene_problems(phases={"inflate": 5.0, "lift": 4.5, "disturb": 8.6})
+    assert problems == [
+        "paper.toml.phases.lift = 4.5 s must come after inflate = 5 s",
+        "paper.toml.phases.deflate_time = 0.5 s does not fit between disturb = 8.6 s "
+        "and ungrasp = 9 s",
+    ]
+
+
+def test_deflation_must_end_before_the_grasp_does():
+    (problem,) = scene_problems(phases={"deflate_time": 1.5})
+    assert "deflate_time" in problem
+
+
+def test_contact_stiffer_than_the_time_step_allows():
+    (problem,) = scene_problems(discretization={"timestep": 0.02})
+    assert "time_constant" in problem and "0.04" in problem
+
+
+def test_all_problems_of_all_files_at_once(tmp_path):
+    hand_path = edited(
+        tmp_path, "hands", "pneuflex4", ("width = 0.020", "width = 18"), ("low = 10", "low = 190")
+    )
+    object_path = edited(
+        tmp_path, "objects", "paper", ("mass = 0.1", "mass = -1"), ('type = "box"', 'type = "bx"')
+    )
+    with pytest.raises(schema.SceneError) as caught:
+        scene.load(
+            "paper",
+            hand_name=hand_path,
+            object_set=object_path,
+            overrides={"solver": {"tolerance": -1.0}, "cost": {"failure": "ignore"}},
+        )
+    text = "\n".join(caught.value.problems)
+    for part in ("width", "mass", "type = 'bx'", "tolerance", "failure"):
+        assert part in text
+    assert len(caught.value.problems) == 5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('unit = "mm"', 'unit = "kPa"', "unit"),  # a length is no pressure
+        ("low = 10\nhigh = 180\ndefault", "low = 200\nhigh = 180\ndefault", "must be below"),
+        ("default = 110", "default = 190", "default = 190"),
+        ('name = "wall"', 'name = "height"', "'wall' must be given once, not 0 times"),
+        ('per = "finger"', 'per = "hand"', "per must be 'finger'"),
+        ("high = 7", "high = 9", "no air chamber"),
+        ("low = 10\nhigh = 180\ndefault", "low = 0\nhigh = 180\ndefault", "length"),
+        ("\npressure = 120", "\npresure = 120", "did you mean 'pressure'?"),
+        ("\npressure = 120", "\npressure = 220", "fixed.pressure"),
+        ("\nwall = 5", "\nwall = 2.5", "limit"),  # 120 kPa exceeds 40 kPa/mm * 2.5 mm
+        ("[preset.fixed]", "[preset.fixed]\nlength = 100", "both free and fixed"),
+        ('[[preset]]\nname = "2d"', '[[preset]]\nname = "full"', "full"),
+    ],
+)
+def test_inconsistent_hand(tmp_path, old, new, expected):
+    problems = hand_problems(tmp_path, (old, new))
+    assert any(expected in p for p in problems), problems
+
+
+def test_object_with_the_wrong_number_of_sizes(tmp_path):
+    (problem,) = object_problems(tmp_path, ("size = [0.030, 0.036]", "size = [0.030]"))
+    assert "size of a cylinder has 2 values, not 1" in problem
+
+
+def test_names_of_objects_must_differ(tmp_path):
+    (problem,) = object_problems(tmp_path, ('name = "sphere"', 'name = "cuboid"'))
+    assert "cuboid" in problem
+
+
+def test_unknown_names_and_files(tmp_path):
+    assert "did you mean 'pneuflex4'?" in problems_of(hand.load, "pneuflex")[0]
+    assert "no file" in problems_of(hand.load, "nowhere/hand.toml")[0]
+    (tmp_path / "broken.toml").write_text("a = = 1")
+    assert "not valid TOML" in problems_of(hand.load, tmp_path / "broken.toml")[0]
+    (tmp_path / "latin.toml").write_bytes(b'name = "\xe9"')
+    assert "not valid TOML" in problems_of(hand.load, tmp_path / "latin.toml")[0]
+
+
+def test_paths_in_a_scene_file_are_relative_to_it(tmp_path):
+    text = text_of("scenes", "paper").replace('hand = "pneuflex4"', 'hand = "mine.toml"')
+    (tmp_path / "scene.toml").write_text(text)
+    mine = text_of("hands", "pneuflex4").replace('name = "pneuflex4"', 'name = "mine"')
+    (tmp_path / "mine.toml").write_text(mine)
+    assert scene.load(tmp_path / "scene.toml").hand.name == "mine"
+
+
+# --- scenes as values ----------------------------------------------------------------------------
+
+
+def test_scenes_are_hashable_values():
+    one, two = scene.load("paper"), scene.load("paper")
+    assert one == two and hash(one) == hash(two)
+    other = scene.load("paper", overrides={"solver": {"iterations": 31}})
+    assert other != one and hash(other) != hash(one)
+
+
+def test_the_grasp_is_the_papers():
+    the_scene = scene.load("paper")
+    assert the_scene.num_steps == 900 and the_scene.end_time == 9.0
+    assert the_scene.window == (3.5, 8.0)
+    short = scene.load("paper", overrides={"effects": {"ungrasp": False, "disturb": False}})
+    assert short.end_time == 4.5 and short.window == (3.5, 4.5)
+
+
+def test_built_in_files_say_what_is_ours():
+    """The paper leaves sizes, mounts and times open; the files mark those values."""
+    for kind, name in (("hands", "pneuflex4"), ("objects", "paper"), ("scenes", "paper")):
+        text = text_of(kind, name)
+        assert "[ours]" in text and tomllib.loads(text)["name"] == name
+
+
+# --- contract: every hand with every object set --------------------------------------------------
+
+
+@pytest.mark.parametrize("object_set", OBJECTS)
+@pytest.mark.parametrize("hand_name", HANDS)
+def test_every_hand_and_object_set_steps_finitely(hand_name, object_set):
+    the_scene = scene.load("paper", hand_name=hand_name, object_set=object_set)
+    space = parameters.design_space(the_scene.hand)
+    params = space.params(space.default())
+    shapes = range(len(the_scene.objects.object))
+    trials = [rollout.nominal_trial(the_scene, i) for i in shapes]
+    fields = jax.jit(jax.vmap(lambda t: model.model_fields(the_scene, params, t)))(stack(*trials))
+    ctrl = stack(*(control.commands(the_scene, params, t) for t in trials))
+    trace = make_engine("mujoco", the_scene).rollout(fields, ctrl[:, :60])
+    assert np.isfinite(trace.distance).all()
+    assert (trace.speed < 20.0).all()  # a hand at rest that starts an approach, in rad/s and m/s
+    # The object settles into the table: m g / k with k = 4 kN/m of one contact at the least, and
+    # 1 % for what is left to settle.
+    for i, shape in enumerate(the_scene.objects.object):
+        sunk = nth(fields, i).start[-5] - trace.height[i, -1]
+        assert 0.0 < sunk < 1.01 * shape.mass * 9.81 / (2 * the_scene.contact.normal_stiffness)
+
+
+def test_effects_that_are_off_are_not_in_the_model():
+    full = model.compile_template(scene.load("paper"))
+    for effect, changed in (
+        ("lateral_bending", "nv"),
+        ("twist", "nv"),
+        ("finger_object", "npair"),
+        ("finger_table", "npair"),
+        ("palm_contact", "ngeom"),
+    ):
+        reduced = model.compile_template(
+            scene.load("paper", overrides={"effects": {effect: False}})
+        )
+        assert getattr(reduced, changed) < getattr(full, changed)
+    assert full.nv == 6 + 4 * 10 * 3 + 6
+
+
+def test_dimensions_follow_the_files():
+    the_scene = scene.load("paper", hand_name="tripod3", overrides={"discretization": {"links": 4}})
+    assert model.compile_template(the_scene).nv == 6 + 3 * 4 * 3 + 6
+    assert dataclasses.replace(the_scene).num_fingers == 3
+
+
+def test_ranges_of_the_noise_keep_every_draw_positive():
+    """Mass and size factors are 1 + sigma z, and float32 normal draws stay within |z| < 5.6."""
+    fields = {f.name: f.metadata for f in dataclasses.fields(objects.Noise)}
+    for name in ("mass", "size"):
+        assert fields[name]["high"] * 5.6 < 1.0
+
+
+def test_data_files_of_the_tests_load():
+    assert scene.load("paper", hand_name=DATA / "pinch.toml").num_fingers == 2
+    assert math.isclose(objects.load(DATA / "sphere.toml").object[0].size[0], 0.03)

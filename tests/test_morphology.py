@@ -1,0 +1,151 @@
+"""Beam theory of a finger against worked numbers, closed forms and monotonicity."""
+
+import math
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy import integrate
+
+from codesign_jax import morphology
+
+repeatable = settings(max_examples=100, deadline=None, derandomize=True)
+heights, walls = st.floats(0.015, 0.025), st.floats(0.002, 0.007)
+
+
+def section(height=0.020, wall=0.005, width=0.020, shear_modulus=70e3, density=1070.0):
+    """Python floats in, Python floats out: float64 whatever jax's mode."""
+    return morphology.beam(height, wall, width=width, shear_modulus=shear_modulus, density=density)
+
+
+def test_worked_numbers():
+    """The design's table for h = w = 20 mm, d = 5 mm, p = 120 kPa, G = 70 kPa, to its digits."""
+    beam, p = section(), 120e3
+    assert beam.bending / (4 * 70e3) == pytest.approx(42_500e-12, rel=1e-9)
+    assert beam.torsion / 70e3 == pytest.approx(16_875e-12, rel=1e-9)
+    assert beam.line_density / 1070 == pytest.approx(300e-6, rel=1e-9)
+    moment = p * beam.moment_per_pressure
+    assert moment == pytest.approx(0.120, rel=1e-9)
+    assert beam.bending == pytest.approx(0.0119, rel=1e-9)
+    assert beam.lateral == pytest.approx(0.0119, rel=5e-3)
+    assert beam.torsion == pytest.approx(0.00118, rel=2e-3)
+    assert math.degrees(moment / beam.bending * 0.1) == pytest.approx(58, abs=0.5)
+    length, weight = 0.1, beam.line_density * 9.81
+    assert beam.bending / (length / 10) == pytest.approx(1.19, rel=1e-9)
+    assert beam.torsion / (length / 10) == pytest.approx(0.118, rel=2e-3)
+    assert 3 * beam.bending / length**3 == pytest.approx(35.7, rel=1e-3)
+    assert 3 * beam.bending / 0.18**3 == pytest.approx(6.1, rel=5e-3)
+    assert moment / length == pytest.approx(1.2, rel=1e-9)
+    assert weight * length**4 / (8 * beam.bending) == pytest.approx(3.3e-3, rel=1e-2)
+    assert weight * 0.18**4 / (8 * beam.bending) == pytest.approx(35e-3, rel=1e-2)
+    frequency = 3.516015 / (2 * math.pi) * math.sqrt(beam.bending / beam.line_density)
+    assert frequency / length**2 == pytest.approx(10.8, rel=5e-3)
+    assert frequency / 0.18**2 == pytest.approx(3.3, rel=2e-2)
+
+
+def wall_integral(height, wall, width, weight):
+    """Integral of weight(y, z) over the wall, by strips: outer rectangle less chamber."""
+
+    def rectangle(y0, y1, half):
+        return integrate.dblquad(lambda z, y: weight(y, z), y0, y1, -half, half, epsabs=1e-16)[0]
+
+    inner = rectangle(wall, height - wall, width / 2 - wall)
+    return rectangle(0, height, width / 2) - inner
+
+
+@pytest.mark.parametrize("height, wall, width", [(0.02, 0.005, 0.02), (0.025, 0.002, 0.024)])
+def test_section_integrals(height, wall, width):
+    """Area and second moments are the integrals that they stand for; quadrature is exact here."""
+    beam = section(height, wall, width)
+    young = 4 * 70e3
+    bending = wall_integral(height, wall, width, lambda y, z: y**2)
+    lateral = wall_integral(height, wall, width, lambda y, z: (z + width / 2) ** 2)
+    area = wall_integral(height, wall, width, lambda y, z: 1.0)
+    assert beam.bending == pytest.approx(young * bending, rel=1e-6)
+    assert beam.lateral == pytest.approx(young * lateral, rel=1e-6)
+    assert beam.line_density == pytest.approx(1070 * area, rel=1e-6)
+
+
+def test_thin_wall_limit():
+    """A thin square tube of side a: I about its base 5/3... of a^3 d, Bredt's J = a^3 d."""
+    a, d = 0.02, 1e-6
+    beam = section(a, d, a)
+    # Base 0, lid a * a^2, two sides a^3 / 3 each.
+    assert beam.bending == pytest.approx(4 * 70e3 * (1 + 2 / 3) * a**3 * d, rel=5 * d / a)
+    assert beam.lateral == pytest.approx(beam.bending, rel=5 * d / a)  # a square tube has no sides
+    assert beam.torsion == pytest.approx(70e3 * a**3 * d, rel=5 * d / a)
+    assert beam.moment_per_pressure == pytest.approx(a**3 / 2, rel=10 * d / a)
+
+
+def test_solid_limit():
+    """No chamber: a solid block bends about its base with w h^3 / 3 and takes no pressure."""
+    h, w = 0.02, 0.02
+    beam = section(h, h / 2, w)
+    assert beam.bending == pytest.approx(4 * 70e3 * w * h**3 / 3, rel=1e-12)
+    assert beam.moment_per_pressure == 0.0
+
+
+@repeatable
+@given(heights, walls, st.floats(1.01, 1.5))
+def test_more_wall_is_stiffer_heavier_and_weaker(height, wall, factor):
+    thick = min(wall * factor, 0.007)
+    assume(thick > wall)
+    thin, fat = section(height, wall), section(height, thick)
+    assert fat.bending > thin.bending and fat.lateral > thin.lateral
+    assert fat.line_density > thin.line_density
+    if (
+        thick < 0.0035
+    ):  # Bredt's thin-wall formula falls again where walls are a quarter of the height
+        assert fat.torsion > thin.torsion
+    assert fat.moment_per_pressure < thin.moment_per_pressure
+    assert fat.moment_per_pressure > 0
+
+
+@repeatable
+@given(heights, walls, st.floats(1.01, 1.5))
+def test_a_taller_section_is_stiffer_and_stronger(height, wall, factor):
+    low, tall = section(height, wall), section(height * factor, wall)
+    assert tall.bending > low.bending and tall.moment_per_pressure > low.moment_per_pressure
+
+
+@repeatable
+@given(heights, walls, st.floats(0.5, 2.0))
+def test_scaling(height, wall, s):
+    """Stiffness is linear in G and of fourth power in size; mass of second; moment of third."""
+    one = section(height, wall)
+    softer = section(height, wall, shear_modulus=70e3 * s)
+    assert softer.bending == pytest.approx(s * one.bending, rel=1e-12)
+    assert softer.line_density == one.line_density
+    scaled = section(height * s, wall * s, 0.020 * s)
+    for name, power in (("bending", 4), ("lateral", 4), ("torsion", 4), ("line_density", 2)):
+        assert getattr(scaled, name) == pytest.approx(s**power * getattr(one, name), rel=1e-12)
+    assert scaled.moment_per_pressure == pytest.approx(s**3 * one.moment_per_pressure, rel=1e-12)
+
+
+@repeatable
+@given(heights, walls)
+def test_virtual_work_of_the_chamber(height, wall):
+    """M dtheta = p dV: a segment bent by dtheta gains the chamber's area times y_c dtheta."""
+    chamber = (0.020 - 2 * wall) * (height - 2 * wall)
+    assert section(height, wall).moment_per_pressure == pytest.approx(chamber * height / 2)
+
+
+@repeatable
+@given(heights, walls)
+def test_iso_curvature_of_the_pressure_limit(height, wall):
+    """Below the limit of 40 kPa/mm the free curvature stays moderate: under 1 / (10 mm)."""
+    beam = section(height, wall, shear_modulus=56e3)
+    assert 40e6 * wall * beam.moment_per_pressure / beam.bending < 100.0
+
+
+def test_block_inertia():
+    ix, iy, iz = morphology.block_inertia(2.0, 0.3, 0.2, 0.1)
+    assert (ix, iy, iz) == pytest.approx((0.1 / 12, 0.2 / 12, 0.26 / 12))
+
+
+def test_beams_differentiate():
+    """Gradients of stiffness with respect to the section are finite and of the right sign."""
+    gradient = jax.grad(lambda d: section(0.02, d).bending)(0.005)
+    assert np.isfinite(gradient) and gradient > 0

@@ -1,0 +1,131 @@
+"""Design spaces: the order of Table I, presets, tied parameters, units and the pressure limit."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from codesign_jax import hand, parameters, schema
+
+HAND = hand.load("pneuflex4")
+FULL, PLANAR = parameters.design_space(HAND), parameters.design_space(HAND, "2d")
+repeatable = settings(max_examples=50, deadline=None, derandomize=True)
+
+
+def test_the_full_table_is_the_papers():
+    assert FULL.num_parameters == 23
+    assert sum(FULL.is_morphology) == 13
+    rows = ["length", "height", "wall"]
+    expected = [f"{row}[{i}]" for row in rows for i in range(4)]
+    expected += ["spread", "arm_roll", "arm_yaw", "arm_pitch", "arm_z", "arm_x", "arm_y"]
+    expected += [f"pressure[{i}]" for i in range(4)]
+    assert FULL.names == tuple(expected)
+    assert parameters.design_space(HAND, "23d") == FULL
+    low, high = FULL.in_units(np.array(FULL.low)), FULL.in_units(np.array(FULL.high))
+    per_row = [(10, 180)] * 4 + [(15, 25)] * 4 + [(2, 7)] * 4 + [(0, 110)] + [(-60, 60)] * 3
+    per_row += [(-50, 150), (-60, 60), (-60, 60)] + [(0, 150)] * 4
+    np.testing.assert_allclose(np.stack([low, high], 1), per_row, rtol=1e-14)
+
+
+def test_params_are_named_and_in_si_units():
+    design = FULL.from_units(np.arange(1.0, 24.0))  # 1, 2, ... in the file's units
+    params = FULL.params(jnp.asarray(design))
+    np.testing.assert_allclose(params.length, np.arange(1, 5) * 1e-3, rtol=1e-6)
+    np.testing.assert_allclose(params.height, np.arange(5, 9) * 1e-3, rtol=1e-6)
+    np.testing.assert_allclose(params.wall, np.arange(9, 13) * 1e-3, rtol=1e-6)
+    np.testing.assert_allclose(params.spread, np.deg2rad(13), rtol=1e-6)
+    # The table has roll 14, yaw 15, pitch 16, z 17, x 18, y 19; Params has x y z roll pitch yaw.
+    arm = np.array([18e-3, 19e-3, 17e-3, *np.deg2rad([14, 16, 15])])
+    np.testing.assert_allclose(params.arm, arm, rtol=1e-6)
+    np.testing.assert_allclose(params.pressure, np.arange(20, 24) * 1e3, rtol=1e-6)
+
+
+def test_units_round_trip():
+    design = np.random.default_rng(0).uniform(FULL.low, FULL.high, (5, 23))
+    np.testing.assert_allclose(FULL.from_units(FULL.in_units(design)), design, rtol=1e-14)
+
+
+def test_the_2d_preset_ties_lengths_and_fixes_the_rest():
+    assert PLANAR.names == ("length", "arm_z") and PLANAR.is_morphology == (True, False)
+    np.testing.assert_allclose(PLANAR.in_units(np.array(PLANAR.low)), [10, -60])
+    np.testing.assert_allclose(PLANAR.in_units(np.array(PLANAR.high)), [180, 200])
+    params = PLANAR.params(jnp.asarray([0.123, 0.045]))
+    fixed = {p.name: p.fixed for p in HAND.preset}["2d"]
+    np.testing.assert_allclose(params.length, 0.123, rtol=1e-6)
+    np.testing.assert_allclose(params.arm[2], 0.045, rtol=1e-6)
+    np.testing.assert_allclose(params.arm[0], fixed["arm_x"] * 1e-3, rtol=1e-6)
+    np.testing.assert_allclose(params.arm[4], np.deg2rad(fixed["arm_pitch"]), rtol=1e-6)
+    np.testing.assert_allclose(params.pressure, 120e3, rtol=1e-6)
+
+
+def test_the_subset_agrees_with_the_full_table():
+    """A 2D design expands to the full vector that gives the same hand in the whole table."""
+    design = jnp.asarray([0.1, 0.02])
+    one = PLANAR.params(design)
+    other = FULL.params(PLANAR.expand(design))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_gradients_reach_every_free_parameter():
+    """No entry of a design is lost on its way into Params."""
+    for space in (FULL, PLANAR):
+        weights = jax.grad(lambda d, s=space: sum(v.sum() for v in s.params(d)))(
+            jnp.asarray(space.default(), jnp.float32)
+        )
+        tied = [space.source.count(j) for j in range(space.num_parameters)]
+        np.testing.assert_allclose(weights, tied)
+
+
+def test_fixed_entries_do_not_take_part():
+    base = PLANAR.expand(jnp.asarray([0.1, 0.0]))
+    moved = PLANAR.expand(jnp.asarray([0.2, 0.1]))
+    fixed = np.array(PLANAR.source) < 0
+    np.testing.assert_array_equal(base[fixed], moved[fixed])
+
+
+def test_default_lies_inside_the_bounds():
+    for name in ("full", "2d"):
+        space = parameters.design_space(HAND, name)
+        default = space.default()
+        assert (default >= space.low).all() and (default <= space.high).all()
+
+
+def test_unknown_preset_names_the_nearest():
+    with pytest.raises(schema.SceneError, match="did you mean '2d'"):
+        parameters.design_space(HAND, "2D")
+
+
+designs = st.lists(st.floats(0, 1, width=32, allow_subnormal=False), min_size=23, max_size=23).map(
+    lambda u: np.array(FULL.low) + np.array(u) * (np.array(FULL.high) - np.array(FULL.low))
+)
+
+
+@repeatable
+@given(designs)
+def test_projection_keeps_pressures_strictly_below_their_limit(design):
+    before = jnp.asarray(design, jnp.float32)
+    after = PROJECT(before)
+    params = FULL.params(after)
+    assert (np.asarray(params.pressure) < np.float32(40e6) * np.asarray(params.wall)).all()
+    np.testing.assert_array_equal(PROJECT(after), after)  # idempotent
+    pressure = np.array([n.startswith("pressure") for n in FULL.names])
+    np.testing.assert_array_equal(after[~pressure], before[~pressure])
+    legal = np.asarray(before[pressure]) < np.float32(40e6) * (1 - 1e-5) * np.asarray(params.wall)
+    np.testing.assert_array_equal(after[pressure][legal], before[pressure][legal])
+
+
+PROJECT = jax.jit(FULL.project)
+
+
+def test_a_tied_pressure_obeys_the_thinnest_wall():
+    free = (hand.Free("wall"), hand.Free("pressure", tied=True))
+    tied = dataclasses.replace(HAND, preset=(hand.Preset("tied", free),))
+    space = parameters.design_space(tied, "tied")
+    design = jnp.asarray([0.007, 0.005, 0.002, 0.006, 150e3])
+    np.testing.assert_allclose(space.project(design)[-1], 80e3, rtol=1e-5)
+    assert space.project(design)[-1] < 80e3

@@ -1,0 +1,53 @@
+# Everything from a bare checkout: `make demo` and `make test` build .venv first, once.
+# PYTHON chooses the interpreter (3.11 or newer), VENV the environment's folder.
+
+VENV ?= .venv
+PYTHON ?= $(shell for p in python3 python3.12 python3.13 python3.11 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; \
+	done)
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+CHECKED := codesign_jax scripts tests notebooks
+
+.PHONY: demo test test-slow notebooks lint format types clean help
+
+help:
+	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
+	@echo "make test        quick tests          make test-slow   whole optimisations"
+	@echo "make notebooks   execute them         make lint types  ruff, pyright"
+	@echo "make format      ruff format          make clean       remove what make built"
+
+demo: $(STAMP)
+	$(BIN)/python scripts/demo.py
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -q
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -q -m slow
+
+notebooks: $(STAMP)
+	$(BIN)/python scripts/run_notebooks.py
+
+lint: $(STAMP)
+	$(BIN)/ruff check $(CHECKED)
+	$(BIN)/ruff format --check $(CHECKED)
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix $(CHECKED)
+	$(BIN)/ruff format $(CHECKED)
+
+types: $(STAMP)
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+# Installed again only when the dependencies change.
+$(STAMP): pyproject.toml
+	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found: apt-get install python3 python3-venv" >&2; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
+		{ echo "No venv module: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[viz,notebooks,test,dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

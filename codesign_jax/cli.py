@@ -1,0 +1,136 @@
+"""The `codesign` command: its flags.  Nothing heavy is imported before they are parsed."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Overrides = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        name="set",
+        metavar="KEY=VALUE ...",
+        help="Values that replace the scene file's, e.g. discretization.links=5 gravity=3.7",
+        help_behavior_hint="",
+    ),
+]
+
+# Without a default of its own: the help text says what takes its place.
+Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
+Count = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+
+
+@dataclasses.dataclass
+class Optimize:
+    """Co-design morphology and control of a hand.
+
+    The same command again resumes the run in its folder.  Sizes that are not given are the paper's.
+    """
+
+    preset: str = "2d"
+    """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
+    hand: Text = None
+    """Hand: a built-in name or a .toml file; default: the scene's."""
+    objects: Text = None
+    """Object set: a built-in name or a .toml file; default: the scene's."""
+    scene: str = "paper"
+    """Scene: a built-in name or a .toml file."""
+    overrides: Overrides = ()
+    schedule: str = "concurrent"
+    """Strategy: concurrent, single, switch-K (K switches), morphology or control."""
+    first: Literal["morphology", "control"] = "morphology"
+    """Domain of the first episode with single and switch-K."""
+    engine: str = "mujoco"
+    """Engine that simulates: mujoco (C, float64, all cores) or mjx (JAX)."""
+    particles: Count = None
+    """Particles; the paper's 10 in 2d, 60 otherwise."""
+    trials: Count = None
+    """Trials of a particle in an episode, best a multiple of the objects; the paper's 6."""
+    episodes: Count = None
+    """Episodes; the paper's 64 in 2d, 128 otherwise."""
+    test_trials: Count = None
+    """Further trials that test each final particle; the paper's 36 in 2d, 72 otherwise; 0: none."""
+    seed: int = 0
+    """Root of all random numbers."""
+    out: File = None
+    """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED."""
+    fresh: Flag = False
+    """Delete an earlier run in the folder and start anew."""
+    dry_run: Flag = False
+    """Print the resolved scene, the number of grasps and an estimate; write nothing."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import optimize
+
+        return optimize.main(self)
+
+
+@dataclasses.dataclass
+class Evaluate:
+    """Evaluate one design: costs of each object, success, and an animation if asked for."""
+
+    design: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint="")
+    ] = ()
+    """The design in the hand file's units, e.g. length=148 arm_z=-59; the rest is the default."""
+    run_folder: Annotated[
+        Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
+    ] = None
+    """Take scene, design space and best particle from this run folder."""
+    preset: str = "2d"
+    """Design space that the names belong to."""
+    hand: Text = None
+    """Hand: a built-in name or a .toml file; default: the scene's."""
+    objects: Text = None
+    """Object set: a built-in name or a .toml file; default: the scene's."""
+    scene: str = "paper"
+    """Scene: a built-in name or a .toml file."""
+    overrides: Overrides = ()
+    engine: Text = None
+    """Engine that simulates; default: the run's, or mujoco."""
+    trials: int = 6
+    """Trials, taking turns between the objects."""
+    seed: int = 0
+    """Root of the trials' noise."""
+    render: File = None
+    """Write an animation of the first trial of each object to this .gif file."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import evaluate
+
+        return evaluate.main(self)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parses the command line, runs the command and returns the exit status.
+
+    0: done; 1: it failed on the way; 2: the input was refused and nothing was created;
+    130 and 143: stopped by SIGINT or SIGTERM, everything saved.
+
+    Args:
+      arguments: Arguments without the program's name; default: those of the process.
+    """
+    command = tyro.cli(
+        Optimize | Evaluate,  # type: ignore[arg-type]
+        args=arguments,
+        prog="codesign",
+        description="Co-design of soft hand morphology and control.",
+    )
+    from codesign_jax.schema import SceneError
+
+    try:
+        return command.run()
+    except SceneError as error:
+        for problem in error.problems:
+            print(f"error: {problem}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

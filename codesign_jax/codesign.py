@@ -1,0 +1,252 @@
+"""Co-design: one episode, that is move, simulate, weigh and resample, as one jitted program.
+
+Source: Deimel, Irmisch, Wall, Brock (2017), section VI.1 and Fig. 5; the measures are those of
+section VI.4.  Everything here is a pure function of arrays; files and progress are the caller's.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import rollout
+from codesign_jax.cost import particle_cost
+from codesign_jax.engines import Engine
+from codesign_jax.optimize import Info, ParticleFilter, Space, State, rejection_sample
+from codesign_jax.parameters import DesignSpace
+from codesign_jax.scene import Scene
+from codesign_jax.types import Outcome
+
+# Four ASCII letters each, as the optimiser's streams, so that no two streams of a seed meet.
+STREAM_TRIAL = 0x7472696C
+"""Stream of the noise of an episode's trials ("tril")."""
+STREAM_SCREEN = 0x7363726E
+"""Stream of the noise with which seed candidates are screened ("scrn")."""
+STREAM_TEST = 0x74657374
+"""Stream of the noise of the final test ("test")."""
+
+SUCCESS_COST = 0.01
+"""Mean test cost below which a particle has solved the task (section VI.4)."""
+CONVERGED_COST = 1.0
+"""Mean particle cost of an episode below which a run counts as converged (section VI.4)."""
+SEED_COST = 2.0
+"""Cost that a seed particle must exceed, so that no run starts with a solution (section VI.4)."""
+
+EpisodeFunction = Callable[[State, jax.typing.ArrayLike], tuple[State, "EpisodeInfo"]]
+EvaluateFunction = Callable[[jax.Array, jax.Array], Outcome]
+
+
+class EpisodeInfo(NamedTuple):
+    """What one episode reports.
+
+    Attributes:
+      population: Particles as simulated [SI units], shape (particle, parameter).
+      trials: Cost, status, time of loss and first bad step, each of shape (particle, trial).
+      selection: Particle costs, weights and ancestors of the resampling; see `optimize.Info`.
+    """
+
+    population: jax.Array
+    trials: Outcome
+    selection: Info
+
+
+class FinalTest(NamedTuple):
+    """How particles did in the final test.
+
+    Attributes:
+      trials: Outcomes, every array of shape (particle, trial).
+      cost: Mean cost of each particle by the scene's failure rule, shape (particle,).
+      success: Whether the cost is below `SUCCESS_COST`, bool, shape (particle,).
+    """
+
+    trials: Outcome
+    cost: jax.Array
+    success: jax.Array
+
+
+def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) -> ParticleFilter:
+    """Returns the particle filter over a design space, by default with the paper's constants.
+
+    Args:
+      space: Free parameters with bounds and pressure limit.
+      sigma: Standard deviation of a move as a fraction of the parameter's range.
+      alpha: Cost offset of the weight 1 / (alpha + cost).
+    """
+    box = Space(np.asarray(space.low), np.asarray(space.high), space.project)
+    return ParticleFilter(box, sigma=sigma, alpha=alpha)
+
+
+def make_evaluate(
+    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int
+) -> EvaluateFunction:
+    """Returns a jitted function (population, key) -> outcomes of shape (particle, trial).
+
+    All particles meet the same trials: common random numbers compare designs, not luck.
+
+    Args:
+      scene: The scene.
+      engine: Engine that simulates.
+      space: Design space of the population.
+      num_trials: Trials of each particle.
+    """
+
+    @jax.jit
+    def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
+        trials = rollout.sample_trials(scene, key, num_trials)
+        return rollout.evaluate(scene, engine, jax.vmap(space.params)(population), trials)
+
+    return evaluate
+
+
+def make_episode(
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    optimizer: ParticleFilter,
+    num_trials: int,
+) -> EpisodeFunction:
+    """Returns the jitted function (state, mask) -> (state, info) that runs one episode.
+
+    The mask, bool of shape (parameter,), is data: every schedule shares one compile.  The noise of
+    trial t derives from (root key, stream, episode, t), so that it depends neither on the number
+    of particles nor on where a run was resumed.
+
+    Args:
+      scene: The scene.
+      engine: Engine that simulates.
+      space: Design space of the particles.
+      optimizer: Particle filter over the same space.
+      num_trials: Trials of each particle in an episode.
+    """
+    evaluate = make_evaluate(scene, engine, space, num_trials)
+
+    @jax.jit
+    def episode(state: State, mask: jax.typing.ArrayLike) -> tuple[State, EpisodeInfo]:
+        population = optimizer.ask(state, mask)
+        trials = evaluate(population, stream_key(state.key, STREAM_TRIAL, state.episode))
+        new, selection = optimizer.tell(state, population, particle_cost(scene, trials))
+        return new, EpisodeInfo(population, trials, selection)
+
+    return episode
+
+
+def evaluate_by(episode: EpisodeFunction, num_parameters: int) -> EvaluateFunction:
+    """Returns an evaluation (population, key) -> outcomes that uses an episode's own program.
+
+    With every parameter closed nothing moves, so that seeds and final particles are simulated
+    without a second compile.
+
+    Args:
+      episode: See `make_episode`; works for as many particles as it was compiled for.
+      num_parameters: Number of parameters of a particle.
+    """
+    closed = np.zeros(num_parameters, bool)
+
+    def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
+        state = State(population, jnp.zeros((), jnp.int32), key)
+        return episode(state, closed)[1].trials
+
+    return evaluate
+
+
+def stream_key(key: jax.Array, stream: int, index: jax.typing.ArrayLike = 0) -> jax.Array:
+    """Derives the key of one draw from the root key, the stream and a running number."""
+    return jax.random.fold_in(jax.random.fold_in(key, stream), index)
+
+
+def find_seed(
+    scene: Scene,
+    evaluate: EvaluateFunction,
+    optimizer: ParticleFilter,
+    key: jax.Array,
+    *,
+    batch: int,
+    threshold: float = SEED_COST,
+) -> tuple[jax.Array, float, int]:
+    """Draws the particle that a run starts from by rejection sampling (section VI.4).
+
+    Args:
+      scene: The scene.
+      evaluate: See `make_evaluate`.
+      optimizer: Particle filter whose space is sampled.
+      key: Root key of the run.
+      batch: Candidates simulated at once.
+      threshold: Cost above which a candidate is poor enough.
+
+    Returns:
+      The seed particle [SI units], shape (parameter,), its cost and the number of candidates drawn.
+
+    Raises:
+      RuntimeError: If no candidate is poor enough.
+    """
+    noise = stream_key(key, STREAM_SCREEN)
+    seeds, costs, drawn = rejection_sample(
+        key,
+        optimizer.space,
+        lambda candidates: particle_cost(scene, evaluate(candidates, noise)),
+        1,
+        threshold=threshold,
+        batch=batch,
+    )
+    return seeds[0], float(costs[0]), drawn
+
+
+def final_test(
+    scene: Scene,
+    evaluate: EvaluateFunction,
+    particles: jax.Array,
+    key: jax.Array,
+    *,
+    num_trials: int,
+    previous: Outcome | None = None,
+) -> FinalTest:
+    """Tests final particles on new trials, together with the trials they had already.
+
+    The paper's test: 36 more trials in 2D, which makes 42 with the last episode's 6, and 72 more
+    in 23D, which makes 78.
+
+    Args:
+      scene: The scene.
+      evaluate: See `make_evaluate`; called until there are at least `num_trials` more trials, so
+        that a multiple of its own number of trials gives exactly that many.
+      particles: Particles [SI units], shape (particle, parameter).
+      key: Root key of the run.
+      num_trials: Further trials of each particle.
+      previous: Outcomes that count as well, shape (particle, trial), such as the last episode's.
+    """
+    parts = [] if previous is None else [previous]
+    done, chunk = 0, 0
+    while done < num_trials:
+        parts.append(evaluate(particles, stream_key(key, STREAM_TEST, chunk)))
+        done, chunk = done + parts[-1].cost.shape[1], chunk + 1
+    return summarize_test(scene, jax.tree.map(lambda *v: jnp.concatenate(v, axis=1), *parts))
+
+
+def summarize_test(scene: Scene, trials: Outcome) -> FinalTest:
+    """Returns cost and success of particles from the outcomes of their test.
+
+    Args:
+      scene: The scene.
+      trials: Outcomes, every array of shape (particle, trial).
+    """
+    cost = particle_cost(scene, trials)
+    return FinalTest(trials, cost, cost < SUCCESS_COST)
+
+
+def convergence_episode(
+    mean_cost: np.typing.ArrayLike, *, threshold: float = CONVERGED_COST
+) -> int | None:
+    """Returns the first episode from which the mean particle cost stays below the threshold.
+
+    Args:
+      mean_cost: Mean particle cost of each episode, shape (episode,).
+      threshold: The paper's c_convergence.
+
+    Returns:
+      Zero-based episode, or None if the last episode is not below the threshold.
+    """
+    above = np.flatnonzero(~(np.asarray(mean_cost) < threshold))
+    first = int(above[-1]) + 1 if above.size else 0
+    return first if first < np.size(mean_cost) else None

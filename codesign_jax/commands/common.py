@@ -1,0 +1,99 @@
+"""What the commands share: overrides, designs and JAX's compilation cache."""
+
+import math
+import os
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from codesign_jax import schema
+from codesign_jax.parameters import DesignSpace
+from codesign_jax.schema import SceneError
+
+
+def use_compilation_cache() -> None:
+    """Keeps compiled programs between processes, unless the user has chosen a place already."""
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(Path(root) / "codesign-jax" / "jax"))
+
+
+def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
+    """Turns "discretization.links=5" into {"discretization": {"links": 5}}.
+
+    Raises:
+      SceneError: If a pair is not KEY=VALUE, or a key has more than two parts.
+    """
+    tables: dict[str, Any] = {}
+    problems = []
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        parts = key.strip().split(".")
+        if not equals or len(parts) > 2 or not all(parts):
+            problems.append(f"--set {pair!r} must be KEY=VALUE, such as discretization.links=5")
+        elif len(parts) == 1:
+            tables[parts[0]] = _toml_value(text)
+        else:
+            group = tables.setdefault(parts[0], {})
+            if isinstance(group, dict):
+                group[parts[1]] = _toml_value(text)
+    if problems:
+        raise SceneError(problems)
+    return tables
+
+
+def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
+    """Reads a design given as NAME=VALUE in the hand file's units.
+
+    Args:
+      space: The design space; parameters that are not named take its default.
+      pairs: The pairs.
+
+    Returns:
+      The design [SI units], shape (parameter,).
+
+    Raises:
+      SceneError: With every unknown name, value that is not a number and value out of range.
+    """
+    values = dict(zip(space.names, space.in_units(space.default()), strict=True))
+    lows = dict(zip(space.names, space.in_units(np.array(space.low)), strict=True))
+    highs = dict(zip(space.names, space.in_units(np.array(space.high)), strict=True))
+    units = dict(zip(space.names, space.units, strict=True))
+    problems = []
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        if name not in values:
+            problems.append(f"--design {name!r} is not a parameter; {schema.nearest(name, values)}")
+            continue
+        value = _number(text)
+        # Bounds went to SI and back; the last bit of that is no reason to refuse one.
+        low, high = (round(float(b[name]), 9) for b in (lows, highs))
+        if value is None:
+            problems.append(f"--design {name} = {text!r} must be a number in {units[name]}")
+        elif problem := schema.range_problem(f"--design {name}", value, units[name], low, high):
+            problems.append(problem)
+        else:
+            values[name] = value
+    if problems:
+        raise SceneError(problems)
+    return np.clip(space.from_units(np.array(list(values.values()))), space.low, space.high)
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _toml_value(text: str) -> Any:
+    """Reads a TOML value; what is none, such as a bare word, is a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,133 @@
+"""`codesign evaluate`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from codesign_jax import codesign, engines, rollout, runs, schema
+from codesign_jax import scene as scenes
+from codesign_jax.commands import common
+from codesign_jax.cost import particle_cost
+from codesign_jax.engines import make_engine
+from codesign_jax.parameters import DesignSpace, design_space
+from codesign_jax.scene import Scene
+from codesign_jax.schema import SceneError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Evaluate
+
+
+class _Case(NamedTuple):
+    scene: Scene
+    space: DesignSpace
+    design: np.ndarray
+    engine: str
+
+
+def main(options: "Evaluate") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      SceneError: If something is wrong with the input.
+    """
+    common.use_compilation_cache()
+    case = _from_run(options) if options.run_folder else _from_flags(options)
+    _check(options, case.engine)
+    engine = make_engine(case.engine, case.scene)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
+    _evaluate(case, engine, options, console)
+    if options.render:
+        _render(case, engine, options, console)
+    return 0
+
+
+def _check(options: "Evaluate", engine: str) -> None:
+    problems = []
+    for name, value, high in (
+        ("trials", options.trials, 100_000),
+        ("seed", options.seed, 2**31 - 1),
+    ):
+        low = 1 if name == "trials" else 0
+        problem = schema.range_problem(f"--{name}", value, "", low, high)
+        problems += [problem] if problem else []
+    if engine not in engines.NAMES:
+        problems.append(
+            f"--engine {engine!r} is not valid; {schema.nearest(engine, engines.NAMES)}"
+        )
+    if options.render and options.render.suffix != ".gif":
+        problems.append(f"--render {options.render} must end in .gif")
+    if problems:
+        raise SceneError(problems)
+
+
+def _from_flags(options: "Evaluate") -> _Case:
+    scene = scenes.load(
+        options.scene,
+        hand_name=options.hand,
+        object_set=options.objects,
+        overrides=common.parse_overrides(options.overrides),
+    )
+    space = design_space(scene.hand, options.preset)
+    design = common.parse_design(space, options.design)
+    return _Case(scene, space, design, options.engine or engines.DEFAULT)
+
+
+def _from_run(options: "Evaluate") -> _Case:
+    """The final particle of a run that tested best, or the last episode's best without a test."""
+    if options.design or options.hand or options.objects or options.overrides:
+        raise SceneError(["--run brings its own design and scene; leave out the flags for them"])
+    folder: Path = options.run_folder  # type: ignore[assignment]
+    scene, settings = runs.read_run(folder)
+    record = runs.load_record(folder)
+    if record is None or record.done == 0:
+        raise SceneError([f"--run {folder} has no finished episode yet"])
+    if record.test is not None:
+        best = int(particle_cost(scene, record.test).argmin())
+        design = np.asarray(record.state.particles)[best]
+    else:
+        best = int(record.history.cost[record.done - 1].argmin())
+        design = record.history.population[record.done - 1][best]
+    space = design_space(scene.hand, settings.preset)
+    return _Case(scene, space, design, options.engine or settings.engine)
+
+
+def _evaluate(case: _Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+    """Simulates the trials and prints the costs of each object."""
+    evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
+    population = jnp.asarray(case.design, jnp.float32)[None]
+    outcomes = jax.tree.map(np.asarray, evaluate(population, jax.random.key(options.seed)))
+    names = [shape.name for shape in case.scene.objects.object]
+    for k, name in enumerate(names):
+        cost, status = outcomes.cost[0, k :: len(names)], outcomes.status[0, k :: len(names)]
+        if not cost.size:
+            continue
+        lost = np.isfinite(outcomes.lost_time[0, k :: len(names)]).sum()
+        failed = ", ".join(sorted({runs.status_names(s) for s in status if s}))
+        console.print(
+            f"{name:>12}: mean cost {cost.mean():.3f} over {cost.size} trials, {lost} lost, "
+            f"{(status != 0).sum()} failed" + (f" ({failed})" if failed else "")
+        )
+    total = float(particle_cost(case.scene, outcomes)[0])
+    verdict = "success" if total < codesign.SUCCESS_COST else "no success"
+    limit = codesign.SUCCESS_COST
+    console.print(f"{'all':>12}: mean cost {total:.4f} ({verdict}: limit {limit})")
+
+
+def _render(case: _Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+    try:
+        from codesign_jax.report import animation
+    except ImportError as error:
+        message = f"--render needs {error.name}: pip install 'codesign-jax[viz]'"
+        raise SceneError([message]) from error
+    count = min(options.trials, len(case.scene.objects.object))
+    trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)
+    params = case.space.params(jnp.asarray(case.design, jnp.float32))
+    grasps = animation.replay(case.scene, engine, params, trials)
+    path: Path = options.render  # type: ignore[assignment]
+    animation.write_gif(case.scene, grasps, path, notify=console.print)
+    console.print(f"animation: {path}", markup=False)

@@ -1,0 +1,148 @@
+"""`codesign optimize`."""
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from codesign_jax import codesign, runs
+from codesign_jax import scene as scenes
+from codesign_jax.commands import common
+from codesign_jax.engines import make_engine
+from codesign_jax.optimize import candidates
+from codesign_jax.parameters import design_space
+from codesign_jax.runs import AllFailed, Plan, RunResult, Settings
+from codesign_jax.runs.progress import duration
+from codesign_jax.runs.scene_files import scene_texts
+from codesign_jax.scene import Scene
+from codesign_jax.schema import SceneError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Optimize
+
+
+def main(options: "Optimize") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      SceneError: If something is wrong with the input; nothing was created then.
+    """
+    common.use_compilation_cache()
+    scene, settings = resolve(options)
+    if options.dry_run:
+        _dry_run(scene, settings)
+        return 0
+    plan = runs.prepare(scene, settings)
+    folder = options.out or _default_folder(scene, settings)
+    try:
+        result = runs.optimize(plan, folder, sys.argv, fresh=options.fresh)
+    except (AllFailed, OSError, RuntimeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    if result.signum:
+        return 128 + result.signum
+    _summarize(plan, result, folder)
+    return 0
+
+
+def resolve(options: "Optimize") -> tuple[Scene, Settings]:
+    """Reads the scene and fills the settings.
+
+    Raises:
+      SceneError: With the problems of both.
+    """
+    problems, scene = [], None
+    try:
+        scene = scenes.load(
+            options.scene,
+            hand_name=options.hand,
+            object_set=options.objects,
+            overrides=common.parse_overrides(options.overrides),
+        )
+    except SceneError as error:
+        problems += error.problems
+    settings = runs.make_settings(
+        options.preset,
+        options.schedule,
+        options.first,
+        options.engine,
+        options.seed,
+        particles=options.particles,
+        trials=options.trials,
+        episodes=options.episodes,
+        test_trials=options.test_trials,
+    )
+    problems += runs.check(settings, scene.hand if scene else None)
+    if problems or scene is None:
+        raise SceneError(problems)
+    return scene, settings
+
+
+def _default_folder(scene: Scene, settings: Settings) -> Path:
+    name = f"{scene.hand.name}-{settings.preset}-{settings.schedule}-{settings.seed}"
+    return Path("runs") / name
+
+
+def _dry_run(scene: Scene, settings: Settings) -> None:
+    """Prints scene, settings, grasps and what they will take, measured on a few random designs."""
+    for name, text in scene_texts(scene).items():
+        print(f"# ---- {name}\n{text}")
+    print(f"# ---- settings\n{settings}\n")
+    space = design_space(scene.hand, settings.preset)
+    batch = settings.particles * settings.trials
+    print(f"grasps: {settings.grasps} and at least {batch} to find the seed")
+    row = 40 + 12 * space.num_parameters
+    rows = settings.episodes * settings.particles * (settings.trials + 1)
+    print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
+    engine, optimizer = make_engine(settings.engine, scene), codesign.make_filter(space)
+    evaluate = codesign.make_evaluate(scene, engine, space, 3)
+    population = candidates(jax.random.key(settings.seed), optimizer.space, jnp.arange(4))
+    compiled = evaluate.lower(population, jax.random.key(0)).compile()  # type: ignore[attr-defined]
+    start = time.perf_counter()
+    jax.block_until_ready(compiled(population, jax.random.key(0)))
+    rate = 12 / (time.perf_counter() - start)
+    total = duration(settings.grasps / rate)
+    print(f"time: about {total} at {rate:.1f} grasps/s (12 grasps of random designs; good ones")
+    print("take longer, as lost trials end early; larger batches may be faster)")
+
+
+def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:
+    """Prints the final particle that did best, and draws the figures if matplotlib is there."""
+    console = Console(highlight=False, soft_wrap=True)
+    if result.record is None:
+        return
+    history, particles = result.record.history, np.asarray(result.record.state.particles)
+    converged = codesign.convergence_episode(history.cost.mean(1))
+    if converged is None:
+        console.print(f"not converged: the mean cost does not stay below {codesign.CONVERGED_COST}")
+    else:
+        grasps = converged * plan.settings.particles * plan.settings.trials
+        console.print(f"converged from episode {converged + 1} on, after {grasps} grasps")
+    if result.test is not None:
+        cost = np.asarray(result.test.cost)
+        best, count = int(cost.argmin()), result.test.trials.cost.shape[1]
+        console.print(f"best final particle: {runs.describe(plan.space, particles[best])}")
+        verdict = "success" if bool(result.test.success[best]) else "no success"
+        limit = codesign.SUCCESS_COST
+        console.print(
+            f"its mean cost over {count} trials: {cost[best]:.4f} ({verdict}: limit {limit})"
+        )
+    _figures(plan, result, folder, console)
+    console.print(f"results: {folder}", markup=False)
+
+
+def _figures(plan: Plan, result: RunResult, folder: Path, console: Console) -> None:
+    try:
+        from codesign_jax.report import figures
+    except ImportError:
+        console.print("no figures: pip install 'codesign-jax[viz]'", markup=False)
+        return
+    assert result.record is not None
+    path = folder / "figures" / "cost_evolution.png"
+    figures.cost_evolution(result.record.history.cost, path)
+    console.print(f"figure: {path}", markup=False)

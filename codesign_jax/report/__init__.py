@@ -1,0 +1,1 @@
+"""Figures and animations; nothing numerical imports this package, and it needs the extra `viz`."""

@@ -1,0 +1,248 @@
+"""Animation of grasps as GIF (MuJoCo's renderer and Pillow).
+
+Where the machine has no OpenGL, links and object are drawn with matplotlib instead, so that an
+animation always exists.
+"""
+
+import functools
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from PIL import Image
+
+from codesign_jax import model, rollout
+from codesign_jax.engines import Engine
+from codesign_jax.report import sketch
+from codesign_jax.scene import Scene
+from codesign_jax.types import Outcome, Params, Trial
+
+# Point looked at [m], distance [m], azimuth and elevation [deg].
+CAMERA = (0.0, 0.0, 0.15, 0.85, 125.0, -14.0)
+_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
+
+
+class Replay(NamedTuple):
+    """A grasp to be drawn.
+
+    Attributes:
+      params: Parameters of the hand, concrete arrays without leading axis.
+      trial: Object and noise, likewise.
+      outcome: How it ended, likewise.
+      qpos: Generalized positions at every time step, shape (time, nq).
+    """
+
+    params: Params
+    trial: Trial
+    outcome: Outcome
+    qpos: np.ndarray
+
+
+def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[Replay]:
+    """Simulates one hand in several trials and keeps the trajectories.
+
+    Args:
+      scene: The scene.
+      engine: The engine.
+      params: Parameters of one hand, no leading axis.
+      trials: Trials with leading axis (trial,).
+    """
+    count = trials.yaw.shape[0]
+    worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (count, *jnp.shape(v))), params)
+    simulate = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t, trajectory=True))
+    outcomes, trace = jax.tree.map(np.asarray, simulate(worlds, trials))
+
+    def one(tree, i: int):
+        return jax.tree.map(lambda v: np.asarray(v)[i], tree)
+
+    return [
+        Replay(one(worlds, i), one(trials, i), one(outcomes, i), trace.qpos[i])
+        for i in range(count)
+    ]
+
+
+def frames(
+    scene: Scene,
+    grasp: Replay,
+    times: np.ndarray,
+    *,
+    size: tuple[int, int] = (320, 320),
+    notify: Callable[[str], None] = print,
+) -> np.ndarray:
+    """Draws a grasp at given times.
+
+    Args:
+      scene: The scene.
+      grasp: The grasp.
+      times: Times of the frames [s], shape (frame,).
+      size: Width and height in pixels.
+      notify: Told in one line if there is no OpenGL.
+
+    Returns:
+      Frames, uint8, shape (frame, height, width, 3).
+    """
+    step = np.rint(times / scene.discretization.timestep).astype(int)
+    qpos = grasp.qpos[np.clip(step, 0, len(grasp.qpos) - 1)]
+    compiled = _visual_model(scene, grasp)
+    way = _opengl()
+    if way is not None:
+        return _render(compiled, qpos, size, way)
+    notify(f"no OpenGL: drawing a sketch; for pictures, apt-get install {_PACKAGES}")
+    return sketch.draw(scene, compiled, qpos, int(grasp.trial.shape), size)
+
+
+def write_gif(
+    scene: Scene,
+    grasps: list[Replay],
+    path: Path,
+    *,
+    frames_per_second: int = 20,
+    size: tuple[int, int] = (320, 320),
+    notify: Callable[[str], None] = print,
+) -> Path:
+    """Writes grasps side by side as an animated GIF.
+
+    Args:
+      scene: The scene.
+      grasps: Grasps to draw.
+      path: File to write; its folder is made.
+      frames_per_second: Frames of a second of simulated time, which is shown in real time.
+      size: Width and height of one grasp's picture in pixels.
+      notify: See `frames`.
+
+    Returns:
+      The path.
+    """
+    times = np.arange(0.0, scene.end_time, 1 / frames_per_second)
+    parts = [frames(scene, g, times, size=size, notify=notify) for g in grasps]
+    images = [Image.fromarray(f) for f in np.concatenate(parts, axis=2)]
+    # One palette for all frames: separate ones flicker and take more space.
+    palette = _common_palette(images)
+    indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # GIF counts in hundredths of a second.
+    duration = 10 * round(100 / frames_per_second)
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
+    return path
+
+
+def write_strip(
+    scene: Scene,
+    grasps: list[Replay],
+    path: Path,
+    *,
+    times: tuple[float, ...] | None = None,
+    size: tuple[int, int] = (240, 240),
+    notify: Callable[[str], None] = print,
+) -> Path:
+    """Writes a film strip, one row a grasp, by default one frame at the end of each phase.
+
+    Args:
+      scene: The scene.
+      grasps: Grasps to draw.
+      path: Image file to write; its folder is made.
+      times: Times of the frames [s].
+      size: Width and height of a frame in pixels.
+      notify: See `frames`.
+
+    Returns:
+      The path.
+    """
+    p = scene.phases
+    chosen = times or (0.0, p.approach, p.inflate, p.lift, p.disturb, scene.end_time)
+    rows = [frames(scene, g, np.array(chosen), size=size, notify=notify) for g in grasps]
+    picture = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(picture).quantize(128).save(path)
+    return path
+
+
+def _common_palette(images: list[Image.Image]) -> Image.Image:
+    """Palette of a few frames spread over the animation, glued together."""
+    chosen = images[:: max(1, len(images) // 8)]
+    width, height = chosen[0].size
+    glued = Image.new("RGB", (width, height * len(chosen)))
+    for i, image in enumerate(chosen):
+        glued.paste(image, (0, i * height))
+    return glued.quantize(128)
+
+
+def _visual_model(scene: Scene, grasp: Replay) -> mujoco.MjModel:
+    """Compiles the hand and object of a grasp with table, sky and light to look at."""
+    spec = model.build_spec(scene, grasp.params, grasp.trial, visual=True)
+    texture, kind = mujoco.mjtTexture, mujoco.mjtBuiltin
+    spec.add_texture(
+        name="sky",
+        type=texture.mjTEXTURE_SKYBOX,
+        builtin=kind.mjBUILTIN_GRADIENT,
+        rgb1=[0.93, 0.95, 0.98],
+        rgb2=[0.70, 0.77, 0.86],
+        width=64,
+        height=384,
+    )
+    spec.add_texture(
+        name="board",
+        type=texture.mjTEXTURE_2D,
+        builtin=kind.mjBUILTIN_CHECKER,
+        rgb1=[0.86, 0.84, 0.80],
+        rgb2=[0.80, 0.78, 0.74],
+        width=256,
+        height=256,
+    )
+    material = spec.add_material(name="board", texrepeat=[20, 20], texuniform=False)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "board"
+    spec.geom("table").material = "board"
+    spec.worldbody.add_light(
+        pos=[0.4, -0.5, 1.2], dir=[-0.3, 0.4, -1.0], diffuse=[0.55] * 3, specular=[0.1] * 3
+    )
+    spec.visual.headlight.ambient = [0.45] * 3
+    spec.visual.headlight.diffuse = [0.35] * 3
+    spec.visual.headlight.specular = [0.05] * 3
+    spec.visual.map.znear, spec.visual.quality.shadowsize = 0.02, 2048
+    return spec.compile()
+
+
+@functools.cache
+def _opengl() -> str | None:
+    """The way to OpenGL that works here, tried on a small scene: EGL, OSMesa or none."""
+    chosen = os.environ.get("MUJOCO_GL")
+    tiny = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"
+    )
+    for way in [chosen] if chosen else ["egl", "osmesa"]:
+        try:
+            _render(tiny, np.zeros((1, tiny.nq)), (16, 16), way)
+        except subprocess.CalledProcessError:
+            continue
+        return way
+    return None
+
+
+def _render(
+    compiled: mujoco.MjModel, qpos: np.ndarray, size: tuple[int, int], way: str
+) -> np.ndarray:
+    """Renders in a child process; see `renderer`.
+
+    Raises:
+      CalledProcessError: If this way to OpenGL does not work.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        files = [str(Path(folder) / name) for name in ("model.mjb", "qpos.npy", "frames.npy")]
+        mujoco.mj_saveModel(compiled, files[0])
+        np.save(files[1], qpos)
+        numbers = [str(v) for v in (*size, *CAMERA)]
+        subprocess.run(
+            [sys.executable, "-m", "codesign_jax.report.renderer", *files, *numbers],
+            check=True,
+            capture_output=True,
+            env=os.environ | {"MUJOCO_GL": way, "PYOPENGL_PLATFORM": way},
+        )
+        return np.load(files[2], allow_pickle=False)

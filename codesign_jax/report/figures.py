@@ -1,0 +1,45 @@
+"""Figures of a run (matplotlib)."""
+
+from pathlib import Path
+
+import matplotlib.figure
+import numpy as np
+from numpy.typing import ArrayLike
+
+from codesign_jax.codesign import CONVERGED_COST
+
+
+def cost_evolution(
+    cost: ArrayLike, path: Path, *, threshold: float = CONVERGED_COST, title: str = ""
+) -> Path:
+    """Draws the evolution of the cost as Fig. 6 of the paper.
+
+    Dots are the costs of the particles, the line is their mean, and the dashed line is the
+    threshold that defines convergence.
+
+    Args:
+      cost: Particle costs, shape (episode, particle).
+      path: File to write; its folder is made.
+      threshold: Cost of the dashed line.
+      title: Text above the figure.
+
+    Returns:
+      The path.
+    """
+    cost = np.asarray(cost)
+    episode = np.arange(1, len(cost) + 1)
+    # A figure of its own instead of pyplot's: no state and no display is touched.
+    figure = matplotlib.figure.Figure(figsize=(6.4, 3.6), dpi=120, layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(
+        np.repeat(episode, cost.shape[1]), cost.ravel(), ".", color="tab:blue", alpha=0.4, ms=5
+    )
+    axes.plot([], [], ".", color="tab:blue", label="particle")
+    axes.plot(episode, cost.mean(1), color="tab:orange", lw=2, label="mean of the particles")
+    axes.axhline(threshold, color="black", lw=1, ls="--", label="convergence threshold")
+    axes.set(xlabel="episode", ylabel="cost", title=title, xlim=(0, len(cost) + 1))
+    axes.set_ylim(bottom=-0.05)
+    axes.legend(loc="upper right", frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    return path

@@ -1,0 +1,77 @@
+"""Sketches of a grasp in matplotlib, from link and object positions alone: no OpenGL needed."""
+
+import matplotlib.backends.backend_agg
+import matplotlib.figure
+import mujoco
+import numpy as np
+
+from codesign_jax.model import layout
+from codesign_jax.scene import Scene
+
+
+def draw(
+    scene: Scene, model: mujoco.MjModel, qpos: np.ndarray, shape: int, size: tuple[int, int]
+) -> np.ndarray:
+    """Draws one frame for each row of qpos.
+
+    Args:
+      scene: The scene.
+      model: Model of the hand and object.
+      qpos: Generalized positions, shape (frame, nq).
+      shape: Index of the object's shape.
+      size: Width and height in pixels.
+
+    Returns:
+      Frames, uint8, shape (frame, height, width, 3).
+    """
+    width, height = size
+    figure = matplotlib.figure.Figure(figsize=(width / 100, height / 100), dpi=100)
+    canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1), projection="3d")
+    data, outline = mujoco.MjData(model), _outline(scene, model, shape)
+    pictures = []
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        axes.clear()
+        _frame(axes, scene, data, outline)
+        canvas.draw()
+        pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    return np.stack(pictures)
+
+
+def _frame(axes, scene: Scene, data: mujoco.MjData, outline: list[np.ndarray]) -> None:
+    lay = layout(scene)
+    reach = 0.18
+    corners = reach * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    axes.plot(*corners.T, 0.0, color="0.6", lw=1)
+    for stub, links in zip(lay.stubs, lay.bodies, strict=True):
+        axes.plot(*data.xpos[[stub, *links]].T, color="tab:blue", lw=3)
+    palm = data.xpos[1]
+    for stub in lay.stubs:
+        axes.plot(*np.stack([palm, data.xpos[stub]]).T, color="0.3", lw=3)
+    position, rotation = data.xpos[lay.object], data.xmat[lay.object].reshape(3, 3)
+    for line in outline:
+        axes.plot(*(position + line @ rotation.T).T, color="tab:orange", lw=1.5)
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(0, 2 * reach))
+    axes.set_box_aspect((1, 1, 1))
+    axes.view_init(elev=14, azim=-55)
+    axes.set_axis_off()
+
+
+def _outline(scene: Scene, model: mujoco.MjModel, shape: int) -> list[np.ndarray]:
+    """Lines of the object in its own frame [m], each of shape (point, 3)."""
+    size = model.geom_size[layout(scene).object_geoms[shape]]
+    turn = np.linspace(0, 2 * np.pi, 25)
+    circle = np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
+    kind = scene.objects.object[shape].type
+    if kind == "sphere":
+        return [size[0] * np.roll(circle, k, axis=1) for k in range(3)]
+    if kind == "cylinder":
+        flat, top = circle * size[0], np.array([0, 0, size[1]])
+        sides = [np.stack([p - top, p + top]) for p in flat[::6]]
+        return [flat - top, flat + top, *sides]
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    ring = np.column_stack([square, np.zeros(5)]) * size
+    top = np.array([0, 0, size[2]])
+    return [ring - top, ring + top, *(np.stack([p - top, p + top]) for p in ring[:4])]

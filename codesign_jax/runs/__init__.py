@@ -1,0 +1,27 @@
+"""Runs on disk: an optimisation that saves every episode and resumes where it stopped.
+
+The numerical modules know nothing of files; this package knows nothing of physics.
+"""
+
+from codesign_jax.runs.directory import read_run
+from codesign_jax.runs.loop import AllFailed, Plan, RunResult, load_record, optimize, prepare
+from codesign_jax.runs.record import History, Record
+from codesign_jax.runs.settings import Settings, check, make_settings
+from codesign_jax.runs.tables import describe, status_names
+
+__all__ = [
+    "AllFailed",
+    "History",
+    "Plan",
+    "Record",
+    "RunResult",
+    "Settings",
+    "check",
+    "describe",
+    "load_record",
+    "make_settings",
+    "optimize",
+    "prepare",
+    "read_run",
+    "status_names",
+]

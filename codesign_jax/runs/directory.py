@@ -1,0 +1,198 @@
+"""The run folder: one run, one process at a time, and nothing in it that is not the run's.
+
+scene.toml, hand.toml, objects.toml   the resolved scene
+provenance.json                       settings, code, versions, machine
+checkpoints/                          the last few episodes, see `checkpoint`
+episodes.csv particles.csv trials.csv tests.csv   results, see `tables`
+events.log                            what happened when
+figures/                              pictures
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import difflib
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from codesign_jax import scene as scenes
+from codesign_jax.runs import scene_files
+from codesign_jax.runs.provenance import environment, git_state
+from codesign_jax.runs.settings import Settings
+from codesign_jax.scene import Scene
+from codesign_jax.schema import SceneError
+
+_LOCK = ".lock"
+_PROVENANCE = "provenance.json"
+_TABLES = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
+_OURS = {*scene_files.NAMES, _PROVENANCE, *_TABLES, "checkpoints", "events.log", "figures", _LOCK}
+
+
+class RunDirectory:
+    """An open run folder; see `open_run`."""
+
+    def __init__(self, path: Path):
+        """Refers to a folder that `open_run` has prepared."""
+        self.path = path
+        self.checkpoints = path / "checkpoints"
+        self.figures = path / "figures"
+
+    def log(self, message: str) -> None:
+        """Appends a line with the time to events.log."""
+        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+        with (self.path / "events.log").open("a", encoding="utf-8") as file:
+            file.write(f"{now} {message}\n")
+
+
+@contextlib.contextmanager
+def open_run(
+    path: Path, scene: Scene, settings: Settings, command: list[str], *, fresh: bool = False
+) -> Iterator[tuple[RunDirectory, list[str]]]:
+    """Opens a run folder: makes it, or checks that it is this very run; locks it meanwhile.
+
+    Args:
+      path: The folder.
+      scene: The scene of the run.
+      settings: Its settings.
+      command: Command line to note in provenance.json.
+      fresh: Deletes an earlier run's files first.
+
+    Yields:
+      The folder and what the user should know about resuming in it.
+
+    Raises:
+      SceneError: If the folder holds other files, belongs to another scene or other settings
+        (with a diff), or is in use; nothing is changed then.
+    """
+    _refuse_foreign(path)
+    made = not path.exists()
+    path.mkdir(parents=True, exist_ok=True)
+    with _locked(path):
+        notes = []
+        if fresh:
+            _clear(path)
+        if (path / _PROVENANCE).exists():
+            stored = json.loads((path / _PROVENANCE).read_text(encoding="utf-8"))
+            _refuse_other(path, scene, settings, stored)
+            notes = _differences(stored["environment"], environment())
+            stored["resumed"] = [*stored.get("resumed", []), _start(command)]
+            _write_provenance(path, stored)
+        else:
+            _clear(path)  # remains of a start that was cut short
+            _create(path, scene, settings, command)
+        run = RunDirectory(path)
+        run.log("created" if made or fresh else "opened")
+        for note in notes:
+            run.log(note)
+        yield run, notes
+
+
+def read_run(path: Path) -> tuple[Scene, Settings]:
+    """Reads scene and settings of a run folder.
+
+    Raises:
+      SceneError: If it is not a run folder.
+    """
+    try:
+        stored = json.loads((path / _PROVENANCE).read_text(encoding="utf-8"))
+        settings = Settings(**stored["settings"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SceneError([f"{path} is not a run folder: {_PROVENANCE} cannot be read"]) from error
+    return scenes.load(path / "scene.toml"), settings
+
+
+def _refuse_foreign(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise SceneError([f"--out {path} is a file"])
+    # A killed process leaves the temporary of a file that it was replacing.
+    present = {p.name.removesuffix(".tmp") for p in path.iterdir()} if path.exists() else set()
+    others = sorted(present - _OURS)
+    if others:
+        names = ", ".join(others[:3])
+        raise SceneError([f"--out {path} holds other files ({names}); choose another folder"])
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Holds the folder's lock; the kernel releases it with the process, however it ends."""
+    with (path / _LOCK).open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.seek(0)
+            owner = file.read().strip() or "?"
+            raise SceneError([f"--out {path} is in use by process {owner}"]) from error
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield
+
+
+def _clear(path: Path) -> None:
+    for target in path.iterdir():
+        if target.name == _LOCK:
+            continue
+        if target.is_dir():
+            shutil.rmtree(target)
+        else:
+            target.unlink()
+
+
+def _create(path: Path, scene: Scene, settings: Settings, command: list[str]) -> None:
+    scene_files.write_scene(scene, path)
+    # Last: a folder with this file is a run.
+    _write_provenance(
+        path,
+        {
+            "settings": dataclasses.asdict(settings),
+            "started": _start(command),
+            "environment": environment(),
+            "git": git_state(),
+        },
+    )
+
+
+def _start(command: list[str]) -> dict[str, Any]:
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return {"time": now, "command": command}
+
+
+def _write_provenance(path: Path, content: dict[str, Any]) -> None:
+    temporary = path / (_PROVENANCE + ".tmp")
+    temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    os.replace(temporary, path / _PROVENANCE)
+
+
+def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
+    """Refuses to resume another run, and says what differs."""
+    problems = []
+    for name, value in dataclasses.asdict(settings).items():
+        before = stored["settings"].get(name)
+        if before != value:
+            problems.append(f"{name}: the run has {before!r}, asked for is {value!r}")
+    if scenes.load(path / "scene.toml") != scene:
+        for name, text in scene_files.scene_texts(scene).items():
+            old = (path / name).read_text(encoding="utf-8").splitlines()
+            diff = difflib.unified_diff(old, text.splitlines(), f"run/{name}", f"asked/{name}", n=0)
+            problems += list(diff)
+    if problems:
+        head = f"--out {path} holds another run; choose another folder, or --fresh to delete it"
+        raise SceneError([head, *(p.rstrip() for p in problems)])
+
+
+def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """Returns how the environment changed; resuming is allowed, bitwise equality is lost."""
+    flat_before, flat_now = (v | v.get("versions", {}) for v in (before, now))
+    changed = [
+        f"{name} {flat_before.get(name)} -> {flat_now[name]}"
+        for name in flat_now
+        if name != "versions" and flat_before.get(name) != flat_now[name]
+    ]
+    if not changed:
+        return []
+    return [f"not bitwise comparable with an uninterrupted run: {', '.join(changed)}"]

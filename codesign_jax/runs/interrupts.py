@@ -1,0 +1,67 @@
+"""SIGINT and SIGTERM: finish the step, save, stop; the second time at once."""
+
+import concurrent.futures
+import os
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Any, TypeVar
+
+import jax
+
+T = TypeVar("T")
+
+
+class Stopped(Exception):
+    """The user asked to stop, and nothing is left to save."""
+
+
+class Interrupts:
+    """Context in which the signals only set a flag.
+
+    Simulations run in a worker thread: a signal's handler runs between two byte codes of the main
+    thread, which a simulation may otherwise hold for minutes.
+
+    Attributes:
+      signum: Number of the signal that came, or 0.
+    """
+
+    def __init__(self, notify: Callable[[str], None]):
+        """Takes what tells the user that the signal was understood."""
+        self.signum = 0
+        self._notify = notify
+        self._before: dict[int, Any] = {}
+        self._worker = concurrent.futures.ThreadPoolExecutor(1)
+
+    def __enter__(self) -> "Interrupts":
+        """Installs the handlers where that is allowed, which is in the main thread."""
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Puts the earlier handlers back."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._worker.shutdown()
+
+    def call(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Runs a function and waits until its arrays are there.
+
+        Raises:
+          Stopped: If a signal came before.
+        """
+        if self.signum:
+            raise Stopped
+        future = self._worker.submit(lambda: jax.block_until_ready(function(*arguments)))
+        while not future.done():
+            concurrent.futures.wait([future], timeout=0.2)
+        return future.result()
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.signum:
+            os._exit(128 + number)  # every saved episode is complete; nothing needs tidying
+        self.signum = number
+        self._notify("stopping after this step; again to stop at once")

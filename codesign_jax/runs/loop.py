@@ -1,0 +1,256 @@
+"""The optimisation of one run: seed, episodes, final test; saved after every step and resumable."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from codesign_jax import codesign
+from codesign_jax.checkpoint import Checkpoints
+from codesign_jax.codesign import EpisodeFunction, FinalTest
+from codesign_jax.engines import Engine, make_engine
+from codesign_jax.optimize import ParticleFilter, State, schedule
+from codesign_jax.parameters import DesignSpace, design_space
+from codesign_jax.runs import record as records
+from codesign_jax.runs import tables
+from codesign_jax.runs.directory import RunDirectory, open_run
+from codesign_jax.runs.interrupts import Interrupts, Stopped
+from codesign_jax.runs.progress import Progress
+from codesign_jax.runs.record import History, Record
+from codesign_jax.runs.settings import Settings
+from codesign_jax.scene import Scene
+
+
+class AllFailed(RuntimeError):
+    """Every trial of an episode failed; there is nothing to optimise."""
+
+
+class Plan(NamedTuple):
+    """A run that was checked and can start; see `prepare`."""
+
+    scene: Scene
+    settings: Settings
+    engine: Engine
+    space: DesignSpace
+    optimizer: ParticleFilter
+    mask: np.ndarray
+    key: jax.Array
+
+
+class RunResult(NamedTuple):
+    """How a run ended.
+
+    Attributes:
+      record: State and history, or None if the run was stopped before it had a seed.
+      test: The final test, or None if there was none.
+      signum: Signal that stopped the run early, or 0.
+    """
+
+    record: Record | None
+    test: FinalTest | None
+    signum: int
+
+
+def prepare(scene: Scene, settings: Settings) -> Plan:
+    """Builds everything that a run needs in memory, so that errors come before any file.
+
+    Args:
+      scene: The scene.
+      settings: Settings without `settings.problems`.
+    """
+    space = design_space(scene.hand, settings.preset)
+    mask = schedule(
+        settings.schedule,
+        np.array(space.is_morphology),
+        settings.episodes,
+        settings.first,  # type: ignore[arg-type]
+    )
+    engine, optimizer = make_engine(settings.engine, scene), codesign.make_filter(space)
+    return Plan(scene, settings, engine, space, optimizer, mask, jax.random.key(settings.seed))
+
+
+def optimize(plan: Plan, folder: Path, command: list[str], *, fresh: bool = False) -> RunResult:
+    """Runs an optimisation in a folder, or goes on with it; the same call does both.
+
+    Args:
+      plan: The run; see `prepare`.
+      folder: Run folder.
+      command: Command line to note in the folder.
+      fresh: Deletes an earlier run in the folder first.
+
+    Raises:
+      SceneError: If the folder cannot be used; see `open_run`.
+      AllFailed: If every trial of an episode failed.
+      OSError: If an episode cannot be saved; earlier ones stay intact.
+    """
+    with (
+        open_run(folder, plan.scene, plan.settings, command, fresh=fresh) as (run, notes),
+        Checkpoints(run.checkpoints) as store,
+        Progress(plan.settings.episodes) as progress,
+    ):
+        for note in notes:
+            progress.message(note)
+        with Interrupts(progress.message) as interrupts:
+            return _Loop(plan, run, store, progress, interrupts).run()
+
+
+class _Loop:
+    """One process's part of a run."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        run: RunDirectory,
+        store: Checkpoints,
+        progress: Progress,
+        interrupts: Interrupts,
+    ):
+        self.plan, self.run_directory, self.store = plan, run, store
+        self.progress, self.interrupts = progress, interrupts
+
+    def run(self) -> RunResult:
+        """Runs what is left of the run."""
+        record, settings = self._restore(), self.plan.settings
+        try:
+            if record is None or record.done < settings.episodes or not self._tested(record):
+                episode = self._compile()
+                if record is None:
+                    record = self._seed(episode)
+                self._write_tables(record, 0)
+                self._episodes(record, episode)
+                self._test(record, episode)
+        except Stopped:
+            self._say(f"stopped by signal {self.interrupts.signum}; the same command resumes")
+        test = None if record is None else _final_test(self.plan, record)
+        return RunResult(record, test, self.interrupts.signum)
+
+    def _tested(self, record: Record) -> bool:
+        return record.test is not None or self.plan.settings.test_trials == 0
+
+    def _restore(self) -> Record | None:
+        found = self.store.restore()
+        for step, reason in found.damaged:
+            self._say(f"checkpoint {step} is lost: {reason}; using an older one")
+        self.store.discard([step for step, _ in found.damaged])
+        if found.step is None:
+            return None
+        record = records.from_arrays(found.arrays)
+        done, total = record.done, self.plan.settings.episodes
+        if done < total:
+            self._say(f"resuming episode {done + 1}/{total} from {self.run_directory.path}")
+        else:
+            self._say(f"all {total} episodes are done in {self.run_directory.path}")
+        return record
+
+    def _seed(self, episode: EpisodeFunction) -> Record:
+        """Finds the seed particle and saves it as step 0."""
+        plan, settings = self.plan, self.plan.settings
+        evaluate = codesign.evaluate_by(episode, plan.space.num_parameters)
+
+        def search() -> tuple[jax.Array, float, int]:
+            return codesign.find_seed(
+                plan.scene, evaluate, plan.optimizer, plan.key, batch=settings.particles
+            )
+
+        with self.progress.busy("looking for a poor seed") as watch:
+            seed, cost, drawn = self.interrupts.call(search)
+        design = tables.describe(plan.space, np.asarray(seed))
+        self._say(f"seed {design}: cost {cost:.3f}, candidate {drawn} ({watch.seconds:.1f} s)")
+        state = plan.optimizer.init(plan.key, seed, settings.particles)
+        record = Record(state, records.empty_history(settings, plan.space.num_parameters))
+        self._save(0, record)
+        return record
+
+    def _episodes(self, record: Record, episode: EpisodeFunction) -> None:
+        for e in range(record.done, self.plan.settings.episodes):
+            with self.progress.busy("simulating") as watch:
+                record.state, info = self.interrupts.call(episode, record.state, self.plan.mask[e])
+            records.report(record.history, e, info)
+            self._save(e + 1, record)
+            self._write_tables(record, e)
+            self._report(record.history, e, watch.seconds)
+            _check_failures(record.history.trials.status[e])
+
+    def _compile(self) -> EpisodeFunction:
+        """Compiles the episode apart, so that its time is not an episode's."""
+        plan, n = self.plan, self.plan.settings.particles
+        episode = codesign.make_episode(
+            plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
+        )
+        state = plan.optimizer.init(plan.key, np.array(plan.space.low), n)  # for its shapes
+        with self.progress.busy("compiling") as watch:
+            compiled = self.interrupts.call(lambda: episode.lower(state, plan.mask[0]).compile())  # type: ignore[attr-defined]
+        self._say(f"compiled in {watch.seconds:.1f} s (engine {plan.engine.name})")
+        return compiled
+
+    def _test(self, record: Record, episode: EpisodeFunction) -> None:
+        """Tests the final particles once and saves the outcomes as one more step."""
+        plan, settings = self.plan, self.plan.settings
+        if self._tested(record):
+            return
+        evaluate = codesign.evaluate_by(episode, plan.space.num_parameters)
+        with self.progress.busy("testing the final particles") as watch:
+            test = codesign.final_test(
+                plan.scene,
+                lambda population, key: self.interrupts.call(evaluate, population, key),
+                record.state.particles,
+                plan.key,
+                num_trials=settings.test_trials,
+                previous=record.last_outcomes(),
+            )
+        record.test = test.trials
+        self._save(settings.episodes + 1, record)
+        self._write_tables(record, settings.episodes)
+        grasps = settings.particles * settings.test_rounds * settings.trials
+        self._say(f"final test: {grasps} grasps in {watch.seconds:.1f} s")
+
+    def _report(self, history: History, e: int, seconds: float) -> None:
+        status = history.trials.status[e]
+        line = self.progress.episode(
+            e + 1,
+            mean=float(history.cost[e].mean()),
+            best=float(history.cost[e].min()),
+            failed=int((status != 0).sum()),
+            grasps=status.size,
+            seconds=seconds,
+        )
+        self.run_directory.log(f"{line}  {seconds:.2f} s")
+
+    def _save(self, step: int, record: Record) -> None:
+        self.store.save(step, records.to_arrays(record))
+
+    def _write_tables(self, record: Record, start: int) -> None:
+        plan, folder = self.plan, self.run_directory.path
+        tables.write_episodes(folder, plan.scene, plan.space, record.history, start, record.done)
+        test = _final_test(plan, record)
+        if test is not None:
+            tables.write_tests(folder, plan.space, np.asarray(record.state.particles), test)
+
+    def _say(self, message: str) -> None:
+        self.progress.message(message)
+        self.run_directory.log(message)
+
+
+def load_record(folder: Path) -> Record | None:
+    """Reads the newest good checkpoint of a run folder; None if it has none."""
+    if not (folder / "checkpoints").is_dir():
+        return None
+    with Checkpoints(folder / "checkpoints") as store:
+        found = store.restore()
+    return records.from_arrays(found.arrays) if found.step is not None else None
+
+
+def _final_test(plan: Plan, record: Record) -> FinalTest | None:
+    return None if record.test is None else codesign.summarize_test(plan.scene, record.test)
+
+
+def _check_failures(status: np.ndarray) -> None:
+    if (status == 0).any():
+        return
+    names, counts = np.unique([tables.status_names(s) for s in status.flat], return_counts=True)
+    causes = ", ".join(f"{name} {count}" for name, count in zip(names, counts, strict=True))
+    raise AllFailed(
+        f"every one of {status.size} trials failed ({causes}); see trials.csv. "
+        "A smaller discretization.timestep or more solver.iterations may help."
+    )

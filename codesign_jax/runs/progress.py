@@ -1,0 +1,90 @@
+"""Progress on the terminal: a live bar where there is one, plain lines where not."""
+
+import time
+
+import rich.console
+import rich.progress
+
+
+def duration(seconds: float) -> str:
+    """Formats a time as 1:02:03 or 2:03."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class Progress:
+    """Reports a run's episodes; use as a context manager."""
+
+    def __init__(self, total: int, *, console: rich.console.Console | None = None):
+        """Takes the number of episodes."""
+        self.total = total
+        self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
+        columns = (
+            rich.progress.BarColumn(),
+            rich.progress.TextColumn("{task.description}"),
+            rich.progress.TimeElapsedColumn(),
+        )
+        self._bar = rich.progress.Progress(
+            *columns, console=self.console, transient=True, disable=not self.console.is_terminal
+        )
+        self._task = self._bar.add_task("", total=total)
+        self._seconds, self._grasps = 0.0, 0
+
+    def __enter__(self) -> "Progress":
+        """Starts the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Removes the bar; the lines stay."""
+        self._bar.stop()
+
+    def message(self, text: str) -> None:
+        """Prints a line above the bar."""
+        self.console.print(text, markup=False)
+
+    def busy(self, text: str) -> "Stopwatch":
+        """Shows what goes on while a block runs, and measures it."""
+        self._bar.update(self._task, description=text)
+        return Stopwatch()
+
+    def episode(
+        self, done: int, *, mean: float, best: float, failed: int, grasps: int, seconds: float
+    ) -> str:
+        """Reports a finished episode and returns the line.
+
+        Args:
+          done: Episodes finished, with those of earlier processes.
+          mean: Mean particle cost.
+          best: Lowest particle cost.
+          failed: Failed worlds among the episode's grasps.
+          grasps: Grasps of the episode.
+          seconds: Wall time of the episode.
+        """
+        self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
+        rate = self._grasps / max(self._seconds, 1e-9)
+        left = duration((self.total - done) * grasps / rate)
+        count = f"{done:>{len(str(self.total))}}/{self.total}"
+        line = (
+            f"episode {count}  mean {mean:.3f}  best {best:.3f}  failed {failed}/{grasps}  "
+            f"{rate:.1f} grasps/s  ETA {left}"
+        )
+        self._bar.update(self._task, completed=done, description=f"{rate:.1f} grasps/s  ETA {left}")
+        self.message(line)
+        return line
+
+
+class Stopwatch:
+    """Measures the wall time of a block."""
+
+    seconds = 0.0
+
+    def __enter__(self) -> "Stopwatch":
+        """Starts."""
+        self._start = time.perf_counter()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Stops."""
+        self.seconds = time.perf_counter() - self._start

@@ -1,0 +1,100 @@
+"""What a run has so far: the filter's state and the reports of its episodes, and both as arrays."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.codesign import EpisodeInfo
+from codesign_jax.optimize import State
+from codesign_jax.runs.settings import Settings
+from codesign_jax.types import Outcome
+
+
+class History(NamedTuple):
+    """Reports of all episodes; those not run yet are zero.
+
+    Attributes:
+      population: Particles as simulated [SI units], shape (episode, particle, parameter).
+      trials: Outcomes, every array of shape (episode, particle, trial).
+      cost: Mean cost of each particle, shape (episode, particle).
+      weight: Normalised weights, shape (episode, particle).
+      ancestors: Row of the population that each new particle copies, shape (episode, particle).
+    """
+
+    population: np.ndarray
+    trials: Outcome
+    cost: np.ndarray
+    weight: np.ndarray
+    ancestors: np.ndarray
+
+
+def empty_history(settings: Settings, num_parameters: int) -> History:
+    """Returns a history with room for all episodes of a run."""
+    e, n, t = settings.episodes, settings.particles, settings.trials
+
+    def trials(dtype: type) -> np.ndarray:
+        return np.zeros((e, n, t), dtype)
+
+    real, whole = np.float32, np.int32
+    return History(
+        population=np.zeros((e, n, num_parameters), real),
+        trials=Outcome(trials(real), trials(whole), trials(real), trials(whole)),
+        cost=np.zeros((e, n), real),
+        weight=np.zeros((e, n), real),
+        ancestors=np.zeros((e, n), whole),
+    )
+
+
+def report(history: History, episode: int, info: EpisodeInfo) -> None:
+    """Writes the report of an episode into the history's arrays."""
+    s = info.selection
+    new = History(info.population, info.trials, s.cost, s.weight, s.ancestors)
+    for array, value in zip(jax.tree.leaves(history), jax.tree.leaves(new), strict=True):
+        array[episode] = np.asarray(value)
+
+
+@dataclasses.dataclass
+class Record:
+    """What a run has so far; the content of a checkpoint.
+
+    Attributes:
+      state: State of the particle filter.
+      history: Reports of the episodes.
+      test: Outcomes of the final test, shape (particle, trial), or None before it.
+    """
+
+    state: State
+    history: History
+    test: Outcome | None = None
+
+    @property
+    def done(self) -> int:
+        """Number of finished episodes."""
+        return int(self.state.episode)
+
+    def last_outcomes(self) -> Outcome:
+        """Outcomes in the last episode of the final particles, shape (particle, trial)."""
+        kept = self.history.ancestors[self.done - 1]
+        return jax.tree.map(lambda v: jnp.asarray(v[self.done - 1][kept]), self.history.trials)
+
+
+def to_arrays(record: Record) -> dict:
+    """Returns a record as nested dictionaries of NumPy arrays."""
+    s, h = record.state, record.history
+    state = {"particles": s.particles, "episode": s.episode, "key": jax.random.key_data(s.key)}
+    arrays = {"state": state, "history": h._asdict() | {"trials": h.trials._asdict()}}
+    if record.test is not None:
+        arrays["test"] = record.test._asdict()
+    return jax.tree.map(np.asarray, arrays)
+
+
+def from_arrays(arrays: dict) -> Record:
+    """Inverse of `to_arrays`; the history is copied, so that `report` may write to it."""
+    s, h = arrays["state"], jax.tree.map(np.array, arrays["history"])
+    key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
+    state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key)
+    test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
+    return Record(state, History(**(h | {"trials": Outcome(**h["trials"])})), test)

@@ -1,0 +1,118 @@
+"""What a run does with a scene: design space, schedule, sizes and seed."""
+
+import dataclasses
+
+from codesign_jax import engines, schema
+from codesign_jax.hand import Hand
+from codesign_jax.optimize import MAX_PARTICLES, schedule
+from codesign_jax.parameters import DesignSpace, design_space
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of an optimisation, beside the scene; a run is determined by both.
+
+    Attributes:
+      preset: Design space: a preset of the hand, or "full" for its whole table.
+      schedule: "concurrent", "single", "switch-K", "morphology" or "control".
+      first: Domain of the first episode for "single" and "switch-K".
+      engine: Engine that simulates.
+      particles: Particles.
+      trials: Trials of a particle in an episode.
+      episodes: Episodes.
+      seed: Root of all random draws.
+      test_trials: Further trials in which the final particles are tested; 0 for no test.
+    """
+
+    preset: str
+    schedule: str
+    first: str
+    engine: str
+    particles: int
+    trials: int
+    episodes: int
+    seed: int
+    test_trials: int
+
+    @property
+    def grasps(self) -> int:
+        """Grasps of the episodes and the final test, without those that find the seed."""
+        return self.particles * (self.episodes * self.trials + self.test_rounds * self.trials)
+
+    @property
+    def test_rounds(self) -> int:
+        """Batches of `trials` trials that the final test simulates."""
+        return -(-self.test_trials // self.trials)
+
+
+# The paper's sizes (sections VI.2 and VI.4): particles, trials, episodes and further test trials.
+_SIZES = {"2d": (10, 6, 64, 36)}
+_SIZES_OTHERWISE = (60, 6, 128, 72)
+
+_RANGES = {
+    "particles": (1, MAX_PARTICLES),
+    "trials": (1, 100_000),
+    "episodes": (1, 1_000_000),
+    "seed": (0, 2**31 - 1),
+    "test_trials": (0, 1_000_000),
+}
+
+
+def make_settings(
+    preset: str,
+    schedule: str,
+    first: str,
+    engine: str,
+    seed: int,
+    *,
+    particles: int | None = None,
+    trials: int | None = None,
+    episodes: int | None = None,
+    test_trials: int | None = None,
+) -> Settings:
+    """Fills sizes that are not given with the paper's: those of 2D for "2d", of 23D otherwise."""
+    sizes = _SIZES.get(preset, _SIZES_OTHERWISE)
+    asked = (particles, trials, episodes, test_trials)
+    chosen = (s if a is None else a for a, s in zip(asked, sizes, strict=True))
+    n, t, e, test = chosen
+    return Settings(preset, schedule, first, engine, n, t, e, seed, test)
+
+
+def check(settings: Settings, hand: Hand | None) -> list[str]:
+    """Returns everything that is wrong with the settings.
+
+    Args:
+      settings: The settings.
+      hand: The hand, or None if it could not be read; then its presets are not checked.
+    """
+    found = []
+    for name, (low, high) in _RANGES.items():
+        problem = schema.range_problem(f"--{_flag(name)}", getattr(settings, name), "", low, high)
+        if problem:
+            found.append(problem)
+    if settings.engine not in engines.NAMES:
+        hint = schema.nearest(settings.engine, engines.NAMES)
+        found.append(f"--engine = {settings.engine!r} is not valid; {hint}")
+    space = None
+    if hand is not None:
+        try:
+            space = design_space(hand, settings.preset)
+        except schema.SceneError as error:
+            found += [f"--{problem}" for problem in error.problems]
+    if settings.episodes >= 1:
+        found += _schedule_problems(settings, space)
+    return found
+
+
+def _schedule_problems(settings: Settings, space: DesignSpace | None) -> list[str]:
+    """Checks the schedule, on both domains where the design space is not known."""
+    domains = (True, False) if space is None else space.is_morphology
+    try:
+        schedule(settings.schedule, list(domains), settings.episodes, settings.first)  # type: ignore[arg-type]
+    except ValueError as error:
+        return [f"--schedule: {error}"]
+    return []
+
+
+def _flag(name: str) -> str:
+    return name.replace("_", "-")

@@ -1,0 +1,126 @@
+"""Results as CSV, units in the column names; a resumed run writes the same bytes.
+
+Numbers have nine significant digits, which name a float32 exactly.  Times of day and durations are
+in events.log.
+"""
+
+import csv
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from codesign_jax.codesign import FinalTest
+from codesign_jax.parameters import DesignSpace
+from codesign_jax.runs.record import History
+from codesign_jax.scene import Scene
+from codesign_jax.types import Status
+
+
+def design_columns(space: DesignSpace) -> list[str]:
+    """Names of the parameters with their units, e.g. length_mm and pressure_0_kPa."""
+    names = (name.replace("[", "_").replace("]", "") for name in space.names)
+    return [f"{name}_{unit}" for name, unit in zip(names, space.units, strict=True)]
+
+
+def write_episodes(
+    folder: Path, scene: Scene, space: DesignSpace, history: History, start: int, stop: int
+) -> None:
+    """Writes the rows of episodes start to stop: replaces the files if start is 0, else appends.
+
+    Args:
+      folder: The run folder.
+      scene: The scene, for the objects' names.
+      space: The design space.
+      history: The run's history.
+      start: First episode.
+      stop: Episode after the last.
+    """
+    span = range(start, stop)
+    designs = design_columns(space)
+    head = ["episode", "mean_cost", "best_cost", "failed_trials", "effective_sample_size"]
+    _write(folder / "episodes.csv", head + _best(designs), _episodes(history, space, span), start)
+    head = ["episode", "particle", "cost", "weight", "next_copies_particle", *designs]
+    _write(folder / "particles.csv", head, _particles(history, space, span), start)
+    head = ["episode", "particle", "trial", "object", "cost", "lost_time_s", "status"]
+    _write(folder / "trials.csv", head, _trials(history, scene, span), start)
+
+
+def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: FinalTest) -> None:
+    """Writes the final particles and their test.
+
+    Args:
+      folder: The run folder.
+      space: The design space.
+      particles: Final particles [SI units], shape (particle, parameter).
+      test: Their test.
+    """
+    head = ["particle", "test_cost", "trials", "failed_trials", "success", *design_columns(space)]
+    failed = np.asarray(test.trials.status) != 0
+    rows = (
+        [i, _number(test.cost[i]), failed.shape[1], failed[i].sum(), int(test.success[i]), *design]
+        for i, design in enumerate(_designs(space, particles))
+    )
+    _write(folder / "tests.csv", head, rows, 0)
+
+
+def describe(space: DesignSpace, design: np.ndarray) -> str:
+    """Formats a design [SI units] in the hand file's units, e.g. "length=110 mm arm_z=20 mm"."""
+    values = zip(space.names, space.in_units(design), space.units, strict=True)
+    return " ".join(f"{name}={value:.4g} {unit}" for name, value, unit in values)
+
+
+def status_names(status: int) -> str:
+    """Names of the status bits that are set, joined by "+", or "OK"."""
+    return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
+
+
+def _best(designs: list[str]) -> list[str]:
+    return [f"best_{name}" for name in designs]
+
+
+def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[list]:
+    for e in span:
+        best = int(np.argmin(history.cost[e]))
+        failed = int((history.trials.status[e] != 0).sum())
+        size = 1 / (history.weight[e] ** 2).sum()
+        costs = [_number(history.cost[e].mean()), _number(history.cost[e, best])]
+        yield [e, *costs, failed, _number(size), *_designs(space, history.population[e])[best]]
+
+
+def _particles(history: History, space: DesignSpace, span: range) -> Iterator[list]:
+    for e in span:
+        for i, design in enumerate(_designs(space, history.population[e])):
+            numbers = [_number(history.cost[e, i]), _number(history.weight[e, i])]
+            yield [e, i, *numbers, history.ancestors[e, i], *design]
+
+
+def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
+    names, trials = [s.name for s in scene.objects.object], history.trials
+    for e in span:
+        for i, t in np.ndindex(*history.trials.cost.shape[1:]):
+            numbers = [_number(trials.cost[e, i, t]), _number(trials.lost_time[e, i, t])]
+            yield [e, i, t, names[t % len(names)], *numbers, status_names(trials.status[e, i, t])]
+
+
+def _designs(space: DesignSpace, population: np.ndarray) -> list[list[str]]:
+    return [[_number(v) for v in row] for row in space.in_units(population)]
+
+
+def _number(value: float) -> str:
+    return f"{value:.9g}"
+
+
+def _write(path: Path, head: list[str], rows: Iterable[list], start: int) -> None:
+    """Appends rows, or replaces the file as a whole if they are its first."""
+    if start > 0:
+        with path.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+        return
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(head)
+        writer.writerows(rows)
+    os.replace(temporary, path)

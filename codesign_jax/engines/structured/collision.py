@@ -1,0 +1,201 @@
+"""Contact geometry: spheres against the object's signed distance function and the table, object on table."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.engines.structured.contact import Cone, Contacts
+from codesign_jax.engines.structured.hand import HandLanes, apply_columns
+from codesign_jax.engines.structured.kinematics import Kinematics
+from codesign_jax.engines.structured.lanes import cross, dot
+from codesign_jax.model import contact_invweight
+from codesign_jax.model.layout import palm_points
+from codesign_jax.scene import Scene
+
+_TINY = 1e-12
+
+
+def make_cone(scene: Scene, friction: jax.Array | float, *, bodies: int) -> Cone:
+    """MuJoCo's contact parameters (Computation chapter, 'Solver parameters') for constant impedance.
+
+    Args:
+      scene: The scene.
+      friction: Coulomb coefficient.
+      bodies: Bodies other than the world in the contact, whose declared inverse weights add.
+    """
+    c = scene.contact
+    regularizer = (1.0 - c.impedance) / c.impedance * contact_invweight(scene) * bodies
+    ratio = friction / np.sqrt(c.friction_ratio)
+    spring = 1.0 / (c.impedance * c.time_constant) ** 2 * c.impedance
+    damper = 2.0 / (c.impedance * c.time_constant)
+    return Cone(
+        1.0 / regularizer, c.friction_ratio / regularizer, friction, ratio, spring, damper
+    )
+
+
+def object_friction(scene: Scene, shape: jax.Array) -> jax.Array:
+    """Friction of each world's object with the hand, shape (1, world)."""
+    values = np.array([s.friction for s in scene.objects.object])
+    return jnp.asarray(values)[shape]
+
+
+def spheres_on_object(
+    scene: Scene, hand: HandLanes, kin: Kinematics, centre: jax.Array, radius: jax.Array | float
+) -> Contacts:
+    """Contacts of spheres with the object, normals pointing from the object to the hand.
+
+    Args:
+      scene: The scene.
+      hand: The hand.
+      kin: Kinematics.
+      centre: Sphere centres in the palm's frame, shape (3, ...).
+      radius: Sphere radii, broadcasting to (...).
+    """
+    away = jnp.stack([centre[i] - kin.object_pos[i] for i in range(3)])
+    local = jnp.stack([dot(kin.object[k], away) for k in range(3)])
+    distance, gradient = signed_distance(scene, hand, local)
+    normal = apply_columns(kin.object, gradient)
+    gap = distance - radius
+    point = centre - normal * (radius + 0.5 * gap)
+    cone = make_cone(scene, object_friction(scene, hand.shape), bodies=2)
+    return Contacts(point, normal, gap, cone)
+
+
+def spheres_on_table(
+    scene: Scene, height: jax.Array, centre: jax.Array, radius: jax.Array | float
+) -> Contacts:
+    """Contacts of spheres with the table z = 0; `height` is the palm's, the frame's origin, (1, world)."""
+    gap = centre[2] + height - radius
+    zero = jnp.zeros_like(gap)
+    normal = jnp.stack([zero, zero, zero + 1.0])
+    point = centre - normal * (radius + 0.5 * gap)
+    return Contacts(point, normal, gap, make_cone(scene, scene.contact.finger_table_friction, bodies=1))
+
+
+def finger_spheres(hand: HandLanes, kin: Kinematics) -> jax.Array:
+    """Centres of the finger spheres in the palm's frame, shape (3, link, k, finger, world)."""
+    return kin.origin[:, :, None] + apply_columns(kin.link[:, :, :, None], hand.sphere)
+
+
+def palm_spheres(scene: Scene, kin: Kinematics) -> jax.Array:
+    """Centres of the palm spheres in the palm's frame, shape (3, sphere, world)."""
+    points = jnp.asarray(palm_points(scene).T[:, :, None], kin.palm.dtype)
+    return apply_columns(kin.palm, points)
+
+
+def signed_distance(
+    scene: Scene, hand: HandLanes, local: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Signed distance and its unit gradient in the object's frame, for the shape of each world.
+
+    Args:
+      scene: The scene.
+      hand: Sizes and shape index of the objects.
+      local: Points, shape (3, ...).
+    """
+    functions = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
+    kinds = [s.type for s in scene.objects.object]
+    result = None
+    for kind in dict.fromkeys(kinds):
+        distance, gradient = functions[kind](hand.object_size, local)
+        if result is None:
+            result = distance, gradient
+            continue
+        mine = jnp.isin(hand.shape, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
+        result = jnp.where(mine, distance, result[0]), jnp.where(mine, gradient, result[1])
+    assert result is not None
+    return result
+
+
+def _sphere(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+    length = jnp.sqrt(dot(p, p) + _TINY**2)
+    return length - size[0], p / length
+
+
+def _box(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+    sign = jnp.where(p < 0, -1.0, 1.0).astype(p.dtype)
+    excess = jnp.abs(p) - size.reshape(3, *([1] * (p.ndim - size.ndim)), *size.shape[1:])
+    outside = jnp.maximum(excess, 0.0)
+    square = dot(outside, outside)
+    length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    deepest = jnp.maximum(jnp.maximum(excess[0], excess[1]), excess[2])
+    first = excess[0] >= deepest
+    second = ~first & (excess[1] >= deepest)
+    face = jnp.stack([first, second, ~first & ~second]).astype(p.dtype)
+    is_out = square > 0
+    gradient = jnp.where(is_out, outside / length, face)
+    return jnp.where(is_out, length, deepest), sign * gradient
+
+
+def _cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+    radial = jnp.sqrt(p[0] ** 2 + p[1] ** 2 + _TINY**2)
+    sign = jnp.where(p[2] < 0, -1.0, 1.0).astype(p.dtype)
+    side, cap = radial - size[0], jnp.abs(p[2]) - size[1]
+    out_side, out_cap = jnp.maximum(side, 0.0), jnp.maximum(cap, 0.0)
+    square = out_side**2 + out_cap**2
+    is_out = square > 0
+    length = jnp.sqrt(jnp.where(is_out, square, 1.0))
+    nearer_side = side > cap
+    g_side = jnp.where(is_out, out_side / length, nearer_side.astype(p.dtype))
+    g_cap = jnp.where(is_out, out_cap / length, (~nearer_side).astype(p.dtype))
+    gradient = jnp.stack([g_side * p[0] / radial, g_side * p[1] / radial, g_cap * sign])
+    return jnp.where(is_out, length, jnp.maximum(side, cap)), gradient
+
+
+def object_on_table(scene: Scene, hand: HandLanes, kin: Kinematics, height: jax.Array) -> Contacts:
+    """Contacts of the object with the table, four slots as in MuJoCo's plane colliders.
+
+    The points are the four lower corners of a box; the lower rim's lowest point, its upper counterpart and
+    two more on the lower rim, 120 degrees apart, of a cylinder; the lowest point of a sphere (one slot).
+    """
+    functions = {"box": _box_corners, "cylinder": _rim_points, "sphere": _lowest_point}
+    kinds = [s.type for s in scene.objects.object]
+    arms = None
+    for kind in dict.fromkeys(kinds):
+        mine = jnp.isin(hand.shape, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
+        new = functions[kind](hand.object_size[:, 0], kin.object[:, :, 0])
+        arms = new if arms is None else jnp.where(mine, new, arms)
+    assert arms is not None
+    point = kin.object_pos + arms
+    gap = point[2] + height
+    zero = jnp.zeros_like(gap)
+    normal = jnp.stack([zero, zero, zero + 1.0])
+    cone = make_cone(scene, scene.objects.table.friction, bodies=1)
+    return Contacts(point - 0.5 * gap * normal, normal, gap, cone)
+
+
+_AWAY = 1e3  # an unused slot hangs this far above the table
+
+
+def _box_corners(size: jax.Array, columns: jax.Array) -> jax.Array:
+    """Of each opposite pair of corners the lower one, shape (3, 4, world)."""
+    edges = [size[k] * columns[k] for k in range(3)]
+    corners = []
+    for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        corner = edges[0] + a * edges[1] + b * edges[2]
+        corners.append(jnp.where(corner[2] > 0, -corner, corner))
+    return jnp.stack(corners, 1)
+
+
+def _rim_points(size: jax.Array, columns: jax.Array) -> jax.Array:
+    """MuJoCo's cylinder points, shape (3, 4, world)."""
+    axis = jnp.where(columns[2, 2] > 0, -columns[2], columns[2])  # towards the table
+    down = jnp.stack([axis[2] * axis[0], axis[2] * axis[1], axis[2] * axis[2] - 1.0])
+    square = dot(down, down)
+    flat = square < _TINY
+    length = jnp.sqrt(jnp.where(flat, 1.0, square))
+    # A disc parallel to the table has no lowest rim point: take the body's x axis.
+    radial = jnp.where(flat, columns[0], down / length) * size[0]
+    half = axis * size[1]
+    across = cross(radial, axis)
+    across_length = jnp.sqrt(jnp.maximum(dot(across, across), _TINY**2))
+    across = across / across_length * size[0] * np.sqrt(3.0) / 2
+    lower, upper = half + radial, radial - half
+    return jnp.stack([lower, upper, half - 0.5 * radial + across, half - 0.5 * radial - across], 1)
+
+
+def _lowest_point(size: jax.Array, columns: jax.Array) -> jax.Array:
+    zero = jnp.zeros_like(size[0])
+    lowest = jnp.stack([zero, zero, -size[0]])
+    away = jnp.stack([zero, zero, zero + _AWAY])
+    return jnp.stack([lowest, away, away, away], 1)

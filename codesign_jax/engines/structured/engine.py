@@ -1,0 +1,206 @@
+"""Step and rollout of the structured engine behind the common interface."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import collision, solver
+from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
+from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
+from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
+from codesign_jax.engines.structured.lanes import total
+from codesign_jax.model import ModelFields, layout
+from codesign_jax.scene import Scene
+from codesign_jax.types import Trace
+
+
+class StepInfo(NamedTuple):
+    """What a step reports but does not carry.
+
+    Attributes:
+      acc: Accelerations of the step.
+      residual: Relative Newton decrement of each world, shape (1, world).
+      iterations: Newton iterations of the batch, shape ().
+      centre: Hand centre, world frame, shape (3, 1, world).
+    """
+
+    acc: Acc
+    residual: jax.Array
+    iterations: jax.Array
+    centre: jax.Array
+
+
+class StructuredEngine:
+    """Newton on MuJoCo's own problem by elimination along the fingers; cost linear in the links."""
+
+    name = "structured"
+
+    def __init__(
+        self, scene: Scene, *, iterations: int = 8, evaluations: int = 4, tolerance: float = 1e-8
+    ):
+        """Prepares the engine.
+
+        Args:
+          scene: The scene.
+          iterations: Largest number of Newton iterations a step.
+          evaluations: Line-search evaluations an iteration.
+          tolerance: Relative Newton decrement below which a world needs no further iteration.
+        """
+        self.scene = scene
+        self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
+
+    def reset(self, fields: ModelFields) -> State:
+        """Start states of a batch, fields with leading axis (world,)."""
+        lay = layout(self.scene)
+        start = fields.start.T[:, None]
+        n, links, axes = lay.dofs.shape
+        zero = jnp.zeros_like
+        angles = start[6 : 6 + lay.dofs.size].reshape(n, links, axes, -1)
+        finger = jnp.moveaxis(angles, 0, 2)
+        free = start[6 + lay.dofs.size :]
+        acc = Acc(zero(start[:6]), zero(finger), zero(start[:6]))
+        return State(
+            start[:6],
+            finger,
+            free[:3],
+            free[3:],
+            zero(start[:6]),
+            zero(finger),
+            zero(free[:3]),
+            zero(free[:3]),
+            acc,
+        )
+
+    def qpos(self, state: State) -> jax.Array:
+        """MuJoCo's qpos, shape (world, nq)."""
+        finger = jnp.moveaxis(state.finger, 2, 0).reshape(-1, state.finger.shape[-1])
+        parts = [state.wrist[:, 0], finger, state.position[:, 0], state.quat[:, 0]]
+        return jnp.concatenate(parts).T
+
+    def qvel(self, state: State) -> jax.Array:
+        """MuJoCo's qvel, shape (world, nv)."""
+        finger = jnp.moveaxis(state.finger_vel, 2, 0).reshape(-1, state.finger.shape[-1])
+        parts = [state.wrist_vel[:, 0], finger, state.linear_vel[:, 0], state.angular_vel[:, 0]]
+        return jnp.concatenate(parts).T
+
+    def problem(
+        self, hand: HandLanes, state: State, ctrl: jax.Array
+    ) -> tuple[solver.Problem, solver.Spatial]:
+        """Assembles a step's problem and the bodies' velocities; ctrl has shape (nu, world)."""
+        kin = kinematics(hand, layout(self.scene).axes, state)
+        body = bodies(hand, kin)
+        smooth = smooth_forces(hand, kin, body, state, ctrl, self.scene)
+        contacts = self._contacts(hand, kin, state.wrist[2])
+        velocity = solver.Spatial(kin.palm_vel, kin.vel, kin.object_vel)
+        return solver.Problem(hand, kin, body, smooth, contacts), velocity
+
+    def _contacts(self, hand: HandLanes, kin: Kinematics, height: jax.Array) -> solver.ContactSet:
+        scene, e = self.scene, self.scene.effects
+        spheres = collision.finger_spheres(hand, kin) if hand.sphere.size else None
+        palm = collision.palm_spheres(scene, kin) if e.palm_contact else None
+        r = scene.hand.palm.contact_radius
+        fo = ft = po = pt = None
+        if spheres is not None and e.finger_object:
+            fo = collision.spheres_on_object(scene, hand, kin, spheres, hand.radius)
+        if spheres is not None and e.finger_table:
+            ft = collision.spheres_on_table(scene, height, spheres, hand.radius)
+        if palm is not None:
+            po = collision.spheres_on_object(scene, hand, kin, palm, r)
+            pt = collision.spheres_on_table(scene, height, palm, r)
+        on_table = collision.object_on_table(scene, hand, kin, height)
+        return solver.ContactSet(fo, ft, po, pt, on_table)
+
+    def step(self, hand: HandLanes, state: State, ctrl: jax.Array) -> tuple[State, StepInfo]:
+        """Advances a batch by one time step under controls of shape (nu, world)."""
+        problem, velocity = self.problem(hand, state, ctrl)
+        solution = solver.solve(
+            problem,
+            velocity,
+            state.acc,
+            iterations=self.iterations,
+            evaluations=self.evaluations,
+            tolerance=self.tolerance,
+        )
+        new = integrate(state, problem.kin, solution.acc, self.scene.discretization.timestep)
+        centre = self._centre(hand, problem.kin, problem.body) + state.wrist[:3]
+        return new, StepInfo(solution.acc, solution.residual, solution.iterations, centre)
+
+    def _centre(self, hand: HandLanes, kin: Kinematics, body: Bodies) -> jax.Array:
+        """Mean position of the segments in the palm's frame: half weight for the half segments."""
+        n, links = hand.mount.shape[2], hand.mass.shape[0]
+        weights = [1.0] * (links - 1) + [0.5]
+        moving = total([w * body.link.centre[:, i] for i, w in enumerate(weights)])
+        every = moving + 0.5 * apply_columns(kin.palm, hand.stub_centre)
+        return total([every[:, f : f + 1] for f in range(n)]) / (n * links)
+
+    def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
+        """See `Engine.rollout`."""
+        with jax.default_matmul_precision("highest"):
+            return self._rollout(fields, ctrl, trajectory)
+
+    def _rollout(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
+        hand, limits = hand_lanes(self.scene, fields), self.scene.limits
+
+        def body(carry, u):
+            state, speed = carry
+            new, info = self.step(hand, state, u)
+            away = state.position - info.centre
+            entry = Trace(
+                jnp.sqrt(total([away[i, 0] ** 2 for i in range(3)])),
+                state.position[2, 0],
+                speed,
+                self.qpos(state) if trajectory else jnp.zeros((u.shape[1], 0), u.dtype),
+            )
+            new_speed = self._speed(new)
+            was_good = speed <= limits.speed
+            good = was_good & (new_speed <= limits.speed)
+            good &= state.position[2, 0] >= -limits.penetration
+            state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
+            return (state, jnp.where(was_good, new_speed, speed)), entry
+
+        start = (self.reset(fields), jnp.zeros(ctrl.shape[0], ctrl.dtype))
+        _, trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 0, -1))
+        return Trace(*(jnp.moveaxis(v, 0, 1) for v in trace))
+
+    def _speed(self, state: State) -> jax.Array:
+        """Largest absolute generalized velocity; not finite if any velocity or position is not."""
+        qvel, qpos = self.qvel(state), self.qpos(state)
+        return jnp.abs(qvel).max(1) + 0.0 * qpos.sum(1)
+
+
+def integrate(state: State, kin: Kinematics, acc: Acc, h: float) -> State:
+    """Semi-implicit Euler: velocities first, then positions with the new velocities."""
+    local = jnp.stack([total([kin.object[k, i] * acc.object[i] for i in range(3)]) for k in range(3)])
+    wrist_vel, finger_vel = state.wrist_vel + h * acc.wrist, state.finger_vel + h * acc.finger
+    linear, angular = state.linear_vel + h * acc.object[3:], state.angular_vel + h * local
+    return State(
+        state.wrist + h * wrist_vel,
+        state.finger + h * finger_vel,
+        state.position + h * linear,
+        _turn(state.quat, angular, h),
+        wrist_vel,
+        finger_vel,
+        linear,
+        angular,
+        acc,
+    )
+
+
+def _turn(quat: jax.Array, omega: jax.Array, h: float) -> jax.Array:
+    """Quaternion after turning with the body-frame angular velocity for a time h."""
+    square = total([omega[i] ** 2 for i in range(3)])
+    speed = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    half = 0.5 * h * jnp.where(square > 0, speed, 0.0)
+    axis = omega / speed * jnp.sin(half)
+    w, x, y, z = quat
+    a, (b, c, d) = jnp.cos(half), axis
+    turned = jnp.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ]
+    )
+    return turned / jnp.sqrt(total([turned[i] ** 2 for i in range(4)]))

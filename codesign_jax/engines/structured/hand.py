@@ -1,0 +1,149 @@
+"""Constants of a rollout in lane layout, taken from the same model fields as every engine uses."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.engines.structured.lanes import dot, total
+from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax.scene import Scene
+
+
+class HandLanes(NamedTuple):
+    """Hand and object of every world; lanes are (finger, world) or (1, world), all lengths SI.
+
+    Attributes:
+      mount: Columns of the finger bases' orientations in the palm frame, shape (3, 3, finger, world).
+      base: Base positions in the palm frame, shape (3, finger, world).
+      offset: Joint positions along the previous link, shape (link, finger, world).
+      mass: Link masses, shape (link, finger, world).
+      centre: Link centres of mass in the link frame, shape (3, link, finger, world).
+      inertia: Principal inertia of the links, shape (3, link, finger, world).
+      stiffness: Joint stiffness, shape (link, axis, finger, world).
+      damping: Joint damping with the implicit term, same shape.
+      armature: Joint armature with the implicit terms, same shape.
+      gain: Bending moment per pressure, shape (finger, world).
+      sphere: Sphere centres in the link frame, shape (3, link, k, finger, world).
+      radius: Sphere radii, shape (link, k, finger, world).
+      stub_centre: Centre of the half segments at the palm in the palm frame, shape (3, finger, world).
+      palm_mass: Mass of the palm with the half segments, shape (1, world).
+      palm_centre: Its centre of mass in the palm frame, shape (3, 1, world).
+      palm_inertia: Its inertia tensor about that centre, shape (3, 3, 1, world).
+      wrist_damping: Damping with the implicit term, shape (6, 1, world).
+      wrist_armature: Armature with the implicit terms, shape (6, 1, world).
+      object_mass: Shape (1, world).
+      object_inertia: Principal inertia, shape (3, 1, world).
+      object_size: Sizes of the object's shape, shape (3, 1, world).
+      shape: Index of the object's shape, shape (1, world).
+    """
+
+    mount: jax.Array
+    base: jax.Array
+    offset: jax.Array
+    mass: jax.Array
+    centre: jax.Array
+    inertia: jax.Array
+    stiffness: jax.Array
+    damping: jax.Array
+    armature: jax.Array
+    gain: jax.Array
+    sphere: jax.Array
+    radius: jax.Array
+    stub_centre: jax.Array
+    palm_mass: jax.Array
+    palm_centre: jax.Array
+    palm_inertia: jax.Array
+    wrist_damping: jax.Array
+    wrist_armature: jax.Array
+    object_mass: jax.Array
+    object_inertia: jax.Array
+    object_size: jax.Array
+    shape: jax.Array
+
+
+def rotation_columns(quat: jax.Array) -> jax.Array:
+    """Columns of the rotation matrix of unit quaternions, (4, ...) to (3 columns, 3, ...)."""
+    w, x, y, z = quat[0], quat[1], quat[2], quat[3]
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),
+            jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]),
+            jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def apply_columns(columns: jax.Array, v: jax.Array) -> jax.Array:
+    """Rotates vectors: columns times components, (3, 3, ...) and (3, ...); items broadcast."""
+    return jnp.stack([total([columns[k][i] * v[k] for k in range(3)]) for i in range(3)])
+
+
+def hand_lanes(scene: Scene, fields: ModelFields) -> HandLanes:
+    """Transposes batched model fields, leading axis (world,), into lane layout."""
+    lay, template = layout(scene), compile_template(scene)
+
+    def last(array: jax.Array) -> jax.Array:
+        return jnp.moveaxis(array, 0, -1)
+
+    def by_link(array: jax.Array, ids: np.ndarray) -> jax.Array:
+        """(world, item, ...) at ids (finger, link, ...) to (..., link, ..., finger, world)."""
+        picked = jnp.moveaxis(array[:, ids], 1, -1)  # (world, link, ..., finger)
+        return last(picked)
+
+    def vectors(array: jax.Array, ids: np.ndarray) -> jax.Array:
+        picked = jnp.moveaxis(array[:, ids], -1, 1)  # (world, 3, finger, ...)
+        return last(jnp.moveaxis(picked, 2, -1))
+
+    mount = rotation_columns(vectors(fields.body_quat, lay.stubs))
+    base = vectors(fields.body_pos, lay.stubs)
+    stub_centre = base + apply_columns(mount, vectors(fields.body_ipos, lay.stubs))
+    palm = _palm(fields, lay.stubs, mount, stub_centre, last)
+    sizes, rbound = fields.geom_size[:, lay.object_geoms], fields.geom_rbound[:, lay.object_geoms]
+    shape = jnp.argmax(rbound, axis=1)  # the one not shrunk to INACTIVE
+    picked = jnp.take_along_axis(sizes, shape[:, None, None], axis=1)[:, 0]
+    no_spheres = lay.spheres.size == 0
+    return HandLanes(
+        mount=mount,
+        base=base,
+        offset=by_link(fields.body_pos[..., 0], lay.bodies),
+        mass=by_link(fields.body_mass, lay.bodies),
+        centre=vectors(fields.body_ipos, lay.bodies),
+        inertia=vectors(fields.body_inertia, lay.bodies),
+        stiffness=by_link(fields.jnt_stiffness, lay.dofs),
+        damping=by_link(fields.dof_damping, lay.dofs),
+        armature=by_link(fields.dof_armature, lay.dofs),
+        gain=last(fields.actuator_gainprm[:, 6 : template.nu, 0]),
+        sphere=jnp.zeros((0,)) if no_spheres else vectors(fields.geom_pos, lay.spheres),
+        radius=jnp.zeros((0,)) if no_spheres else by_link(fields.geom_size[..., 0], lay.spheres),
+        stub_centre=stub_centre,
+        palm_mass=palm[0],
+        palm_centre=palm[1],
+        palm_inertia=palm[2],
+        wrist_damping=last(fields.dof_damping[:, :6])[:, None],
+        wrist_armature=last(fields.dof_armature[:, :6])[:, None],
+        object_mass=last(fields.body_mass[:, lay.object])[None],
+        object_inertia=last(fields.body_inertia[:, lay.object])[:, None],
+        object_size=last(picked)[:, None],
+        shape=shape[None],
+    )
+
+
+def _palm(fields: ModelFields, stubs: np.ndarray, mount: jax.Array, stub_centre: jax.Array, last):
+    """Mass, centre and inertia of the palm with the half segments welded to it, in the palm frame."""
+    masses = jnp.concatenate([last(fields.body_mass[:, 1])[None], last(fields.body_mass[:, stubs])])
+    palm_centre = last(fields.body_ipos[:, 1])[:, None]
+    centres = jnp.concatenate([palm_centre, stub_centre], 1)
+    palm_principal = last(fields.body_inertia[:, 1])[:, None]
+    stub_principal = last(jnp.moveaxis(fields.body_inertia[:, stubs], -1, 1))
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=masses.dtype)[:, :, None, None], (3, 3, *palm_centre.shape[1:]))
+    frames = jnp.concatenate([eye, mount], 2)
+    principal = jnp.concatenate([palm_principal, stub_principal], 1)
+    mass = masses.sum(0, keepdims=True)
+    centre = (masses * centres).sum(1, keepdims=True) / mass
+    arm = centres - centre
+    own = total([principal[k] * frames[k][:, None] * frames[k][None] for k in range(3)])
+    unit = jnp.eye(3, dtype=masses.dtype)[:, :, None, None]
+    shift = masses * (dot(arm, arm) * unit - arm[:, None] * arm[None])
+    return mass, centre, (own + shift).sum(2, keepdims=True)

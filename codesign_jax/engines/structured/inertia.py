@@ -1,0 +1,162 @@
+"""Spatial inertia and smooth forces: gravity, gyroscopic terms, springs, damping, actuators."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.hand import HandLanes, apply_columns
+from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State
+from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
+
+
+class Body(NamedTuple):
+    """Inertia of bodies in the palm's frame; the item axes (link, finger or 1) precede the world's.
+
+    Attributes:
+      mass: Shape (..., world).
+      centre: Centres of mass, shape (3, ..., world).
+      tensor: Rotational inertia about the centre, world axes, shape (3, 3, ..., world).
+    """
+
+    mass: jax.Array
+    centre: jax.Array
+    tensor: jax.Array
+
+    def times(self, acc: jax.Array) -> jax.Array:
+        """Spatial force (moment about the origin, force) of a spatial acceleration, (6, ...)."""
+        force = self.mass * (acc[3:] + cross(acc[:3], self.centre))
+        moment = apply_columns(self.tensor, acc[:3])
+        return spatial(moment + cross(self.centre, force), force)
+
+    def matrix(self) -> jax.Array:
+        """Rows of the 6 x 6 spatial inertia, shape (6, 6, ...)."""
+        m, c = self.mass, self.centre
+        zero, square = jnp.zeros_like(m * c[0]), dot(c, c)
+        m = m + zero
+        skew = [[zero, -m * c[2], m * c[1]], [m * c[2], zero, -m * c[0]], [-m * c[1], m * c[0], zero]]
+        rows = []
+        for i in range(3):
+            turning = [
+                self.tensor[i, j] + m * ((square if i == j else 0.0) - c[i] * c[j]) for j in range(3)
+            ]
+            rows.append(jnp.stack([*turning, *skew[i]]))
+        for i in range(3):
+            moving = [m if i == j else zero for j in range(3)]
+            rows.append(jnp.stack([skew[j][i] for j in range(3)] + moving))
+        return jnp.stack(rows)
+
+    def smooth_force(self, vel: jax.Array, bias: jax.Array, gravity: float) -> jax.Array:
+        """External minus inertial force at zero joint acceleration, shape (6, ...).
+
+        Args:
+          vel: Spatial velocities.
+          bias: Spatial accelerations that velocities alone cause.
+          gravity: Magnitude of gravity, along -z [m/s^2].
+        """
+        omega, alpha = vel[:3], bias[:3]
+        point_vel = vel[3:] + cross(omega, self.centre)
+        acc = bias[3:] + cross(alpha, self.centre) + cross(omega, point_vel)
+        force = -self.mass * jnp.stack([acc[0], acc[1], acc[2] + gravity])
+        spin = apply_columns(self.tensor, omega)
+        moment = -apply_columns(self.tensor, alpha) - cross(omega, spin)
+        return spatial(moment + cross(self.centre, force), force)
+
+
+class Bodies(NamedTuple):
+    """The palm (1, world), the links (link, finger, world) and the object (1, world)."""
+
+    palm: Body
+    link: Body
+    object: Body
+
+
+class Smooth(NamedTuple):
+    """Smooth forces on the bodies, (6, ...), and on the joints.
+
+    Attributes:
+      palm: Shape (6, 1, world).
+      link: Shape (6, link, finger, world).
+      object: Shape (6, 1, world).
+      wrist: Joint forces, shape (6, 1, world).
+      finger: Joint forces, shape (link, axis, finger, world).
+    """
+
+    palm: jax.Array
+    link: jax.Array
+    object: jax.Array
+    wrist: jax.Array
+    finger: jax.Array
+
+
+def principal_tensor(columns: jax.Array, principal: jax.Array) -> jax.Array:
+    """World inertia tensor from body axes (3 columns, 3, ...) and principal moments (3, ...)."""
+    rows = [
+        [total([principal[k] * columns[k, i] * columns[k, j] for k in range(3)]) for j in range(3)]
+        for i in range(3)
+    ]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def bodies(hand: HandLanes, kin: Kinematics) -> Bodies:
+    """Inertia of all bodies at the present positions."""
+    palm = kin.palm
+    turned = [[apply_columns(palm, hand.palm_inertia[i])[j] for j in range(3)] for i in range(3)]
+    columns = jnp.stack([jnp.stack([turned[i][j] for i in range(3)]) for j in range(3)])
+    palm_tensor = jnp.stack([apply_columns(palm, columns[j]) for j in range(3)])
+    return Bodies(
+        palm=Body(hand.palm_mass, apply_columns(palm, hand.palm_centre), palm_tensor),
+        link=Body(
+            hand.mass,
+            kin.origin + apply_columns(kin.link, hand.centre),
+            principal_tensor(kin.link, hand.inertia),
+        ),
+        object=Body(
+            hand.object_mass, kin.object_pos, principal_tensor(kin.object, hand.object_inertia)
+        ),
+    )
+
+
+def smooth_forces(
+    hand: HandLanes, kin: Kinematics, body: Bodies, state: State, ctrl: jax.Array, scene
+) -> Smooth:
+    """All forces that do not depend on the accelerations.
+
+    Args:
+      hand: The hand.
+      kin: Kinematics of the state.
+      body: Inertia of the state.
+      state: The state.
+      ctrl: Controls: arm pose and pressures, shape (nu, world).
+      scene: The scene.
+    """
+    w, g = scene.hand.wrist, scene.gravity
+    arm, pressure = ctrl[:6, None], ctrl[6:]
+    stiffness = jnp.array([w.linear_stiffness] * 3 + [w.angular_stiffness] * 3, ctrl.dtype)
+    wrist = stiffness[:, None, None] * (arm - state.wrist) - hand.wrist_damping * state.wrist_vel
+    finger = -hand.stiffness * state.finger - hand.damping * state.finger_vel
+    finger = jnp.concatenate([finger[:, :1] + hand.gain * pressure, finger[:, 1:]], 1)
+    # The object's coordinates are its own velocity components: no acceleration is left at zero.
+    spin = jnp.concatenate([jnp.zeros_like(kin.object_vel[:3])] * 2)
+    turning = spatial(kin.object_vel[:3], -cross(kin.object_vel[:3], kin.object_pos))
+    return Smooth(
+        palm=body.palm.smooth_force(kin.palm_vel, kin.palm_bias, g),
+        link=body.link.smooth_force(kin.vel, kin.bias, g),
+        object=body.object.smooth_force(turning, spin, g),
+        wrist=wrist,
+        finger=finger,
+    )
+
+
+def inertial_product(
+    hand: HandLanes, body: Bodies, acc: Acc, kin_acc: tuple[jax.Array, jax.Array, jax.Array]
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
+    """M a in factored form: forces on palm, links and object, and armature forces on the joints."""
+    palm, link, obj = kin_acc
+    return (
+        body.palm.times(palm),
+        body.link.times(link),
+        body.object.times(obj),
+        hand.wrist_armature * acc.wrist,
+        hand.armature * acc.finger,
+    )

@@ -26,7 +26,8 @@ from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Params, Trial
 
 # Point looked at [m], distance [m], azimuth and elevation [deg].
-CAMERA = (0.0, 0.0, 0.15, 0.85, 125.0, -14.0)
+CAMERA = (0.0, 0.0, 0.15, 0.62, 125.0, -20.0)
+_OBJECT_COLOR = (0.95, 0.50, 0.10)
 _PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
 
 
@@ -75,7 +76,6 @@ def frames(
     times: np.ndarray,
     *,
     size: tuple[int, int] = (320, 320),
-    notify: Callable[[str], None] = print,
 ) -> np.ndarray:
     """Draws a grasp at given times.
 
@@ -84,19 +84,18 @@ def frames(
       grasp: The grasp.
       times: Times of the frames [s], shape (frame,).
       size: Width and height in pixels.
-      notify: Told in one line if there is no OpenGL.
 
     Returns:
       Frames, uint8, shape (frame, height, width, 3).
     """
     step = np.rint(times / scene.discretization.timestep).astype(int)
     qpos = grasp.qpos[np.clip(step, 0, len(grasp.qpos) - 1)]
-    compiled = _visual_model(scene, grasp)
-    way = _opengl()
+    compiled, way = _visual_model(scene, grasp), _opengl()
+    # A world that was lost or failed stands still from then on: its frames are drawn once.
+    qpos, index = np.unique(qpos, axis=0, return_inverse=True)
     if way is not None:
-        return _render(compiled, qpos, size, way)
-    notify(f"no OpenGL: drawing a sketch; for pictures, apt-get install {_PACKAGES}")
-    return sketch.draw(scene, compiled, qpos, int(grasp.trial.shape), size)
+        return _render(compiled, qpos, size, way)[index]
+    return sketch.draw(scene, compiled, qpos, int(grasp.trial.shape), size)[index]
 
 
 def write_gif(
@@ -104,7 +103,7 @@ def write_gif(
     grasps: list[Replay],
     path: Path,
     *,
-    frames_per_second: int = 20,
+    frames_per_second: float = 12.5,
     size: tuple[int, int] = (320, 320),
     notify: Callable[[str], None] = print,
 ) -> Path:
@@ -116,13 +115,14 @@ def write_gif(
       path: File to write; its folder is made.
       frames_per_second: Frames of a second of simulated time, which is shown in real time.
       size: Width and height of one grasp's picture in pixels.
-      notify: See `frames`.
+      notify: Told in one line if there is no OpenGL.
 
     Returns:
       The path.
     """
+    _announce(notify)
     times = np.arange(0.0, scene.end_time, 1 / frames_per_second)
-    parts = [frames(scene, g, times, size=size, notify=notify) for g in grasps]
+    parts = [frames(scene, g, times, size=size) for g in grasps]
     images = [Image.fromarray(f) for f in np.concatenate(parts, axis=2)]
     # One palette for all frames: separate ones flicker and take more space.
     palette = _common_palette(images)
@@ -151,18 +151,24 @@ def write_strip(
       path: Image file to write; its folder is made.
       times: Times of the frames [s].
       size: Width and height of a frame in pixels.
-      notify: See `frames`.
+      notify: Told in one line if there is no OpenGL.
 
     Returns:
       The path.
     """
+    _announce(notify)
     p = scene.phases
     chosen = times or (0.0, p.approach, p.inflate, p.lift, p.disturb, scene.end_time)
-    rows = [frames(scene, g, np.array(chosen), size=size, notify=notify) for g in grasps]
+    rows = [frames(scene, g, np.array(chosen), size=size) for g in grasps]
     picture = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture).quantize(128).save(path)
     return path
+
+
+def _announce(notify: Callable[[str], None]) -> None:
+    if _opengl() is None:
+        notify(f"no OpenGL here: drawing sketches; for pictures: apt-get install {_PACKAGES}")
 
 
 def _common_palette(images: list[Image.Image]) -> Image.Image:
@@ -197,16 +203,27 @@ def _visual_model(scene: Scene, grasp: Replay) -> mujoco.MjModel:
         width=256,
         height=256,
     )
-    material = spec.add_material(name="board", texrepeat=[20, 20], texuniform=False)
+    material = spec.add_material(name="board", texrepeat=[10, 10], texuniform=True)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "board"
-    spec.geom("table").material = "board"
+    table = spec.geom("table")
+    table.material, table.size = "board", [0.6, 0.6, 0.05]
+    for shape in range(len(scene.objects.object)):
+        rgba = spec.geom(f"object_{shape}").rgba
+        spec.geom(f"object_{shape}").rgba = [*_OBJECT_COLOR, rgba[3]]
     spec.worldbody.add_light(
-        pos=[0.4, -0.5, 1.2], dir=[-0.3, 0.4, -1.0], diffuse=[0.55] * 3, specular=[0.1] * 3
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=[-0.15, 0.25, 1.0],
+        castshadow=True,
+        dir=[0.15, -0.25, -1.0],
+        diffuse=[0.5] * 3,
+        specular=[0.1] * 3,
     )
-    spec.visual.headlight.ambient = [0.45] * 3
-    spec.visual.headlight.diffuse = [0.35] * 3
-    spec.visual.headlight.specular = [0.05] * 3
-    spec.visual.map.znear, spec.visual.quality.shadowsize = 0.02, 2048
+    spec.visual.headlight.ambient = [0.5] * 3
+    spec.visual.headlight.diffuse = [0.4] * 3
+    spec.visual.headlight.specular = [0.0] * 3
+    spec.visual.quality.offsamples = 2  # a software renderer pays for every sample
+    spec.stat.extent, spec.stat.center = 1.0, [0, 0, 0.15]  # what the shadow map covers
+    spec.visual.map.znear, spec.visual.quality.shadowsize = 0.01, 2048
     return spec.compile()
 
 

@@ -42,7 +42,7 @@ def draw(
 
 def _frame(axes, scene: Scene, data: mujoco.MjData, outline: list[np.ndarray]) -> None:
     lay = layout(scene)
-    reach = 0.18
+    reach = 0.15
     corners = reach * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     axes.plot(*corners.T, 0.0, color="0.6", lw=1)
     for stub, links in zip(lay.stubs, lay.bodies, strict=True):
@@ -61,7 +61,7 @@ def _frame(axes, scene: Scene, data: mujoco.MjData, outline: list[np.ndarray]) -
 
 def _outline(scene: Scene, model: mujoco.MjModel, shape: int) -> list[np.ndarray]:
     """Lines of the object in its own frame [m], each of shape (point, 3)."""
-    size = model.geom_size[layout(scene).object_geoms[shape]]
+    size = model.geom(f"object_{shape}").size
     turn = np.linspace(0, 2 * np.pi, 25)
     circle = np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
     kind = scene.objects.object[shape].type

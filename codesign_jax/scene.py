@@ -78,11 +78,14 @@ class Discretization:
 
 @dataclasses.dataclass(frozen=True)
 class Solver:
-    """Limits of the contact solver: Newton and line-search iterations, scaled tolerance."""
+    """Limits of the contact solver: Newton and line-search iterations, scaled tolerance.
+
+    The tolerance must not be zero: MuJoCo's line search may then return no step at all.
+    """
 
     iterations: int = quantity("", 1, 1000)
     ls_iterations: int = quantity("", 1, 1000)
-    tolerance: float = quantity("", 0, 1)
+    tolerance: float = quantity("", 1e-16, 1)
 
 
 @dataclasses.dataclass(frozen=True)

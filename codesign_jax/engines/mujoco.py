@@ -3,7 +3,6 @@
 import threading
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import mujoco.batch
 import numpy as np
@@ -132,5 +131,5 @@ def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:
     model = copy.deepcopy(compile_template(scene))
     for name in ModelFields._fields:
         if name != "start":
-            getattr(model, name)[:] = np.asarray(jnp.asarray(getattr(fields, name)), np.float64)
+            getattr(model, name)[:] = np.asarray(getattr(fields, name), np.float64)
     return model

@@ -32,6 +32,7 @@ class ModelFields(NamedTuple):
     jnt_stiffness: jax.Array
     dof_damping: jax.Array
     dof_armature: jax.Array
+    dof_M0: jax.Array
     actuator_gainprm: jax.Array
     start: jax.Array
 
@@ -102,6 +103,8 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         jnt_stiffness=base("jnt_stiffness").at[lay.dofs].set(stiffness[lay.dofs]),
         dof_damping=implicit,
         dof_armature=h * implicit,
+        # MuJoCo takes the inertia of a free body from this constant; of other bodies it does not.
+        dof_M0=base("dof_M0").at[-6:-3].set(object_mass).at[-3:].set(object_inertia),
         actuator_gainprm=base("actuator_gainprm").at[6:, 0].set(beam.moment_per_pressure),
         start=_start(scene, params, trial, rest),
     )

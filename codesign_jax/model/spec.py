@@ -1,5 +1,6 @@
 """Scene to MjSpec and MjModel: the template once a scene, and fresh compiles of single hands."""
 
+import contextlib
 import functools
 
 import jax
@@ -30,12 +31,18 @@ _GEOM = {
 @functools.cache
 def compile_template(scene: Scene) -> mujoco.MjModel:
     """Compiles the scene's template model, once a scene."""
-    space = parameters.design_space(scene.hand)
-    with jax.ensure_compile_time_eval():  # also when first asked for inside a traced function
-        params = jax.tree.map(np.asarray, space.params(jax.numpy.asarray(space.default())))
-        one = np.ones(())
-        trial = Trial(np.int32(0), np.zeros(2), 0 * one, np.zeros(2), one, one)
-        return compile_model(scene, params, trial)
+    space, one = parameters.design_space(scene.hand), np.ones(())
+    with _float64():
+        params = jax.tree.map(np.asarray, space.params(space.default()))
+    trial = Trial(np.int32(0), np.zeros(2), 0 * one, np.zeros(2), one, one)
+    return compile_model(scene, params, trial)
+
+
+@contextlib.contextmanager
+def _float64():
+    """Models are compiled in float64 whatever the caller's mode, also inside a traced function."""
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        yield
 
 
 def compile_model(
@@ -55,6 +62,7 @@ def compile_model(
     return model
 
 
+@_float64()
 def build_spec(
     scene: Scene, params: Params, trial: Trial, *, visual: bool = False
 ) -> mujoco.MjSpec:

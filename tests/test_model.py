@@ -1,0 +1,285 @@
+"""Model fields against fresh compiles, and implicit springs against MuJoCo's own integrator."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from small import nth, pinch, random_worlds
+
+from codesign_jax import control, model, parameters, rollout, scene
+from codesign_jax.engines.mujoco import world_model
+
+# Arrays of mjModel that differ between hands although no ModelFields entry carries them, and why
+# nothing in these scenes reads them.
+UNREAD = {
+    "qpos0": "hinges and slides start at 0; the object's entry only serves mj_resetData",
+    "qpos_spring": "differs at the free joint only, which has no spring",
+    "dof_invweight0": "scales joint limits, joint friction and equalities: there are none",
+    "tendon_invweight0": "scales tendon limits and friction: there are none",
+    "actuator_acc0": "read by muscles only",
+    "dof_length": "read by sleeping only, which is off",
+}
+# Rows of model fields that may differ from a fresh compile, since nothing reads them either.
+READ_ROWS = {
+    "body_pos": slice(-1),  # the object's pose comes from its free joint
+    "body_quat": slice(-1),
+    "dof_M0": slice(-6, None),  # only free bodies take their inertia from it: the object
+}
+
+
+def arrays(compiled):
+    """Every array of an mjModel by name."""
+    names = (n for n in dir(compiled) if not n.startswith("_"))
+    values = {n: getattr(compiled, n) for n in names}
+    return {n: v for n, v in values.items() if isinstance(v, np.ndarray)}
+
+
+SCENES = {
+    "pneuflex4": lambda: scene.load("paper"),
+    "tripod3, two spheres": lambda: scene.load(
+        "paper",
+        hand_name="tripod3",
+        overrides={"discretization": {"links": 4, "spheres_per_link": 2}},
+    ),
+    "bending only": lambda: pinch(effects__lateral_bending=False, effects__twist=False),
+    "no finger contact": lambda: pinch(
+        effects__finger_object=False, effects__finger_table=False, effects__palm_contact=False
+    ),
+    "one link": lambda: pinch("cylinder", links=1),
+}
+
+
+@pytest.fixture(params=SCENES, scope="module")
+def worlds(request):
+    """A scene with fields of six random worlds in float64 and their fresh compiles."""
+    the_scene = SCENES[request.param]()
+    with jax.enable_x64(True):
+        params, trials = random_worlds(the_scene, seed=1, count=6)
+        fields = jax.jit(jax.vmap(lambda p, t: model.model_fields(the_scene, p, t)))(params, trials)
+        fresh = [model.compile_model(the_scene, nth(params, i), nth(trials, i)) for i in range(6)]
+    return the_scene, nth(fields, slice(None)), fresh
+
+
+def test_fields_equal_a_fresh_compile(worlds):
+    """To a few units in the last place: the compiler evaluates the same formulas in its order."""
+    the_scene, fields, fresh = worlds
+    for i, compiled in enumerate(fresh):
+        for name, value in nth(fields, i)._asdict().items():
+            if name == "start":
+                continue
+            expected = getattr(compiled, name)
+            assert value.shape == expected.shape and value.dtype == np.float64
+            rows = READ_ROWS.get(name, slice(None))
+            # Entries span 1e-8 to 1e4 within an array, so the bound is relative to each entry; the
+            # absolute one is for exact zeros.
+            np.testing.assert_allclose(
+                value[rows], expected[rows], rtol=1e-14, atol=1e-18, err_msg=name
+            )
+        # Object and palm as MuJoCo would place them; fingers straight.
+        rest = nth(fields, i).start[-7:]
+        np.testing.assert_allclose(rest, compiled.qpos0[-7:], rtol=1e-14, atol=1e-18)
+        np.testing.assert_array_equal(nth(fields, i).start[6:-7], 0.0)
+
+
+def test_every_array_that_depends_on_the_hand_is_covered(worlds):
+    """Whatever differs between two fresh compiles is a model field or is known to be unread."""
+    _, _, fresh = worlds
+    first = arrays(fresh[0])
+    differing = {
+        n for c in fresh[1:] for n, v in arrays(c).items() if not np.array_equal(v, first[n])
+    }
+    assert differing <= set(model.ModelFields._fields) | set(UNREAD)
+
+
+def test_options_are_the_scenes(worlds):
+    """Options do not depend on the hand: everything mj_step reads from them is in the template."""
+    the_scene, _, fresh = worlds
+    template = model.compile_template(the_scene).opt
+    for compiled in fresh:
+        for name in (n for n in dir(template) if not n.startswith("_")):
+            if not callable(getattr(template, name)):
+                np.testing.assert_array_equal(getattr(compiled.opt, name), getattr(template, name))
+
+
+def test_no_part_reads_the_unread_constants(worlds):
+    """What UNREAD claims: no limits, joint friction, equalities, muscles or sleeping."""
+    _, _, (compiled, *_) = worlds
+    assert (
+        compiled.neq == 0 and not compiled.jnt_limited.any() and not compiled.tendon_limited.any()
+    )
+    assert not compiled.dof_frictionloss.any() and not compiled.tendon_frictionloss.any()
+    assert not (compiled.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE).any()
+    assert not (compiled.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
+    free = compiled.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    assert not compiled.jnt_stiffness[free].any()
+    assert not compiled.tendon_stiffness.any() and not compiled.tendon_damping.any()
+    np.testing.assert_array_equal(np.flatnonzero(compiled.body_simple), [0, compiled.nbody - 1])
+
+
+def test_vmap_is_one_at_a_time(worlds):
+    the_scene, fields, _ = worlds
+    with jax.enable_x64(True):
+        params, trials = random_worlds(the_scene, seed=1, count=6)
+        one = jax.jit(lambda p, t: model.model_fields(the_scene, p, t))(
+            nth(params, 4), nth(trials, 4)
+        )
+    for a, b in zip(one, nth(fields, 4), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-15, atol=1e-18)  # the batch may fuse otherwise
+
+
+def test_the_template_is_its_own_field_set(worlds):
+    """Default parameters give back the template."""
+    the_scene, _, _ = worlds
+    template = model.compile_template(the_scene)
+    space = parameters.design_space(the_scene.hand)
+    with jax.enable_x64(True):
+        params, trial = space.params(space.default()), rollout.nominal_trial(the_scene)
+        fields = jax.jit(lambda p, t: model.model_fields(the_scene, p, t))(params, trial)
+    rebuilt = arrays(world_model(the_scene, fields))
+    for name, value in arrays(template).items():
+        np.testing.assert_allclose(rebuilt[name], value, rtol=1e-14, atol=1e-18, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def grasp():
+    """A scene with five links and, for each object, params, trial, fields and controls."""
+    the_scene = scene.load("paper", overrides={"discretization": {"links": 5}})
+    with jax.enable_x64(True):
+        params, trials = random_worlds(the_scene, seed=3, count=3)
+        # Random sections and spreads, straight above the object, fingers fully inflated.
+        length, pressure = 0 * params.length + 0.1, np.minimum(120e3, 39e6 * params.wall)
+        params = params._replace(length=length, arm=0 * params.arm, pressure=pressure)
+        both = jax.jit(
+            jax.vmap(
+                lambda p, t: (
+                    model.model_fields(the_scene, p, t),
+                    control.commands(the_scene, p, t),
+                )
+            )
+        )
+        return the_scene, nth((params, trials, *both(params, trials)), slice(None))
+
+
+@pytest.mark.parametrize("shape, resting", [(0, 4), (1, 4), (2, 1)])
+def test_contact_rich_steps_as_a_fresh_compile(grasp, shape, resting):
+    """Approach, inflation and lift: every step from the same state, with both models."""
+    the_scene, worlds = grasp
+    params, trial, fields, ctrl = nth(worlds, shape)
+    fresh = model.compile_model(the_scene, params, trial)
+    mine = world_model(the_scene, fields)
+    # The mean inertia only scales the tolerance at which the solver stops; a batch has one for all.
+    fresh.stat.meaninertia = mine.stat.meaninertia
+    fresh.opt.tolerance = mine.opt.tolerance = 1e-12
+    one, other = mujoco.MjData(fresh), mujoco.MjData(mine)
+    one.qpos[:] = fields.start
+    contacts, error = [], []
+    for u in ctrl[:450]:
+        one.ctrl[:] = u
+        for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
+            getattr(other, name)[:] = getattr(one, name)
+        mujoco.mj_step(fresh, one)
+        mujoco.mj_step(mine, other)
+        contacts.append(one.ncon)
+        # At rest accelerations are the rounding of forces that balance: not below 1 rad/s^2.
+        error.append(np.abs(one.qacc - other.qacc).max() / max(1.0, np.abs(one.qacc).max()))
+    assert np.sum(np.array(contacts) >= resting + 2) > 100  # a second of finger contacts
+    # The same problem to rounding (measured 6e-12): 1e-16 times a condition number of about 1e5
+    # between links and palm; twenty times that leaves room for another processor.
+    assert max(error) < 1e-10
+
+
+# --- implicit springs ----------------------------------------------------------------------------
+
+
+def discrete_twin(the_scene, params, trial):
+    """The model with physical springs and dampers under MuJoCo's own implicit integrator."""
+    m = model.compile_model(the_scene, params, trial)
+    with jax.enable_x64(True):
+        stiffness, damping = nth(model.joint_springs(the_scene, params), slice(None))
+    m.opt.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    m.dof_damping[:], m.dof_armature[:] = damping, 0.0
+    return m, stiffness
+
+
+def free_scene(**discretization):
+    """A hand above nothing: no contacts at all, gravity on."""
+    settings = {f"discretization__{k}": v for k, v in discretization.items()}
+    return pinch(
+        "sphere",
+        links=5,
+        effects__finger_object=False,
+        effects__finger_table=False,
+        effects__palm_contact=False,
+        **settings,
+    )
+
+
+def hand_world(the_scene, **changes):
+    """The table's default design with changes, and a nominal trial, as NumPy arrays."""
+    space = parameters.design_space(the_scene.hand)
+    with jax.enable_x64(True):
+        params = nth(space.params(space.default()), ...)
+        trial = nth(rollout.nominal_trial(the_scene), ...)
+    changes = {k: 0 * getattr(params, k) + v for k, v in changes.items()}
+    return params._replace(**changes), trial
+
+
+def wobble(m, steps, ctrl):
+    """Speeds of every step under constant controls from the start pose, (steps, nv)."""
+    data, speeds = mujoco.MjData(m), []
+    data.qpos[2] = 0.3
+    for _ in range(steps):
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(m, data)
+        speeds.append(data.qvel.copy())
+    return np.array(speeds), data
+
+
+def test_implicit_springs_equal_mujocos_discrete_integrator():
+    """Without contact, every step of a second of inflation under gravity and a moving arm.
+
+    The twin's wrist springs are passive too: position actuators are not implicit in MuJoCo.
+    """
+    the_scene = free_scene()
+    params, trial = hand_world(the_scene)
+    ours = model.compile_model(the_scene, params, trial)
+    twin, stiffness = discrete_twin(the_scene, params, trial)
+    twin.jnt_stiffness[:6] = stiffness[:6]
+    twin.actuator_gainprm[:6, 0] = twin.actuator_biasprm[:6, 1] = 0.0
+    one, other = mujoco.MjData(ours), mujoco.MjData(twin)
+    worst = 0.0
+    for step in range(100):
+        target = np.array([0.0, 0.01, 0.02, 0.1, 0.0, 0.3]) * step / 100
+        one.ctrl[:6], one.ctrl[6:] = target, 1200.0 * step
+        other.ctrl[:] = one.ctrl
+        other.qfrc_applied[:6] = stiffness[:6] * target
+        for name in ("qpos", "qvel"):
+            getattr(other, name)[:] = getattr(one, name)
+        mujoco.mj_step(ours, one)
+        mujoco.mj_step(twin, other)
+        # The object falls on the table in both; only the hand is compared.
+        worst = max(worst, np.abs(one.qacc[:-6] - other.qacc[:-6]).max())
+    assert np.abs(one.qpos[6:-7]).max() > 0.05  # it did bend
+    # Accelerations of up to 10 rad/s^2 to rounding, with the condition number of M (measured 3e-13).
+    assert worst < 1e-11
+
+
+def test_implicit_springs_are_stable_where_explicit_ones_are_not(tmp_path, monkeypatch):
+    """The stiffest finger of Table I, 10 mm long, at the paper's 10 ms."""
+    the_scene = free_scene()
+    params, trial = hand_world(the_scene, length=0.010, height=0.025, wall=0.007, pressure=150e3)
+    ours = model.compile_model(the_scene, params, trial)
+    ctrl = np.array([0, 0, 0.3, 0.3, 0, 0.3, 150e3, 150e3])
+    speeds, data = wobble(ours, 900, ctrl)
+    assert np.isfinite(speeds).all()
+    assert np.abs(speeds).max() < 50.0  # the first steps throw the hand towards its target
+    assert np.abs(speeds[-100:, :-6]).max() < 1e-6  # and then it rests
+
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs the instability where it runs
+    explicit = model.compile_model(the_scene, params, trial)
+    with jax.enable_x64(True):
+        _, damping = nth(model.joint_springs(the_scene, params), slice(None))
+    explicit.dof_damping[:], explicit.dof_armature[:] = damping, 0.0
+    speeds, _ = wobble(explicit, 900, ctrl)
+    assert not np.abs(speeds[-100:, :-6]).max() < 1e3  # measured: not a number

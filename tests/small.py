@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import parameters, rollout, scene
+from codesign_jax.types import Trial
 
 DATA = Path(__file__).parent / "data"
 # Shapes of the paper's object set, which are also the names of the one-object sets in data/.
@@ -41,6 +42,12 @@ def random_worlds(the_scene, seed, count):
     space = parameters.design_space(the_scene.hand)
     params = jax.vmap(space.params)(random_designs(space, seed, count))
     return params, rollout.sample_trials(the_scene, jax.random.key(seed), count)
+
+
+def still(shape=0):
+    """A trial without noise, as NumPy arrays."""
+    zero, one = np.zeros(()), np.ones(())
+    return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), one, one)
 
 
 def nth(tree, index):

@@ -1,0 +1,310 @@
+"""One finger, built as every hand is, against closed forms of beams, rods and pendulums.
+
+The finger leaves a palm on a stiff wrist horizontally.  Statics come from stepping until nothing
+moves: the implicit springs damp, and the fixed point of a step is the static solution.  Loads and
+positions are taken in the palm's frame, so that the wrist's remaining compliance does not matter.
+"""
+
+import dataclasses
+import functools
+
+import mujoco
+import numpy as np
+import pytest
+from scipy import linalg, special
+from small import pinch, still
+
+from codesign_jax import hand, model, morphology
+from codesign_jax.types import Params
+
+HEIGHT, WALL = 0.020, 0.005
+
+
+@functools.cache
+def finger_scene(links, *, bending_only=True, gravity=0.0, timestep=0.01, shear_modulus=70e3):
+    the_scene = pinch(
+        "sphere",
+        links=links,
+        discretization__timestep=timestep,
+        effects__lateral_bending=not bending_only,
+        effects__twist=not bending_only,
+        effects__finger_object=False,
+        effects__finger_table=False,
+        effects__palm_contact=False,
+    )
+    one = dataclasses.replace(
+        the_scene.hand,
+        finger=(hand.Finger(azimuth=0.0, spread=0.0, radius=0.0, tilt=0.0),),
+        wrist=hand.Wrist(1e5, 1e4, 1e3, 1e2),
+        material=dataclasses.replace(the_scene.hand.material, shear_modulus=shear_modulus),
+    )
+    return dataclasses.replace(the_scene, hand=one, gravity=gravity)
+
+
+class Finger:
+    """A single finger's model with its beam properties; loads act at the tip's bottom layer."""
+
+    def __init__(self, links, length=0.1, height=HEIGHT, **options):
+        self.scene = finger_scene(links, **options)
+        self.layout = model.layout(self.scene)
+        one = np.ones(1)
+        params = Params(length * one, height * one, WALL * one, np.zeros(()), np.zeros(6), 0 * one)
+        self.model = model.compile_model(self.scene, params, still())
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[2] = self.data.ctrl[2] = 0.3
+        self.length, self.links = length, links
+        material = self.scene.hand.material
+        self.beam = morphology.beam(
+            height,
+            WALL,
+            width=self.scene.hand.section.width,
+            shear_modulus=material.shear_modulus,
+            density=material.density,
+        )
+
+    def tip(self):
+        """Tip position (3,) and orientation (3, 3) in the frame of the finger's root."""
+        d, last = self.data, self.layout.bodies[0, -1]
+        palm = d.xmat[1].reshape(3, 3)
+        frame = d.xmat[last].reshape(3, 3)
+        end = d.xpos[last] + frame @ [self.length / self.links / 2, 0, 0]
+        return palm.T @ (end - d.xpos[1]), palm.T @ frame
+
+    def settle(self, force=(0, 0, 0), torque=(0, 0, 0), pressure=0.0, steps=3000):
+        """Steps under a load of fixed direction at the tip until nothing moves; returns tip pose."""
+        m, d, last = self.model, self.data, self.layout.bodies[0, -1]
+        d.ctrl[6] = pressure
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_comPos(m, d)
+        for _ in range(steps):
+            point = d.xpos[last] + d.xmat[last].reshape(3, 3) @ [
+                self.length / self.links / 2,
+                0,
+                0,
+            ]
+            palm, d.qfrc_applied[:] = d.xmat[1].reshape(3, 3), 0.0
+            mujoco.mj_applyFT(m, d, palm @ force, palm @ torque, point, last, d.qfrc_applied)
+            mujoco.mj_step(m, d)
+            if np.abs(d.qvel[:-6]).max() < 1e-11 and d.time > 0.1:
+                break
+        assert np.abs(d.qvel[:-6]).max() < 1e-10, "not at rest"
+        mujoco.mj_kinematics(m, d)
+        return self.tip()
+
+
+# --- statics -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("links", [5, 10, 20, 40])
+def test_small_load_cantilever(links):
+    """P L^3 / 3 E I, for the midpoint chain times exactly 1 - 1 / (4 N^2); slope P L^2 / 2 E I."""
+    finger = Finger(links)
+    load = 1e-4 * finger.beam.bending / finger.length**2  # alpha = 1e-4: geometry stays linear
+    position, frame = finger.settle(force=(0, 0, -load))
+    expected = load * finger.length**3 / (3 * finger.beam.bending)
+    # At this load geometric nonlinearity is of order alpha^2 = 1e-8.
+    assert -position[2] == pytest.approx(expected * (1 - 1 / (4 * links**2)), rel=1e-6)
+    slope = load * finger.length**2 / (2 * finger.beam.bending)
+    assert -frame[2, 0] == pytest.approx(slope, rel=1e-4)  # exact for every N: the mean of x is L/2
+
+
+def test_convergence_is_of_second_order():
+    """Tip error against the continuum falls with the square of the number of links."""
+    counts, errors = np.array([3, 5, 10, 20]), []
+    for links in counts:
+        finger = Finger(int(links))
+        load = 1e-4 * finger.beam.bending / finger.length**2
+        position, _ = finger.settle(force=(0, 0, -load))
+        errors.append(1 + position[2] * 3 * finger.beam.bending / (load * finger.length**3))
+    slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
+    assert slope == pytest.approx(-2.0, abs=0.01)
+
+
+def elastica(alpha):
+    """w/L and u/L of a cantilever under a dead transverse tip load (Bisshopp and Drucker 1945)."""
+    from scipy import optimize
+
+    def phi(k):
+        return np.arcsin(1 / (k * np.sqrt(2)))
+
+    def gap(k):
+        return special.ellipk(k**2) - special.ellipkinc(phi(k), k**2) - np.sqrt(alpha)
+
+    k = optimize.brentq(gap, np.sqrt(0.5) + 1e-12, 1 - 1e-12, xtol=1e-15)
+    w = 1 - 2 / np.sqrt(alpha) * (special.ellipe(k**2) - special.ellipeinc(phi(k), k**2))
+    u = 1 - np.sqrt(2 * np.sin(np.arcsin(2 * k**2 - 1)) / alpha)
+    return w, u
+
+
+@pytest.mark.parametrize(
+    "alpha, continuum, chain",
+    [
+        (1, (0.301720770, 0.056433236), (0.300897, 0.056417)),
+        (2, (0.493457480, 0.160641720), (0.491924, 0.160531)),
+        (10, (0.810609020, 0.554995600), (0.806629, 0.554083)),
+    ],
+)
+def test_elastica(alpha, continuum, chain):
+    """Large deflection at ten links: the table of docs/physics.md, recomputed here."""
+    np.testing.assert_allclose(elastica(alpha), continuum, atol=5e-9)
+    finger = Finger(10, timestep=0.002)  # the dead load's own stiffness is explicit
+    load = alpha * finger.beam.bending / finger.length**2
+    position, _ = finger.settle(force=(0, 0, -load))
+    tip = np.array([-position[2], finger.length - position[0]]) / finger.length
+    np.testing.assert_allclose(tip, chain, atol=1e-6)  # the chain's numbers have six digits
+    np.testing.assert_allclose(tip, continuum, rtol=5e-3)
+
+
+@pytest.mark.parametrize("links", [2, 3, 10])
+def test_roll_up_under_pressure(links):
+    """M = 2 pi E I / L closes the midpoint chain to a circle, tip at root, for every N."""
+    finger = Finger(links)
+    full = 2 * np.pi * finger.beam.bending / finger.length / finger.beam.moment_per_pressure
+    for fraction in (0.1, 0.3, 0.5, 0.7, 0.9):  # not in one step: it would swing through itself
+        finger.settle(pressure=fraction * full)
+    position, frame = finger.settle(pressure=full)
+    np.testing.assert_allclose(position, 0.0, atol=1e-7 * finger.length)
+    np.testing.assert_allclose(frame, np.eye(3), atol=1e-6)
+
+
+def test_pressure_curls_towards_the_bottom_layer():
+    """Half a circle of diameter 2 L / pi lies below the root; (L / N) cot(pi / 2 N) for a chain."""
+    finger = Finger(10)
+    half = np.pi * finger.beam.bending / finger.length / finger.beam.moment_per_pressure
+    position, frame = finger.settle(pressure=half)
+    diameter = finger.length / 10 / np.tan(np.pi / 20)
+    np.testing.assert_allclose(position, [0, 0, -diameter], atol=1e-7)
+    assert diameter == pytest.approx(2 * finger.length / np.pi, rel=1e-2)
+    np.testing.assert_allclose(frame[:, 0], [-1, 0, 0], atol=1e-6)
+
+
+def test_free_curvature_does_not_depend_on_the_load_path():
+    """A constant moment, not a moving rest angle: pressure and an opposed tip moment cancel."""
+    finger = Finger(10)
+    pressure = 60e3
+    moment = pressure * finger.beam.moment_per_pressure
+    position, _ = finger.settle(pressure=pressure, torque=(0, -moment, 0))
+    np.testing.assert_allclose(position, [finger.length, 0, 0], atol=1e-8)
+
+
+@pytest.mark.parametrize("links", [5, 20])
+def test_self_weight(links):
+    """w L^4 / 8 E I, for the midpoint chain times exactly 1 - 1 / (2 N^2)."""
+    finger = Finger(links, length=0.05, gravity=9.81, shear_modulus=1e7)
+    weight = finger.beam.line_density * 9.81
+    position, _ = finger.settle()
+    expected = weight * finger.length**4 / (8 * finger.beam.bending)
+    assert expected / finger.length < 1e-4  # a rod of this modulus stays straight
+    # The centre of mass lies h / 2 above the layer that carries it: a correction of order sag / L.
+    assert -position[2] == pytest.approx(expected * (1 - 1 / (2 * links**2)), rel=2e-4)
+
+
+@pytest.mark.parametrize("links", [1, 10])
+def test_twist(links):
+    """T L / G J: the same for every number of links."""
+    finger = Finger(links, bending_only=False)
+    torque = 0.1 * finger.beam.torsion / finger.length
+    _, frame = finger.settle(torque=(torque, 0, 0))
+    assert np.arctan2(frame[2, 1], frame[1, 1]) == pytest.approx(0.1, rel=1e-5)
+
+
+def test_lateral_and_vertical_stiffness_of_the_full_joint():
+    """With all three hinges, small loads bend each plane as its own beam."""
+    finger = Finger(10, bending_only=False)
+    stiffness = np.array([finger.beam.lateral, finger.beam.bending])
+    load = 1e-4 * finger.beam.bending / finger.length**2
+    position, _ = finger.settle(force=(0, load, load))
+    expected = load * finger.length**3 / (3 * stiffness) * (1 - 1 / 400)
+    np.testing.assert_allclose(position[1:], expected, rtol=1e-4)
+
+
+# --- dynamics ------------------------------------------------------------------------------------
+
+
+def eigenfrequencies(finger):
+    """Angular frequencies of the finger on a fixed palm, from MuJoCo's mass matrix, ascending."""
+    m, dofs = finger.model, finger.layout.dofs.ravel()
+    finger.data.qpos[6 + np.arange(dofs.size)] = 0.0
+    mujoco.mj_forward(m, finger.data)
+    mass = np.zeros((m.nv, m.nv))
+    mujoco.mj_fullM(m, finger.data, mass)
+    mass -= np.diag(m.dof_armature)
+    stiffness = np.diag(m.jnt_stiffness[dofs])
+    values, vectors = linalg.eigh(stiffness, mass[np.ix_(dofs, dofs)])
+    return np.sqrt(values), vectors
+
+
+def test_natural_frequencies():
+    """b_n^2 sqrt(E I / rho A L^4), times 1 + 0.23, 0.80 and 1.30 % for ten links.
+
+    The finger is slender (20 mm on 2 m), since the closed form knows no rotary inertia: what is
+    left of it is (h^2 / 3 L^2) times 2, 20 and 50 for the three modes, below 0.2 %.
+    """
+    finger = Finger(10, length=2.0)
+    omega, _ = eigenfrequencies(finger)
+    scale = np.sqrt(finger.beam.bending / finger.beam.line_density) / finger.length**2
+    ratio = omega[:3] / (np.array([3.516015, 22.034492, 61.697214]) * scale)
+    np.testing.assert_allclose(ratio, [1.0023, 1.0080, 1.0130], atol=2e-3)
+
+
+def test_ring_down():
+    """Log decrement 2 pi zeta / sqrt(1 - zeta^2) with zeta = (beta + h) omega / 2.
+
+    Linearly implicit springs act as a Kelvin-Voigt time of beta + h, to first order in h omega,
+    which is 7e-3 here.
+    """
+    finger = Finger(5, timestep=1e-3, length=0.3)
+    omega, shape = eigenfrequencies(finger)
+    m, d = finger.model, finger.data
+    d.qpos[6:11] = 1e-3 * shape[:, 0] / np.abs(shape[:, 0]).max()
+    d.qvel[:] = 0.0
+    d.ctrl[2] = d.qpos[2]
+    angle = []
+    for _ in range(4000):
+        angle.append(d.qpos[6])
+        mujoco.mj_step(m, d)
+    angle = np.array(angle)
+    peaks = np.flatnonzero((angle[1:-1] > angle[:-2]) & (angle[1:-1] >= angle[2:])) + 1
+    beta, h = finger.scene.hand.material.damping_time, 1e-3
+    zeta = (beta + h) * omega[0] / 2
+    period = 2 * np.pi / (omega[0] * np.sqrt(1 - zeta**2))
+    assert len(peaks) >= 4
+    # Four periods of 0.85 s, peaks at whole steps.
+    assert (peaks[3] - peaks[0]) / 3 * h == pytest.approx(period, rel=1e-3)
+    decrement = np.log(angle[peaks[0]] / angle[peaks[3]]) / 3
+    assert decrement == pytest.approx(2 * np.pi * zeta / np.sqrt(1 - zeta**2), rel=2e-3)
+
+
+def test_free_fall():
+    """Semi-implicit Euler falls g h^2 n (n + 1) / 2 in n steps, exactly."""
+    finger = Finger(1, gravity=9.81)
+    m, d = finger.model, finger.data
+    d.qpos[-5] = 2.0
+    for _ in range(50):
+        mujoco.mj_step(m, d)
+    assert 2.0 - d.qpos[-5] == pytest.approx(9.81 * 0.01**2 * 50 * 51 / 2, rel=1e-12)
+    assert 2.0 - d.qpos[-5] == pytest.approx(9.81 * 0.5**2 / 2, rel=0.02 + 1e-9)  # h / t
+
+
+def test_pendulum():
+    """A link without spring: period 4 sqrt(I / m g r) K(sin^2(A / 2)) at a large amplitude."""
+    finger = Finger(1, gravity=9.81, timestep=1e-3, length=0.2)
+    m, d = finger.model, finger.data
+    joint = finger.layout.dofs[0, 0, 0]
+    m.jnt_stiffness[joint] = m.dof_damping[joint] = m.dof_armature[joint] = 0.0
+    body = finger.layout.bodies[0, 0]
+    offset = m.body_ipos[body]
+    arm, mass = np.hypot(offset[0], offset[2]), m.body_mass[body]
+    inertia = m.body_inertia[body, 1] + mass * arm**2
+    hanging = np.pi / 2 + np.arctan2(offset[2], offset[0])  # centre of mass straight below
+    amplitude = np.deg2rad(100)
+    d.qpos[joint] = hanging - amplitude
+    velocity = []
+    for _ in range(2000):
+        mujoco.mj_step(m, d)
+        velocity.append(d.qvel[joint])
+    turns = np.flatnonzero(np.diff(np.sign(velocity)))
+    period = 4 * np.sqrt(inertia / (mass * 9.81 * arm)) * special.ellipk(np.sin(amplitude / 2) ** 2)
+    measured = (turns[2] - turns[0]) * 1e-3
+    # Turning points are whole steps: two of 1 ms in a period of 0.8 s.
+    assert measured == pytest.approx(period, rel=4e-3)

@@ -7,7 +7,7 @@ import numpy as np
 from codesign_jax.engines.structured.contact import Cone, Contacts
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics
-from codesign_jax.engines.structured.lanes import cross, dot
+from codesign_jax.engines.structured.lanes import Stages, cross, dot
 from codesign_jax.model import contact_invweight
 from codesign_jax.model.layout import palm_points
 from codesign_jax.scene import Scene
@@ -28,9 +28,7 @@ def make_cone(scene: Scene, friction: jax.Array | float, *, bodies: int) -> Cone
     ratio = friction / np.sqrt(c.friction_ratio)
     spring = 1.0 / (c.impedance * c.time_constant) ** 2 * c.impedance
     damper = 2.0 / (c.impedance * c.time_constant)
-    return Cone(
-        1.0 / regularizer, c.friction_ratio / regularizer, friction, ratio, spring, damper
-    )
+    return Cone(1.0 / regularizer, c.friction_ratio / regularizer, friction, ratio, spring, damper)
 
 
 def object_friction(scene: Scene, shape: jax.Array) -> jax.Array:
@@ -40,7 +38,12 @@ def object_friction(scene: Scene, shape: jax.Array) -> jax.Array:
 
 
 def spheres_on_object(
-    scene: Scene, hand: HandLanes, kin: Kinematics, centre: jax.Array, radius: jax.Array | float
+    scene: Scene,
+    hand: HandLanes,
+    kin: Kinematics,
+    run: Stages,
+    centre: jax.Array,
+    radius: jax.Array | float,
 ) -> Contacts:
     """Contacts of spheres with the object, normals pointing from the object to the hand.
 
@@ -48,17 +51,24 @@ def spheres_on_object(
       scene: The scene.
       hand: The hand.
       kin: Kinematics.
+      run: Runs the stages.
       centre: Sphere centres in the palm's frame, shape (3, ...).
       radius: Sphere radii, broadcasting to (...).
     """
-    away = jnp.stack([centre[i] - kin.object_pos[i] for i in range(3)])
-    local = jnp.stack([dot(kin.object[k], away) for k in range(3)])
-    distance, gradient = signed_distance(scene, hand, local)
-    normal = apply_columns(kin.object, gradient)
-    gap = distance - radius
-    point = centre - normal * (radius + 0.5 * gap)
+
+    def measure(columns: jax.Array, position: jax.Array, centre: jax.Array):
+        away = jnp.stack([centre[i] - position[i] for i in range(3)])
+        local = jnp.stack([dot(columns[k], away) for k in range(3)])
+        return signed_distance(scene, hand, local)
+
+    def place(columns: jax.Array, centre: jax.Array, distance: jax.Array, gradient: jax.Array):
+        normal, gap = apply_columns(columns, gradient), distance - radius
+        return centre - normal * (radius + 0.5 * gap), normal, gap
+
+    distance, gradient = run(measure, kin.object, kin.object_pos, centre)
+    placed = run(place, kin.object, centre, distance, gradient)
     cone = make_cone(scene, object_friction(scene, hand.shape), bodies=2)
-    return Contacts(point, normal, gap, cone)
+    return Contacts(*placed, cone)
 
 
 def spheres_on_table(
@@ -69,7 +79,9 @@ def spheres_on_table(
     zero = jnp.zeros_like(gap)
     normal = jnp.stack([zero, zero, zero + 1.0])
     point = centre - normal * (radius + 0.5 * gap)
-    return Contacts(point, normal, gap, make_cone(scene, scene.contact.finger_table_friction, bodies=1))
+    return Contacts(
+        point, normal, gap, make_cone(scene, scene.contact.finger_table_friction, bodies=1)
+    )
 
 
 def finger_spheres(hand: HandLanes, kin: Kinematics) -> jax.Array:
@@ -83,9 +95,7 @@ def palm_spheres(scene: Scene, kin: Kinematics) -> jax.Array:
     return apply_columns(kin.palm, points)
 
 
-def signed_distance(
-    scene: Scene, hand: HandLanes, local: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def signed_distance(scene: Scene, hand: HandLanes, local: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Signed distance and its unit gradient in the object's frame, for the shape of each world.
 
     Args:
@@ -142,7 +152,9 @@ def _cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(is_out, length, jnp.maximum(side, cap)), gradient
 
 
-def object_on_table(scene: Scene, hand: HandLanes, kin: Kinematics, height: jax.Array) -> Contacts:
+def object_on_table(
+    run: Stages, scene: Scene, hand: HandLanes, kin: Kinematics, height: jax.Array
+) -> Contacts:
     """Contacts of the object with the table, four slots as in MuJoCo's plane colliders.
 
     The points are the four lower corners of a box; the lower rim's lowest point, its upper counterpart and
@@ -150,18 +162,23 @@ def object_on_table(scene: Scene, hand: HandLanes, kin: Kinematics, height: jax.
     """
     functions = {"box": _box_corners, "cylinder": _rim_points, "sphere": _lowest_point}
     kinds = [s.type for s in scene.objects.object]
-    arms = None
-    for kind in dict.fromkeys(kinds):
-        mine = jnp.isin(hand.shape, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
-        new = functions[kind](hand.object_size[:, 0], kin.object[:, :, 0])
-        arms = new if arms is None else jnp.where(mine, new, arms)
-    assert arms is not None
-    point = kin.object_pos + arms
-    gap = point[2] + height
-    zero = jnp.zeros_like(gap)
-    normal = jnp.stack([zero, zero, zero + 1.0])
+
+    def points(size: jax.Array, columns: jax.Array, position: jax.Array, height: jax.Array):
+        arms = None
+        for kind in dict.fromkeys(kinds):
+            mine = jnp.isin(hand.shape, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
+            new = functions[kind](size, columns)
+            arms = new if arms is None else jnp.where(mine, new, arms)
+        assert arms is not None
+        point = position + arms
+        gap = point[2] + height
+        zero = jnp.zeros_like(gap)
+        normal = jnp.stack([zero, zero, zero + 1.0])
+        return point - 0.5 * gap * normal, normal, gap
+
     cone = make_cone(scene, scene.objects.table.friction, bodies=1)
-    return Contacts(point - 0.5 * gap * normal, normal, gap, cone)
+    placed = run(points, hand.object_size[:, 0], kin.object[:, :, 0], kin.object_pos, height)
+    return Contacts(*placed, cone)
 
 
 _AWAY = 1e3  # an unused slot hangs this far above the table

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import cross, dot, total
+from codesign_jax.engines.structured.lanes import cross, dot
 
 
 class Cone(NamedTuple):
@@ -178,8 +178,3 @@ def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
 def contact_wrench(contacts: Contacts, force: jax.Array) -> jax.Array:
     """Spatial force (moment about the origin, force), shape (6, ...)."""
     return jnp.concatenate([cross(contacts.point, force), force])
-
-
-def sum_items(x: jax.Array, axis: int) -> jax.Array:
-    """Sum over a short axis, written out."""
-    return total([jnp.take(x, i, axis) for i in range(x.shape[axis])])

@@ -4,7 +4,7 @@ The objective of a subtree, as a function of its base link's spatial acceleratio
   1/2 v'P v - v'C v_o + 1/2 v_o'Q v_o - r'v - r_o'v_o.
 With v = v_parent + S a and the joint's own 1/2 a'(arm)a - tau'a, minimising over the joint accelerations a
 gives the same form in v_parent: Featherstone's articulated-body recursion (Rigid Body Dynamics Algorithms,
-2008, ch. 7) extended by the object that every finger may touch.  About 650 multiply-adds for three axes.
+2008, ch. 7) extended by the object that every finger may touch.
 """
 
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import dot, inverse_spd, total
+from codesign_jax.engines.structured.lanes import Stages, contract, inverse_spd
 
 
 class Quadratic(NamedTuple):
     """Coefficients of a subtree's objective.
 
     Attributes:
-      p: Rows of P, shape (6, 6, finger, world).
-      c: Rows of C, same shape.
-      q: Rows of Q, same shape.
+      p: P, shape (6, 6, finger, world).
+      c: C, same shape.
+      q: Q, same shape.
       r: r, shape (6, finger, world).
       r_object: r_o, same shape.
     """
@@ -48,11 +48,12 @@ class Factors(NamedTuple):
 
 
 def eliminate(
-    node: Quadratic, axes: jax.Array, arm: jax.Array, tau: jax.Array
+    run: Stages, node: Quadratic, axes: jax.Array, arm: jax.Array, tau: jax.Array
 ) -> tuple[Quadratic, Factors]:
     """Minimises over the accelerations of a joint.
 
     Args:
+      run: Runs the stages.
       node: The subtree's objective in its base link's acceleration.
       axes: Motion subspace S, shape (axis, 6, finger, world).
       arm: Diagonal joint inertia (armature with implicit terms), shape (axis, finger, world).
@@ -61,52 +62,73 @@ def eliminate(
     Returns:
       The objective in the parent's acceleration and the factors for `substitute`.
     """
-    n = range(axes.shape[0])
-    # jnp.stack of separately computed rows keeps XLA from recomputing an intermediate in each user.
-    u = jnp.stack([total([node.p[j] * axes[a, j] for j in range(6)]) for a in n])
-    h = jnp.stack([total([node.c[j] * axes[a, j] for j in range(6)]) for a in n])
-    y = jnp.stack([dot(axes[a], node.r) + tau[a] for a in n])
-    d = [[dot(axes[min(a, b)], u[max(a, b)]) for b in n] for a in n]
-    inverse = inverse_spd([[d[a][b] + arm[a] if a == b else d[a][b] for b in n] for a in n])
-    inverse = jnp.stack([jnp.stack(row) for row in inverse])
-    w = jnp.stack([total([inverse[a, b] * u[b] for b in n]) for a in n])
-    g = jnp.stack([total([inverse[a, b] * h[b] for b in n]) for a in n])
-    z = jnp.stack([total([inverse[a, b] * y[b] for b in n]) for a in n])
-    reduced = Quadratic(
-        p=jnp.stack([node.p[i] - total([u[a, i] * w[a] for a in n]) for i in range(6)]),
-        c=jnp.stack([node.c[i] - total([u[a, i] * g[a] for a in n]) for i in range(6)]),
-        q=jnp.stack([node.q[i] - total([h[a, i] * g[a] for a in n]) for i in range(6)]),
-        r=node.r - total([u[a] * z[a] for a in n]),
-        r_object=node.r_object + total([h[a] * z[a] for a in n]),
-    )
-    return reduced, Factors(w, g, z)
+    u, h, y = run(_project, node.p, node.c, node.r, axes, tau)
+    inverse = run(_joint_inverse, axes, u, arm)
+    factors = Factors(*run(_factor, inverse, u, h, y))
+    return Quadratic(*run(_reduce, node, u, h, factors)), factors
 
 
-def substitute(factors: Factors, parent: jax.Array, object_acc: jax.Array) -> jax.Array:
-    """Joint accelerations, shape (axis, finger, world), from the parent's and the object's (6, ...)."""
-    n = range(factors.z.shape[0])
-    return jnp.stack(
-        [factors.z[a] - dot(factors.w[a], parent) + dot(factors.g[a], object_acc) for a in n]
+def _project(p: jax.Array, c: jax.Array, r: jax.Array, axes: jax.Array, tau: jax.Array):
+    """U = P S, H = S'C and y = S'r + tau, transposed to rows by axis."""
+    u = contract(p[None], axes[:, None], 2)
+    return u, contract(axes[:, :, None], c[None], 1), contract(axes, r[None], 1) + tau
+
+
+def _joint_inverse(axes: jax.Array, u: jax.Array, arm: jax.Array) -> jax.Array:
+    """D^-1 with D = S'P S + arm."""
+    n = axes.shape[0]
+    eye = jnp.eye(n, dtype=axes.dtype)[:, :, None, None]
+    return inverse_spd(contract(axes[:, None], u[None], 2) + eye * arm[:, None])
+
+
+def _factor(inverse: jax.Array, u: jax.Array, h: jax.Array, y: jax.Array):
+    return (
+        contract(inverse[:, :, None], u[None], 1),
+        contract(inverse[:, :, None], h[None], 1),
+        contract(inverse, y[None], 1),
     )
 
 
-def solve_object(q: jax.Array, r: jax.Array) -> jax.Array:
-    """Solves Q v_o = r for the six object accelerations, by 3 x 3 blocks.
+def _reduce(node: Quadratic, u: jax.Array, h: jax.Array, f: Factors):
+    return (
+        node.p - contract(u[:, :, None], f.w[:, None], 0),
+        node.c - contract(u[:, :, None], f.g[:, None], 0),
+        node.q - contract(h[:, :, None], f.g[:, None], 0),
+        node.r - contract(u, f.z[:, None], 0),
+        node.r_object + contract(h, f.z[:, None], 0),
+    )
+
+
+def substitute(
+    axes: jax.Array, factors: Factors, parent: jax.Array, object_acc: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Back substitution of one joint.
 
     Args:
-      q: Rows of Q, shape (6, 6, 1, world).
-      r: Right-hand side, shape (6, 1, world).
+      axes: Motion subspace, shape (axis, 6, finger, world).
+      factors: Its factors.
+      parent: Spatial acceleration of the parent, shape (6, finger or 1, world).
+      object_acc: Spatial acceleration of the object, shape (6, 1, world).
+
+    Returns:
+      Joint accelerations, shape (axis, finger, world), and the link's spatial acceleration.
     """
-    top = inverse_spd([[q[i, j] for j in range(3)] for i in range(3)])
-    top = jnp.stack([jnp.stack(row) for row in top])
-    # L = Q_ba Q_aa^-1, Schur complement Q_bb - L Q_ab.
-    low = jnp.stack([total([top[i] * q[3 + k, i] for i in range(3)]) for k in range(3)])
-    schur = jnp.stack(
-        [q[3 + k, 3:] - total([q[i, 3:] * low[k, i] for i in range(3)]) for k in range(3)]
-    )
-    inverse = inverse_spd([[schur[i, j] for j in range(3)] for i in range(3)])
-    rest = [r[3 + k] - dot(low[k], r[:3]) for k in range(3)]
-    second = jnp.stack([total([inverse[k][i] * rest[i] for i in range(3)]) for k in range(3)])
-    reduced = [r[i] - dot(q[i, 3:], second) for i in range(3)]
-    first = jnp.stack([total([top[k, i] * reduced[i] for i in range(3)]) for k in range(3)])
-    return jnp.concatenate([first, second])
+    a = factors.z - contract(factors.w, parent[None], 1) + contract(factors.g, object_acc[None], 1)
+    return a, parent + contract(axes, a[:, None], 0)
+
+
+def solve_object(run: Stages, q: jax.Array, r: jax.Array) -> jax.Array:
+    """Solves Q v_o = r for the six object accelerations by 3 x 3 blocks, shape (6, 1, world)."""
+
+    def schur(q: jax.Array, r: jax.Array):
+        top = inverse_spd(q[:3, :3])
+        low = contract(q[3:, :3, None], top[None], 1)  # Q_ba Q_aa^-1
+        rest = q[3:, 3:] - contract(low[:, :, None], q[None, :3, 3:], 1)
+        return top, rest, r[3:] - contract(low, r[None, :3], 1)
+
+    def finish(q: jax.Array, r: jax.Array, top: jax.Array, rest: jax.Array, right: jax.Array):
+        second = contract(inverse_spd(rest), right[None], 1)
+        left = r[:3] - contract(q[:3, 3:], second[None], 1)
+        return jnp.concatenate([contract(top, left[None], 1), second])
+
+    return run(finish, q, r, *run(schur, q, r))

@@ -1,15 +1,17 @@
 """Step and rollout of the structured engine behind the common interface."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import collision, solver
+from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
-from codesign_jax.engines.structured.lanes import total
+from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
@@ -49,6 +51,7 @@ class StructuredEngine:
         """
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
+        self.conditional = jax.default_backend() == "cpu"  # see Stages
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -85,36 +88,44 @@ class StructuredEngine:
         return jnp.concatenate(parts).T
 
     def problem(
-        self, hand: HandLanes, state: State, ctrl: jax.Array
+        self, run: Stages, hand: HandLanes, state: State, ctrl: jax.Array
     ) -> tuple[solver.Problem, solver.Spatial]:
         """Assembles a step's problem and the bodies' velocities; ctrl has shape (nu, world)."""
-        kin = kinematics(hand, layout(self.scene).axes, state)
-        body = bodies(hand, kin)
-        smooth = smooth_forces(hand, kin, body, state, ctrl, self.scene)
-        contacts = self._contacts(hand, kin, state.wrist[2])
+        kin = kinematics(run, hand, layout(self.scene).axes, state)
+        body = bodies(run, hand, kin)
+        smooth = smooth_forces(run, hand, kin, body, state, ctrl, self.scene)
+        matrix = solver.Matrices(*(run(lambda b: b.matrix(), b) for b in body))
+        contacts = self._contacts(run, hand, kin, state.wrist[2])
         velocity = solver.Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-        return solver.Problem(hand, kin, body, smooth, contacts), velocity
+        return solver.Problem(hand, kin, body, matrix, smooth, contacts), velocity
 
-    def _contacts(self, hand: HandLanes, kin: Kinematics, height: jax.Array) -> solver.ContactSet:
-        scene, e = self.scene, self.scene.effects
-        spheres = collision.finger_spheres(hand, kin) if hand.sphere.size else None
-        palm = collision.palm_spheres(scene, kin) if e.palm_contact else None
-        r = scene.hand.palm.contact_radius
-        fo = ft = po = pt = None
-        if spheres is not None and e.finger_object:
-            fo = collision.spheres_on_object(scene, hand, kin, spheres, hand.radius)
-        if spheres is not None and e.finger_table:
-            ft = collision.spheres_on_table(scene, height, spheres, hand.radius)
-        if palm is not None:
-            po = collision.spheres_on_object(scene, hand, kin, palm, r)
-            pt = collision.spheres_on_table(scene, height, palm, r)
-        on_table = collision.object_on_table(scene, hand, kin, height)
-        return solver.ContactSet(fo, ft, po, pt, on_table)
+    def _contacts(
+        self, run: Stages, hand: HandLanes, kin: Kinematics, height: jax.Array
+    ) -> dict[str, Contacts]:
+        """Contacts that the scene's effects call for, by pair of bodies."""
+        scene, e, found = self.scene, self.scene.effects, {}
+        on_object = partial(collision.spheres_on_object, scene, hand, kin)
+        on_table = partial(collision.spheres_on_table, scene, height)
+        if hand.sphere.size:
+            spheres = run(collision.finger_spheres, hand, kin)
+            if e.finger_object:
+                found["finger_object"] = on_object(run, spheres, hand.radius)
+            if e.finger_table:
+                found["finger_table"] = on_table(spheres, hand.radius)
+        if e.palm_contact:
+            palm, radius = collision.palm_spheres(scene, kin), scene.hand.palm.contact_radius
+            found["palm_object"] = on_object(run, palm, radius)
+            found["palm_table"] = on_table(palm, radius)
+        found["object_table"] = collision.object_on_table(run, scene, hand, kin, height)
+        return found
 
     def step(self, hand: HandLanes, state: State, ctrl: jax.Array) -> tuple[State, StepInfo]:
         """Advances a batch by one time step under controls of shape (nu, world)."""
-        problem, velocity = self.problem(hand, state, ctrl)
+        # The compiler does not know that a shape's index is never negative.
+        run = Stages(hand.shape[0, 0] >= 0 if self.conditional else None)
+        problem, velocity = self.problem(run, hand, state, ctrl)
         solution = solver.solve(
+            run,
             problem,
             velocity,
             state.acc,
@@ -122,7 +133,8 @@ class StructuredEngine:
             evaluations=self.evaluations,
             tolerance=self.tolerance,
         )
-        new = integrate(state, problem.kin, solution.acc, self.scene.discretization.timestep)
+        h = self.scene.discretization.timestep
+        new = run(lambda s, k, a: integrate(s, k, a, h), state, problem.kin, solution.acc)
         centre = self._centre(hand, problem.kin, problem.body) + state.wrist[:3]
         return new, StepInfo(solution.acc, solution.residual, solution.iterations, centre)
 
@@ -171,7 +183,9 @@ class StructuredEngine:
 
 def integrate(state: State, kin: Kinematics, acc: Acc, h: float) -> State:
     """Semi-implicit Euler: velocities first, then positions with the new velocities."""
-    local = jnp.stack([total([kin.object[k, i] * acc.object[i] for i in range(3)]) for k in range(3)])
+    local = jnp.stack(
+        [total([kin.object[k, i] * acc.object[i] for i in range(3)]) for k in range(3)]
+    )
     wrist_vel, finger_vel = state.wrist_vel + h * acc.wrist, state.finger_vel + h * acc.finger
     linear, angular = state.linear_vel + h * acc.object[3:], state.angular_vel + h * local
     return State(

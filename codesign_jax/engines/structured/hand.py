@@ -137,7 +137,9 @@ def _palm(fields: ModelFields, stubs: np.ndarray, mount: jax.Array, stub_centre:
     centres = jnp.concatenate([palm_centre, stub_centre], 1)
     palm_principal = last(fields.body_inertia[:, 1])[:, None]
     stub_principal = last(jnp.moveaxis(fields.body_inertia[:, stubs], -1, 1))
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=masses.dtype)[:, :, None, None], (3, 3, *palm_centre.shape[1:]))
+    eye = jnp.broadcast_to(
+        jnp.eye(3, dtype=masses.dtype)[:, :, None, None], (3, 3, *palm_centre.shape[1:])
+    )
     frames = jnp.concatenate([eye, mount], 2)
     principal = jnp.concatenate([palm_principal, stub_principal], 1)
     mass = masses.sum(0, keepdims=True)

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns
-from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State
-from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
+from codesign_jax.engines.structured.kinematics import Kinematics, State
+from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
 
 
 class Body(NamedTuple):
@@ -34,11 +34,16 @@ class Body(NamedTuple):
         m, c = self.mass, self.centre
         zero, square = jnp.zeros_like(m * c[0]), dot(c, c)
         m = m + zero
-        skew = [[zero, -m * c[2], m * c[1]], [m * c[2], zero, -m * c[0]], [-m * c[1], m * c[0], zero]]
+        skew = [
+            [zero, -m * c[2], m * c[1]],
+            [m * c[2], zero, -m * c[0]],
+            [-m * c[1], m * c[0], zero],
+        ]
         rows = []
         for i in range(3):
             turning = [
-                self.tensor[i, j] + m * ((square if i == j else 0.0) - c[i] * c[j]) for j in range(3)
+                self.tensor[i, j] + m * ((square if i == j else 0.0) - c[i] * c[j])
+                for j in range(3)
             ]
             rows.append(jnp.stack([*turning, *skew[i]]))
         for i in range(3):
@@ -98,31 +103,43 @@ def principal_tensor(columns: jax.Array, principal: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-def bodies(hand: HandLanes, kin: Kinematics) -> Bodies:
+def bodies(run: Stages, hand: HandLanes, kin: Kinematics) -> Bodies:
     """Inertia of all bodies at the present positions."""
-    palm = kin.palm
-    turned = [[apply_columns(palm, hand.palm_inertia[i])[j] for j in range(3)] for i in range(3)]
-    columns = jnp.stack([jnp.stack([turned[i][j] for i in range(3)]) for j in range(3)])
-    palm_tensor = jnp.stack([apply_columns(palm, columns[j]) for j in range(3)])
+
+    def link(origin: jax.Array, frame: jax.Array):
+        return origin + apply_columns(frame, hand.centre), principal_tensor(frame, hand.inertia)
+
+    def rest(palm: jax.Array, obj: jax.Array):
+        # R T R' of the palm's tensor T, rows of T first, then columns of T R'.
+        half = jnp.stack([apply_columns(palm, hand.palm_inertia[i]) for i in range(3)], 1)
+        tensor = jnp.stack([apply_columns(palm, half[j]) for j in range(3)])
+        return (
+            apply_columns(palm, hand.palm_centre),
+            tensor,
+            principal_tensor(obj, hand.object_inertia),
+        )
+
+    centre, tensor, object_tensor = run(rest, kin.palm, kin.object)
     return Bodies(
-        palm=Body(hand.palm_mass, apply_columns(palm, hand.palm_centre), palm_tensor),
-        link=Body(
-            hand.mass,
-            kin.origin + apply_columns(kin.link, hand.centre),
-            principal_tensor(kin.link, hand.inertia),
-        ),
-        object=Body(
-            hand.object_mass, kin.object_pos, principal_tensor(kin.object, hand.object_inertia)
-        ),
+        palm=Body(hand.palm_mass, centre, tensor),
+        link=Body(hand.mass, *run(link, kin.origin, kin.link)),
+        object=Body(hand.object_mass, kin.object_pos, object_tensor),
     )
 
 
 def smooth_forces(
-    hand: HandLanes, kin: Kinematics, body: Bodies, state: State, ctrl: jax.Array, scene
+    run: Stages,
+    hand: HandLanes,
+    kin: Kinematics,
+    body: Bodies,
+    state: State,
+    ctrl: jax.Array,
+    scene,
 ) -> Smooth:
     """All forces that do not depend on the accelerations.
 
     Args:
+      run: Runs the stages.
       hand: The hand.
       kin: Kinematics of the state.
       body: Inertia of the state.
@@ -139,24 +156,11 @@ def smooth_forces(
     # The object's coordinates are its own velocity components: no acceleration is left at zero.
     spin = jnp.concatenate([jnp.zeros_like(kin.object_vel[:3])] * 2)
     turning = spatial(kin.object_vel[:3], -cross(kin.object_vel[:3], kin.object_pos))
+    links = run(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
     return Smooth(
         palm=body.palm.smooth_force(kin.palm_vel, kin.palm_bias, g),
-        link=body.link.smooth_force(kin.vel, kin.bias, g),
+        link=links,
         object=body.object.smooth_force(turning, spin, g),
         wrist=wrist,
         finger=finger,
-    )
-
-
-def inertial_product(
-    hand: HandLanes, body: Bodies, acc: Acc, kin_acc: tuple[jax.Array, jax.Array, jax.Array]
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
-    """M a in factored form: forces on palm, links and object, and armature forces on the joints."""
-    palm, link, obj = kin_acc
-    return (
-        body.palm.times(palm),
-        body.link.times(link),
-        body.object.times(obj),
-        hand.wrist_armature * acc.wrist,
-        hand.armature * acc.finger,
     )

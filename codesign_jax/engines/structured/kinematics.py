@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, rotation_columns
-from codesign_jax.engines.structured.lanes import cross, motion_cross, rotate, spatial
+from codesign_jax.engines.structured.lanes import Stages, cross, motion_cross, rotate, spatial
 
 # Axis of the frame about which each hinge turns, in the order bend (y), lateral (z), twist (x).
 _HINGE = {"bend": 1, "lateral": 2, "twist": 0}
@@ -90,33 +90,31 @@ class Kinematics(NamedTuple):
     object_vel: jax.Array
 
 
-def kinematics(hand: HandLanes, axis_names: tuple[str, ...], state: State) -> Kinematics:
+def kinematics(
+    run: Stages, hand: HandLanes, axis_names: tuple[str, ...], state: State
+) -> Kinematics:
     """Computes the kinematics of all bodies."""
-    palm, wrist_axes, palm_vel, palm_bias = _wrist(state)
-    frame = [apply_columns(palm, hand.mount[k]) for k in range(3)]
-    origin = apply_columns(palm, hand.base)
+    palm, wrist_axes, palm_vel, palm_bias = run(_wrist, state.wrist, state.wrist_vel)
+    frame, origin = run(_mount, palm, hand.mount, hand.base)
     vel, bias = palm_vel, palm_bias
-    cos, sin = jnp.cos(state.finger), jnp.sin(state.finger)
+    trig = run(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
     frames, origins, axes, vels, biases = [], [], [], [], []
     for i in range(state.finger.shape[0]):
-        origin = origin + frame[0] * hand.offset[i]
-        subspace = []
-        for a, name in enumerate(axis_names):
-            axis = frame[_HINGE[name]]
-            s = spatial(axis, cross(origin, axis))
-            bias = bias + motion_cross(vel, s) * state.finger_vel[i, a]
-            vel = vel + s * state.finger_vel[i, a]
-            subspace.append(s)
-            frame = rotate(frame, _HINGE[name], cos[i, a], sin[i, a])
-        frame = list(jnp.stack(frame))
-        axes.append(jnp.stack(subspace))
-        frames.append(jnp.stack(frame))
+        origin, frame, subspace = run(
+            lambda *args: _turn_link(axis_names, *args),
+            origin,
+            frame,
+            hand.offset[i],
+            trig[0][i],
+            trig[1][i],
+        )
+        vel, bias = run(_link_velocity, vel, bias, subspace, state.finger_vel[i])
+        axes.append(subspace)
+        frames.append(frame)
         origins.append(origin)
         vels.append(vel)
         biases.append(bias)
-    columns = rotation_columns(state.quat)
-    position = state.position - state.wrist[:3]
-    omega = apply_columns(columns, state.angular_vel)
+    columns, position, object_vel = run(_object, state)
     return Kinematics(
         palm=palm,
         wrist_axes=wrist_axes,
@@ -129,21 +127,51 @@ def kinematics(hand: HandLanes, axis_names: tuple[str, ...], state: State) -> Ki
         bias=jnp.stack(biases, 1),
         object=columns,
         object_pos=position,
-        object_vel=spatial(omega, state.linear_vel + cross(position, omega)),
+        object_vel=object_vel,
     )
 
 
-def _wrist(state: State) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    one, zero = jnp.ones_like(state.wrist[0]), jnp.zeros_like(state.wrist[0])
+def _wrist(wrist: jax.Array, wrist_vel: jax.Array):
+    one, zero = jnp.ones_like(wrist[0]), jnp.zeros_like(wrist[0])
     frame = [jnp.stack([one if i == k else zero for i in range(3)]) for k in range(3)]
     none = jnp.stack([zero] * 3)
-    vel, bias = spatial(none, state.wrist_vel[:3]), spatial(none, none)
-    cos, sin = jnp.cos(state.wrist[3:]), jnp.sin(state.wrist[3:])
+    vel, bias = spatial(none, wrist_vel[:3]), spatial(none, none)
+    cos, sin = jnp.cos(wrist[3:]), jnp.sin(wrist[3:])
     axes = []
     for k, axis in enumerate(_WRIST):
         s = spatial(frame[axis], none)
-        bias = bias + motion_cross(vel, s) * state.wrist_vel[3 + k]
-        vel = vel + s * state.wrist_vel[3 + k]
+        bias = bias + motion_cross(vel, s) * wrist_vel[3 + k]
+        vel = vel + s * wrist_vel[3 + k]
         axes.append(s)
         frame = rotate(frame, axis, cos[k], sin[k])
     return jnp.stack(frame), jnp.stack(axes), vel, bias
+
+
+def _mount(palm: jax.Array, mount: jax.Array, base: jax.Array):
+    frame = jnp.stack([apply_columns(palm, mount[k]) for k in range(3)])
+    return frame, apply_columns(palm, base)
+
+
+def _turn_link(names: tuple[str, ...], origin, frame, offset, cos, sin):
+    """Position, orientation and motion subspace of a link from its parent's."""
+    origin = origin + frame[0] * offset
+    columns, subspace = list(frame), []
+    for a, name in enumerate(names):
+        axis = columns[_HINGE[name]]
+        subspace.append(spatial(axis, cross(origin, axis)))
+        columns = rotate(columns, _HINGE[name], cos[a], sin[a])
+    return origin, jnp.stack(columns), jnp.stack(subspace)
+
+
+def _link_velocity(vel: jax.Array, bias: jax.Array, subspace: jax.Array, rate: jax.Array):
+    for a in range(subspace.shape[0]):
+        bias = bias + motion_cross(vel, subspace[a]) * rate[a]
+        vel = vel + subspace[a] * rate[a]
+    return vel, bias
+
+
+def _object(state: State):
+    columns = rotation_columns(state.quat)
+    position = state.position - state.wrist[:3]
+    omega = apply_columns(columns, state.angular_vel)
+    return columns, position, spatial(omega, state.linear_vel + cross(position, omega))

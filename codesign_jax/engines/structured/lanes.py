@@ -1,14 +1,44 @@
 """Small linear algebra on lanes: the batch is the last axis, components are leading axes.
 
 A *lane* is an array of shape (finger, world) or one that broadcasts to it; a vector has its components in
-front, shape (3, ..., finger, world); a 6 x 6 matrix is a list of six rows of shape (6, finger, world).
-Sums over short axes are written out: XLA's reductions over them are far slower than additions on a CPU.
+front, shape (3, ..., finger, world), a matrix two such axes.  Sums over short axes are written out: XLA's
+reductions over them are many times slower than additions on a CPU.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+
+class Stages:
+    """Runs parts of a program so that XLA computes each result once.
+
+    XLA's fusion recomputes an intermediate in every kernel that uses it; in a chain of small matrix products
+    that multiplies the work by ten and the compile time by a hundred.  On a CPU the optimization barrier is
+    gone before fusion, but a conditional is not: with a predicate that is true at run time its branch is
+    compiled by itself.  On a GPU, where a predicate costs a round trip, the barrier works.
+    """
+
+    def __init__(self, predicate: jax.Array | None):
+        """Takes a scalar that is true at run time and unknown to the compiler, or None for barriers."""
+        self._predicate = predicate
+
+    def __call__(self, function: Callable, *args: Any) -> Any:
+        """Returns function(*args), computed once; both are pytrees of arrays."""
+        if self._predicate is None:
+            return jax.lax.optimization_barrier(function(*args))
+        shapes = jax.eval_shape(function, *args)
+
+        def never(*_: Any) -> Any:
+            return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+
+        return jax.lax.cond(self._predicate, function, never, *args)
+
+    def only_if(self, condition: jax.Array) -> "Stages":
+        """Stages that return zeros when a scalar is false; where barriers are used, they always run."""
+        return Stages(None if self._predicate is None else condition)
 
 
 def total(terms: Sequence[jax.Array]) -> jax.Array:
@@ -19,13 +49,22 @@ def total(terms: Sequence[jax.Array]) -> jax.Array:
     return result
 
 
+def contract(a: jax.Array, b: jax.Array, axis: int) -> jax.Array:
+    """Sum over one axis of the broadcast product, written out."""
+
+    def take(x: jax.Array, i: int) -> jax.Array:
+        return jax.lax.index_in_dim(x, i if x.shape[axis] > 1 else 0, axis, keepdims=False)
+
+    return total([take(a, i) * take(b, i) for i in range(max(a.shape[axis], b.shape[axis]))])
+
+
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Sum over the leading axis of a * b."""
+    """Sum over the leading axis of a * b; trailing axes broadcast."""
     return total([a[i] * b[i] for i in range(a.shape[0])])
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Cross product of vectors with the components in front."""
+    """Cross product of vectors with the components in front; trailing axes broadcast."""
     return jnp.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
@@ -50,26 +89,39 @@ def rotate(columns: list[jax.Array], axis: int, angle_cos: jax.Array, angle_sin:
     return turned
 
 
+def sum_axis(x: jax.Array, axis: int) -> jax.Array:
+    """Sum over a short axis, written out."""
+    return total([jax.lax.index_in_dim(x, i, axis, keepdims=False) for i in range(x.shape[axis])])
+
+
 def sum_fingers(x: jax.Array) -> jax.Array:
     """Sum over the finger axis, kept with length one."""
-    return total([x[..., f : f + 1, :] for f in range(x.shape[-2])])
+    return sum_axis(x, x.ndim - 2)[..., None, :]
 
 
-def inverse_spd(m: list[list[jax.Array]]) -> list[list[jax.Array]]:
-    """Inverse of a symmetric positive definite matrix of order 1 to 3, by cofactors."""
-    n = len(m)
+def sum_items(x: jax.Array) -> jax.Array:
+    """Sum over all axes but the world's, shape (1, world)."""
+    while x.ndim > 2:
+        x = sum_axis(x, 0)
+    return sum_fingers(x)
+
+
+def inverse_spd(m: jax.Array) -> jax.Array:
+    """Inverse of symmetric positive definite matrices of order 1 to 3, (n, n, ...), by cofactors."""
+    n = m.shape[0]
     if n == 1:
-        return [[1.0 / m[0][0]]]
+        return 1.0 / m
     if n == 2:
-        scale = 1.0 / (m[0][0] * m[1][1] - m[0][1] * m[0][1])
-        off = -m[0][1] * scale
-        return [[m[1][1] * scale, off], [off, m[0][0] * scale]]
-    (a, b, c), (_, d, e), (_, _, f) = m
+        scale = 1.0 / (m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1])
+        off = -m[0, 1] * scale
+        return jnp.stack([jnp.stack([m[1, 1] * scale, off]), jnp.stack([off, m[0, 0] * scale])])
+    a, b, c, d, e, f = m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     scale = 1.0 / (a * aa + b * bb + c * cc)
     ab, ac, bc = bb * scale, cc * scale, (b * c - a * e) * scale
-    return [
+    rows = [
         [aa * scale, ab, ac],
         [ab, (a * f - c * c) * scale, bc],
         [ac, bc, (a * d - b * b) * scale],
     ]
+    return jnp.stack([jnp.stack(row) for row in rows])

@@ -13,18 +13,25 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured import elimination as el
 from codesign_jax.engines.structured.contact import (
     Contacts,
-    Line,
     contact_inertia,
     contact_wrench,
     line,
     respond,
     slopes,
-    sum_items,
 )
 from codesign_jax.engines.structured.hand import HandLanes
 from codesign_jax.engines.structured.inertia import Bodies, Smooth
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics
-from codesign_jax.engines.structured.lanes import cross, dot, spatial, sum_fingers, total
+from codesign_jax.engines.structured.lanes import (
+    Stages,
+    cross,
+    dot,
+    spatial,
+    sum_axis,
+    sum_fingers,
+    sum_items,
+    total,
+)
 
 
 class Spatial(NamedTuple):
@@ -35,22 +42,12 @@ class Spatial(NamedTuple):
     object: jax.Array
 
 
-class ContactSet(NamedTuple):
-    """Contacts by the pair of bodies that they join; None where the scene has none.
+class Matrices(NamedTuple):
+    """Spatial inertia matrices: palm (6, 6, 1, world), links (6, 6, link, finger, world), object."""
 
-    Attributes:
-      finger_object: Items (link, k, finger).
-      finger_table: Items (link, k, finger).
-      palm_object: Items (sphere,).
-      palm_table: Items (sphere,).
-      object_table: Items (slot,).
-    """
-
-    finger_object: Contacts | None
-    finger_table: Contacts | None
-    palm_object: Contacts | None
-    palm_table: Contacts | None
-    object_table: Contacts
+    palm: jax.Array
+    link: jax.Array
+    object: jax.Array
 
 
 class Problem(NamedTuple):
@@ -59,8 +56,9 @@ class Problem(NamedTuple):
     hand: HandLanes
     kin: Kinematics
     body: Bodies
+    matrix: Matrices
     smooth: Smooth
-    contacts: ContactSet
+    contacts: dict[str, Contacts]
 
 
 class Solution(NamedTuple):
@@ -77,24 +75,28 @@ class Solution(NamedTuple):
     iterations: jax.Array
 
 
-def propagate(kin: Kinematics, acc: Acc) -> Spatial:
+def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
     """Spatial accelerations J a of all bodies, without velocity terms."""
-    palm = spatial(jnp.zeros_like(acc.wrist[:3]), acc.wrist[:3])
-    palm = palm + total([kin.wrist_axes[k] * acc.wrist[3 + k] for k in range(3)])
+
+    def palm_motion(wrist: jax.Array, axes: jax.Array):
+        moving = spatial(jnp.zeros_like(wrist[:3]), wrist[:3])
+        return moving + total([axes[k] * wrist[3 + k] for k in range(3)])
+
+    def next_link(parent: jax.Array, axes: jax.Array, a: jax.Array):
+        return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
+
+    palm = run(palm_motion, acc.wrist, kin.wrist_axes)
     link, links = palm, []
     for i, axes in enumerate(kin.axes):
-        link = link + total([axes[a] * acc.finger[i, a] for a in range(axes.shape[0])])
+        link = run(next_link, link, axes, acc.finger[i])
         links.append(link)
-    return Spatial(palm, jnp.stack(links, 1), _object_motion(kin, acc.object))
-
-
-def _object_motion(kin: Kinematics, acc: jax.Array) -> jax.Array:
-    """Spatial motion at the origin from (angular, linear at the object's centre)."""
-    return spatial(acc[:3], acc[3:] + cross(kin.object_pos, acc[:3]))
+    angular = acc.object[:3]
+    obj = spatial(angular, acc.object[3:] + cross(kin.object_pos, angular))
+    return Spatial(palm, jnp.stack(links, 1), obj)
 
 
 def relative(name: str, motion: Spatial) -> jax.Array:
-    """Relative spatial motion of a pair of bodies, with the items' axes."""
+    """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
     obj = motion.object
     if name == "finger_object":
         return jnp.stack([motion.link[i] - obj[i] for i in range(6)])[:, :, None]
@@ -106,27 +108,8 @@ def relative(name: str, motion: Spatial) -> jax.Array:
     }[name]
 
 
-def _present(contacts: ContactSet) -> list[tuple[str, Contacts]]:
-    return [(n, c) for n, c in zip(contacts._fields, contacts, strict=True) if c is not None]
-
-
-def residual_jar(problem: Problem, motion: Spatial, velocity: Spatial) -> dict[str, jax.Array]:
-    """jar = J a - aref of every contact."""
-    return {
-        name: c.relative(relative(name, motion)) - c.reference(c.relative(relative(name, velocity)))
-        for name, c in _present(problem.contacts)
-    }
-
-
-def _item_sum(values: jax.Array) -> jax.Array:
-    """Sum over all item axes, shape (1, world)."""
-    while values.ndim > 2:
-        values = sum_items(values, 0)
-    return sum_fingers(values)
-
-
-class _Gradient(NamedTuple):
-    """Negative gradient: spatial forces on the bodies and joint forces, and the inertial pieces."""
+class Forces(NamedTuple):
+    """Forces on the bodies, (6, ...), and on the joints, shaped as `Smooth`."""
 
     palm: jax.Array
     link: jax.Array
@@ -135,113 +118,114 @@ class _Gradient(NamedTuple):
     finger: jax.Array
 
 
-def _smooth_residual(problem: Problem, acc: Acc, motion: Spatial) -> _Gradient:
-    """Smooth forces minus inertia times acceleration."""
-    hand, body, smooth = problem.hand, problem.body, problem.smooth
-    return _Gradient(
-        smooth.palm - body.palm.times(motion.palm),
-        smooth.link - body.link.times(motion.link),
-        smooth.object - body.object.times(motion.object),
-        smooth.wrist - hand.wrist_armature * acc.wrist,
-        smooth.finger - hand.armature * acc.finger,
+def inertial_forces(run: Stages, problem: Problem, acc: Acc, motion: Spatial) -> Forces:
+    """M a in factored form: spatial forces of the bodies and armature forces of the joints."""
+    body, hand = problem.body, problem.hand
+    return Forces(
+        body.palm.times(motion.palm),
+        run(lambda b, m: b.times(m), body.link, motion.link),
+        body.object.times(motion.object),
+        hand.wrist_armature * acc.wrist,
+        hand.armature * acc.finger,
     )
 
 
-def _work(force: _Gradient, acc: Acc, motion: Spatial) -> jax.Array:
-    """Power-like product of forces and accelerations, shape (1, world)."""
-    links = dot(force.link, motion.link)
-    joints = _item_sum(force.finger * acc.finger) + dot(force.wrist, acc.wrist)
-    return (
-        _item_sum(links) + dot(force.palm, motion.palm) + dot(force.object, motion.object) + joints
-    )
+def work(run: Stages, force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
+    """Product of forces and accelerations over all bodies and joints, shape (1, world)."""
+
+    def product(force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
+        links = sum_axis(dot(force.link, motion.link), 0)
+        joints = sum_axis(sum_axis(force.finger * acc.finger, 0), 0)
+        rest = dot(force.palm, motion.palm) + dot(force.object, motion.object)
+        return sum_fingers(links + joints) + rest + dot(force.wrist, acc.wrist)
+
+    return run(product, force, acc, motion)
 
 
 def newton_step(
-    problem: Problem, force: _Gradient, jar: dict[str, jax.Array]
-) -> tuple[Acc, Spatial, jax.Array]:
+    run: Stages, problem: Problem, force: Forces, pushes: dict[str, tuple[jax.Array, jax.Array]]
+) -> tuple[Acc, Spatial]:
     """Solves (M + J'WJ) p = -gradient by elimination from the tips to the object.
 
+    Args:
+      run: Runs the stages.
+      problem: The problem.
+      force: Smooth forces minus inertial forces.
+      pushes: Contact inertia (6, 6, ...) and wrench (6, ...) by pair of bodies, summed over a body's
+        contacts.
+
     Returns:
-      The step in the joints, its spatial motion, and its product with the contact forces, (1, world).
+      The step in the joints and its spatial motion.
     """
-    kin, contacts = problem.kin, problem.contacts
-    inertia, wrench = {}, {}
-    for name, c in _present(contacts):
-        response = respond(c, jar[name])
-        matrix, push = contact_inertia(c, response.hessian), contact_wrench(c, response.force)
-        if name.startswith("finger"):
-            matrix, push = sum_items(matrix, 3), sum_items(push, 2)
-        else:
-            matrix, push = sum_fingers(matrix), sum_fingers(push)
-        inertia[name], wrench[name] = matrix, push
-    link_p, link_r = problem.body.link.matrix(), force.link
-    palm_p, palm_r = problem.body.palm.matrix(), force.palm
-    object_q = problem.body.object.matrix() + inertia["object_table"]
-    object_r = force.object + wrench["object_table"]
-    for name in ("finger_object", "finger_table"):
-        if name in inertia:
-            link_p, link_r = link_p + inertia[name], link_r + wrench[name]
-    for name in ("palm_object", "palm_table"):
-        if name in inertia:
-            palm_p, palm_r = palm_p + inertia[name], palm_r + wrench[name]
-    coupling, push = inertia.get("finger_object"), wrench.get("finger_object")
-    factors = []
+    kin, hand = problem.kin, problem.hand
+    factors: list[el.Factors] = []
     node = None
     for i in reversed(range(len(kin.axes))):
-        p, r = link_p[:, :, i], link_r[:, i]
-        zero = jnp.zeros_like(p)
-        c = zero if coupling is None else coupling[:, :, i]
-        ro = jnp.zeros_like(r) if push is None else -push[:, i]
-        if node is None:
-            node = el.Quadratic(p, c, c, r, ro)
-        else:
-            node = el.Quadratic(
-                node.p + p, node.c + c, node.q + c, node.r + r, node.r_object + ro
-            )
-        node, f = el.eliminate(node, kin.axes[i], problem.hand.armature[i], force.finger[i])
+        node = run(
+            lambda *a: _add_link(*a),
+            node,
+            problem.matrix.link[:, :, i],
+            force.link[:, i],
+            *_of_link(pushes, i),
+        )
+        node, f = el.eliminate(run, node, kin.axes[i], hand.armature[i], force.finger[i])
         factors.append(f)
     assert node is not None
-    node = el.Quadratic(*(sum_fingers(v) for v in node))
-    palm_c, palm_w = inertia.get("palm_object"), wrench.get("palm_object")
-    node = el.Quadratic(
-        node.p + palm_p,
-        node.c if palm_c is None else node.c + palm_c,
-        node.q + object_q + (0.0 if palm_c is None else palm_c),
-        node.r + palm_r,
-        node.r_object + object_r - (0.0 if palm_w is None else palm_w),
-    )
-    arm = problem.hand.wrist_armature
-    node, hinges = el.eliminate(node, kin.wrist_axes, arm[3:], force.wrist[3:])
+    node = run(_add_palm, node, problem.matrix, force, pushes)
+    arm = hand.wrist_armature
+    node, hinges = el.eliminate(run, node, kin.wrist_axes, arm[3:], force.wrist[3:])
     slide_axes = _slides(arm)
-    node, slides = el.eliminate(node, slide_axes, arm[:3], force.wrist[:3])
-    obj = el.solve_object(node.q, node.r_object)
-    base = jnp.zeros_like(obj)
-    first = el.substitute(slides, base, obj)
-    palm = total([slide_axes[k] * first[k] for k in range(3)])
-    second = el.substitute(hinges, palm, obj)
-    palm = palm + total([kin.wrist_axes[k] * second[k] for k in range(3)])
+    node, slides = el.eliminate(run, node, slide_axes, arm[:3], force.wrist[:3])
+    obj = el.solve_object(run, node.q, node.r_object)
+    first, palm = run(el.substitute, slide_axes, slides, jnp.zeros_like(obj), obj)
+    second, palm = run(el.substitute, kin.wrist_axes, hinges, palm, obj)
     link, links, fingers = palm, [], []
     for axes, f in zip(kin.axes, reversed(factors), strict=True):
-        a = el.substitute(f, link, obj)
-        link = link + total([axes[k] * a[k] for k in range(axes.shape[0])])
-        link = jnp.stack([link[k] for k in range(6)])
+        a, link = run(el.substitute, axes, f, link, obj)
         fingers.append(a)
         links.append(link)
-    angular = obj[:3]
-    acc = Acc(
-        jnp.concatenate([first, second]),
-        jnp.stack(fingers),
-        spatial(angular, obj[3:] - cross(kin.object_pos, angular)),
-    )
-    motion = Spatial(palm, jnp.stack(links, 1), obj)
-    pushed = dot(motion.object, wrench["object_table"])
-    for name in ("palm_object", "palm_table"):
-        if name in wrench:
-            pushed = pushed + dot(relative(name, motion), wrench[name])
+    at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
+    acc = Acc(jnp.concatenate([first, second]), jnp.stack(fingers), at_centre)
+    return acc, Spatial(palm, jnp.stack(links, 1), obj)
+
+
+def _of_link(pushes: dict, i: int) -> tuple:
+    """A link's contact terms: (object inertia, wrench, table inertia, wrench), None where absent."""
+    terms = []
     for name in ("finger_object", "finger_table"):
-        if name in wrench:
-            pushed = pushed + _item_sum(dot(relative(name, motion)[:, :, 0], wrench[name]))
-    return acc, motion, pushed
+        if name in pushes:
+            terms += [pushes[name][0][:, :, i], pushes[name][1][:, i]]
+        else:
+            terms += [None, None]
+    return tuple(terms)
+
+
+def _add_link(node, p, r, object_p, object_r, table_p, table_r) -> el.Quadratic:
+    """Adds a link's own inertia, forces and contacts to what its children left."""
+    if table_p is not None:
+        p, r = p + table_p, r + table_r
+    if object_p is not None:
+        p, r = p + object_p, r + object_r
+    c = jnp.zeros_like(p) if object_p is None else object_p
+    own = el.Quadratic(p, c, c, r, jnp.zeros_like(r) if object_r is None else -object_r)
+    return own if node is None else el.Quadratic(*(a + b for a, b in zip(node, own, strict=True)))
+
+
+def _add_palm(node: el.Quadratic, matrix: Matrices, force: Forces, pushes: dict) -> el.Quadratic:
+    """Sums the fingers and adds the palm, the object and their contacts."""
+    p, c, q, r, ro = (sum_fingers(v) for v in node)
+    p, r = p + matrix.palm, r + force.palm
+    q, ro = q + matrix.object, ro + force.object
+    inertia, wrench = pushes["object_table"]
+    q, ro = q + inertia, ro + wrench
+    if "palm_table" in pushes:
+        inertia, wrench = pushes["palm_table"]
+        p, r = p + inertia, r + wrench
+    if "palm_object" in pushes:
+        inertia, wrench = pushes["palm_object"]
+        p, c, q = p + inertia, c + inertia, q + inertia
+        r, ro = r + wrench, ro - wrench
+    return el.Quadratic(p, c, q, r, ro)
 
 
 def _slides(like: jax.Array) -> jax.Array:
@@ -250,8 +234,22 @@ def _slides(like: jax.Array) -> jax.Array:
     return jnp.broadcast_to(eye, (3, 6, *like.shape[1:]))
 
 
+def _push(stages: Stages, name: str, c: Contacts, jar: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Contact inertia and wrench of a pair of bodies, summed over the contacts of each body."""
+
+    def summed(c: Contacts, hessian: jax.Array, force: jax.Array):
+        matrix, wrench = contact_inertia(c, hessian), contact_wrench(c, force)
+        if name.startswith("finger"):
+            return sum_axis(matrix, 3), sum_axis(wrench, 2)
+        return sum_fingers(matrix), sum_fingers(wrench)
+
+    response = stages(respond, c, jar)
+    return stages(summed, c, response.hessian, response.force)
+
+
 def line_search(
-    problem: Problem,
+    run: dict[str, Stages],
+    contacts: dict[str, Contacts],
     jar: dict[str, jax.Array],
     step: dict[str, jax.Array],
     slope: jax.Array,
@@ -261,7 +259,8 @@ def line_search(
     """Minimises along the step by safeguarded Newton on the convex objective's derivative.
 
     Args:
-      problem: The problem.
+      run: Runs the stages of each set of contacts.
+      contacts: The contacts.
       jar: J a - aref of every contact.
       step: J p of every contact.
       slope: Derivative of the smooth part at 0, shape (1, world).
@@ -271,21 +270,18 @@ def line_search(
     Returns:
       Step length, shape (1, world).
     """
-    rays: dict[str, tuple[Contacts, Line]] = {
-        n: (c, line(c, jar[n], step[n])) for n, c in _present(problem.contacts)
-    }
+    rays = {n: run[n](line, c, jar[n], step[n]) for n, c in contacts.items()}
 
-    def evaluate(alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
-        first, second = slope + alpha * curvature, curvature
-        for c, ray in rays.values():
-            f, s = slopes(c, ray, alpha)
-            first, second = first + _item_sum(f), second + _item_sum(s)
-        return first, second
+    def summed(c: Contacts, ray, alpha: jax.Array):
+        return tuple(sum_items(v) for v in slopes(c, ray, alpha))
 
     low, high = jnp.zeros_like(slope), jnp.full_like(slope, jnp.inf)
     alpha = jnp.ones_like(slope)
     for _ in range(evaluations):
-        first, second = evaluate(alpha)
+        first, second = slope + alpha * curvature, curvature
+        for n, c in contacts.items():
+            f, s = run[n](summed, c, rays[n], alpha)
+            first, second = first + f, second + s
         low, high = jnp.where(first <= 0, alpha, low), jnp.where(first > 0, alpha, high)
         guess = alpha - first / jnp.maximum(second, 1e-30)
         inside = (guess >= low) & (guess <= high)
@@ -295,11 +291,19 @@ def line_search(
 
 
 def solve(
-    problem: Problem, velocity: Spatial, start: Acc, *, iterations: int, evaluations: int, tolerance: float
+    run: Stages,
+    problem: Problem,
+    velocity: Spatial,
+    start: Acc,
+    *,
+    iterations: int,
+    evaluations: int,
+    tolerance: float,
 ) -> Solution:
     """Solves one step's contact problem.
 
     Args:
+      run: Runs the stages.
       problem: The problem.
       velocity: Spatial velocities of the bodies.
       start: Warm start.
@@ -307,32 +311,42 @@ def solve(
       evaluations: Line-search evaluations per iteration.
       tolerance: Newton decrement, relative to the objective's scale, below which a world is done.
     """
-    motion = propagate(problem.kin, start)
-    jar = residual_jar(problem, motion, velocity)
+    contacts = problem.contacts
+    # A set without a contact in any world of the batch costs nothing: its stages return zeros.
+    runs = {n: run.only_if(c.active.any()) for n, c in contacts.items()}
+
+    def initial(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Array:
+        return c.relative(relative(name, motion)) - c.reference(
+            c.relative(relative(name, velocity))
+        )
+
+    motion = propagate(run, problem.kin, start)
+    jar = {
+        n: runs[n](lambda c, m, v, n=n: initial(n, c, m, v), c, motion, velocity)
+        for n, c in contacts.items()
+    }
 
     def body(carry):
         acc, motion, jar, _, count = carry
-        force = _smooth_residual(problem, acc, motion)
-        step, step_motion, pushed = newton_step(problem, force, jar)
-        slope = -_work(force, step, step_motion)
-        inertial = _Gradient(
-            problem.body.palm.times(step_motion.palm),
-            problem.body.link.times(step_motion.link),
-            problem.body.object.times(step_motion.object),
-            problem.hand.wrist_armature * step.wrist,
-            problem.hand.armature * step.finger,
-        )
-        curvature = _work(inertial, step, step_motion)
-        decrement = jnp.maximum(pushed - slope, 0.0)
+        inertial = inertial_forces(run, problem, acc, motion)
+        force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))
+        pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items()}
+        step, step_motion = newton_step(run, problem, force, pushes)
+        slope = -work(run, force, step, step_motion)
+        curvature = work(run, inertial_forces(run, problem, step, step_motion), step, step_motion)
         jar_step = {
-            n: c.relative(relative(n, step_motion)) for n, c in _present(problem.contacts)
+            n: runs[n](lambda c, m, n=n: c.relative(relative(n, m)), c, step_motion)
+            for n, c in contacts.items()
         }
-        alpha = line_search(problem, jar, jar_step, slope, curvature, evaluations)
-        # Below rounding the slope has no sign: a full Newton step is then the better one.
-        acc = jax.tree.map(lambda a, p: a + alpha * p, acc, step)
-        motion = jax.tree.map(lambda a, p: a + alpha * p, motion, step_motion)
-        jar = jax.tree.map(lambda a, p: a + alpha * p, jar, jar_step)
-        return acc, motion, jar, decrement / _scale(problem, motion), count + 1
+        alpha = line_search(runs, contacts, jar, jar_step, slope, curvature, evaluations)
+        decrement = _decrement(slope, pushes, step_motion)
+
+        def advance(old, new):
+            return jax.tree.map(lambda a, p: a + alpha * p, old, new)
+
+        scale = _scale(problem, motion)
+        acc, motion, jar = advance((acc, motion, jar), (step, step_motion, jar_step))
+        return acc, motion, jar, decrement / scale, count + 1
 
     def going(carry):
         return (carry[4] < iterations) & jnp.any(carry[3] > tolerance)
@@ -344,8 +358,19 @@ def solve(
     return Solution(acc, residual, count)
 
 
+def _decrement(slope: jax.Array, pushes: dict, step: Spatial) -> jax.Array:
+    """Newton decrement -p'gradient, shape (1, world): twice the decrease that the step predicts."""
+    pushed = -slope
+    for name, (_, wrench) in pushes.items():
+        product = dot(
+            relative(name, step)[:, :, 0] if name.startswith("finger") else relative(name, step),
+            wrench,
+        )
+        pushed = pushed + sum_items(product)
+    return jnp.maximum(pushed, 0.0)
+
+
 def _scale(problem: Problem, motion: Spatial) -> jax.Array:
-    """Typical size of the objective: palm and object under gravity, plus their present motion."""
+    """Typical size of the objective: object and palm at g, plus the object's present motion."""
     mass, palm = problem.hand.object_mass, problem.hand.palm_mass
-    weight = 100.0 * (mass + palm)
-    return weight + mass * dot(motion.object[3:], motion.object[3:])
+    return 100.0 * (mass + palm) + mass * dot(motion.object[3:], motion.object[3:])

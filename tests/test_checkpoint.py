@@ -1,0 +1,161 @@
+"""Checkpoints: what is saved comes back bit for bit, and damage never passes for data."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from codesign_jax.checkpoint import Checkpoints, digest
+
+PACKAGE = Path(__file__).parent.parent / "codesign_jax"
+
+
+def arrays(step):
+    """Arrays of the kinds that a run saves, different at every step."""
+    rng = np.random.default_rng(step)
+    return {
+        "state": {
+            "particles": rng.random((10, 2)).astype(np.float32),
+            "key": rng.integers(0, 2**32, 2, np.uint32),
+            "episode": np.array(step, np.int32),
+        },
+        "history": {"cost": rng.random((8, 10, 6)).astype(np.float32), "flag": np.ones(3, bool)},
+    }
+
+
+def equal(a, b):
+    """Whether nested arrays agree in names, types, shapes and bytes."""
+    return digest(a) == digest(b)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with steps 1 to 4, of which the last three are kept."""
+    with Checkpoints(tmp_path / "checkpoints", keep=3) as store:
+        for step in range(1, 5):
+            store.save(step, arrays(step))
+    return tmp_path / "checkpoints"
+
+
+def restore(folder):
+    with Checkpoints(folder) as store:
+        return store.restore()
+
+
+def test_round_trip_is_bitwise(folder):
+    found = restore(folder)
+    assert found.step == 4 and found.damaged == ()
+    assert equal(found.arrays, arrays(4))
+    assert found.arrays["state"]["particles"].dtype == np.float32
+    assert found.arrays["state"]["episode"].shape == ()
+
+
+def test_only_the_newest_steps_stay(folder):
+    assert sorted(p.name for p in folder.glob("*.sha256")) == ["2.sha256", "3.sha256", "4.sha256"]
+    assert sorted(p.name for p in folder.iterdir() if p.is_dir()) == ["2", "3", "4"]
+
+
+def test_empty_folder_has_no_step(tmp_path):
+    found = restore(tmp_path / "none")
+    assert found.step is None and found.arrays == {}
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate", "remove"])
+def test_damage_of_any_file_falls_back_to_the_step_before(folder, damage):
+    for path in [p for p in sorted((folder / "4").rglob("*")) if p.is_file()]:
+        content = path.read_bytes()
+        if damage == "remove":
+            path.unlink()
+        elif damage == "truncate":
+            path.write_bytes(content[: len(content) // 2] if content else b"x")
+        else:
+            middle = len(content) // 2
+            path.write_bytes(
+                content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+            )
+        found = restore(folder)
+        assert found.step == 3, path
+        assert equal(found.arrays, arrays(3))
+        [(step, reason)] = found.damaged
+        assert step == 4 and path.name in reason
+        path.write_bytes(content)
+    assert restore(folder).step == 4, "putting the bytes back heals it"
+
+
+def test_arrays_that_differ_from_what_was_saved_are_refused(folder):
+    # As if orbax had cast or misread: the files are intact, the arrays are not those saved.
+    digests = folder / "4.sha256"
+    text = digests.read_text()
+    digests.write_text(re.sub(r"# arrays \w+", f"# arrays {digest(arrays(9))}", text))
+    found = restore(folder)
+    assert found.step == 3 and found.damaged == ((4, "its arrays' digest differs"),)
+
+
+def test_step_cut_short_before_its_digest_is_refused(folder):
+    (folder / "4.sha256").unlink()
+    found = restore(folder)
+    assert found.step == 3 and found.damaged == ((4, "4.sha256 is missing"),)
+
+
+def test_restore_changes_nothing(folder):
+    (folder / "4.sha256").unlink()
+    before = sorted(folder.rglob("*"))
+    restore(folder)
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_nothing_good_left(folder):
+    for path in folder.glob("*.sha256"):
+        path.write_text("")
+    found = restore(folder)
+    assert found.step is None and [step for step, _ in found.damaged] == [4, 3, 2]
+
+
+def test_discarded_step_can_be_saved_again(folder):
+    (folder / "4" / "_CHECKPOINT_METADATA").unlink()
+    with Checkpoints(folder) as store:
+        found = store.restore()
+        store.discard([step for step, _ in found.damaged])
+        store.save(4, arrays(44))
+        found = store.restore()
+    assert found.step == 4 and equal(found.arrays, arrays(44))
+
+
+def test_saving_an_old_step_is_an_error(folder):
+    with Checkpoints(folder) as store, pytest.raises(OSError, match="newer"):
+        store.save(2, arrays(2))
+
+
+def test_full_disk_is_said_and_older_steps_stay(folder):
+    # A limit on the size of files stands in for a full disk: both fail the write.
+    program = f"""
+import resource, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+import numpy as np
+from codesign_jax.checkpoint import Checkpoints
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+with Checkpoints(Path({str(folder)!r})) as store:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
+    try:
+        store.save(5, {{"big": np.random.default_rng(0).random(100_000)}})
+    except OSError as error:
+        print("refused:", error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "refused: checkpoint 5 could not be written" in done.stdout, done.stderr
+    found = restore(folder)
+    assert found.step == 4 and equal(found.arrays, arrays(4))
+
+
+def test_only_one_module_imports_orbax():
+    users = [p.name for p in PACKAGE.rglob("*.py") if re.search(r"\borbax\.", p.read_text())]
+    assert users == ["checkpoint.py"]
+
+
+def test_nothing_uses_pickle():
+    pattern = re.compile(r"import (c?pickle|dill|joblib|shelve)|allow_pickle=True")
+    assert [p.name for p in PACKAGE.rglob("*.py") if pattern.search(p.read_text())] == []

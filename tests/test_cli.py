@@ -1,0 +1,356 @@
+"""The command line: errors create nothing, runs resume bit for bit, whatever ended them."""
+
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from toy import TINY
+
+from codesign_jax import cli, runs
+from codesign_jax.checkpoint import Checkpoints, digest
+from codesign_jax.runs.record import to_arrays
+
+EPISODES = 40
+RUN = [
+    *("optimize", "--scene", str(TINY), "--seed", "3"),
+    *("--particles", "4", "--trials", "2", "--episodes", str(EPISODES), "--test-trials", "4"),
+]
+RESULTS = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path, monkeypatch):
+    """An empty working directory, and a compilation cache that is not the user's."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "work"
+
+
+def command(*arguments):
+    """Exit status of the command."""
+    try:
+        return cli.main([str(a) for a in arguments])
+    except SystemExit as stop:  # how the parser refuses
+        return stop.code
+
+
+def launch(*arguments):
+    """Starts the command in a process of its own."""
+    program = [sys.executable, "-m", "codesign_jax.cli", *map(str, arguments)]
+    return subprocess.Popen(
+        program, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=os.getcwd()
+    )
+
+
+def wait_for(path, text, process):
+    """Waits until a file holds a text; fails if the process ends before."""
+    while not (path.exists() and text in path.read_text()):
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.02)
+
+
+def snapshot(folder):
+    """Names and bytes of all files in a folder, but the lock's owner and times of day."""
+    return {
+        p.relative_to(folder): p.read_bytes()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file() and p.name != ".lock"
+    }
+
+
+def stored(folder):
+    """Digest of the newest checkpoint: every array, bit for bit."""
+    record = runs.load_record(folder)
+    assert record is not None
+    return digest(to_arrays(record))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run that nothing interrupted; copy it to change it."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    assert command(*RUN, "--out", folder) == 0
+    return folder
+
+
+def assert_same_run(folder, finished):
+    assert stored(folder) == stored(finished)
+    for name in RESULTS:
+        assert (folder / name).read_bytes() == (finished / name).read_bytes(), name
+
+
+def test_help_imports_nothing_heavy():
+    program = """
+import sys
+from codesign_jax import cli
+for arguments in (["--help"], ["optimize", "--help"], ["evaluate", "--help"]):
+    try:
+        cli.main(arguments)
+    except SystemExit as stop:
+        assert stop.code == 0
+heavy = {"jax", "numpy", "mujoco", "orbax", "matplotlib"} & set(sys.modules)
+assert not heavy, heavy
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_run_folder_is_complete(finished):
+    names = {p.name for p in finished.iterdir()}
+    assert names >= {*RESULTS, "scene.toml", "hand.toml", "objects.toml", "provenance.json"}
+    assert names >= {"checkpoints", "events.log", "figures"}
+    assert not list(finished.rglob("*.tmp"))
+    provenance = json.loads((finished / "provenance.json").read_text())
+    assert provenance["settings"]["seed"] == 3
+    assert set(provenance["environment"]["versions"]) >= {"jax", "mujoco", "codesign-jax"}
+    assert len((finished / "episodes.csv").read_text().splitlines()) == EPISODES + 1
+
+
+def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    assert command(*RUN, "--out", folder) == 0
+    assert f"all {EPISODES} episodes are done" in capsys.readouterr().out
+    assert_same_run(folder, finished)
+
+
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [
+        (signal.SIGKILL, -signal.SIGKILL),
+        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+    ],
+)
+def test_interrupted_run_resumes_bit_for_bit(number, status, finished, tmp_path, capsys):
+    folder = tmp_path / "run"
+    process = launch(*RUN, "--out", folder)
+    wait_for(folder / "events.log", "episode  7/", process)
+    process.send_signal(number)
+    output, _ = process.communicate()
+    assert process.returncode == status, output
+    done = runs.load_record(folder)
+    assert done is not None and 7 <= done.done < EPISODES, "it was to stop on the way"
+    assert command(*RUN, "--out", folder) == 0
+    assert f"resuming episode {done.done + 1}/{EPISODES}" in capsys.readouterr().out
+    assert_same_run(folder, finished)
+
+
+@pytest.mark.slow
+def test_run_killed_again_and_again_resumes_bit_for_bit(finished, tmp_path):
+    folder, kills = tmp_path / "run", 0
+    while True:
+        process = launch(*RUN, "--out", folder)
+        before = len(list((folder / "checkpoints").glob("*.sha256"))) if folder.exists() else 0
+        try:
+            # Any moment of start, compile, seed, episode or save, a little later each time.
+            process.wait(timeout=2.0 + 0.37 * kills)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            kills += 1
+        process.communicate()
+        if process.returncode == 0:
+            break
+        assert process.returncode == -signal.SIGKILL, before
+    assert kills > 5
+    assert_same_run(folder, finished)
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate"])
+def test_damaged_checkpoint_is_said_and_the_older_one_used(damage, finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    newest = EPISODES + 1  # the final test
+    largest = max(
+        (folder / "checkpoints" / str(newest)).rglob("d/*"), key=lambda p: p.stat().st_size
+    )
+    content = bytearray(largest.read_bytes())
+    content[len(content) // 2] ^= 1
+    largest.write_bytes(content if damage == "flip" else content[: len(content) // 2])
+    assert command(*RUN, "--out", folder) == 0
+    assert f"checkpoint {newest} is lost" in capsys.readouterr().out
+    assert f"checkpoint {newest} is lost" in (folder / "events.log").read_text()
+    assert_same_run(folder, finished)
+
+
+def test_losing_every_checkpoint_starts_anew(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    for path in (folder / "checkpoints").glob("*.sha256"):
+        path.unlink()
+    assert command(*RUN, "--out", folder) == 0
+    assert capsys.readouterr().out.count("is lost") == 3
+    assert_same_run(folder, finished)
+
+
+def test_resume_with_another_scene_is_refused_with_a_diff(finished, capsys):
+    before = snapshot(finished)
+    assert command(*RUN, "--out", finished, "--set", "gravity=9.7") == 2
+    error = capsys.readouterr().err
+    assert "-gravity = 9.81  # m/s^2" in error and "+gravity = 9.7  # m/s^2" in error
+    assert snapshot(finished) == before
+
+
+def test_resume_with_other_settings_is_refused(finished, capsys):
+    before = snapshot(finished)
+    assert command(*RUN, "--out", finished, "--particles", "5", "--schedule", "switch-2") == 2
+    error = capsys.readouterr().err
+    assert "particles: the run has 4, asked for is 5" in error
+    assert "schedule: the run has 'concurrent', asked for is 'switch-2'" in error
+    assert snapshot(finished) == before
+
+
+def test_other_versions_resume_and_say_so(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    path = folder / "provenance.json"
+    path.write_text(path.read_text().replace('"mujoco": "', '"mujoco": "0.'))
+    assert command(*RUN, "--out", folder) == 0
+    assert "not bitwise comparable" in capsys.readouterr().out
+
+
+def test_second_process_on_a_folder_is_refused(finished, capsys):
+    before = snapshot(finished)
+    with (finished / ".lock").open("r+") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert command(*RUN, "--out", finished) == 2
+    assert f"is in use by process {os.getpid()}" in capsys.readouterr().err
+    assert snapshot(finished) == before
+
+
+def test_folder_with_other_files_is_refused(workplace, capsys):
+    (workplace / "thesis.tex").write_text("years of work")
+    assert command(*RUN, "--out", workplace, "--fresh") == 2
+    assert "thesis.tex" in capsys.readouterr().err
+    assert [p.name for p in workplace.iterdir()] == ["thesis.tex"]
+
+
+def test_fresh_starts_anew(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    few = [*RUN, "--episodes", "2", "--test-trials", "0", "--out", folder]
+    assert command(*few) == 2, "other settings need --fresh"
+    assert command(*few, "--fresh") == 0
+    assert "episode 1/2" in capsys.readouterr().out
+    assert len((folder / "episodes.csv").read_text().splitlines()) == 3
+    assert not (folder / "tests.csv").exists()
+
+
+WRONG = {
+    "unknown hand": (["--hand", "pneuflex5"], ["did you mean 'pneuflex4'?"]),
+    "no hand file": (["--hand", "no.toml"], ["no file 'no.toml'"]),
+    "unknown scene": (["--scene", "papr"], ["did you mean 'paper'?"]),
+    "unknown preset": (["--preset", "3d"], ["preset '3d' unknown", "did you mean '2"]),
+    "unknown schedule": (["--schedule", "concurent"], ["did you mean 'concurrent'?"]),
+    "too many switches": (["--schedule", "switch-64"], ["--schedule", "65 episodes"]),
+    "unknown engine": (["--engine", "mujco"], ["--engine", "did you mean 'mujoco'?"]),
+    "out of range": (["--particles", "0"], ["--particles = 0 is outside [1, 32768]"]),
+    "wrong type of a flag": (["--particles", "ten"], ["ten"]),
+    "unknown flag": (["--particle", "10"], ["--particle"]),
+    "unknown key": (
+        ["--set", "discretization.timestp=0.01"],
+        ["discretization.timestp is not a known key", "did you mean 'timestep'?"],
+    ),
+    "unit slip": (
+        ["--set", "discretization.timestep=18"],
+        ["discretization.timestep = 18 is outside [1e-05, 0.05] s", "did you mean 0.018?"],
+    ),
+    "wrong type of a value": (
+        ["--set", "discretization.links=3.5", "gravity='low'"],
+        ["discretization.links = 3.5 must be of type int", "gravity = 'low' must be of type float"],
+    ),
+    "not a number": (["--set", "gravity=nan"], ["gravity = nan is outside [0, 100] m/s^2"]),
+    "no value": (["--set", "gravity"], ["--set 'gravity' must be KEY=VALUE"]),
+    "all at once": (
+        [
+            *("--hand", "pneuflex5", "--engine", "mujco", "--seed", "-1"),
+            *("--set", "gravity=1000", "cost.failur=worst"),
+        ],
+        ["pneuflex4", "mujoco", "--seed = -1", "gravity = 1000", "did you mean 'failure'?"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]], ids=["run", "dry"])
+def test_wrong_input_exits_2_and_creates_nothing(case, dry, workplace, capsys):
+    arguments, parts = WRONG[case]
+    assert command("optimize", *arguments, *dry) == 2
+    captured = capsys.readouterr()
+    for part in parts:
+        assert part in captured.err + captured.out
+    assert list(workplace.iterdir()) == []
+
+
+def test_wrong_hand_file_reports_every_problem(tmp_path, workplace, capsys):
+    text = (TINY.parent / "pinch.toml").read_text()
+    text = text.replace("width = 0.020", "width = 18").replace("density = 1070.0", "densty = 1070")
+    bad = tmp_path / "bad.toml"
+    bad.write_text(text.replace("azimuth = 180.0", 'azimuth = "back"'))
+    assert command("optimize", "--hand", bad) == 2
+    error = capsys.readouterr().err
+    assert "bad.toml.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018?" in error
+    assert "bad.toml.material.densty is not a known key; did you mean 'density'?" in error
+    assert "bad.toml.material.density is missing (unit kg/m^3)" in error
+    assert "bad.toml.finger[1].azimuth = 'back' must be of type float" in error
+    assert list(workplace.iterdir()) == []
+
+
+def test_dry_run_writes_nothing(workplace, capsys):
+    assert command(*RUN, "--out", "run", "--dry-run") == 0
+    output = capsys.readouterr().out
+    assert "timestep = 0.02  # s" in output and f"grasps: {EPISODES * 8 + 16}" in output
+    assert "grasps/s" in output and "MB" in output
+    assert list(workplace.iterdir()) == []
+
+
+def test_evaluate_prints_costs_of_each_object(capsys):
+    design = ["length=100", "arm_z=-20"]
+    assert command("evaluate", "--scene", TINY, "--design", *design, "--trials", "3") == 0
+    output = capsys.readouterr().out
+    assert "design: length=100 mm arm_z=-20 mm" in output
+    assert "sphere: mean cost" in output and "over 3 trials" in output and "success" in output
+
+
+def test_evaluate_takes_the_best_of_a_run(finished, capsys):
+    rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
+    best = min(rows, key=lambda row: float(row[1]))
+    assert command("evaluate", "--run", finished, "--trials", "2") == 0
+    assert f"length={float(best[-2]):.4g} mm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--design", "lenght=100"], "'lenght' is not a parameter; did you mean 'length'?"),
+        (["--design", "length=0.148"], "did you mean 148?"),
+        (["--design", "length=1480"], "length = 1480.0 is outside [10, 180] mm"),
+        (["--design", "length=long"], "length = 'long' must be a number in mm"),
+        (["--design", "length=nan"], "must be a number in mm"),
+        (["--design", "length"], "must be a number in mm"),
+        (["--trials", "0"], "--trials = 0 is outside"),
+        (["--engine", "c"], "--engine"),
+        (["--render", "grasp.mp4"], "must end in .gif"),
+        (["--run", "nowhere"], "nowhere is not a run folder"),
+        (["--run", "nowhere", "--design", "length=100"], "leave out the flags"),
+    ],
+)
+def test_evaluate_refuses_wrong_input(arguments, part, workplace, capsys):
+    assert command("evaluate", *arguments) == 2
+    assert part in capsys.readouterr().err
+    assert list(workplace.iterdir()) == []
+
+
+def test_bounds_themselves_are_designs(capsys):
+    space_low = ["length=10", "arm_z=-50"]
+    assert command("evaluate", "--scene", TINY, "--design", *space_low, "--trials", "1") == 0
+
+
+def test_checkpoints_are_written_every_episode(finished):
+    with Checkpoints(Path(finished) / "checkpoints") as store:
+        found = store.restore()
+    assert found.step == EPISODES + 1 and "test" in found.arrays
+    kept = sorted(int(p.stem) for p in (finished / "checkpoints").glob("*.sha256"))
+    assert kept == [EPISODES - 1, EPISODES, EPISODES + 1]

@@ -1,0 +1,214 @@
+"""Episodes, seeds and tests: what an optimisation does with an engine's outcomes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import ToyEngine, tiny
+
+from codesign_jax import codesign
+from codesign_jax.engines import make_engine
+from codesign_jax.optimize import State, schedule
+from codesign_jax.optimize.schedule import NAMES
+from codesign_jax.types import Outcome
+
+PARTICLES, TRIALS = 8, 3
+
+
+@pytest.fixture(scope="module")
+def setup():
+    """Scene, space, engine, filter and the episode function."""
+    the_scene, space, engine = tiny()
+    optimizer = codesign.make_filter(space)
+    episode = codesign.make_episode(the_scene, engine, space, optimizer, TRIALS)
+    return the_scene, space, engine, optimizer, episode
+
+
+def start(optimizer, seed=0, particles=PARTICLES, design=(0.05, 0.0)):
+    """State before the first episode."""
+    return optimizer.init(jax.random.key(seed), np.array(design), particles)
+
+
+def outcomes(cost, status=0):
+    """Outcomes with the given costs, shape (particle, trial)."""
+    cost = jnp.asarray(cost, jnp.float32)
+    whole = jnp.broadcast_to(jnp.asarray(status, jnp.int32), cost.shape)
+    return Outcome(cost, whole, jnp.full_like(cost, jnp.inf), -jnp.ones_like(whole))
+
+
+def test_one_compile_serves_every_schedule_and_seed():
+    the_scene, space, engine = tiny()
+    optimizer = codesign.make_filter(space)
+    episode = codesign.make_episode(the_scene, engine, space, optimizer, TRIALS)
+    for seed, name in enumerate(NAMES):
+        mask = schedule(name, np.array(space.is_morphology), 40)
+        state, _ = episode(start(optimizer, seed), mask[0])
+        episode(state, mask[-1])
+    codesign.find_seed(
+        the_scene,
+        codesign.evaluate_by(episode, space.num_parameters),
+        optimizer,
+        jax.random.key(0),
+        batch=PARTICLES,
+    )
+    assert engine.traced == 1
+
+
+def test_episode_is_move_evaluate_weigh_and_resample(setup):
+    the_scene, space, engine, optimizer, episode = setup
+    state, mask = start(optimizer), np.array([True, True])
+    new, info = episode(state, mask)
+    # The same arithmetic in another program, where the compiler fuses it: the last bit may differ.
+    np.testing.assert_allclose(info.population, optimizer.ask(state, mask), rtol=1e-6, atol=1e-8)
+    assert info.trials.cost.shape == info.trials.status.shape == (PARTICLES, TRIALS)
+    np.testing.assert_allclose(info.selection.cost, info.trials.cost.mean(1), rtol=1e-6)
+    np.testing.assert_array_equal(new.particles, info.population[info.selection.ancestors])
+    assert int(new.episode) == 1
+
+
+def test_closed_domain_does_not_move(setup):
+    _, space, _, optimizer, episode = setup
+    for domain in (True, False):
+        mask = np.array(space.is_morphology) == domain
+        _, info = episode(start(optimizer), mask)
+        moved = (np.asarray(info.population) != np.float32([0.05, 0.0])).any(0)
+        np.testing.assert_array_equal(moved, mask)
+
+
+def test_particles_share_their_trials(setup):
+    _, _, _, optimizer, episode = setup
+    closed = np.zeros(2, bool)
+    _, info = episode(start(optimizer), closed)  # nothing moves: all particles are the same
+    cost = np.asarray(info.trials.cost)
+    np.testing.assert_array_equal(cost, np.broadcast_to(cost[0], cost.shape))
+    assert len(np.unique(cost[0])) > 1, "trials of one particle have noise of their own"
+
+
+def test_noise_differs_between_episodes_seeds_and_the_test(setup):
+    the_scene, space, engine, optimizer, episode = setup
+    closed = np.zeros(2, bool)
+    first, info = episode(start(optimizer), closed)
+    seen = [info, episode(first, closed)[1], episode(start(optimizer, seed=1), closed)[1]]
+    evaluate = codesign.evaluate_by(episode, 2)
+    test = codesign.final_test(
+        the_scene, evaluate, first.particles, first.key, num_trials=2 * TRIALS
+    )
+    rows = [i.trials.cost[0] for i in seen]
+    rows += [test.trials.cost[0, :TRIALS], test.trials.cost[0, TRIALS:]]
+    assert len(np.unique(np.asarray(rows), axis=0)) == 5
+
+
+def test_noise_does_not_depend_on_the_number_of_particles():
+    the_scene, space, engine = tiny()
+    optimizer = codesign.make_filter(space)
+    episode = codesign.make_episode(the_scene, engine, space, optimizer, TRIALS)
+    few = episode(start(optimizer, particles=2), np.zeros(2, bool))[1].trials.cost
+    many = episode(start(optimizer, particles=5), np.zeros(2, bool))[1].trials.cost
+    np.testing.assert_array_equal(few[0], many[0])
+
+
+def test_concurrent_design_of_the_toy_converges(setup):
+    the_scene, space, _, optimizer, episode = setup
+    state, means = start(optimizer), []
+    for mask in schedule("concurrent", np.array(space.is_morphology), 60):
+        state, info = episode(state, mask)
+        means.append(float(info.selection.mean_cost))
+    assert means[0] > codesign.SEED_COST
+    assert np.mean(means[-20:]) < codesign.CONVERGED_COST
+    # Toy physics: longer fingers hold longer.  The start was 50 mm of 10 to 180 mm.
+    assert float(state.particles[:, 0].mean()) > 0.1
+
+
+def test_failed_trials_are_left_out_of_the_mean():
+    the_scene, space, _ = tiny()
+    # Worlds are particle-major: the first particle fails once, the second always.
+    engine = ToyEngine(the_scene, failing=[0, 3, 4, 5])
+    optimizer = codesign.make_filter(space)
+    episode = codesign.make_episode(the_scene, engine, space, optimizer, TRIALS)
+    _, info = episode(start(optimizer, particles=3), np.zeros(2, bool))
+    np.testing.assert_array_equal((info.trials.status != 0).sum(1), [1, 3, 0])
+    np.testing.assert_allclose(info.selection.cost[0], info.trials.cost[0, 1:].mean(), rtol=1e-6)
+    assert float(info.selection.cost[1]) == the_scene.cost.maximum
+
+
+def test_evaluate_by_an_episode_equals_evaluate(setup):
+    the_scene, space, engine, optimizer, episode = setup
+    population = jnp.asarray(np.random.default_rng(0).uniform([0.03, -0.05], [0.17, 0.1], (8, 2)))
+    key = jax.random.key(3)
+    by_episode = codesign.evaluate_by(episode, 2)(population, key)
+    evaluate = codesign.make_evaluate(the_scene, engine, space, TRIALS)
+    direct = evaluate(population, codesign.stream_key(key, codesign.STREAM_TRIAL))
+    # Two programs round the noise differently, which may move a loss by one time step.
+    step = the_scene.discretization.timestep
+    np.testing.assert_allclose(by_episode.lost_time, direct.lost_time, atol=1.01 * step)
+
+
+def test_seed_is_poor_and_reproducible(setup):
+    the_scene, space, _, optimizer, episode = setup
+    evaluate = codesign.evaluate_by(episode, 2)
+
+    def find(seed):
+        key = jax.random.key(seed)
+        return codesign.find_seed(the_scene, evaluate, optimizer, key, batch=PARTICLES)
+
+    (a, cost, drawn), (b, *_), (c, *_) = find(0), find(0), find(1)
+    assert cost > codesign.SEED_COST and drawn >= 1
+    np.testing.assert_array_equal(a, b)
+    assert (np.asarray(a) != np.asarray(c)).any()
+    assert (np.asarray(a) >= space.low).all() and (np.asarray(a) <= space.high).all()
+
+
+def test_final_test_counts_the_last_episode(setup):
+    the_scene, _, _, optimizer, episode = setup
+    state, info = episode(start(optimizer), np.ones(2, bool))
+    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.trials)
+    evaluate = codesign.evaluate_by(episode, 2)
+    result = codesign.final_test(
+        the_scene, evaluate, state.particles, state.key, num_trials=4, previous=kept
+    )
+    # Four more trials take two rounds of three, and three were there.
+    assert result.trials.cost.shape == (PARTICLES, 9)
+    np.testing.assert_array_equal(result.trials.cost[:, :3], kept.cost)
+    np.testing.assert_allclose(result.cost, result.trials.cost.mean(1), rtol=1e-6)
+
+
+def test_success_needs_a_mean_below_a_hundredth():
+    the_scene, *_ = tiny()
+    cost = np.zeros((4, 42))
+    cost[1, 0], cost[2, 0] = 0.41, 0.43  # means on both sides of 0.01
+    status = np.zeros((4, 42), int)
+    status[3] = 1
+    result = codesign.summarize_test(the_scene, outcomes(cost, status))
+    np.testing.assert_array_equal(result.success, [True, True, False, False])
+    assert float(result.cost[3]) == the_scene.cost.maximum, "all trials failed"
+
+
+@pytest.mark.parametrize(
+    ("means", "expected"),
+    [
+        ([3, 2, 0.5, 0.4], 2),
+        ([0.5, 0.4], 0),
+        ([3, 0.5, 1.0, 0.4], 3),  # at the threshold is not below it
+        ([0.5, 3], None),
+        ([3.0, np.nan, 0.5], 2),
+        ([np.inf, np.nan], None),
+    ],
+)
+def test_convergence_episode(means, expected):
+    assert codesign.convergence_episode(means) == expected
+
+
+def test_episode_on_real_physics_is_repeatable():
+    the_scene, space, _ = tiny()
+    optimizer = codesign.make_filter(space)
+    engine = make_engine("mujoco", the_scene)
+    episode = codesign.make_episode(the_scene, engine, space, optimizer, 2)
+    state = start(optimizer, particles=3, design=(0.1, 0.0))
+    once, info = episode(state, np.ones(2, bool))
+    again, repeated = episode(state, np.ones(2, bool))
+    assert isinstance(once, State)
+    for a, b in zip(jax.tree.leaves(info), jax.tree.leaves(repeated), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(once.particles, again.particles)
+    assert (np.asarray(info.trials.status) == 0).all()
+    assert ((np.asarray(info.trials.cost) >= 0) & (np.asarray(info.trials.cost) <= 3)).all()

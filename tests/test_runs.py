@@ -1,0 +1,228 @@
+"""Run folders: scene files, settings, tables and the signals that stop a run."""
+
+import csv
+import os
+import signal
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import tiny
+
+from codesign_jax import codesign, files, parameters, scene
+from codesign_jax.checkpoint import digest
+from codesign_jax.runs import record as records
+from codesign_jax.runs import settings as settings_module
+from codesign_jax.runs import tables
+from codesign_jax.runs.interrupts import Interrupts, Stopped
+from codesign_jax.runs.progress import Progress, duration
+from codesign_jax.runs.record import Record
+from codesign_jax.runs.scene_files import write_scene
+from codesign_jax.types import Status
+
+
+def settings(**changes):
+    """The paper's 2D settings, changed."""
+    sizes = {"particles": 4, "trials": 2, "episodes": 3, "test_trials": 3}
+    named = {k: v for k, v in changes.items() if k not in sizes}
+    sizes |= {k: v for k, v in changes.items() if k in sizes}
+    base = {
+        "preset": "2d",
+        "schedule": "concurrent",
+        "first": "control",
+        "engine": "mujoco",
+        "seed": 0,
+    }
+    return settings_module.make_settings(**(base | named), **sizes)
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A toy run of three episodes: scene, space, record and final test."""
+    the_scene, space, engine = tiny()
+    s, optimizer = settings(), codesign.make_filter(space)
+    episode = codesign.make_episode(the_scene, engine, space, optimizer, s.trials)
+    state = optimizer.init(jax.random.key(0), np.array([0.05, 0.0]), s.particles)
+    record = Record(state, records.empty_history(s, space.num_parameters))
+    for e in range(s.episodes):
+        record.state, info = episode(record.state, np.ones(2, bool))
+        records.report(record.history, e, info)
+    test = codesign.final_test(
+        the_scene,
+        codesign.evaluate_by(episode, 2),
+        record.state.particles,
+        record.state.key,
+        num_trials=s.test_trials,
+        previous=record.last_outcomes(),
+    )
+    record.test = test.trials
+    return the_scene, space, record, test
+
+
+@pytest.mark.parametrize("hand", sorted(files.available("hands")))
+@pytest.mark.parametrize("name", sorted(files.available("scenes")))
+def test_resolved_scene_reads_back_the_same(tmp_path, name, hand):
+    original = scene.load(name, hand_name=hand, overrides={"discretization": {"links": 7}})
+    write_scene(original, tmp_path)
+    again = scene.load(tmp_path / "scene.toml")
+    assert again == original and hash(again) == hash(original)
+    assert parameters.design_space(again.hand) == parameters.design_space(original.hand)
+
+
+def test_resolved_scene_ignores_the_working_directory(tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    write_scene(scene.load(), tmp_path / "a")
+    (tmp_path / "hand.toml").write_text("another = 'hand'")
+    monkeypatch.chdir(tmp_path)
+    assert scene.load("a/scene.toml") == scene.load()
+
+
+def test_resolved_scene_names_units(tmp_path):
+    write_scene(scene.load(), tmp_path)
+    assert "timestep = 0.01  # s\n" in (tmp_path / "scene.toml").read_text()
+    assert "shear_modulus = 56000.0  # Pa\n" in (tmp_path / "hand.toml").read_text()
+
+
+def test_text_survives_the_scene_file(tmp_path):
+    odd = 'quote " backslash \\ newline \n tab \t é 🖐'
+    original = scene.load(overrides={"description": odd})
+    write_scene(original, tmp_path)
+    assert scene.load(tmp_path / "scene.toml").description == odd
+
+
+def test_sizes_default_to_the_papers():
+    def sizes(preset):
+        s = settings_module.make_settings(preset, "concurrent", "control", "mujoco", 0)
+        return s.particles, s.trials, s.episodes, s.test_trials
+
+    assert sizes("2d") == (10, 6, 64, 36)
+    assert sizes("23d") == (60, 6, 128, 72)
+    # Figure 7's budget, per run: 64 episodes of 60 grasps and 36 more tests of 10 particles.
+    two = settings_module.make_settings("2d", "concurrent", "control", "mujoco", 0)
+    assert two.grasps == 64 * 60 + 360
+
+
+def test_settings_report_every_problem():
+    bad = settings(preset="3d", engine="mujco", particles=0, trials=-1, seed=-5, schedule="x")
+    text = "\n".join(settings_module.check(bad, scene.load().hand))
+    for part in ("--preset '3d'", "did you mean 'mujoco'", "--particles = 0", "[1, 32768]"):
+        assert part in text
+    for part in ("--trials = -1", "--seed = -5", "--schedule: unknown schedule 'x'"):
+        assert part in text
+    assert settings_module.check(settings(), scene.load().hand) == []
+
+
+def test_record_survives_its_arrays_bitwise(run):
+    _, _, record, _ = run
+    again = records.from_arrays(records.to_arrays(record))
+    assert digest(records.to_arrays(again)) == digest(records.to_arrays(record))
+    assert again.done == 3 and jnp.issubdtype(again.state.key.dtype, jax.dtypes.prng_key)
+
+
+def test_history_of_a_restored_record_can_be_written(run):
+    _, _, record, _ = run
+    arrays = jax.tree.map(lambda v: np.asarray(jnp.asarray(v)), records.to_arrays(record))
+    records.from_arrays(arrays).history.cost[0] = 1.0
+
+
+def read(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_tables_hold_the_history_with_units(run, tmp_path):
+    the_scene, space, record, test = run
+    tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
+    tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
+    history, trials = record.history, read(tmp_path / "trials.csv")
+    assert [np.float32(r["cost"]) for r in trials] == history.trials.cost.ravel().tolist()
+    assert {r["object"] for r in trials} == {"sphere"}
+    assert {r["status"] for r in trials} == {"OK"}
+    lengths = [float(r["length_mm"]) for r in read(tmp_path / "particles.csv")]
+    np.testing.assert_allclose(lengths, 1e3 * history.population[..., 0].ravel(), rtol=1e-6)
+    episodes = read(tmp_path / "episodes.csv")
+    assert [int(r["episode"]) for r in episodes] == [0, 1, 2]
+    for row, cost in zip(episodes, history.cost, strict=True):
+        assert np.float32(row["best_cost"]) == cost.min()
+    rows = read(tmp_path / "tests.csv")
+    assert [int(r["trials"]) for r in rows] == [6] * 4  # three in two rounds of two, and two before
+    assert [np.float32(r["test_cost"]) for r in rows] == np.asarray(test.cost).tolist()
+
+
+def test_tables_by_episode_equal_tables_at_once(run, tmp_path):
+    the_scene, space, record, _ = run
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    for folder in (whole, parts):
+        folder.mkdir()
+    tables.write_episodes(whole, the_scene, space, record.history, 0, 3)
+    for e in range(3):
+        tables.write_episodes(parts, the_scene, space, record.history, e, e + 1)
+    for path in whole.iterdir():
+        assert (parts / path.name).read_bytes() == path.read_bytes()
+
+
+def test_status_names():
+    assert tables.status_names(0) == "OK"
+    assert tables.status_names(Status.SPEED) == "SPEED"
+    assert tables.status_names(Status.NONFINITE | Status.PENETRATION) == "NONFINITE+PENETRATION"
+
+
+def test_design_columns_carry_units():
+    columns = tables.design_columns(parameters.design_space(scene.load().hand, "23d"))
+    assert columns[0] == "length_0_mm" and columns[-1] == "pressure_3_kPa" and len(columns) == 23
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_lets_the_step_finish(number):
+    before, said = signal.getsignal(number), []
+
+    def step():
+        os.kill(os.getpid(), number)
+        time.sleep(0.3)
+        return jnp.ones(())
+
+    with Interrupts(said.append) as interrupts:
+        assert float(interrupts.call(step)) == 1.0
+        assert interrupts.signum == number and len(said) == 1
+        with pytest.raises(Stopped):
+            interrupts.call(step)
+    assert signal.getsignal(number) is before
+
+
+def test_interrupts_leave_signals_alone_outside_the_main_thread():
+    result = []
+
+    def work():
+        with Interrupts(lambda _: None) as interrupts:
+            result.append(interrupts.call(lambda: 5))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert result == [5]
+
+
+def test_error_in_a_step_is_passed_on():
+    def step():
+        raise ValueError("broken")
+
+    with Interrupts(lambda _: None) as interrupts, pytest.raises(ValueError, match="broken"):
+        interrupts.call(step)
+
+
+def test_progress_line(capsys):
+    with Progress(64) as progress:
+        line = progress.episode(16, mean=1.5, best=0.25, failed=1, grasps=60, seconds=10.0)
+    assert "episode 16/64  mean 1.500  best 0.250  failed 1/60  6.0 grasps/s" in line
+    assert line.endswith("ETA 8:00")  # 48 episodes of 10 s
+    assert line in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (600, "10:00"), (3725, "1:02:05")]
+)
+def test_duration(seconds, text):
+    assert duration(seconds) == text

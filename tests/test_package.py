@@ -1,0 +1,86 @@
+"""The wheel: installed elsewhere it finds its hands, objects and scenes."""
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """Folder into which a wheel of this checkout was installed, without its dependencies."""
+    folder = tmp_path_factory.mktemp("wheel")
+    # hatchling is in the test extra: no network, no isolated build environment.
+    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(ROOT)]
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, *build], check=True)
+    [wheel] = folder.glob("*.whl")
+    target = folder / "site"
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(target), str(wheel)], check=True)
+    return target
+
+
+def run_installed(installed, program, cwd):
+    """Runs a program that sees the installed package before the checkout, from another folder."""
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=cwd,
+        env=environment,
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    return json.loads(done.stdout)
+
+
+def test_installed_wheel_finds_its_files(installed, tmp_path):
+    program = """
+import json
+from codesign_jax import files, scene
+found = {kind: {n: str(p) for n, p in files.available(kind).items()}
+         for kind in ("hands", "objects", "scenes")}
+loaded = {name: scene.load(hand_name=name).num_fingers for name in found["hands"]}
+print(json.dumps([found, loaded]))
+"""
+    found, fingers = run_installed(installed, program, tmp_path)
+    for kind, folder in (("hands", ROOT), ("objects", ROOT), ("scenes", ROOT / "codesign_jax")):
+        assert set(found[kind]) == {p.stem for p in (folder / kind).glob("*.toml")}
+        assert all(path.startswith(str(installed)) for path in found[kind].values())
+    assert fingers["pneuflex4"] == 4 and fingers["tripod3"] == 3
+
+
+def test_wheel_carries_every_module(installed):
+    def modules(folder):
+        return {p.relative_to(folder) for p in folder.rglob("*.py")}
+
+    assert modules(installed / "codesign_jax") == modules(ROOT / "codesign_jax")
+
+
+def test_installed_command_starts(installed, tmp_path):
+    program = """
+import contextlib, io, json
+from codesign_jax import cli
+text = io.StringIO()
+with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+    cli.main(["--help"])
+print(json.dumps([cli.__file__, "optimize" in text.getvalue()]))
+"""
+    path, works = run_installed(installed, program, tmp_path)
+    assert path.startswith(str(installed)) and works
+    [entry] = (installed).glob("codesign_jax-*.dist-info/entry_points.txt")
+    assert "codesign = codesign_jax.cli:main" in entry.read_text()
+
+
+def test_dependencies_are_bounded():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [r for rows in project["optional-dependencies"].values() for r in rows]
+    for requirement in [*project["dependencies"], *extras]:
+        own = requirement.startswith("codesign-jax")
+        assert own or (">=" in requirement and "<" in requirement), requirement

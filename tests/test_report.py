@@ -1,0 +1,128 @@
+"""Figures and animations exist, show what they should, and stay out of the numerical modules."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from toy import TINY
+
+from codesign_jax import cli, parameters, rollout, scene
+from codesign_jax.engines import make_engine
+from codesign_jax.report import animation, figures
+
+TIMES = np.array([0.0, 0.5, 1.2])
+
+
+@pytest.fixture(scope="module")
+def grasp():
+    """A scene and one simulated grasp in it."""
+    the_scene = scene.load(TINY)
+    space = parameters.design_space(the_scene.hand, "2d")
+    trials = rollout.sample_trials(the_scene, jax.random.key(0), 1)
+    params = space.params(jnp.asarray([0.1, 0.0]))
+    [replay] = animation.replay(the_scene, make_engine("mujoco", the_scene), params, trials)
+    return the_scene, replay
+
+
+@pytest.fixture
+def no_opengl(monkeypatch):
+    monkeypatch.setattr(animation, "_opengl", lambda: None)
+
+
+def test_replay_keeps_the_trajectory(grasp):
+    the_scene, replay = grasp
+    assert replay.qpos.shape[0] == the_scene.num_steps
+    assert np.isfinite(replay.qpos).all() and np.ptp(replay.qpos, axis=0).max() > 0.05
+
+
+def test_sketch_shows_hand_and_object_moving(grasp, no_opengl):
+    the_scene, replay = grasp
+    frames = animation.frames(the_scene, replay, TIMES, size=(160, 120))
+    assert frames.shape == (3, 120, 160, 3) and frames.dtype == np.uint8
+    assert len(np.unique(frames.reshape(3, -1), axis=0)) == 3, "frames differ"
+    r, g, b = np.moveaxis(frames.astype(int), -1, 0)
+    assert ((r > 200) & (b < 120)).any(axis=(1, 2)).all(), "an orange object in every frame"
+    assert ((b > 150) & (r < 120)).any(axis=(1, 2)).all(), "blue fingers in every frame"
+
+
+def test_gif_plays_in_real_time_and_names_what_is_missing(grasp, no_opengl, tmp_path):
+    the_scene, replay = grasp
+    said = []
+    path = tmp_path / "new" / "grasp.gif"
+    animation.write_gif(the_scene, [replay, replay], path, size=(80, 60), notify=said.append)
+    assert len(said) == 1 and "apt-get install libegl1" in said[0]
+    with Image.open(path) as image:
+        assert image.size == (160, 60)
+        total = 0
+        for k in range(image.n_frames):
+            image.seek(k)
+            total += image.info["duration"]
+    assert total == pytest.approx(1000 * the_scene.end_time, abs=80)  # one frame at most
+
+
+def test_strip_has_a_row_a_grasp_and_a_column_a_phase(grasp, no_opengl, tmp_path):
+    the_scene, replay = grasp
+    path = animation.write_strip(the_scene, [replay] * 2, tmp_path / "s.png", size=(50, 40))
+    with Image.open(path) as image:
+        assert image.size == (6 * 50, 2 * 40)
+
+
+def test_renderer_draws_hand_and_object(grasp):
+    the_scene, replay = grasp
+    if animation._opengl() is None:
+        pytest.skip("no OpenGL on this machine")
+    frames = animation.frames(the_scene, replay, TIMES, size=(160, 120))
+    assert frames.shape == (3, 120, 160, 3)
+    r, g, b = np.moveaxis(frames.astype(int), -1, 0)
+    assert ((r > 150) & (b < 80)).any(axis=(1, 2)).all(), "an orange object in every frame"
+    assert ((b > r + 40) & (b > 90)).any(axis=(1, 2)).all(), "blue fingers in every frame"
+
+
+def test_broken_opengl_falls_back(grasp, monkeypatch, tmp_path):
+    the_scene, replay = grasp
+    animation._opengl.cache_clear()
+    monkeypatch.setenv("MUJOCO_GL", "no-such-way")
+    try:
+        said = []
+        animation.write_strip(
+            the_scene, [replay], tmp_path / "s.png", size=(40, 40), notify=said.append
+        )
+        assert len(said) == 1
+    finally:
+        animation._opengl.cache_clear()
+
+
+def test_cost_evolution_marks_particles_mean_and_threshold(tmp_path):
+    cost = np.random.default_rng(0).uniform(0, 3, (20, 10))
+    path = figures.cost_evolution(cost, tmp_path / "figures" / "cost.png")
+    with Image.open(path) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    r, g, b = np.moveaxis(pixels, -1, 0)
+    assert (b > r + 60).sum() > 200, "blue dots"
+    assert (r > b + 100).sum() > 200, "orange mean"
+    assert ((pixels.max(-1) < 60).sum(1) > 0.2 * pixels.shape[1]).any(), "black threshold"
+
+
+def test_cost_evolution_of_an_unfinished_run(tmp_path):
+    figures.cost_evolution(np.ones((1, 1)), tmp_path / "one.png")
+
+
+def test_evaluate_renders(tmp_path, monkeypatch, capsys, no_opengl):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    out = tmp_path / "grasp.gif"
+    assert cli.main(["evaluate", "--scene", str(TINY), "--trials", "1", "--render", str(out)]) == 0
+    assert out.exists() and f"animation: {out}" in capsys.readouterr().out
+
+
+def test_numerical_modules_need_no_report():
+    program = """
+import sys
+import codesign_jax.codesign, codesign_jax.runs, codesign_jax.engines.mujoco, codesign_jax.optimize
+unwanted = [m for m in sys.modules if m.startswith(("matplotlib", "PIL", "codesign_jax.report"))]
+assert not unwanted, unwanted
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

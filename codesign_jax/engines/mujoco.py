@@ -14,6 +14,7 @@ from codesign_jax.types import Trace
 # Steps between looking at the worlds: a lost object or a failed world stops being simulated at this
 # grain.
 _CHUNK = 25
+_TIME = int(mujoco.mjtState.mjSTATE_TIME)
 
 
 class MujocoEngine:
@@ -72,32 +73,46 @@ class MujocoEngine:
         going = np.arange(worlds)
         for first in range(0, steps, _CHUNK):
             part = slice(first, min(first + _CHUNK, steps))
-            new = self._advance(batch, going, ctrl[going, part], trajectory)
+            new, taken = self._advance(batch, going, ctrl[going, part], trajectory)
             for array, values in zip(trace, new, strict=True):
                 array[going, part] = values
             # The cost window's end counts as lost only strictly inside it, as in `cost.outcome`.
             time = np.arange(part.start, part.stop)
             lost = (new.distance >= scene.cost.lost_distance) & (time >= start) & (time < end)
             failed = ~np.isfinite(new.speed) | (new.speed > scene.limits.speed)
+            # MuJoCo warned (a bad control, state or inertia, a full contact list) and stopped.
+            stopped = batch.warning[going, :, 0].any(1)
             done = lost.any(1) | failed.any(1) | (new.height < -scene.limits.penetration).any(1)
+            done |= stopped
             for array in trace:
                 array[going[done], part.stop :] = array[going[done], part.stop - 1][:, None]
+            for world, count in zip(going[stopped], taken[stopped], strict=True):
+                trace.speed[world, first + count :] = np.nan
             going = going[~done]
             if not going.size:
                 break
         return trace
 
-    def _advance(self, batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool) -> Trace:
-        """Steps the given worlds through a chunk; entry k describes the state before step k."""
+    def _advance(
+        self, batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool
+    ) -> tuple[Trace, np.ndarray]:
+        """Steps the given worlds through a chunk.
+
+        Returns:
+          The chunk's trace, whose entry k describes the state before step k, and the steps taken by
+          each world: fewer than asked for where MuJoCo stopped.
+        """
         lay = layout(self.scene)
         before = batch.bind("qvel")[ids][:, None], batch.bind("qpos")[ids][:, None]
         record = batch.rollout(
             ctrl.shape[1],
             ctrl,
             control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
-            record=("xipos", "qvel", *(("qpos",) if trajectory else ())),
+            record=("xipos", "qvel", _TIME, *(("qpos",) if trajectory else ())),
             ids=ids,
         )
+        # Where a world stopped, its records repeat, and so does their time.
+        taken = 1 + np.count_nonzero(np.diff(record[_TIME][..., 0], axis=1), axis=1)
         xipos = record["xipos"]
         centre = np.tensordot(xipos, lay.centre_weights, axes=(2, 0))
         middle = xipos[:, :, lay.object]
@@ -110,7 +125,8 @@ class MujocoEngine:
             if trajectory
             else xipos[:, :, 0, :0]
         )
-        return Trace(np.linalg.norm(middle - centre, axis=-1), middle[..., 2], speed, qpos)
+        distance = np.linalg.norm(middle - centre, axis=-1)
+        return Trace(distance, middle[..., 2], speed, qpos), taken
 
 
 def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:

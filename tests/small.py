@@ -50,6 +50,15 @@ def still(shape=0):
     return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), one, one)
 
 
+def hand_world(the_scene, **changes):
+    """The table's default design with changes, and a still trial, as NumPy arrays in float64."""
+    space = parameters.design_space(the_scene.hand)
+    with jax.enable_x64(True):
+        params = nth(space.params(space.default()), ...)
+    changes = {k: 0 * getattr(params, k) + v for k, v in changes.items()}
+    return params._replace(**changes), still()
+
+
 def nth(tree, index):
     """Entry of every array of a batch, as NumPy arrays."""
     return jax.tree.map(lambda v: np.asarray(v)[index], tree)

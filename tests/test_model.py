@@ -4,7 +4,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from small import nth, pinch, random_worlds
+from small import hand_world, nth, pinch, random_worlds
 
 from codesign_jax import control, model, parameters, rollout, scene
 from codesign_jax.engines.mujoco import world_model
@@ -215,16 +215,6 @@ def free_scene(**discretization):
     )
 
 
-def hand_world(the_scene, **changes):
-    """The table's default design with changes, and a nominal trial, as NumPy arrays."""
-    space = parameters.design_space(the_scene.hand)
-    with jax.enable_x64(True):
-        params = nth(space.params(space.default()), ...)
-        trial = nth(rollout.nominal_trial(the_scene), ...)
-    changes = {k: 0 * getattr(params, k) + v for k, v in changes.items()}
-    return params._replace(**changes), trial
-
-
 def wobble(m, steps, ctrl):
     """Speeds of every step under constant controls from the start pose, (steps, nv)."""
     data, speeds = mujoco.MjData(m), []
@@ -261,7 +251,7 @@ def test_implicit_springs_equal_mujocos_discrete_integrator():
         # The object falls on the table in both; only the hand is compared.
         worst = max(worst, np.abs(one.qacc[:-6] - other.qacc[:-6]).max())
     assert np.abs(one.qpos[6:-7]).max() > 0.05  # it did bend
-    # Accelerations of up to 10 rad/s^2 to rounding, with the condition number of M (measured 3e-13).
+    # Accelerations of up to 10 rad/s^2 to rounding, with the condition of M (measured 3e-13).
     assert worst < 1e-11
 
 

@@ -1,0 +1,194 @@
+"""The object on its table: rest, friction cone, creep, sliding and tipping, by closed forms."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+from small import SHAPES, hand_world, pinch
+
+from codesign_jax import model
+
+MASS, GRAVITY, MU = 0.1, 9.81, 0.5
+CORNERS = {"box": 4, "cylinder": 3, "sphere": 1}  # contact points of a resting object
+
+
+class Table:
+    """The object on its table, the hand high above, under gravity tilted by an angle.
+
+    A flat object has its centre 3 mm above the table, so that a slope does not shift the load from
+    one side of it to the other.
+    """
+
+    def __init__(self, shape, angle=0.0, *, flat=False, **settings):
+        self.scene = pinch(shape, links=1, solver__tolerance=1e-12, **settings)
+        params, trial = hand_world(self.scene)
+        self.model = model.compile_model(self.scene, params, trial)
+        tilted = [GRAVITY * np.sin(angle), 0, -GRAVITY * np.cos(angle)]
+        self.model.opt.gravity[:] = tilted
+        self.data = mujoco.MjData(self.model)
+        # The wrist follows the arm; without it the tilted gravity would pull the hand down.
+        self.data.qpos[2] = self.data.ctrl[2] = 1.0
+        if flat:
+            geom = model.layout(self.scene).object_geoms[0]
+            self.model.geom_size[geom, {"box": 2, "cylinder": 1}[shape]] = 0.003
+            self.data.qpos[-5] = 0.003
+
+    def run(self, seconds):
+        """Positions (time, 3) and velocities (time, 3) of the object."""
+        rows = []
+        for _ in range(round(seconds / self.model.opt.timestep)):
+            mujoco.mj_step(self.model, self.data)
+            rows.append([self.data.qpos[-7:-4].copy(), self.data.qvel[-6:-3].copy()])
+        return np.array(rows).swapaxes(0, 1)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_resting_object(shape):
+    """Sinks m g / (n k) with the declared stiffness, doubled at the table, and stays."""
+    table = Table(shape)
+    position, velocity = table.run(12.0)
+    start = table.model.qpos0[-7:-4]
+    assert table.data.ncon == CORNERS[shape]
+    stiffness = 2 * table.scene.contact.normal_stiffness
+    sunk = start[2] - position[-1, 2]
+    assert sunk == pytest.approx(MASS * GRAVITY / (CORNERS[shape] * stiffness), rel=1e-3)
+    late = position[-1000:]
+    assert np.abs(late - late[0]).max() < 1e-9  # ten seconds: no drift
+    assert np.abs(velocity[-1]).max() < 1e-9
+    force = np.zeros(6)
+    total = 0.0
+    for i in range(table.data.ncon):
+        mujoco.mj_contactForce(table.model, table.data, i, force)
+        total += force[0]
+    assert total == pytest.approx(MASS * GRAVITY, rel=1e-6)
+
+
+@pytest.mark.parametrize("time_constant, impedance", [(0.02, 0.9), (0.04, 0.9), (0.02, 0.98)])
+@pytest.mark.parametrize("timestep", [0.01, 0.005])
+def test_stiffness_is_a_material_number(time_constant, impedance, timestep):
+    """k_n does not depend on time step, time constant or impedance: invweight makes up for them."""
+    table = Table(
+        "sphere",
+        contact__time_constant=time_constant,
+        contact__impedance=impedance,
+        discretization__timestep=timestep,
+    )
+    position, _ = table.run(3.0)
+    sunk = table.model.qpos0[-5] - position[-1, 2]
+    assert sunk == pytest.approx(MASS * GRAVITY / 4000.0, rel=1e-3)
+
+
+def creep(table, shape, angle):
+    """Steady speed below the cone: m g sin(angle) w (1 - d) timeconst / (2 n impratio).
+
+    A sticking contact is a damper: R f = -b v with R = w (1 - d) / (d impratio) and
+    b = 2 / (d timeconst); n contacts share m g sin(angle).
+    """
+    contact, n = table.scene.contact, CORNERS[shape]
+    weight = model.contact_invweight(table.scene)
+    resistance = (1 - contact.impedance) / contact.impedance * weight / contact.friction_ratio
+    damping = 2 / (contact.impedance * contact.time_constant)
+    return MASS * GRAVITY * np.sin(angle) * resistance / (n * damping)
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder"])
+def test_incline_below_the_friction_angle_holds(shape):
+    """At 0.9 of the friction angle the object only creeps, at the soft contact's own speed."""
+    angle = 0.9 * np.arctan(MU)
+    flat, full = Table(shape, angle, flat=True), Table(shape, angle)
+    (_, slow), (_, velocity) = flat.run(3.0), full.run(3.0)
+    expected = creep(flat, shape, angle)
+    assert slow[-1, 0] == pytest.approx(expected, rel=1e-6)
+    assert np.abs(slow[-1, 1:]).max() < 1e-9
+    # Uphill contacts of a tall object carry less, slip, and leave the rest to the others.
+    assert expected < velocity[-1, 0] < 2 * expected < 2e-4
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder"])
+def test_incline_above_the_friction_angle_slides(shape):
+    """At 1.1 of the friction angle: a = g (sin - mu cos), on average.
+
+    MuJoCo's elliptic cone couples slip into the normal direction, so that a sliding object floats
+    up and hops; over many hops the impulses obey Coulomb's law.
+    """
+    angle = 1.1 * np.arctan(MU)
+    expected = GRAVITY * (np.sin(angle) - MU * np.cos(angle))
+    for timestep, error in ((0.01, 0.15), (0.002, 0.05)):
+        table = Table(shape, angle, flat=True, discretization__timestep=timestep)
+        _, velocity = table.run(1.0)
+        assert velocity[-1, 0] == pytest.approx(expected, rel=error)
+
+
+def test_friction_is_the_objects_with_the_table():
+    """Half the friction, and the incline that held does not hold."""
+    angle = 0.9 * np.arctan(MU)
+    table = Table("box", angle)
+    table.model.pair_friction[:, :2] *= 0.5
+    _, velocity = table.run(1.0)
+    assert velocity[-1, 0] > 1.0
+
+
+def test_a_sphere_rolls_down():
+    """Rolling without slip: a = 5/7 g sin(angle), at any angle below atan(7/2 mu)."""
+    angle = np.deg2rad(10)
+    table = Table("sphere", angle)
+    _, velocity = table.run(1.0)
+    acceleration = (velocity[-1, 0] - velocity[49, 0]) / 0.5
+    # The contact is a point without rolling friction; the soft cone's creep adds a little.
+    assert acceleration == pytest.approx(5 / 7 * GRAVITY * np.sin(angle), rel=5e-3)
+
+
+def test_a_sliding_sphere_comes_to_roll():
+    """Thrown with v_0 without spin: 5/7 v_0 once 2 v_0 / 7 mu g have passed."""
+    table = Table("sphere")
+    table.run(0.5)
+    table.data.qvel[-6] = v0 = 1.0
+    time = 2 * v0 / (7 * MU * GRAVITY)
+    _, velocity = table.run(1.0)
+    before, after = round(0.7 * time / 0.01), round(2 * time / 0.01)
+    # It hops as it slides (see above): Coulomb's law on average.
+    assert velocity[before - 1, 0] == pytest.approx(v0 - MU * GRAVITY * before * 0.01, rel=0.05)
+    assert velocity[after, 0] == pytest.approx(5 / 7 * v0, rel=5e-3)
+
+
+@pytest.mark.parametrize("ratio, falls", [(0.8, False), (1.25, True)])
+def test_box_tips_beyond_its_corner(ratio, falls):
+    """With friction enough, a box tips iff tan(angle) > half width / half height."""
+    table = Table("box")
+    half = np.array([0.02, 0.03, 0.04])
+    geom = model.layout(table.scene).object_geoms[0]
+    table.model.geom_size[geom] = half
+    table.model.pair_friction[:, :2] = 5.0
+    table.data.qpos[-5] = half[2]
+    angle = np.arctan(ratio * half[0] / half[2])
+    table.model.opt.gravity[:] = GRAVITY * np.array([np.sin(angle), 0, -np.cos(angle)])
+    table.run(1.0)
+    upright = 1 - 2 * (table.data.qpos[-3] ** 2 + table.data.qpos[-2] ** 2)
+    assert (upright < 0.7) == falls
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_finger_contact_has_the_declared_stiffness(shape):
+    """Pressed by a known force, a finger's sphere sinks into the object by F / k_n."""
+    scene = pinch(shape, links=1, solver__tolerance=1e-12)
+    params, trial = hand_world(dataclasses.replace(scene, gravity=0.0))
+    compiled = model.compile_model(dataclasses.replace(scene, gravity=0.0), params, trial)
+    lay = model.layout(scene)
+    # Everything is held but the object's position, and a force presses it up against one sphere.
+    data = mujoco.MjData(compiled)
+    data.qpos[2] = data.ctrl[2] = 0.5
+    compiled.dof_armature[: lay.dofs.max() + 1] = 1e6
+    compiled.body_inertia[lay.object] = compiled.dof_M0[-3:] = 1e6
+    mujoco.mj_kinematics(compiled, data)
+    sphere = lay.spheres[0, 0, 0]
+    radius, centre = compiled.geom_size[sphere, 0], data.geom_xpos[sphere]
+    reach = {"box": 0.03, "cylinder": 0.036, "sphere": 0.03}[shape]
+    data.qpos[-7:-4] = centre - [0, 0, radius + reach - 1e-4]
+    force = 0.5
+    for _ in range(300):
+        data.xfrc_applied[lay.object, 2] = force
+        mujoco.mj_step(compiled, data)
+    assert data.ncon == 1
+    depth = -data.contact.dist[0]
+    assert depth == pytest.approx(force / scene.contact.normal_stiffness, rel=1e-2)

@@ -13,8 +13,8 @@ def outcome(scene: Scene, trace: Trace) -> Outcome:
 
     c = c_max (t_end - t_lost) / (t_end - t_0), where t_lost is the first time in [t_0, t_end) at
     which the object is `lost_distance` or more from the hand centre; 0 if it is kept.  A trial is
-    decided once it is
-    lost: what happens later neither fails it nor needs simulating.
+    decided once it is lost: what happens later neither fails it nor needs simulating.  A failed
+    trial says nothing about the grasp and shows c_max; `particle_cost` decides what it counts.
 
     Args:
       scene: The scene.
@@ -35,6 +35,7 @@ def outcome(scene: Scene, trace: Trace) -> Outcome:
     cost = scene.cost.maximum * (end - jnp.where(lost, lost_time, end)) / (end - start)
     status = jnp.where(failed, bits[jnp.minimum(bad_step, steps - 1)], 0)
     status = jnp.where(_stuck(scene, trace) & ~lost & ~failed, int(Status.STUCK), status)
+    cost = jnp.where(status == 0, cost, scene.cost.maximum)
     return Outcome(cost.astype(dtype), status, lost_time, jnp.where(failed, bad_step, -1))
 
 

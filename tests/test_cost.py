@@ -1,0 +1,164 @@
+"""Cost and status of made-up traces, and the two rules for failed trials."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from codesign_jax import cost, scene
+from codesign_jax.types import Outcome, Status, Trace
+
+SCENE = scene.load("paper")
+STEPS, LOST = SCENE.num_steps, SCENE.cost.lost_distance
+repeatable = settings(max_examples=50, deadline=None, derandomize=True)
+evaluate = jax.jit(lambda trace: cost.outcome(SCENE, trace))
+
+
+def trace(lost_from=None, until=STEPS, **changes):
+    """A grasp that keeps the object until a step, releases it, and leaves it on the table."""
+    distance, height = np.full(STEPS, 0.03), np.full(STEPS, 0.25)
+    distance[850:], height[850:] = 0.25, 0.03  # un-grasped at 8.5 s
+    if lost_from is not None:
+        distance[lost_from:until] = 0.2
+    speed = np.full(STEPS, 0.5)
+    for name, edits in changes.items():
+        array = {"distance": distance, "height": height, "speed": speed}[name]
+        for step, value in edits.items():
+            array[step] = value
+    return Trace(
+        *(jnp.asarray(a, jnp.float32) for a in (distance, height, speed)), jnp.zeros((STEPS, 0))
+    )
+
+
+@pytest.mark.parametrize(
+    "lost_from, expected",
+    [
+        (None, 0.0),
+        (350, 3.0),  # as the lift begins, t_0 = 3.5 s
+        (575, 1.5),
+        (799, 3.0 * 0.01 / 4.5),  # the last step before t_end
+        (800, 0.0),  # t_end = 8 s: kept
+        (0, 3.0),  # never held
+    ],
+)
+def test_cost_falls_linearly_with_the_time_of_loss(lost_from, expected):
+    result = evaluate(trace(lost_from))
+    assert result.status == Status.OK and result.bad_step == -1
+    assert result.cost == pytest.approx(expected, abs=1e-6)
+    inside = lost_from is not None and lost_from < 800
+    time = max(lost_from, 350) * 0.01 if inside else np.inf
+    assert result.lost_time == pytest.approx(time)
+
+
+def test_only_the_window_counts():
+    """Far before the lift and back in time costs nothing; so does leaving after t_end."""
+    assert evaluate(trace(0, until=350)).cost == 0.0
+    assert evaluate(trace(0, until=351)).cost == 3.0
+
+
+def test_the_first_loss_counts():
+    assert evaluate(trace(400, until=401)).cost == evaluate(trace(400)).cost
+
+
+def test_the_threshold_is_inclusive():
+    limit = np.float32(LOST)
+    assert evaluate(trace(distance={500: limit})).cost > 0
+    assert evaluate(trace(distance={500: np.nextafter(limit, np.float32(0))})).cost == 0
+
+
+@pytest.mark.parametrize(
+    "name, value, status",
+    [
+        ("speed", np.nan, Status.NONFINITE),
+        ("speed", np.inf, Status.NONFINITE | Status.SPEED),
+        ("distance", np.nan, Status.NONFINITE),
+        ("speed", 1001.0, Status.SPEED),
+        ("height", -0.011, Status.PENETRATION),
+    ],
+)
+def test_failures_are_flagged_with_their_step(name, value, status):
+    result = evaluate(trace(**{name: {600: value}}))
+    assert result.status == status and result.bad_step == 600
+    assert result.cost == SCENE.cost.maximum and np.isinf(result.lost_time)
+
+
+def test_a_fast_but_legal_world_is_no_failure():
+    assert evaluate(trace(speed={600: 1000.0}, height={600: -0.0099})).status == Status.OK
+
+
+def test_what_follows_a_loss_does_not_fail_the_trial():
+    """The trial is decided: engines need not simulate further, and may differ there."""
+    result = evaluate(trace(400, speed={600: np.nan}))
+    assert result.status == Status.OK and result.cost == pytest.approx(3.0 * 4.0 / 4.5)
+    result = evaluate(trace(600, speed={400: np.nan}))
+    assert result.status == Status.NONFINITE and result.bad_step == 400
+
+
+def test_a_stuck_object_fails_the_trial():
+    """At the end it must be far from the hand or lie on the table."""
+    last = STEPS - 1
+    assert evaluate(trace(distance={last: 0.05}, height={last: 0.25})).status == Status.STUCK
+    assert evaluate(trace(distance={last: 0.05}, height={last: 0.03})).status == Status.OK
+    assert evaluate(trace(distance={last: 0.09}, height={last: 0.25})).status == Status.OK
+    # One that was lost before cannot be stuck.
+    assert evaluate(trace(400, distance={last: 0.05}, height={last: 0.25})).status == Status.OK
+    without = scene.load("paper", overrides={"effects": {"ungrasp": False}})
+    held = jax.tree.map(lambda v: v[: without.num_steps], trace())
+    assert cost.outcome(without, held).status == Status.OK
+
+
+@repeatable
+@given(st.integers(350, 799), st.integers(350, 799))
+def test_earlier_losses_cost_more(first, second):
+    a, b = evaluate(trace(first)).cost, evaluate(trace(second)).cost
+    assert (a > b) == (first < second)
+    assert 0 < a <= 3 and 0 < b <= 3
+
+
+def test_worlds_are_independent_under_vmap():
+    traces = [trace(400), trace(), trace(speed={300: np.nan}), trace(700)]
+    batch = jax.tree.map(lambda *v: jnp.stack(v), *traces)
+    together = jax.vmap(lambda t: cost.outcome(SCENE, t))(batch)
+    for i, t in enumerate(traces):
+        for a, b in zip(evaluate(t), together, strict=True):
+            np.testing.assert_array_equal(a, b[i])
+
+
+# --- particles -----------------------------------------------------------------------------------
+
+
+def outcomes(costs, statuses):
+    shape = np.shape(costs)
+    return Outcome(
+        jnp.asarray(costs, jnp.float32),
+        jnp.asarray(statuses, jnp.int32),
+        jnp.zeros(shape),
+        jnp.zeros(shape, jnp.int32),
+    )
+
+
+def test_exclusion_and_worst():
+    """The paper's rule averages what is left; the strict one charges failed trials in full."""
+    trials = outcomes(
+        [[0.0, 3.0, 1.0], [3.0, 3.0, 0.5], [3.0, 3.0, 3.0]], [[0, 64, 0], [1, 2, 0], [1, 1, 1]]
+    )
+    np.testing.assert_allclose(cost.particle_cost(SCENE, trials), [0.5, 0.5, 3.0])
+    worst = scene.load("paper", overrides={"cost": {"failure": "worst"}})
+    np.testing.assert_allclose(cost.particle_cost(worst, trials), [4 / 3, 6.5 / 3, 3.0])
+
+
+def test_costs_of_failed_trials_do_not_matter():
+    """Not even one that is not a number."""
+    trials = outcomes([[0.25, np.nan, 0.75]], [[0, 1, 0]])
+    np.testing.assert_allclose(cost.particle_cost(SCENE, trials), [0.5])
+    worst = scene.load("paper", overrides={"cost": {"failure": "worst"}})
+    np.testing.assert_allclose(cost.particle_cost(worst, trials), [4 / 3])
+
+
+def test_all_failed_is_the_maximum():
+    trials = outcomes([[0.0, 0.0]], [[1, 64]])
+    for rule in ("exclude", "worst"):
+        rules = scene.load("paper", overrides={"cost": {"failure": rule}})
+        np.testing.assert_array_equal(cost.particle_cost(rules, trials), [3.0])

@@ -1,0 +1,212 @@
+"""Trials, commands and batches: the same numbers in any order, number and company."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small import hand_world, nth, pinch, random_designs, stack
+
+from codesign_jax import control, parameters, rollout, scene
+from codesign_jax.engines import make_engine
+
+PAPER = scene.load("paper")
+KEY = jax.random.key(5)
+draw = jax.jit(lambda key, n: rollout.sample_trials(PAPER, key, n), static_argnums=1)
+
+
+# --- trials --------------------------------------------------------------------------------------
+
+
+def test_more_trials_do_not_change_the_first():
+    few, many = draw(KEY, 4), draw(KEY, 40)
+    for a, b in zip(few, many, strict=True):
+        np.testing.assert_array_equal(a, b[:4])
+
+
+def test_shapes_take_turns():
+    np.testing.assert_array_equal(draw(KEY, 7).shape, [0, 1, 2, 0, 1, 2, 0])
+
+
+def test_noise_has_the_declared_spread():
+    """Means and standard deviations over 20,000 trials, to four standard errors."""
+    count, noise = 20_000, PAPER.objects.noise
+    trials = draw(jax.random.key(0), count)
+    angle = np.deg2rad(noise.orientation)
+    for values, mean, sigma in (
+        (trials.position, 0.0, noise.position),
+        (trials.yaw[:, None], 0.0, angle),
+        (trials.arm_tilt, 0.0, angle),
+        (trials.mass[:, None], 1.0, noise.mass),
+        (trials.size[:, None], 1.0, noise.size),
+    ):
+        np.testing.assert_allclose(values.mean(0), mean, atol=4 * sigma / np.sqrt(count))
+        np.testing.assert_allclose(values.std(0), sigma, rtol=4 / np.sqrt(2 * count))
+    columns = np.column_stack(
+        [trials.position, trials.yaw, trials.arm_tilt, trials.mass, trials.size]
+    )
+    correlation = np.corrcoef(columns.T) - np.eye(7)
+    assert np.abs(correlation).max() < 4.5 / np.sqrt(count)
+
+
+def test_keys_give_different_trials():
+    one, other = draw(jax.random.key(1), 6), draw(jax.random.key(2), 6)
+    assert not np.isclose(one.yaw, other.yaw).any()
+
+
+def test_nominal_trials_have_no_noise():
+    trial = rollout.nominal_trial(PAPER, "cylinder")
+    assert trial.shape == 1 and trial.mass == trial.size == 1.0
+    assert not trial.position.any() and not trial.arm_tilt.any() and trial.yaw == 0.0
+
+
+# --- commands ------------------------------------------------------------------------------------
+
+
+def commands(**changes):
+    params, trial = hand_world(PAPER, pressure=100e3)
+    arm = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.3])  # x y z roll pitch yaw
+    trial = trial._replace(**changes)
+    params, trial = jax.tree.map(jnp.asarray, (params._replace(arm=arm), trial))
+    return np.asarray(control.commands(PAPER, params, trial))
+
+
+def test_commands_of_a_grasp():
+    """Key frames at the phases' ends, in the actuators' order: x y z, roll yaw pitch, pressures."""
+    u = commands()
+    assert u.shape == (900, 10)
+    start, low = 0.3, 0.06 + 0.05
+    for time, height, inflation in (
+        (0.0, start, 0.0),
+        (1.0, (start + low) / 2, 0.0),
+        (2.0, low, 0.0),
+        (2.75, low, 0.5),
+        (3.5, low, 1.0),
+        (4.0, (start + low) / 2, 1.0),
+        (4.5, start, 1.0),
+        (7.99, start, 1.0),
+        (8.25, start, 0.5),
+        (8.5, start, 0.0),
+        (8.99, start, 0.0),
+    ):
+        row = u[round(time * 100)]
+        np.testing.assert_allclose(row[2], height, atol=1e-6)
+        np.testing.assert_allclose(row[6:], 100e3 * inflation, rtol=1e-5, atol=1e-2)
+    np.testing.assert_allclose(
+        u[:450, [0, 1, 3, 4, 5]], [[0.01, 0.02, 0.1, 0.3, 0.2]] * 450, rtol=1e-6
+    )
+
+
+def test_the_disturbance_grows_and_alternates():
+    u = commands()
+    roll, pitch = u[:, 3] - 0.1, u[:, 5] - 0.2
+    np.testing.assert_array_equal(u[:, 4], u[0, 4])  # yaw is never shaken
+    period = round(100 / 1.5)
+    assert np.abs(roll[450 : 450 + period]).max() > 0.01  # the first period rolls,
+    np.testing.assert_allclose(pitch[450 : 450 + period], 0.0, atol=1e-6)
+    second = slice(450 + period + 1, 450 + 2 * period)
+    assert (
+        np.abs(pitch[second]).max() > np.abs(roll[450 : 450 + period]).max()
+    )  # the second pitches
+    np.testing.assert_allclose(roll[second], 0.0, atol=1e-6)
+    largest = np.abs(np.stack([roll, pitch])).max()
+    assert 0.8 * np.deg2rad(40) < largest <= np.deg2rad(40) + 1e-6
+    np.testing.assert_allclose(u[850:, 3:6], u[850:, 3:6] * 0 + [0.1, 0.3, 0.2], atol=1e-6)
+    assert np.abs(np.diff(u[:, 3:6], axis=0)).max() < 0.08  # no jumps: 40 deg at 1.5 Hz in a step
+
+
+def test_the_arm_carries_the_trials_tilt():
+    tilted = commands(arm_tilt=np.array([0.05, -0.07]))
+    difference = tilted - commands()
+    np.testing.assert_allclose(difference[:, 3], 0.05, atol=1e-6)
+    np.testing.assert_allclose(difference[:, 5], -0.07, atol=1e-6)
+    np.testing.assert_array_equal(difference[:, [0, 1, 2, 4, 6, 7, 8, 9]], 0.0)
+
+
+def test_effects_that_are_off_have_no_phase():
+    calm = scene.load("paper", overrides={"effects": {"disturb": False, "ungrasp": False}})
+    params, trial = jax.tree.map(jnp.asarray, hand_world(calm))
+    u = np.asarray(control.commands(calm, params, trial))
+    assert u.shape == (450, 10)
+    np.testing.assert_array_equal(u[:, 3:6], 0.0)
+
+
+# --- batches -------------------------------------------------------------------------------------
+
+SHORT = {
+    "phases__approach": 0.4,
+    "phases__inflate": 0.6,
+    "phases__lift": 0.8,
+    "phases__disturb": 1.0,
+    "phases__ungrasp": 1.6,
+}
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """A short scene, its engine, and a jitted evaluation that counts its compiles."""
+    the_scene = pinch("box", links=2, **SHORT)
+    engine, compiles = make_engine("mujoco", the_scene), []
+    space = parameters.design_space(the_scene.hand)
+
+    def evaluate(designs, trials):
+        compiles.append(designs.shape)
+        return rollout.evaluate(the_scene, engine, jax.vmap(space.params)(designs), trials)
+
+    designs = random_designs(space, seed=4, count=5)
+    trials = rollout.sample_trials(the_scene, KEY, 4)
+    return jax.jit(evaluate), compiles, designs, trials, (the_scene, engine, space)
+
+
+def assert_same(one, other):
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_one_compile_for_many_values(batch):
+    evaluate, compiles, designs, trials, (the_scene, *_) = batch
+    evaluate(designs, trials)
+    count = len(compiles)
+    other = rollout.sample_trials(the_scene, jax.random.key(9), 4)
+    for values in (designs * 0.99, designs[::-1]):
+        result = evaluate(values, other)
+        assert result.cost.shape == (5, 4)
+    assert len(compiles) == count
+
+
+def test_order_of_particles_and_trials_does_not_matter(batch):
+    """Also: every particle meets the same trials, whatever its place (common random numbers)."""
+    evaluate, _, designs, trials, _ = batch
+    whole = evaluate(designs, trials)
+    particles, order = np.array([3, 0, 4, 1, 2]), np.array([2, 3, 0, 1])
+    shuffled = evaluate(designs[particles], nth(trials, order))
+    assert_same(shuffled, (v[particles][:, order] for v in whole))
+    twins = evaluate(jnp.stack([designs[0]] * 5), trials)
+    assert_same(twins, (jnp.stack([v[0]] * 5) for v in whole))
+
+
+def test_trials_do_not_depend_on_their_number(batch):
+    evaluate, _, designs, trials, _ = batch
+    whole = evaluate(designs, trials)
+    assert_same(evaluate(designs, nth(trials, slice(0, 2))), (v[:, :2] for v in whole))
+    assert_same(evaluate(designs[:2], trials), (v[:2] for v in whole))
+
+
+def test_jit_and_single_worlds_agree(batch):
+    """A world by itself, with its trace, costs what it costs in the batch."""
+    evaluate, _, designs, trials, (the_scene, engine, space) = batch
+    whole = evaluate(designs, trials)
+    params = space.params(designs[3])
+    world = jax.tree.map(lambda v: v[None], (params, nth(trials, 1)))
+    outcome, trace = jax.jit(
+        lambda p, t: rollout.simulate(the_scene, engine, p, t, trajectory=True)
+    )(*stack(nth(world, 0)))
+    assert_same(nth(outcome, 0), (v[3, 1] for v in whole))
+    assert trace.qpos.shape == (1, the_scene.num_steps, engine.template.nq)
+    assert trace.distance.dtype == jnp.float32
+
+
+def test_noise_reaches_the_outcome(batch):
+    """Trials differ: a design's costs or times of loss are not one number."""
+    evaluate, _, designs, trials, _ = batch
+    result = evaluate(designs, trials)
+    assert len(np.unique(result.lost_time)) > 3

@@ -29,13 +29,15 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     height = jnp.interp(time, np.array([0.0, p.approach, p.inflate, p.lift]), frames)
     roll, pitch = _shake(scene, time)
     ones = jnp.ones_like(height)
+    # Positive pitch points the fingers towards +x, so that Table I's x = -20 mm with 15 degrees aims the hand
+    # at the object [ours]; the wrist's hinge turns about +y, which points them towards -x.
     pose = [
         arm[0] * ones,
         arm[1] * ones,
         height,
         arm[3] + trial.arm_tilt[0] + roll,
         arm[5] * ones,
-        arm[4] + trial.arm_tilt[1] + pitch,
+        pitch - arm[4] + trial.arm_tilt[1],
     ]
     pressure = params.pressure[:, None] * _inflation(scene, time)
     return jnp.concatenate([jnp.stack(pose), pressure]).T

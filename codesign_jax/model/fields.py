@@ -185,7 +185,7 @@ def _start(scene: Scene, params: Params, trial: Trial, rest: jax.Array) -> jax.A
     """Start state: palm at the arm's first pose, straight fingers, object at rest."""
     arm, tilt, dtype = params.arm, trial.arm_tilt, params.arm.dtype
     height = jnp.asarray(scene.arm.start_height, dtype)
-    wrist = jnp.stack([arm[0], arm[1], height, arm[3] + tilt[0], arm[5], arm[4] + tilt[1]])
+    wrist = jnp.stack([arm[0], arm[1], height, arm[3] + tilt[0], arm[5], tilt[1] - arm[4]])
     zero = jnp.zeros((), dtype)
     quat = jnp.stack([jnp.cos(trial.yaw / 2), zero, zero, jnp.sin(trial.yaw / 2)])
     fingers = jnp.zeros(layout(scene).dofs.size, dtype)

@@ -5,6 +5,7 @@ arms, so that float32 suffices); it does not move during the step.  In such a fr
 subspaces of different bodies add without transforms.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -68,7 +69,7 @@ class Kinematics(NamedTuple):
       palm_bias: Palm acceleration at zero joint acceleration, same shape.
       link: Columns of the links' orientations, shape (3, 3, link, finger, world).
       origin: Link frame positions, shape (3, link, finger, world).
-      axes: Joint subspaces, one (axis, 6, finger, world) a link.
+      axes: Joint subspaces, shape (link, axis, 6, finger, world).
       vel: Link velocities, shape (6, link, finger, world).
       bias: Link accelerations at zero joint acceleration, same shape.
       object: Columns of the object's orientation, shape (3, 3, 1, world).
@@ -82,7 +83,7 @@ class Kinematics(NamedTuple):
     palm_bias: jax.Array
     link: jax.Array
     origin: jax.Array
-    axes: list[jax.Array]
+    axes: jax.Array
     vel: jax.Array
     bias: jax.Array
     object: jax.Array
@@ -98,33 +99,29 @@ def kinematics(
     frame, origin = run(_mount, palm, hand.mount, hand.base)
     vel, bias = palm_vel, palm_bias
     trig = run(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
-    frames, origins, axes, vels, biases = [], [], [], [], []
-    for i in range(state.finger.shape[0]):
-        origin, frame, subspace = run(
-            lambda *args: _turn_link(axis_names, *args),
-            origin,
-            frame,
-            hand.offset[i],
-            trig[0][i],
-            trig[1][i],
-        )
-        vel, bias = run(_link_velocity, vel, bias, subspace, state.finger_vel[i])
-        axes.append(subspace)
-        frames.append(frame)
-        origins.append(origin)
-        vels.append(vel)
-        biases.append(bias)
+
+    def next_link(carry, link):
+        (origin, frame, vel, bias), (offset, cos, sin, rate) = carry, link
+        turn = partial(_turn_link, axis_names)
+        origin, frame, subspace = run(turn, origin, frame, offset, cos, sin)
+        vel, bias = run(_link_velocity, vel, bias, subspace, rate)
+        return (origin, frame, vel, bias), (origin, frame, vel, bias, subspace)
+
+    over = (hand.offset, *trig, state.finger_vel)
+    lanes = jnp.zeros_like(hand.offset[0])
+    first = (origin, frame, vel + lanes, bias + lanes)
+    _, (origins, frames, vels, biases, axes) = jax.lax.scan(next_link, first, over)
     columns, position, object_vel = run(_object, state)
     return Kinematics(
         palm=palm,
         wrist_axes=wrist_axes,
         palm_vel=palm_vel,
         palm_bias=palm_bias,
-        link=jnp.stack(frames, 2),
-        origin=jnp.stack(origins, 1),
+        link=jnp.moveaxis(frames, 0, 2),
+        origin=jnp.moveaxis(origins, 0, 1),
         axes=axes,
-        vel=jnp.stack(vels, 1),
-        bias=jnp.stack(biases, 1),
+        vel=jnp.moveaxis(vels, 0, 1),
+        bias=jnp.moveaxis(biases, 0, 1),
         object=columns,
         object_pos=position,
         object_vel=object_vel,

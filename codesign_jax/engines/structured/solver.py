@@ -86,13 +86,16 @@ def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
         return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
 
     palm = run(palm_motion, acc.wrist, kin.wrist_axes)
-    link, links = palm, []
-    for i, axes in enumerate(kin.axes):
-        link = run(next_link, link, axes, acc.finger[i])
-        links.append(link)
+
+    def step(parent: jax.Array, link: tuple):
+        motion = run(next_link, parent, *link)
+        return motion, motion
+
+    first = palm + jnp.zeros_like(kin.vel[:, 0])
+    _, links = jax.lax.scan(step, first, (kin.axes, acc.finger))
     angular = acc.object[:3]
     obj = spatial(angular, acc.object[3:] + cross(kin.object_pos, angular))
-    return Spatial(palm, jnp.stack(links, 1), obj)
+    return Spatial(palm, jnp.moveaxis(links, 0, 1), obj)
 
 
 def relative(name: str, motion: Spatial) -> jax.Array:
@@ -158,19 +161,16 @@ def newton_step(
       The step in the joints and its spatial motion.
     """
     kin, hand = problem.kin, problem.hand
-    factors: list[el.Factors] = []
-    node = None
-    for i in reversed(range(len(kin.axes))):
-        node = run(
-            lambda *a: _add_link(*a),
-            node,
-            problem.matrix.link[:, :, i],
-            force.link[:, i],
-            *_of_link(pushes, i),
-        )
-        node, f = el.eliminate(run, node, kin.axes[i], hand.armature[i], force.finger[i])
-        factors.append(f)
-    assert node is not None
+
+    def next_joint(node: el.Quadratic, link: tuple):
+        matrix, push, terms, axes, arm, tau = link
+        return el.eliminate(run, run(_add_link, node, matrix, push, terms), axes, arm, tau)
+
+    terms = {n: v for n, v in pushes.items() if n.startswith("finger")}
+    own = (problem.matrix.link, force.link, terms)
+    own = jax.tree.map(lambda v: jnp.moveaxis(v, -3, 0), own)
+    links = (*own, kin.axes, hand.armature, force.finger)
+    node, factors = jax.lax.scan(next_joint, _nothing(force.link[:, 0]), links, reverse=True)
     node = run(_add_palm, node, problem.matrix, force, pushes)
     arm = hand.wrist_armature
     node, hinges = el.eliminate(run, node, kin.wrist_axes, arm[3:], force.wrist[3:])
@@ -179,36 +179,36 @@ def newton_step(
     obj = el.solve_object(run, node.q, node.r_object)
     first, palm = run(el.substitute, slide_axes, slides, jnp.zeros_like(obj), obj)
     second, palm = run(el.substitute, kin.wrist_axes, hinges, palm, obj)
-    link, links, fingers = palm, [], []
-    for axes, f in zip(kin.axes, reversed(factors), strict=True):
-        a, link = run(el.substitute, axes, f, link, obj)
-        fingers.append(a)
-        links.append(link)
+
+    def next_link(parent: jax.Array, link: tuple):
+        a, motion = run(el.substitute, *link, parent, obj)
+        return motion, (a, motion)
+
+    first_link = palm + jnp.zeros_like(force.link[:, 0])
+    _, (fingers, motions) = jax.lax.scan(next_link, first_link, (kin.axes, factors))
     at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
-    acc = Acc(jnp.concatenate([first, second]), jnp.stack(fingers), at_centre)
-    return acc, Spatial(palm, jnp.stack(links, 1), obj)
+    acc = Acc(jnp.concatenate([first, second]), fingers, at_centre)
+    return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
 
 
-def _of_link(pushes: dict, i: int) -> tuple:
-    """A link's contact terms: (object inertia, wrench, table inertia, wrench), None where absent."""
-    terms = []
-    for name in ("finger_object", "finger_table"):
-        if name in pushes:
-            terms += [pushes[name][0][:, :, i], pushes[name][1][:, i]]
-        else:
-            terms += [None, None]
-    return tuple(terms)
+def _nothing(like: jax.Array) -> el.Quadratic:
+    """The objective beyond the finger tips, for vectors shaped as `like`, (6, finger, world)."""
+    matrix = jnp.zeros((6, *like.shape), like.dtype)
+    return el.Quadratic(matrix, matrix, matrix, jnp.zeros_like(like), jnp.zeros_like(like))
 
 
-def _add_link(node, p, r, object_p, object_r, table_p, table_r) -> el.Quadratic:
+def _add_link(node: el.Quadratic, matrix: jax.Array, push: jax.Array, terms: dict) -> el.Quadratic:
     """Adds a link's own inertia, forces and contacts to what its children left."""
-    if table_p is not None:
-        p, r = p + table_p, r + table_r
-    if object_p is not None:
-        p, r = p + object_p, r + object_r
-    c = jnp.zeros_like(p) if object_p is None else object_p
-    own = el.Quadratic(p, c, c, r, jnp.zeros_like(r) if object_r is None else -object_r)
-    return own if node is None else el.Quadratic(*(a + b for a, b in zip(node, own, strict=True)))
+    p, c, q, r, ro = node
+    p, r = p + matrix, r + push
+    if "finger_table" in terms:
+        inertia, wrench = terms["finger_table"]
+        p, r = p + inertia, r + wrench
+    if "finger_object" in terms:
+        inertia, wrench = terms["finger_object"]
+        p, c, q = p + inertia, c + inertia, q + inertia
+        r, ro = r + wrench, ro - wrench
+    return el.Quadratic(p, c, q, r, ro)
 
 
 def _add_palm(node: el.Quadratic, matrix: Matrices, force: Forces, pushes: dict) -> el.Quadratic:
@@ -275,9 +275,8 @@ def line_search(
     def summed(c: Contacts, ray, alpha: jax.Array):
         return tuple(sum_items(v) for v in slopes(c, ray, alpha))
 
-    low, high = jnp.zeros_like(slope), jnp.full_like(slope, jnp.inf)
-    alpha = jnp.ones_like(slope)
-    for _ in range(evaluations):
+    def evaluate(_: int, carry: tuple):
+        alpha, low, high = carry
         first, second = slope + alpha * curvature, curvature
         for n, c in contacts.items():
             f, s = run[n](summed, c, rays[n], alpha)
@@ -286,8 +285,10 @@ def line_search(
         guess = alpha - first / jnp.maximum(second, 1e-30)
         inside = (guess >= low) & (guess <= high)
         middle = jnp.where(jnp.isinf(high), 2.0 * low, 0.5 * (low + high))
-        alpha = jnp.where(inside, guess, middle)
-    return alpha
+        return jnp.where(inside, guess, middle), low, high
+
+    start = (jnp.ones_like(slope), jnp.zeros_like(slope), jnp.full_like(slope, jnp.inf))
+    return jax.lax.fori_loop(0, evaluations, evaluate, start)[0]
 
 
 def solve(

@@ -29,8 +29,9 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     height = jnp.interp(time, np.array([0.0, p.approach, p.inflate, p.lift]), frames)
     roll, pitch = _shake(scene, time)
     ones = jnp.ones_like(height)
-    # Positive pitch points the fingers towards +x, so that Table I's x = -20 mm with 15 degrees aims the hand
-    # at the object [ours]; the wrist's hinge turns about +y, which points them towards -x.
+    # Positive pitch points the fingers towards +x, so that Table I's x = -20 mm with 15 degrees
+    # aims the hand at the object [ours]; the wrist's hinge turns about +y, which points them
+    # towards -x.
     pose = [
         arm[0] * ones,
         arm[1] * ones,

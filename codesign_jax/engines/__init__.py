@@ -4,8 +4,8 @@ from codesign_jax import schema
 from codesign_jax.engines.base import Engine
 from codesign_jax.scene import Scene
 
-# The structured engine of docs/roadmap takes its place here and becomes the default.
-NAMES = ("mjx", "mujoco")
+# The structured engine becomes the default once its benchmark and its convergence study stand.
+NAMES = ("mjx", "mujoco", "structured")
 DEFAULT = "mujoco"
 
 
@@ -27,6 +27,10 @@ def make_engine(name: str, scene: Scene) -> Engine:
         from codesign_jax.engines.mujoco import MujocoEngine
 
         return MujocoEngine(scene)
+    if name == "structured":
+        from codesign_jax.engines.structured import StructuredEngine
+
+        return StructuredEngine(scene)
     raise schema.SceneError([f"engine {name!r} unknown; {schema.nearest(name, NAMES)}"])
 
 

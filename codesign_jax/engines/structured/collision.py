@@ -1,4 +1,6 @@
-"""Contact geometry: spheres against the object's signed distance function and the table, object on table."""
+"""Contact geometry: spheres against the object and the table, the object on the table."""
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +18,7 @@ _TINY = 1e-12
 
 
 def make_cone(scene: Scene, friction: jax.Array | float, *, bodies: int) -> Cone:
-    """MuJoCo's contact parameters (Computation chapter, 'Solver parameters') for constant impedance.
+    """MuJoCo's contact parameters for constant impedance (its Computation chapter).
 
     Args:
       scene: The scene.
@@ -74,7 +76,7 @@ def spheres_on_object(
 def spheres_on_table(
     scene: Scene, height: jax.Array, centre: jax.Array, radius: jax.Array | float
 ) -> Contacts:
-    """Contacts of spheres with the table z = 0; `height` is the palm's, the frame's origin, (1, world)."""
+    """Contacts of spheres with the table; `height` is the palm's, the origin's, (1, world)."""
     gap = centre[2] + height - radius
     zero = jnp.zeros_like(gap)
     normal = jnp.stack([zero, zero, zero + 1.0])
@@ -103,7 +105,7 @@ def signed_distance(scene: Scene, hand: HandLanes, local: jax.Array) -> tuple[ja
       hand: Sizes and shape index of the objects.
       local: Points, shape (3, ...).
     """
-    functions = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
+    functions: dict[str, Callable] = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
     kinds = [s.type for s in scene.objects.object]
     result = None
     for kind in dict.fromkeys(kinds):
@@ -157,10 +159,15 @@ def object_on_table(
 ) -> Contacts:
     """Contacts of the object with the table, four slots as in MuJoCo's plane colliders.
 
-    The points are the four lower corners of a box; the lower rim's lowest point, its upper counterpart and
-    two more on the lower rim, 120 degrees apart, of a cylinder; the lowest point of a sphere (one slot).
+    The points are the four lower corners of a box; the lower rim's lowest point, its upper
+    counterpart and two more on the lower rim, 120 degrees apart, of a cylinder; the lowest point of
+    a sphere (one slot).
     """
-    functions = {"box": _box_corners, "cylinder": _rim_points, "sphere": _lowest_point}
+    functions: dict[str, Callable] = {
+        "box": _box_corners,
+        "cylinder": _rim_points,
+        "sphere": _lowest_point,
+    }
     kinds = [s.type for s in scene.objects.object]
 
     def points(size: jax.Array, columns: jax.Array, position: jax.Array, height: jax.Array):

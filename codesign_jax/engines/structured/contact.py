@@ -1,8 +1,9 @@
 """Contacts: signed distances of spheres to the object and the table, and MuJoCo's elliptic cone.
 
-A contact's relative velocity and acceleration are those of the hand's (or, on the table, the object's) point
-minus the other body's, with the normal pointing the same way; jar = J a - aref as in MuJoCo.  Within a set of
-contacts every array has the item axes (link, k, finger), (sphere, 1) or (slot, 1) before the world's.
+A contact's relative velocity and acceleration are those of the hand's (or, on the table, the
+object's) point minus the other body's, with the normal pointing the same way; jar = J a - aref as
+in MuJoCo.  Within a set of contacts every array has the item axes (link, k, finger), (sphere, 1) or
+(slot, 1) before the world's.
 """
 
 from typing import NamedTuple
@@ -58,7 +59,7 @@ class Contacts(NamedTuple):
         return motion[3:] + cross(motion[:3], self.point)
 
     def reference(self, velocity: jax.Array) -> jax.Array:
-        """aref from the relative point velocity, shape (3, ...)."""
+        """Reference acceleration aref from the relative point velocity, shape (3, ...)."""
         return -self.cone.damper * velocity - self.cone.spring * self.distance * self.normal
 
 
@@ -79,8 +80,9 @@ class Response(NamedTuple):
 def respond(contacts: Contacts, jar: jax.Array) -> Response:
     """Evaluates MuJoCo's elliptic cone (engine_core_constraint.c, mj_constraintUpdate) at jar.
 
-    With w_n and w_t the normal and tangential parts of jar: the bottom zone is quadratic in both, the
-    middle zone 1/2 D_m (w_n - mu |w_t|)^2 with D_m = D_n / (1 + mu^2 / impratio), the top zone zero.
+    With w_n and w_t the normal and tangential parts of jar: the bottom zone is quadratic in both,
+    the middle zone 1/2 D_m (w_n - mu |w_t|)^2 with D_m = D_n / (1 + mu^2 / impratio), the top zone
+    zero.
     """
     cone, n = contacts.cone, contacts.normal
     normal = dot(n, jar)

@@ -1,10 +1,11 @@
 """Elimination of a joint from a quadratic of the link's and the object's accelerations.
 
-The objective of a subtree, as a function of its base link's spatial acceleration v and the object's v_o, is
+The objective of a subtree, as a function of its base link's spatial acceleration v and the object's
+v_o, is
   1/2 v'P v - v'C v_o + 1/2 v_o'Q v_o - r'v - r_o'v_o.
-With v = v_parent + S a and the joint's own 1/2 a'(arm)a - tau'a, minimising over the joint accelerations a
-gives the same form in v_parent: Featherstone's articulated-body recursion (Rigid Body Dynamics Algorithms,
-2008, ch. 7) extended by the object that every finger may touch.
+With v = v_parent + S a and the joint's own 1/2 a'(arm)a - tau'a, minimising over the joint
+accelerations a gives the same form in v_parent: Featherstone's articulated-body recursion (Rigid
+Body Dynamics Algorithms, 2008, ch. 7) extended by the object that every finger may touch.
 """
 
 from typing import NamedTuple

@@ -15,7 +15,8 @@ class HandLanes(NamedTuple):
     """Hand and object of every world; lanes are (finger, world) or (1, world), all lengths SI.
 
     Attributes:
-      mount: Columns of the finger bases' orientations in the palm frame, shape (3, 3, finger, world).
+      mount: Columns of the finger bases' orientations in the palm frame, shape (3, 3, finger,
+        world).
       base: Base positions in the palm frame, shape (3, finger, world).
       offset: Joint positions along the previous link, shape (link, finger, world).
       mass: Link masses, shape (link, finger, world).
@@ -27,7 +28,8 @@ class HandLanes(NamedTuple):
       gain: Bending moment per pressure, shape (finger, world).
       sphere: Sphere centres in the link frame, shape (3, link, k, finger, world).
       radius: Sphere radii, shape (link, k, finger, world).
-      stub_centre: Centre of the half segments at the palm in the palm frame, shape (3, finger, world).
+      stub_centre: Centre of the half segments at the palm in the palm frame, shape (3, finger,
+        world).
       palm_mass: Mass of the palm with the half segments, shape (1, world).
       palm_centre: Its centre of mass in the palm frame, shape (3, 1, world).
       palm_inertia: Its inertia tensor about that centre, shape (3, 3, 1, world).
@@ -131,7 +133,7 @@ def hand_lanes(scene: Scene, fields: ModelFields) -> HandLanes:
 
 
 def _palm(fields: ModelFields, stubs: np.ndarray, mount: jax.Array, stub_centre: jax.Array, last):
-    """Mass, centre and inertia of the palm with the half segments welded to it, in the palm frame."""
+    """Mass, centre and inertia of the palm with its half segments, in the palm frame."""
     masses = jnp.concatenate([last(fields.body_mass[:, 1])[None], last(fields.body_mass[:, stubs])])
     palm_centre = last(fields.body_ipos[:, 1])[:, None]
     centres = jnp.concatenate([palm_centre, stub_centre], 1)

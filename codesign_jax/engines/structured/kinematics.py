@@ -1,8 +1,8 @@
 """Positions, motion subspaces, velocities and bias accelerations of all bodies of one state.
 
-All spatial quantities are in a world-aligned frame whose origin is the palm's present position (short lever
-arms, so that float32 suffices); it does not move during the step.  In such a frame velocities and motion
-subspaces of different bodies add without transforms.
+All spatial quantities are in a world-aligned frame whose origin is the palm's present position
+(short lever arms, so that float32 suffices); it does not move during the step.  In such a frame
+velocities and motion subspaces of different bodies add without transforms.
 """
 
 from functools import partial
@@ -46,7 +46,7 @@ class State(NamedTuple):
 
 
 class Acc(NamedTuple):
-    """Accelerations; the object's as its spatial vector (angular, linear at its centre), world axes.
+    """Accelerations; the object's as (angular, linear at its centre) in world axes.
 
     Attributes:
       wrist: Shape (6, 1, world).

@@ -1,8 +1,8 @@
 """Small linear algebra on lanes: the batch is the last axis, components are leading axes.
 
-A *lane* is an array of shape (finger, world) or one that broadcasts to it; a vector has its components in
-front, shape (3, ..., finger, world), a matrix two such axes.  Sums over short axes are written out: XLA's
-reductions over them are many times slower than additions on a CPU.
+A *lane* is an array of shape (finger, world) or one that broadcasts to it; a vector has its
+components in front, shape (3, ..., finger, world), a matrix two such axes.  Sums over short axes
+are written out: XLA's reductions over them are many times slower than additions on a CPU.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,14 +15,15 @@ import jax.numpy as jnp
 class Stages:
     """Runs parts of a program so that XLA computes each result once.
 
-    XLA's fusion recomputes an intermediate in every kernel that uses it; in a chain of small matrix products
-    that multiplies the work by ten and the compile time by a hundred.  On a CPU the optimization barrier is
-    gone before fusion, but a conditional is not: with a predicate that is true at run time its branch is
-    compiled by itself.  On a GPU, where a predicate costs a round trip, the barrier works.
+    XLA's fusion recomputes an intermediate in every kernel that uses it; in a chain of small matrix
+    products that multiplies the work by ten and the compile time by a hundred.  On a CPU the
+    optimization barrier is gone before fusion, but a conditional is not: with a predicate that is
+    true at run time its branch is compiled by itself.  On a GPU, where a predicate costs a round
+    trip, the barrier works.
     """
 
     def __init__(self, predicate: jax.Array | None):
-        """Takes a scalar that is true at run time and unknown to the compiler, or None for barriers."""
+        """Takes a scalar, true at run time, that the compiler does not know; None: barriers."""
         self._predicate = predicate
 
     def __call__(self, function: Callable, *args: Any) -> Any:
@@ -37,7 +38,7 @@ class Stages:
         return jax.lax.cond(self._predicate, function, never, *args)
 
     def only_if(self, condition: jax.Array) -> "Stages":
-        """Stages that return zeros when a scalar is false; where barriers are used, they always run."""
+        """Stages that return zeros when a scalar is false; with barriers they always run."""
         return Stages(None if self._predicate is None else condition)
 
 
@@ -107,7 +108,7 @@ def sum_items(x: jax.Array) -> jax.Array:
 
 
 def inverse_spd(m: jax.Array) -> jax.Array:
-    """Inverse of symmetric positive definite matrices of order 1 to 3, (n, n, ...), by cofactors."""
+    """Inverse of positive definite matrices of order 1 to 3, (n, n, ...), by cofactors."""
     n = m.shape[0]
     if n == 1:
         return 1.0 / m

@@ -1,8 +1,8 @@
-"""Newton's method with exact line search on MuJoCo's primal contact problem, without forming J, M or H.
+"""Newton's method with exact line search on MuJoCo's contact problem, without J, M or H.
 
-minimise over a:  1/2 (a - a_s)' M (a - a_s) + sum_c s_c(J_c a - aref_c), M with armature and implicit terms.
-A contact acts on a link as a wrench and a 6 x 6 contact inertia X'KX; one elimination from the finger tips
-to the object solves the Newton system (docs/structured-engine.md).
+minimise over a:  1/2 (a - a_s)' M (a - a_s) + sum_c s_c(J_c a - aref_c), M with armature and
+implicit terms. A contact acts on a link as a wrench and a 6 x 6 contact inertia X'KX; one
+elimination from the finger tips to the object solves the Newton system.
 """
 
 from typing import NamedTuple
@@ -35,7 +35,7 @@ from codesign_jax.engines.structured.lanes import (
 
 
 class Spatial(NamedTuple):
-    """Spatial motion of palm (6, 1, world), links (6, link, finger, world), object (6, 1, world)."""
+    """Spatial motion: palm (6, 1, world), links (6, link, finger, world), object as palm."""
 
     palm: jax.Array
     link: jax.Array
@@ -43,7 +43,7 @@ class Spatial(NamedTuple):
 
 
 class Matrices(NamedTuple):
-    """Spatial inertia matrices: palm (6, 6, 1, world), links (6, 6, link, finger, world), object."""
+    """Spatial inertia: palm (6, 6, 1, world), links (6, 6, link, finger, world), object."""
 
     palm: jax.Array
     link: jax.Array
@@ -154,8 +154,8 @@ def newton_step(
       run: Runs the stages.
       problem: The problem.
       force: Smooth forces minus inertial forces.
-      pushes: Contact inertia (6, 6, ...) and wrench (6, ...) by pair of bodies, summed over a body's
-        contacts.
+      pushes: Contact inertia (6, 6, ...) and wrench (6, ...) by pair of bodies, summed over a
+        body's contacts.
 
     Returns:
       The step in the joints and its spatial motion.

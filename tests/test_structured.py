@@ -1,0 +1,121 @@
+"""The structured engine against MuJoCo C: one step in contact, and free motion step by step."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from codesign_jax import control, model
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.kinematics import Acc
+from tests import small
+
+
+def lanes_state(engine, scene, fields, qpos, qvel):
+    """The engine's state, one world, from MuJoCo's coordinates, with a cold start."""
+    lay = model.layout(scene)
+    state = engine.reset(fields)
+    q, v = jnp.asarray(qpos)[:, None, None], jnp.asarray(qvel)[:, None, None]
+    end = 6 + lay.dofs.size
+
+    def finger(x):
+        return jnp.moveaxis(x[6:end].reshape(*lay.dofs.shape, 1), 0, 2)
+
+    acc = Acc(jnp.zeros_like(v[:6]), jnp.zeros_like(finger(v)), jnp.zeros_like(v[:6]))
+    return state._replace(
+        wrist=q[:6],
+        finger=finger(q),
+        position=q[end : end + 3],
+        quat=q[end + 3 :],
+        wrist_vel=v[:6],
+        finger_vel=finger(v),
+        linear_vel=v[end : end + 3],
+        angular_vel=v[end + 3 :],
+        acc=acc,
+    )
+
+
+def setting(shape, **params):
+    """Scene, MuJoCo C's model and the engine's hand for a pinch grasp, in float64."""
+    scene = small.pinch(shape)
+    world, trial = small.hand_world(scene, **params)
+    trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
+    fields = model.model_fields(scene, jax.tree.map(jnp.asarray, world), trial)
+    ctrl = np.asarray(control.commands(scene, jax.tree.map(jnp.asarray, world), trial))
+    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
+    oracle = world_model(scene, fields)
+    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
+    return scene, oracle, np.asarray(fields.start), batch, ctrl
+
+
+@pytest.mark.parametrize("shape", small.SHAPES)
+def test_accelerations_equal_mujoco_along_a_grasp(shape):
+    """Converged accelerations on states of a grasp, contacts included."""
+    with jax.enable_x64(True):
+        scene, oracle, start, fields, ctrl = setting(shape)
+        engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
+        hand, step = hand_lanes(scene, fields), jax.jit(engine.step)
+        data, touched = mujoco.MjData(oracle), 0
+        data.qpos[:] = start
+        for k in range(420):
+            data.ctrl[:] = ctrl[k]
+            if k % 35 == 20:
+                qpos, qvel = data.qpos.copy(), data.qvel.copy()
+                mujoco.mj_forward(oracle, data)
+                state = lanes_state(engine, scene, fields, qpos, qvel)
+                new, _ = step(hand, state, jnp.asarray(ctrl[k])[:, None])
+                acc = (np.asarray(engine.qvel(new))[0] - qvel) / scene.discretization.timestep
+                scale = max(np.linalg.norm(data.qacc), 100.0)
+                error = np.linalg.norm(acc - data.qacc) / scale
+                # A difference of velocities over 10 ms loses two of 16 digits, and MuJoCo's own Newton
+                # stops at rounding of its cost; the floor of 100 is ten times g: at rest qacc is noise.
+                assert error < 1e-8, (k, data.ncon, error)
+                touched = max(touched, data.ncon)
+            mujoco.mj_step(oracle, data)
+        assert touched > (4 if shape != "sphere" else 1)  # more than the object on the table
+
+
+def test_free_motion_equals_mujoco_step_by_step():
+    """Two seconds' worth of the approach's first steps, before any finger touches."""
+    with jax.enable_x64(True):
+        scene, oracle, start, fields, ctrl = setting("box")
+        oracle.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
+        hand, step = hand_lanes(scene, fields), jax.jit(engine.step)
+        data = mujoco.MjData(oracle)
+        data.qpos[:] = start
+        # Lift the object off the table: it falls for 20 steps without reaching it.
+        data.qpos[-5] += 0.5
+        state = lanes_state(engine, scene, fields, data.qpos, data.qvel)
+        for k in range(20):
+            data.ctrl[:] = ctrl[k]
+            mujoco.mj_step(oracle, data)
+            state, _ = step(hand, state, jnp.asarray(ctrl[k])[:, None])
+            # Rounding of 1e-16 relative, grown over twenty steps of a stiff chain.
+            np.testing.assert_allclose(engine.qpos(state)[0], data.qpos, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(engine.qvel(state)[0], data.qvel, rtol=0, atol=1e-10)
+
+
+def test_float32_is_close_to_float64():
+    """The frame at the palm keeps float32 accelerations within 1e-4 in free motion and contact."""
+    results = []
+    for wide in (True, False):
+        with jax.enable_x64(wide):
+            scene, _, start, fields, ctrl = setting("cylinder")
+            fields = jax.tree.map(lambda x: x.astype(jnp.float64 if wide else jnp.float32), fields)
+            engine = StructuredEngine(scene, iterations=60, evaluations=12, tolerance=1e-10)
+            hand = hand_lanes(scene, fields)
+            # The palm at 60 mm presses the straight fingers onto the table.
+            qpos = np.array(start)
+            qpos[2] = 0.06
+            state = lanes_state(engine, scene, fields, qpos, np.zeros(len(qpos) - 1))
+            state = jax.tree.map(lambda x: x.astype(fields.start.dtype), state)
+            u = jnp.asarray(ctrl[150], fields.start.dtype)[:, None]
+            new, info = jax.jit(engine.step)(hand, state, u)
+            results.append(np.asarray(engine.qvel(new))[0].astype(float))
+            assert float(info.residual.max()) < 1e-6
+    error = np.linalg.norm(results[1] - results[0]) / np.linalg.norm(results[0])
+    assert error < 1e-4

@@ -44,8 +44,8 @@ class Optimize:
     """Strategy: concurrent, single, switch-K (K switches), morphology or control."""
     first: Literal["morphology", "control"] = "morphology"
     """Domain of the first episode with single and switch-K."""
-    engine: str = "mujoco"
-    """Engine that simulates: mujoco (C, float64, all cores) or mjx (JAX)."""
+    engine: Text = None
+    """Engine that simulates, such as mujoco (C, float64, all cores, the default) or mjx (JAX)."""
     particles: Count = None
     """Particles; the paper's 10 in 2d, 60 otherwise."""
     trials: Count = None
@@ -98,7 +98,7 @@ class Evaluate:
     seed: int = 0
     """Root of the trials' noise."""
     render: File = None
-    """Write an animation of the first trial of each object to this .gif file."""
+    """Draw the first trial of each object: an animation (.gif) or a film strip (.png)."""
 
     def run(self) -> int:
         """Runs the command and returns the exit status."""

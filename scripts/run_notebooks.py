@@ -15,7 +15,11 @@ def main() -> int:
         start = time.perf_counter()
         notebook = jupytext.read(path)
         client = nbclient.NotebookClient(
-            notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": folder}}
+            notebook,
+            timeout=600,
+            kernel_name="python3",
+            resources={"metadata": {"path": folder}},
+            extra_arguments=["--log-level=ERROR"],
         )
         try:
             client.execute()

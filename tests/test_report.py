@@ -111,11 +111,12 @@ def test_cost_evolution_of_an_unfinished_run(tmp_path):
     figures.cost_evolution(np.ones((1, 1)), tmp_path / "one.png")
 
 
-def test_evaluate_renders(tmp_path, monkeypatch, capsys, no_opengl):
+@pytest.mark.parametrize("name", ["grasp.gif", "grasp.png"])
+def test_evaluate_renders(name, tmp_path, monkeypatch, capsys, no_opengl):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    out = tmp_path / "grasp.gif"
+    out = tmp_path / name
     assert cli.main(["evaluate", "--scene", str(TINY), "--trials", "1", "--render", str(out)]) == 0
-    assert out.exists() and f"animation: {out}" in capsys.readouterr().out
+    assert out.exists() and f"picture: {out}" in capsys.readouterr().out
 
 
 def test_numerical_modules_need_no_report():

@@ -59,8 +59,8 @@ def _check(options: "Evaluate", engine: str) -> None:
         problems.append(
             f"--engine {engine!r} is not valid; {schema.nearest(engine, engines.NAMES)}"
         )
-    if options.render and options.render.suffix != ".gif":
-        problems.append(f"--render {options.render} must end in .gif")
+    if options.render and options.render.suffix not in (".gif", ".png"):
+        problems.append(f"--render {options.render} must end in .gif or .png")
     if problems:
         raise SceneError(problems)
 
@@ -129,5 +129,8 @@ def _render(case: _Case, engine: engines.Engine, options: "Evaluate", console: C
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
     grasps = animation.replay(case.scene, engine, params, trials)
     path: Path = options.render  # type: ignore[assignment]
-    animation.write_gif(case.scene, grasps, path, notify=console.print)
-    console.print(f"animation: {path}", markup=False)
+    if path.suffix == ".gif":
+        animation.write_gif(case.scene, grasps, path, notify=console.print)
+    else:
+        animation.write_strip(case.scene, grasps, path, notify=console.print)
+    console.print(f"picture: {path}", markup=False)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, runs
+from codesign_jax import codesign, engines, runs
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
@@ -70,7 +70,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         options.preset,
         options.schedule,
         options.first,
-        options.engine,
+        options.engine or engines.DEFAULT,
         options.seed,
         particles=options.particles,
         trials=options.trials,

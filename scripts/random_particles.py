@@ -1,0 +1,92 @@
+"""Simulates random particles of the whole parameter table and counts the worlds that fail.
+
+python scripts/random_particles.py --worlds 100000 --json docs/data/random_particles.json
+"""
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import parameters, rollout, scene
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.types import Status
+
+
+def provenance() -> dict:
+    """Command, commit, versions and device that made a result."""
+    git = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    return {
+        "command": " ".join(["python", *sys.argv]),
+        "commit": git.stdout.strip() or None,
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def particles(space: parameters.DesignSpace, seed: int, count: int) -> jax.Array:
+    """Uniform particles of the table under the pressure limit, shape (particle, parameter)."""
+    low, high = np.array(space.low), np.array(space.high)
+    unit = np.random.default_rng(seed).random((count, len(low)))
+    return jax.vmap(space.project)(jnp.asarray(low + (high - low) * unit, jnp.float32))
+
+
+def main() -> None:
+    """Runs the particles chunk by chunk and writes counts and rates."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--worlds", type=int, default=100_000)
+    parser.add_argument("--chunk", type=int, default=16_384)
+    parser.add_argument("--iterations", type=int, default=8)
+    parser.add_argument("--evaluations", type=int, default=6)
+    parser.add_argument("--json", type=Path, required=True)
+    args = parser.parse_args()
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand)
+    engine = StructuredEngine(
+        the_scene, iterations=args.iterations, evaluations=args.evaluations, tolerance=1e-6
+    )
+
+    @jax.jit
+    def run(designs: jax.Array, key: jax.Array):
+        trials = rollout.sample_trials(the_scene, key, designs.shape[0])
+        return rollout.simulate(the_scene, engine, jax.vmap(space.params)(designs), trials)[0]
+
+    chunks = -(-args.worlds // args.chunk)
+    seconds, status, cost = [], [], []
+    for c in range(chunks):
+        designs = particles(space, c, args.chunk)
+        start = time.perf_counter()
+        result = jax.block_until_ready(run(designs, jax.random.key(c)))
+        seconds.append(time.perf_counter() - start)
+        status.append(np.asarray(result.status))
+        cost.append(np.asarray(result.cost))
+        print(f"chunk {c + 1}/{chunks}: {seconds[-1]:.1f} s, failed {(status[-1] != 0).sum()}")
+    bits, costs = np.concatenate(status), np.concatenate(cost)
+    steady = float(np.median(seconds[1:] or seconds))
+    result = {
+        **provenance(),
+        "worlds": int(bits.size),
+        "steps_per_world": the_scene.num_steps,
+        "iterations": args.iterations,
+        "evaluations": args.evaluations,
+        "failed": {s.name: int((bits & s != 0).sum()) for s in Status if s},
+        "kept_to_the_end": float((costs == 0).mean()),
+        "first_chunk_with_compile_s": seconds[0],
+        "world_steps_per_s": args.chunk * the_scene.num_steps / steady,
+        "grasps_per_s": args.chunk / steady,
+    }
+    args.json.parent.mkdir(parents=True, exist_ok=True)
+    args.json.write_text(json.dumps(result, indent=2) + "\n")
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()

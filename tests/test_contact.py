@@ -102,7 +102,7 @@ def test_incline_below_the_friction_angle_holds(shape):
     assert slow[-1, 0] == pytest.approx(expected, rel=1e-6)
     assert np.abs(slow[-1, 1:]).max() < 1e-9
     # Uphill contacts of a tall object carry less, slip, and leave the rest to the others.
-    assert expected < velocity[-1, 0] < 2 * expected < 2e-4
+    assert expected < velocity[-1, 0] < 2 * expected < 1e-3
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder"])

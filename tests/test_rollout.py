@@ -2,11 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from small import hand_world, nth, pinch, random_designs, stack
 
-from codesign_jax import control, parameters, rollout, scene
+from codesign_jax import control, model, parameters, rollout, scene
 from codesign_jax.engines import make_engine
 
 PAPER = scene.load("paper")
@@ -71,7 +72,10 @@ def commands(**changes):
 
 
 def test_commands_of_a_grasp():
-    """Key frames at the phases' ends, in the actuators' order: x y z, roll yaw pitch, pressures."""
+    """Key frames at the phases' ends, in the actuators' order: x y z, roll yaw pitch, pressures.
+
+    The hinge turns about +y; a positive pitch of the arm, about -y, points the fingers to +x.
+    """
     u = commands()
     assert u.shape == (900, 10)
     start, low = 0.3, 0.06 + 0.05
@@ -92,13 +96,13 @@ def test_commands_of_a_grasp():
         np.testing.assert_allclose(row[2], height, atol=1e-6)
         np.testing.assert_allclose(row[6:], 100e3 * inflation, rtol=1e-5, atol=1e-2)
     np.testing.assert_allclose(
-        u[:450, [0, 1, 3, 4, 5]], [[0.01, 0.02, 0.1, 0.3, 0.2]] * 450, rtol=1e-6
+        u[:450, [0, 1, 3, 4, 5]], [[0.01, 0.02, 0.1, 0.3, -0.2]] * 450, rtol=1e-6
     )
 
 
 def test_the_disturbance_grows_and_alternates():
     u = commands()
-    roll, pitch = u[:, 3] - 0.1, u[:, 5] - 0.2
+    roll, pitch = u[:, 3] - 0.1, u[:, 5] + 0.2
     np.testing.assert_array_equal(u[:, 4], u[0, 4])  # yaw is never shaken
     period = round(100 / 1.5)
     assert np.abs(roll[450 : 450 + period]).max() > 0.01  # the first period rolls,
@@ -110,7 +114,7 @@ def test_the_disturbance_grows_and_alternates():
     np.testing.assert_allclose(roll[second], 0.0, atol=1e-6)
     largest = np.abs(np.stack([roll, pitch])).max()
     assert 0.8 * np.deg2rad(40) < largest <= np.deg2rad(40) + 1e-6
-    np.testing.assert_allclose(u[850:, 3:6], u[850:, 3:6] * 0 + [0.1, 0.3, 0.2], atol=1e-6)
+    np.testing.assert_allclose(u[850:, 3:6], u[850:, 3:6] * 0 + [0.1, 0.3, -0.2], atol=1e-6)
     assert np.abs(np.diff(u[:, 3:6], axis=0)).max() < 0.08  # no jumps: 40 deg at 1.5 Hz in a step
 
 
@@ -210,3 +214,34 @@ def test_noise_reaches_the_outcome(batch):
     evaluate, _, designs, trials, _ = batch
     result = evaluate(designs, trials)
     assert len(np.unique(result.lost_time)) > 3
+
+
+# --- arm and start -------------------------------------------------------------------------------
+
+
+def test_a_grasp_starts_where_its_commands_do():
+    """The wrist starts in the arm's first pose, noise included: nothing jerks at the first step."""
+    params, trial = hand_world(PAPER)
+    arm = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.3])
+    trial = trial._replace(arm_tilt=np.array([0.05, -0.07]))
+    params, trial = jax.tree.map(jnp.asarray, (params._replace(arm=arm), trial))
+    fields = jax.jit(lambda p, t: model.model_fields(PAPER, p, t))(params, trial)
+    np.testing.assert_allclose(
+        fields.start[:6], control.commands(PAPER, params, trial)[0, :6], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("axis, sign, column", [(4, 1, 0), (3, 1, 1)])
+def test_pitch_points_the_fingers_to_x_and_roll_to_y(axis, sign, column):
+    """Table I's x = -20 mm with a pitch of 15 degrees aims at the object."""
+    params, trial = hand_world(PAPER)
+    arm = np.zeros(6)
+    arm[axis] = sign * np.deg2rad(15)
+    params = params._replace(arm=arm)
+    compiled = model.compile_model(PAPER, params, trial)
+    data = mujoco.MjData(compiled)
+    u = control.commands(PAPER, *jax.tree.map(jnp.asarray, (params, trial)))
+    data.qpos[:6] = u[0, :6]
+    mujoco.mj_kinematics(compiled, data)
+    centre = model.layout(PAPER).centre_weights @ data.xipos - data.xpos[1]
+    assert centre[column] > 0.01 and abs(centre[1 - column]) < 1e-6 and centre[2] < 0

@@ -22,7 +22,9 @@ from codesign_jax.types import Status
 
 def provenance() -> dict:
     """Command, commit, versions and device that made a result."""
-    git = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    git = subprocess.run(
+        ["git", "rev-parse", "--verify", "-q", "HEAD"], capture_output=True, text=True, check=False
+    )
     return {
         "command": " ".join(["python", *sys.argv]),
         "commit": git.stdout.strip() or None,

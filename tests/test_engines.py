@@ -95,7 +95,7 @@ def test_mjx_steps_equal_mujocos(steps):
         error = np.abs(our_qacc - qacc).max(1) / np.maximum(1.0, np.abs(qacc).max(1))
         assert error.max() < 1e-5
         assert np.median(error) < 1e-11
-    # Forces [N]: MJX's contacts on a box differ in the last digits of their frames (1e-4 N measured);
+    # Forces [N]: MJX's contacts on a box differ in their frames' last digits (1e-4 N measured);
     # on a cylinder, by descent on a distance function, by up to 0.1 mm, times 2 kN/m.
     bound = {"sphere": 1e-6, "box": 1e-3, "cylinder": 0.2}[steps.shape]
     assert np.abs(our_force - force).max() < bound

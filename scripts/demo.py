@@ -12,7 +12,7 @@ from pathlib import Path
 from codesign_jax import cli
 
 FOLDER = Path("runs") / "demo"
-SIZES = ["--particles", "10", "--trials", "3", "--episodes", "40", "--test-trials", "18"]
+SIZES = ["--particles", "10", "--trials", "6", "--episodes", "14", "--test-trials", "18"]
 
 
 def main() -> int:

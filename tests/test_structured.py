@@ -70,8 +70,8 @@ def test_accelerations_equal_mujoco_along_a_grasp(shape):
                 acc = (np.asarray(engine.qvel(new))[0] - qvel) / scene.discretization.timestep
                 scale = max(np.linalg.norm(data.qacc), 100.0)
                 error = np.linalg.norm(acc - data.qacc) / scale
-                # A difference of velocities over 10 ms loses two of 16 digits, and MuJoCo's own Newton
-                # stops at rounding of its cost; the floor of 100 is ten times g: at rest qacc is noise.
+                # A difference of velocities over 10 ms loses two of 16 digits, and MuJoCo's own
+                # Newton stops at rounding of its cost; the floor is ten g: at rest qacc is noise.
                 assert error < 1e-8, (k, data.ncon, error)
                 touched = max(touched, data.ncon)
             mujoco.mj_step(oracle, data)
@@ -79,7 +79,7 @@ def test_accelerations_equal_mujoco_along_a_grasp(shape):
 
 
 def test_free_motion_equals_mujoco_step_by_step():
-    """Two seconds' worth of the approach's first steps, before any finger touches."""
+    """The approach's first steps, before anything touches."""
     with jax.enable_x64(True):
         scene, oracle, start, fields, ctrl = setting("box")
         oracle.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -105,15 +105,16 @@ def test_float32_is_close_to_float64():
     for wide in (True, False):
         with jax.enable_x64(wide):
             scene, _, start, fields, ctrl = setting("cylinder")
-            fields = jax.tree.map(lambda x: x.astype(jnp.float64 if wide else jnp.float32), fields)
+            dtype = jnp.float64 if wide else jnp.float32
+            fields = jax.tree.map(lambda x, t=dtype: x.astype(t), fields)
             engine = StructuredEngine(scene, iterations=60, evaluations=12, tolerance=1e-10)
             hand = hand_lanes(scene, fields)
             # The palm at 60 mm presses the straight fingers onto the table.
             qpos = np.array(start)
             qpos[2] = 0.06
             state = lanes_state(engine, scene, fields, qpos, np.zeros(len(qpos) - 1))
-            state = jax.tree.map(lambda x: x.astype(fields.start.dtype), state)
-            u = jnp.asarray(ctrl[150], fields.start.dtype)[:, None]
+            state = jax.tree.map(lambda x, t=dtype: x.astype(t), state)
+            u = jnp.asarray(ctrl[150], dtype)[:, None]
             new, info = jax.jit(engine.step)(hand, state, u)
             results.append(np.asarray(engine.qvel(new))[0].astype(float))
             assert float(info.residual.max()) < 1e-6

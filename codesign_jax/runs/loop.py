@@ -10,7 +10,7 @@ from codesign_jax import codesign
 from codesign_jax.checkpoint import Checkpoints
 from codesign_jax.codesign import EpisodeFunction, FinalTest
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import ParticleFilter, State, schedule
+from codesign_jax.optimize import ParticleFilter, schedule
 from codesign_jax.parameters import DesignSpace, design_space
 from codesign_jax.runs import record as records
 from codesign_jax.runs import tables

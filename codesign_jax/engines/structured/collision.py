@@ -68,9 +68,9 @@ def spheres_on_object(
         return centre - normal * (radius + 0.5 * gap), normal, gap
 
     distance, gradient = run(measure, kin.object, kin.object_pos, centre)
-    placed = run(place, kin.object, centre, distance, gradient)
+    point, normal, gap = run(place, kin.object, centre, distance, gradient)
     cone = make_cone(scene, object_friction(scene, hand.shape), bodies=2)
-    return Contacts(*placed, cone)
+    return Contacts(point, normal, gap, cone)
 
 
 def spheres_on_table(
@@ -184,8 +184,10 @@ def object_on_table(
         return point - 0.5 * gap * normal, normal, gap
 
     cone = make_cone(scene, scene.objects.table.friction, bodies=1)
-    placed = run(points, hand.object_size[:, 0], kin.object[:, :, 0], kin.object_pos, height)
-    return Contacts(*placed, cone)
+    point, normal, gap = run(
+        points, hand.object_size[:, 0], kin.object[:, :, 0], kin.object_pos, height
+    )
+    return Contacts(point, normal, gap, cone)
 
 
 _AWAY = 1e3  # an unused slot hangs this far above the table

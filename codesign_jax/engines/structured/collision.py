@@ -35,8 +35,11 @@ def make_cone(scene: Scene, friction: jax.Array | float, *, bodies: int) -> Cone
 
 def object_friction(scene: Scene, shape: jax.Array) -> jax.Array:
     """Friction of each world's object with the hand, shape (1, world)."""
-    values = np.array([s.friction for s in scene.objects.object])
-    return jnp.asarray(values)[shape]
+    values = [s.friction for s in scene.objects.object]
+    friction = jnp.full(shape.shape, values[0])
+    for i, value in enumerate(values[1:], 1):
+        friction = jnp.where(shape == i, value, friction)
+    return friction
 
 
 def spheres_on_object(

@@ -1,0 +1,357 @@
+"""Newton's method of `solver`, inside a kernel: links in loops, numbers in registers."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import elimination as el
+from codesign_jax.engines.structured import solver
+from codesign_jax.engines.structured.fused.contacts import BoundContacts, direct, zeros
+from codesign_jax.engines.structured.fused.tables import (
+    Table,
+    anywhere,
+    full,
+    solid,
+    sum_lanes,
+    upper,
+)
+from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
+from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+
+
+class Palm(NamedTuple):
+    """What the solver needs of palm, wrist and object; lanes of a world."""
+
+    palm: Body
+    object: Body
+    smooth_palm: Any
+    smooth_object: Any
+    smooth_wrist: Any
+    armature: Any
+    axes: Any
+    position: Any
+
+
+class Iterate(NamedTuple):
+    """Accelerations of wrist and object, and motion of palm and object; lanes of a world."""
+
+    wrist: Any
+    object: Any
+    palm_motion: Any
+    object_motion: Any
+
+
+class Quality(NamedTuple):
+    """How the iteration stands: relative decrement, lanes of a world; count, a scalar."""
+
+    residual: Any
+    count: jax.Array
+
+
+class Memory(NamedTuple):
+    """A kernel's memory: tables with their refs, and the bound contact sets by name."""
+
+    hand: Table
+    hand_ref: Any
+    state: Table
+    state_ref: Any
+    scratch: Table
+    scratch_ref: Any
+    contacts: dict[str, BoundContacts]
+
+
+def loop(count: int, body: Callable, start: Any, dims: tuple[int, int], *, reverse: bool = False):
+    """Folds body(item, tree of lanes) over the items."""
+    first, rebuild = solid(start, *dims)
+
+    def step(k: jax.Array, arrays: list) -> list:
+        item = count - 1 - k if reverse else k
+        return solid(body(item, rebuild(arrays)), *dims)[0]
+
+    return rebuild(jax.lax.fori_loop(0, count, step, first))
+
+
+def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
+    """Relative motion of a pair of bodies."""
+    difference = jnp.subtract
+    if name == "finger_object":
+        return lanewise(difference, link, obj)
+    if name == "palm_object":
+        return lanewise(difference, palm, obj)
+    return {"finger_table": link, "palm_table": palm, "object_table": obj}[name]
+
+
+class Newton:
+    """The solver of one step in a kernel."""
+
+    def __init__(self, links: int, dims: tuple[int, int], m: Memory, palm: Palm):
+        """Takes the step's memory, in which the forward pass has left its results."""
+        self.links, self.dims, self.m, self.palm = links, dims, m, palm
+        self.fingers = [c for n, c in m.contacts.items() if n.startswith("finger")]
+        self.slots = [c for n, c in m.contacts.items() if not n.startswith("finger")]
+        self.like = jnp.zeros(dims, palm.armature.dtype)
+
+    def read(self, *names: str, item: Any = 0) -> list[Lanes]:
+        """Reads names from the table that has them."""
+        m = self.m
+        tables = ((m.hand, m.hand_ref), (m.state, m.state_ref), (m.scratch, m.scratch_ref))
+        found = []
+        for name in names:
+            table, ref = next((t, r) for t, r in tables if name in t.groups)
+            found.append(table.read(ref, name, item))
+        return found
+
+    def write(self, name: str, value: Lanes, item: Any) -> None:
+        """Writes to the scratch table."""
+        self.m.scratch.write(self.m.scratch_ref, name, value, item)
+
+    def body_of(self, item: Any) -> list[Lanes]:
+        """Mass, centre and tensor of a link, the tensor as (3, 3)."""
+        mass, centre, tensor = self.read("mass", "body_centre", "tensor", item=item)
+        return [mass, centre, tensor]
+
+    def backward(self) -> el.Quadratic:
+        """Eliminates the fingers from their tips; returns the sum over the fingers."""
+
+        def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes):
+            link = make_body(*body)
+            push = smooth - link.times(motion)
+            node = solver._add_link(node, link.matrix(), push, pushes)
+            return el.eliminate(direct, node, axes, arm, tau - arm * acc)
+
+        def step(i: Any, node: el.Quadratic) -> el.Quadratic:
+            pushes = {c.set.name: c.push(i) for c in self.fingers}
+            names = ("motion", "smooth", "tau", "axes", "armature", "acc")
+            node = node._replace(p=full(node.p), q=full(node.q))
+            node, factors = lanewise(
+                eliminate, node, self.body_of(i), *self.read(*names, item=i), pushes
+            )
+            for name, value in zip(("w", "g", "z"), factors, strict=True):
+                self.write(name, value, i)
+            return node._replace(p=upper(node.p), q=upper(node.q))
+
+        empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
+        node = loop(self.links, step, el.Quadratic(*empty), self.dims, reverse=True)
+        node = el.Quadratic(*map(sum_lanes, node))
+        return node._replace(p=full(node.p), q=full(node.q))
+
+    def slot_pushes(self) -> dict[str, tuple[Lanes, Lanes]]:
+        """Contact inertia and wrench of the palm's and the object's contacts."""
+        pushes = {}
+        for c in self.slots:
+
+            def add(i: Any, carry: tuple, c: BoundContacts = c) -> tuple:
+                matrix, wrench = c.push(i)
+                return lanewise(
+                    lambda a, b: jax.tree.map(jnp.add, a, b), carry, (upper(matrix), wrench)
+                )
+
+            start = (zeros((21,), self.like), zeros((6,), self.like))
+            triangle, wrench = map(sum_lanes, loop(c.set.count, add, start, self.dims))
+            pushes[c.set.name] = (full(triangle), wrench)
+        return pushes
+
+    def at_palm(self, now: Iterate, node: el.Quadratic) -> Iterate:
+        """Solves for wrist and object."""
+
+        def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> Iterate:
+            force = solver.Forces(
+                palm.smooth_palm - palm.palm.times(now.palm_motion),
+                None,  # type: ignore[arg-type]
+                palm.smooth_object - palm.object.times(now.object_motion),
+                palm.smooth_wrist - palm.armature * now.wrist,
+                None,  # type: ignore[arg-type]
+            )
+            matrices = solver.Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
+            node = solver._add_palm(node, matrices, force, pushes)
+            arm = palm.armature
+            node, hinges = el.eliminate(direct, node, palm.axes, arm[3:], force.wrist[3:])
+            slide_axes = solver._slides(arm)
+            node, slides = el.eliminate(direct, node, slide_axes, arm[:3], force.wrist[:3])
+            obj = el.solve_object(direct, node.q, node.r_object)
+            first, motion = el.substitute(slide_axes, slides, jnp.zeros_like(obj), obj)
+            second, motion = el.substitute(palm.axes, hinges, motion, obj)
+            at_centre = spatial(obj[:3], obj[3:] - cross(palm.position, obj[:3]))
+            return Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
+
+        return lanewise(solve, now, self.palm, node, self.slot_pushes())
+
+    def forward(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
+        """Substitutes back and prepares the line search.
+
+        Returns:
+          Slope and curvature of the smooth part, and the contacts' slope, all at 0, (1, world).
+        """
+
+        def substitute(parent, obj, body, motion, smooth, tau, axes, arm, acc, factors):
+            a, moved = el.substitute(axes, el.Factors(*factors), parent, obj)
+            link = make_body(*body)
+            force = smooth - link.times(motion)
+            joints = [(arm[k] * acc[k] - tau[k]) * a[k] for k in range(a.shape[0])]
+            slope = total(joints) - dot(force, moved)
+            stiff = total([arm[k] * a[k] * a[k] for k in range(a.shape[0])])
+            return a, moved, slope, stiff + dot(link.times(moved), moved)
+
+        def one(i: Any, carry: tuple) -> tuple:
+            parent, slope, curvature, touch = carry
+            names = ("motion", "smooth", "tau", "axes", "armature", "acc")
+            a, moved, s, c = lanewise(
+                substitute,
+                parent,
+                step.object_motion,
+                self.body_of(i),
+                *self.read(*names, item=i),
+                self.read("w", "g", "z", item=i),
+            )
+            self.write("step_acc", a, i)
+            self.write("step_motion", moved, i)
+            terms = [touch]
+            for contacts in self.fingers:
+                rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
+                terms.append(contacts.aim(i, rel))
+            touch = lanewise(lambda t: total(t), terms)
+            slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
+            return moved, slope, curvature, touch
+
+        none = zeros((), self.like)
+        parent = lanewise(jnp.add, step.palm_motion, zeros((6,), self.like))
+        _, slope, curvature, touch = loop(self.links, one, (parent, none, none, none), self.dims)
+        for contacts in self.slots:
+
+            def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
+                rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)
+                return lanewise(jnp.add, sum_, contacts.aim(i, rel))
+
+            touch = loop(contacts.set.count, add, touch, self.dims)
+        slope, curvature = lanewise(
+            self._rest, now, step, self.palm, sum_lanes(slope), sum_lanes(curvature)
+        )
+        return slope, curvature, sum_lanes(touch)
+
+    @staticmethod
+    def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
+        """Adds wrist, palm and object to the smooth part's slope and curvature."""
+        push = palm.smooth_palm - palm.palm.times(now.palm_motion)
+        pull = palm.smooth_object - palm.object.times(now.object_motion)
+        twist = palm.smooth_wrist - palm.armature * now.wrist
+        slope = slope - dot(push, step.palm_motion) - dot(pull, step.object_motion)
+        slope = slope - dot(twist, step.wrist)
+        bent = dot(palm.palm.times(step.palm_motion), step.palm_motion)
+        bent = bent + dot(palm.object.times(step.object_motion), step.object_motion)
+        return slope, curvature + bent + dot(palm.armature * step.wrist, step.wrist)
+
+    def line_search(self, slope: Lanes, curvature: Lanes, first: Lanes, evaluations: int) -> Lanes:
+        """Step length, lanes of a world; see `solver.line_search`."""
+
+        def evaluate(alpha: Lanes) -> tuple[Lanes, Lanes]:
+            def add(i: Any, sums: list, sets: list) -> list:
+                for contacts in sets:
+                    new = contacts.slopes(i, alpha)
+                    sums = lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
+                return sums
+
+            sums = [zeros((), self.like)] * 2
+            sums = loop(self.links, lambda i, s: add(i, s, self.fingers), sums, self.dims)
+            for c in self.slots:
+                sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.dims)
+            one, two = map(sum_lanes, sums)
+            return lanewise(
+                lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
+            )
+
+        def refine(alpha, low, high, first, second):
+            low, high = jnp.where(first <= 0, alpha, low), jnp.where(first > 0, alpha, high)
+            guess = alpha - first / jnp.maximum(second, 1e-30)
+            inside = (guess >= low) & (guess <= high)
+            middle = jnp.where(high > 1e30, 2.0 * low, 0.5 * (low + high))
+            return jnp.where(inside, guess, middle), low, high
+
+        def body(carry: list) -> list:
+            count, arrays = carry[0], carry[1:]
+            alpha, low, high, _ = rebuild(arrays)
+            one, two = evaluate(alpha)
+            new = lanewise(refine, alpha, low, high, one, two)
+            return [count + 1, *solid((*new, one), *self.dims)[0]]
+
+        def going(carry: list) -> jax.Array:
+            return (carry[0] < evaluations) & anywhere(jnp.abs(carry[-1]) > goal)
+
+        # Slopes of a thousandth of the first one change the decrease by a millionth.
+        goal = 1e-3 * jnp.abs(lanewise(jnp.add, slope, first).lane)
+        one = lanewise(jnp.ones_like, slope)
+        none = lanewise(jnp.zeros_like, slope)
+        far = lanewise(lambda x: jnp.full_like(x, 3e38), slope)
+        start, rebuild = solid((one, none, far, far), *self.dims)
+        return rebuild(jax.lax.while_loop(going, body, [jnp.int32(0), *start])[1:])[0]
+
+    def advance(self, now: Iterate, step: Iterate, alpha: Lanes) -> Iterate:
+        """Moves accelerations, motions and jar by alpha times the step."""
+
+        def move(alpha, old, new):
+            return jax.tree.map(lambda a, b: a + alpha * b, old, new)
+
+        def one(i: Any, carry: list) -> list:
+            acc, motion, a, moved = self.read("acc", "motion", "step_acc", "step_motion", item=i)
+            acc, motion = lanewise(move, alpha, (acc, motion), (a, moved))
+            self.m.state.write(self.m.state_ref, "acc", acc, i)
+            self.write("motion", motion, i)
+            for contacts in self.fingers:
+                contacts.advance(i, alpha)
+            return carry
+
+        loop(self.links, one, [], self.dims)
+        for c in self.slots:
+            jax.lax.fori_loop(0, c.set.count, lambda i, x, c=c: (c.advance(i, alpha), x)[1], 0)
+        return lanewise(move, alpha, now, step)
+
+    def solve(
+        self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
+    ) -> tuple[Iterate, Quality]:
+        """Iterates until every world that is waited for has converged.
+
+        Args:
+          now: Warm start.
+          waiting: Worlds that must converge, shape (1, world).
+          iterations: Largest number of iterations.
+          evaluations: Largest number of line-search evaluations.
+          tolerance: Relative Newton decrement.
+        """
+
+        def body(carry: list) -> list:
+            count, now = carry[0], rebuild(carry[1:])[0]
+            step = self.at_palm(now, self.backward())
+            slope, curvature, first = self.forward(now, step)
+            alpha = self.line_search(slope, curvature, first, evaluations)
+            residual = lanewise(_residual, slope, first, self.palm, now.object_motion)
+            new = self.advance(now, step, alpha)
+            return [count + 1, *solid((new, residual), *self.dims)[0]]
+
+        def going(carry: list) -> jax.Array:
+            return (carry[0] < iterations) & anywhere(waiting & (carry[-1] > tolerance))
+
+        far = lanewise(lambda a: jnp.full_like(a[0], 3e38), now.wrist)
+        start, rebuild = solid((now, far), *self.dims)
+        count, *arrays = jax.lax.while_loop(going, body, [jnp.int32(0), *start])
+        now, residual = rebuild(arrays)
+        return now, Quality(residual, count)
+
+
+def make_body(mass: jax.Array, centre: jax.Array, tensor: jax.Array) -> Body:
+    """Body of a mass, a centre and the upper triangle xx, xy, xz, yy, yz, zz of a tensor."""
+    xx, xy, xz, yy, yz, zz = (tensor[i] for i in range(6))
+    rows = [jnp.stack(r) for r in ([xx, xy, xz], [xy, yy, yz], [xz, yz, zz])]
+    return Body(mass, centre, jnp.stack(rows))
+
+
+def triangle(tensor: jax.Array) -> jax.Array:
+    """Upper triangle of a symmetric tensor (3, 3, ...)."""
+    return jnp.stack([tensor[i, j] for i in range(3) for j in range(i, 3)])
+
+
+def _residual(slope, first, palm: Palm, motion):
+    scale = 100.0 * (palm.object.mass + palm.palm.mass)
+    scale = scale + palm.object.mass * dot(motion[3:], motion[3:])
+    return jnp.maximum(-slope - first, 0.0) / scale

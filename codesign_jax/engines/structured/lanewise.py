@@ -24,7 +24,8 @@ class Lanes:
 
     Attributes:
       parts: Values, an object array with the array's axes, of which the lane axes have length one;
-        each is a number or an array over the lanes, (finger or 1, world).
+        each is a number or an array over the lanes, (lane,), finger * worlds + world; what belongs
+        to a world is the same on all its fingers' lanes.
       shape: Shape with `FINGER` and `WORLD` for the lane axes.
       dtype: Type of the values.
     """
@@ -171,17 +172,15 @@ def _fold(equation: Any, parts: tuple) -> Any:
 
 
 def _bind(equation: Any, parts: tuple) -> Any:
-    """The operation on lanes: numbers and world lanes broadcast to the largest operand."""
-    shape = functools.reduce(np.broadcast_shapes, [np.shape(p) for p in parts])
+    """The operation on lanes, to which numbers are spread."""
+    shape = next(p.shape for p in parts if not _is_number(p))
     arrays = [spread(p, shape, v.aval.dtype) for p, v in zip(parts, equation.invars, strict=True)]
     return equation.primitive.bind(*arrays, **equation.params)
 
 
 def spread(part: Any, shape: tuple[int, ...], dtype: Any) -> jax.Array:
-    """A number or lanes as lanes of a full shape."""
-    if _is_number(part):
-        return jax.lax.full(shape, np.asarray(part, dtype))
-    return part if part.shape == shape else jax.lax.broadcast_in_dim(part, shape, (0, 1))
+    """A number as lanes; lanes as they are."""
+    return jax.lax.full(shape, np.asarray(part, dtype)) if _is_number(part) else part
 
 
 def _reduce(function: Callable, x: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:

@@ -25,17 +25,17 @@ FIELDS = {"point": 3, "normal": 3, "gap": 1, "jar": 3, "step": 3, "ray": 5}
 
 
 def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
-    """Lanes of zeros over the lanes of an array."""
+    """Lanes of zeros of a finger each, like an array over the lanes."""
     count = 1
     for n in shape:
         count *= n
-    return lanes([jnp.zeros_like(like)] * count, shape, wide=like.shape[0] > 1)
+    return lanes([jnp.zeros_like(like)] * count, shape, wide=True)
 
 
 class ContactSet:
     """The contacts of one pair of bodies: items are links or groups of slots, k contacts each."""
 
-    def __init__(self, scene: Scene, name: str, count: int, k: int, dims: tuple[int, int]):
+    def __init__(self, scene: Scene, name: str, count: int, k: int, size: int):
         """Prepares the set.
 
         Args:
@@ -43,9 +43,9 @@ class ContactSet:
           name: Pair of bodies, as in `solver.relative`.
           count: Number of items.
           k: Contacts of an item, on each lane.
-          dims: Lanes of a block: fingers and worlds.
+          size: Lanes of a block.
         """
-        self.scene, self.name, self.count, self.k, self.dims = scene, name, count, k, dims
+        self.scene, self.name, self.count, self.k, self.size = scene, name, count, k, size
         self.on_object = name.endswith("_object")
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
@@ -92,12 +92,12 @@ class BoundContacts:
 
     def if_touching(self, item: Any, compute: Callable, shapes: list[tuple]) -> list[Lanes]:
         """compute() where a lane touches, zeros of wide shapes elsewhere."""
-        like = jnp.zeros(self.set.dims, self.friction.dtype)
+        like = jnp.zeros((self.set.size,), self.friction.dtype)
         empty = [zeros(shape, like) for shape in shapes]
-        none, rebuild = solid(empty, *self.set.dims)
+        none, rebuild = solid(empty, self.set.size)
 
         def some() -> list[jax.Array]:
-            return solid(compute(), *self.set.dims)[0]
+            return solid(compute(), self.set.size)[0]
 
         return rebuild(jax.lax.cond(self.touching(item), some, lambda: none))
 

@@ -30,7 +30,7 @@ from codesign_jax.engines.structured.fused.newton import (
     relative,
     triangle,
 )
-from codesign_jax.engines.structured.fused.tables import Table, anywhere, sum_lanes
+from codesign_jax.engines.structured.fused.tables import Block, Table, anywhere
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.inertia import Body
 from codesign_jax.engines.structured.kinematics import State
@@ -71,7 +71,7 @@ class Program:
         self.scene, self.limits, self.lay = scene, limits, layout(scene)
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()
-        self.num_fingers, self.block, self.dims = n, block, (self.fingers, block)
+        self.num_fingers, self.block, self.size = n, block, self.fingers * block
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
         self.palm_groups = -(-len(palm_points(scene)) // self.fingers)
         self.sets = self._sets()
@@ -79,7 +79,7 @@ class Program:
 
     def _sets(self) -> list[ContactSet]:
         e, k = self.scene.effects, self.k
-        make = partial(ContactSet, self.scene, dims=self.dims)
+        make = partial(ContactSet, self.scene, size=self.size)
         sets = []
         if k and e.finger_object:
             sets.append(make("finger_object", self.links, k))
@@ -103,7 +103,7 @@ class Program:
             mount=(1, (3, 3)),
             base=(1, (3,)),
             stub_centre=(1, (3,)),
-            share=(1, one),
+            share=(n + 1, one),
             gain=(1, one),
             offset=(n, one),
             mass=(n, one),
@@ -143,6 +143,7 @@ class Program:
             "z": (n, (a,)),
             "step_acc": (n, (a,)),
             "step_motion": (n, (6,)),
+            "sums": (1, (96,)),
             "new_finger": (n, (a,)),
             "new_finger_vel": (n, (a,)),
         }
@@ -159,7 +160,9 @@ class Program:
             k: jnp.moveaxis(v, 1, 0) if k in links_first and v.size else v
             for k, v in hand._asdict().items()
         }
-        arrays["share"] = jnp.ones(lane, dtype)
+        # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
+        share = jnp.ones((self.links + 1, *lane), dtype)
+        arrays["share"] = share.at[jnp.array([0, self.links])].set(0.5)
         if self.scene.effects.palm_contact:
             arrays |= self._palm_slots(worlds, dtype)
         extra = self.fingers - n
@@ -177,7 +180,7 @@ class Program:
         packed = self.world.pack(1, self.block, **narrow)
         ids = jnp.arange(packed.shape[0] * self.block).reshape(-1, self.block)
         alive = self.world.offset["alive"]
-        packed = packed.at[:, alive, 0].multiply(ids < worlds)
+        packed = packed.at[:, alive].multiply(ids < worlds)
         return self.hand.pack(self.fingers, self.block, **wide), packed
 
     def _widen(self, array: jax.Array) -> jax.Array:
@@ -210,13 +213,13 @@ class Program:
         )
 
     def pack_controls(self, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Arm and pressure commands (block, time, 6 or 1, finger or 1, world), of (world, time, nu)."""
+        """Commands of (world, time, nu): arm (block, time, 6, world), pressure (block, time, lane)."""
         worlds, steps, _ = ctrl.shape
         ctrl = jnp.pad(ctrl, [(0, -worlds % self.block), (0, 0), (0, 0)], mode="edge")
         blocks = jnp.moveaxis(ctrl.reshape(-1, self.block, steps, ctrl.shape[2]), 1, 3)
-        arm, pressure = blocks[:, :, :6, None], blocks[:, :, None, 6:]
-        pad = [(0, 0)] * 3 + [(0, self.fingers - self.num_fingers), (0, 0)]
-        return arm, jnp.pad(pressure, pad)
+        arm, pressure = blocks[:, :, :6], blocks[:, :, 6:]
+        pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]
+        return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.size)
 
     def run(
         self, hand: HandLanes, state: State, ctrl: jax.Array, *, interpret: bool = False
@@ -225,10 +228,10 @@ class Program:
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         blocks, steps, dtype = inputs[0].shape[0], ctrl.shape[1], ctrl.dtype
         shapes = [
-            (blocks, self.fine.rows, *self.dims),
-            (blocks, self.rest.rows, 1, self.block),
-            (blocks, self.scratch.rows, *self.dims),
-            (blocks, steps, len(TRACE), 1, self.block),
+            (blocks, self.fine.rows, self.size),
+            (blocks, self.rest.rows, self.block),
+            (blocks, self.scratch.rows, self.size),
+            (blocks, steps, len(TRACE), self.block),
         ]
 
         def spec(shape: tuple[int, ...]) -> pl.BlockSpec:
@@ -240,7 +243,7 @@ class Program:
 
             params = {"compiler_params": triton.CompilerParams(num_warps=1, num_stages=1)}
         out = pl.pallas_call(
-            partial(self._kernel, steps),
+            partial(self._kernel, steps, interpret),
             grid=(blocks,),
             in_specs=[spec(x.shape) for x in inputs],
             out_specs=[spec(s) for s in shapes],
@@ -249,26 +252,28 @@ class Program:
             name="grasp",
             **params,
         )(*inputs)
-        trace = jnp.moveaxis(out[3][:, :, :, 0], 3, 1)  # (block, world, time, entry)
+        trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(TRACE))[: ctrl.shape[0]]
         return {name: trace[..., k] for k, name in enumerate(TRACE)}
 
-    def _kernel(self, steps: int, *refs: Any) -> None:
+    def _kernel(self, steps: int, interpret: bool, *refs: Any) -> None:
         hand, world, fine0, rest0, arm, pressure, fine, rest, scratch, trace = refs
-        step = Step(self, hand, world, fine, rest, scratch)
+        block = Block(self.fingers, self.block, barrier=not interpret)
+        step = Step(self, block, hand, world, fine, rest, scratch)
+        own = block.world
         _copy(fine0, fine, self.fine.rows)
-        _copy(rest0, rest, self.rest.rows)
+        _copy(rest0, rest, self.rest.rows, own)
         start, end = (round(t / self.scene.discretization.timestep) for t in self.scene.window)
         limits, far = self.scene.limits, self.scene.cost.lost_distance
-        alive = self.world.read(world, "alive").lane
+        alive = self.world.read(world, "alive", 0, own).lane
 
         def body(carry: tuple) -> tuple:
             t, alive, speed = carry
-            commands = lanes([arm[t, k] for k in range(6)], (6,), wide=False)
-            chamber = lanes([pressure[t, 0]], (), wide=True)
+            commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)
+            chamber = lanes([pressure[t]], (), wide=True)
             entry, new_speed, good = step.advance(commands, chamber, alive > 0, speed)
             for k, value in enumerate((*entry[:2], speed, *entry[2:])):
-                trace[t, k] = value
+                trace[t, k, own] = value
             lost = (entry[0] >= far) & (t >= start) & (t < end)
             failed = ~good | (entry[1] < -limits.penetration)
             alive = jnp.where(lost | failed, 0.0, alive)
@@ -283,15 +288,16 @@ class Program:
 
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
             for k in range(len(TRACE)):
-                trace[t, k] = speed if k == 2 else trace[jnp.maximum(done - 1, 0), k]
+                last = trace[jnp.maximum(done - 1, 0), k, own]
+                trace[t, k, own] = speed if k == 2 else last
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))
 
 
-def _copy(source: Any, target: Any, rows: int) -> None:
+def _copy(source: Any, target: Any, rows: int, *where: jax.Array) -> None:
     def one(k: jax.Array, x: jax.Array) -> jax.Array:
-        target[k] = source[k]
+        target[(k, *where)] = source[(k, *where)]
         return x
 
     jax.lax.fori_loop(0, rows, one, jnp.int32(0))
@@ -300,14 +306,23 @@ def _copy(source: Any, target: Any, rows: int) -> None:
 class Step:
     """One time step of a block."""
 
-    def __init__(self, program: Program, hand: Any, world: Any, fine: Any, rest: Any, scratch: Any):
-        """Takes the kernel's memory."""
-        self.p, self.hand, self.world = program, hand, world
+    def __init__(
+        self,
+        program: Program,
+        block: Block,
+        hand: Any,
+        world: Any,
+        fine: Any,
+        rest: Any,
+        scratch: Any,
+    ):
+        """Takes the kernel's lanes and memory."""
+        self.p, self.block, self.hand, self.world = program, block, hand, world
         self.fine, self.rest, self.scratch = fine, rest, scratch
 
     def constants(self, *names: str) -> list[Lanes]:
         """Constants of worlds."""
-        return [self.p.world.read(self.world, n) for n in names]
+        return [self.p.world.read(self.world, n, 0, self.block.world) for n in names]
 
     def advance(self, arm: Lanes, pressure: Lanes, waiting: Any, speed: Any):
         """Advances the block.
@@ -323,7 +338,7 @@ class Step:
           the step is good.
         """
         p, scene = self.p, self.p.scene
-        state = {n: p.rest.read(self.rest, n) for n in p.rest.groups}
+        state = {n: p.rest.read(self.rest, n, 0, self.block.world) for n in p.rest.groups}
         geometry = self._palm(state, arm)
         size, shape = self.constants("object_size", "shape")
         friction = lanewise(
@@ -332,7 +347,7 @@ class Step:
         bound = {c.name: c.bind(p.scratch, self.scratch, friction) for c in p.sets}
         memory = Memory(p.hand, self.hand, p.fine, self.fine, p.scratch, self.scratch, bound)
         now, centre = self._forward(state, geometry, pressure, memory, (size, shape))
-        newton = Newton(p.links, p.dims, memory, geometry["palm"])
+        newton = Newton(p.links, self.block, memory, geometry["palm"])
         now, quality = newton.solve(now, waiting, *p.limits)
         distance = lanewise(_distance, state["position"], state["wrist"], centre).lane
         height = state["position"][2].lane
@@ -392,13 +407,13 @@ class Step:
           The warm start and the hand's centre in the palm's frame.
         """
         p, now = self.p, at["now"]
-        like = jnp.zeros(p.dims, self.fine.dtype)
+        like = jnp.zeros((p.size,), self.fine.dtype)
         mount, base, share, stub = (
             p.hand.read(self.hand, n) for n in ("mount", "base", "share", "stub_centre")
         )
         frame, origin = lanewise(kin._mount, at["frame"], mount, base)
         weight = lanewise(
-            lambda f, s, share: 0.5 * share * apply_columns(f, s), at["frame"], stub, share
+            lambda f, s, share: share * apply_columns(f, s), at["frame"], stub, share
         )
         wide = zeros((6,), like)
         vel, bias, motion = (
@@ -422,18 +437,19 @@ class Step:
             carry, stored = out
             for name, value in stored.items():
                 m.scratch.write(self.scratch, name, value, i)
-            # The last segment is half as long.
-            last = jnp.where(i == p.links - 1, 0.5, 1.0).astype(like.dtype)
-            part = lanewise(lambda c, s: s * c, stored["body_centre"], share)
-            middle = _plus(middle, part, last)
+            share = p.hand.read(self.hand, "share", i + 1)
+            middle = lanewise(
+                lambda m, c, s: m + s * c, middle, stored["body_centre"], share
+            )
             self._finger_contacts(i, carry, at, m, shape)
             return (*carry, middle)
 
         start = (origin, frame, vel, bias, motion, weight)
-        middle = loop(p.links, link, start, p.dims)[-1]
+        middle = loop(p.links, link, start, p.size)[-1]
         self._slot_contacts(state, at, m, shape)
         count = p.num_fingers * p.links
-        return now, lanewise(lambda c: c / count, sum_lanes(middle))
+        middle = self.block.sum(middle, self.scratch, p.scratch.offset["sums"])
+        return now, lanewise(lambda c: c / count, middle)
 
     def _finger_contacts(self, i: Any, carry: tuple, at: dict, m: Memory, shape: tuple) -> None:
         p, now = self.p, at["now"]
@@ -458,7 +474,7 @@ class Step:
         if name.endswith("_object"):
             function = partial(sphere_on_object, scene)
             return lanewise(function, *shape, at["columns"], at["palm"].position, centre, radius)
-        height = self.p.rest.read(self.rest, "wrist")[2]
+        height = self.p.rest.read(self.rest, "wrist", 0, self.block.world)[2]
         return lanewise(partial(sphere_on_table, scene), height, centre, radius)
 
     def _slot_contacts(self, state: dict, at: dict, m: Memory, shape: tuple) -> None:
@@ -502,8 +518,7 @@ class Step:
     def _deal(self, slots: list[tuple]) -> tuple[Lanes, Lanes, Lanes]:
         """Deals the slots (component, 1, world) out to the finger lanes."""
         p = self.p
-        finger = jax.lax.broadcasted_iota(jnp.int32, p.dims, 0)
-        away = jnp.full(p.dims, 1e3, self.fine.dtype)
+        away = jnp.full((p.size,), 1e3, self.fine.dtype)
         dealt = []
         for field in range(3):
             values = [s[field] for s in slots]
@@ -511,7 +526,7 @@ class Step:
             for c in range(values[0].parts.shape[0]):
                 lane = away
                 for k, value in enumerate(values):
-                    lane = jnp.where(finger == k, value.parts[c].item(), lane)
+                    lane = jnp.where(self.block.finger == k, value.parts[c].item(), lane)
                 parts.append(lane)
             dealt.append(lanes(parts, (len(parts), 1), wide=True))
         return tuple(dealt)  # type: ignore[return-value]
@@ -535,20 +550,19 @@ class Step:
             p.scratch.write(self.scratch, "new_finger_vel", rate, i)
             return lanewise(_worse, largest, top)
 
-        like = jnp.zeros(p.dims, self.fine.dtype)
-        fingers = loop(p.links, link, zeros((), like), p.dims).lane
+        like = jnp.zeros((p.size,), self.fine.dtype)
+        fingers = loop(p.links, link, zeros((), like), p.size).lane
         largest = size.lane
-        for f in range(p.fingers):  # a maximum that keeps what is not finite
-            mine = jax.lax.broadcasted_iota(jnp.int32, p.dims, 0) == f
-            row = jnp.where(mine, fingers, 0.0).sum(0, keepdims=True)
-            largest = jnp.where((row > largest) | (row != row), row, largest)
+        row = p.scratch.offset["sums"]
+        for mine in self.block.share([fingers], self.scratch, row)[0]:
+            largest = _worse(largest, mine)
         limit = p.scene.limits
         good = (speed <= limit.speed) & (largest <= limit.speed)
         good = good & (height >= -limit.penetration)
         acc = {"acc_wrist": now.wrist, "acc_object": now.object}
         for name, value in {**new, **acc}.items():
             kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
-            p.rest.write(self.rest, name, kept)
+            p.rest.write(self.rest, name, kept, 0, self.block.world)
 
         def store(i: Any, x: Any) -> Any:
             for name in ("finger", "finger_vel"):
@@ -560,14 +574,6 @@ class Step:
 
         jax.lax.fori_loop(0, p.links, store, jnp.int32(0))
         return largest, good
-
-
-def _plus(total_: Lanes, part: Lanes, factor: jax.Array) -> Lanes:
-    """total + factor * part for a scalar factor."""
-    parts = total_.parts.copy()
-    for index in np.ndindex(parts.shape):
-        parts[index] = parts[index] + factor * part.parts[index]
-    return Lanes(parts, total_.shape, total_.dtype)
 
 
 def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, pressure):

@@ -10,11 +10,11 @@ from codesign_jax.engines.structured import elimination as el
 from codesign_jax.engines.structured import solver
 from codesign_jax.engines.structured.fused.contacts import BoundContacts, direct, zeros
 from codesign_jax.engines.structured.fused.tables import (
+    Block,
     Table,
     anywhere,
     full,
     solid,
-    sum_lanes,
     upper,
 )
 from codesign_jax.engines.structured.inertia import Body
@@ -63,13 +63,13 @@ class Memory(NamedTuple):
     contacts: dict[str, BoundContacts]
 
 
-def loop(count: int, body: Callable, start: Any, dims: tuple[int, int], *, reverse: bool = False):
+def loop(count: int, body: Callable, start: Any, size: int, *, reverse: bool = False):
     """Folds body(item, tree of lanes) over the items."""
-    first, rebuild = solid(start, *dims)
+    first, rebuild = solid(start, size)
 
     def step(k: jax.Array, arrays: list) -> list:
         item = count - 1 - k if reverse else k
-        return solid(body(item, rebuild(arrays)), *dims)[0]
+        return solid(body(item, rebuild(arrays)), size)[0]
 
     return rebuild(jax.lax.fori_loop(0, count, step, first))
 
@@ -87,12 +87,12 @@ def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
 class Newton:
     """The solver of one step in a kernel."""
 
-    def __init__(self, links: int, dims: tuple[int, int], m: Memory, palm: Palm):
+    def __init__(self, links: int, block: Block, m: Memory, palm: Palm):
         """Takes the step's memory, in which the forward pass has left its results."""
-        self.links, self.dims, self.m, self.palm = links, dims, m, palm
+        self.links, self.block, self.m, self.palm = links, block, m, palm
         self.fingers = [c for n, c in m.contacts.items() if n.startswith("finger")]
         self.slots = [c for n, c in m.contacts.items() if not n.startswith("finger")]
-        self.like = jnp.zeros(dims, palm.armature.dtype)
+        self.like = jnp.zeros((block.size,), palm.armature.dtype)
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
         """Reads names from the table that has them."""
@@ -107,6 +107,11 @@ class Newton:
     def write(self, name: str, value: Lanes, item: Any) -> None:
         """Writes to the scratch table."""
         self.m.scratch.write(self.m.scratch_ref, name, value, item)
+
+    def sum(self, tree: Any) -> Any:
+        """Sums over the fingers."""
+        m = self.m
+        return self.block.sum(tree, m.scratch_ref, m.scratch.offset["sums"])
 
     def body_of(self, item: Any) -> list[Lanes]:
         """Mass, centre and tensor of a link, the tensor as (3, 3)."""
@@ -134,8 +139,8 @@ class Newton:
             return node._replace(p=upper(node.p), q=upper(node.q))
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
-        node = loop(self.links, step, el.Quadratic(*empty), self.dims, reverse=True)
-        node = el.Quadratic(*map(sum_lanes, node))
+        node = loop(self.links, step, el.Quadratic(*empty), self.block.size, reverse=True)
+        node = self.sum(node)
         return node._replace(p=full(node.p), q=full(node.q))
 
     def slot_pushes(self) -> dict[str, tuple[Lanes, Lanes]]:
@@ -150,7 +155,7 @@ class Newton:
                 )
 
             start = (zeros((21,), self.like), zeros((6,), self.like))
-            triangle, wrench = map(sum_lanes, loop(c.set.count, add, start, self.dims))
+            triangle, wrench = self.sum(loop(c.set.count, add, start, self.block.size))
             pushes[c.set.name] = (full(triangle), wrench)
         return pushes
 
@@ -218,18 +223,17 @@ class Newton:
 
         none = zeros((), self.like)
         parent = lanewise(jnp.add, step.palm_motion, zeros((6,), self.like))
-        _, slope, curvature, touch = loop(self.links, one, (parent, none, none, none), self.dims)
+        _, slope, curvature, touch = loop(self.links, one, (parent, none, none, none), self.block.size)
         for contacts in self.slots:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
                 rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)
                 return lanewise(jnp.add, sum_, contacts.aim(i, rel))
 
-            touch = loop(contacts.set.count, add, touch, self.dims)
-        slope, curvature = lanewise(
-            self._rest, now, step, self.palm, sum_lanes(slope), sum_lanes(curvature)
-        )
-        return slope, curvature, sum_lanes(touch)
+            touch = loop(contacts.set.count, add, touch, self.block.size)
+        slope, curvature, touch = self.sum((slope, curvature, touch))
+        slope, curvature = lanewise(self._rest, now, step, self.palm, slope, curvature)
+        return slope, curvature, touch
 
     @staticmethod
     def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
@@ -254,10 +258,10 @@ class Newton:
                 return sums
 
             sums = [zeros((), self.like)] * 2
-            sums = loop(self.links, lambda i, s: add(i, s, self.fingers), sums, self.dims)
+            sums = loop(self.links, lambda i, s: add(i, s, self.fingers), sums, self.block.size)
             for c in self.slots:
-                sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.dims)
-            one, two = map(sum_lanes, sums)
+                sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
+            one, two = self.sum(sums)
             return lanewise(
                 lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
             )
@@ -274,7 +278,7 @@ class Newton:
             alpha, low, high, _ = rebuild(arrays)
             one, two = evaluate(alpha)
             new = lanewise(refine, alpha, low, high, one, two)
-            return [count + 1, *solid((*new, one), *self.dims)[0]]
+            return [count + 1, *solid((*new, one), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
             return (carry[0] < evaluations) & anywhere(jnp.abs(carry[-1]) > goal)
@@ -284,7 +288,7 @@ class Newton:
         one = lanewise(jnp.ones_like, slope)
         none = lanewise(jnp.zeros_like, slope)
         far = lanewise(lambda x: jnp.full_like(x, 3e38), slope)
-        start, rebuild = solid((one, none, far, far), *self.dims)
+        start, rebuild = solid((one, none, far, far), self.block.size)
         return rebuild(jax.lax.while_loop(going, body, [jnp.int32(0), *start])[1:])[0]
 
     def advance(self, now: Iterate, step: Iterate, alpha: Lanes) -> Iterate:
@@ -302,7 +306,7 @@ class Newton:
                 contacts.advance(i, alpha)
             return carry
 
-        loop(self.links, one, [], self.dims)
+        loop(self.links, one, [], self.block.size)
         for c in self.slots:
             jax.lax.fori_loop(0, c.set.count, lambda i, x, c=c: (c.advance(i, alpha), x)[1], 0)
         return lanewise(move, alpha, now, step)
@@ -314,7 +318,7 @@ class Newton:
 
         Args:
           now: Warm start.
-          waiting: Worlds that must converge, shape (1, world).
+          waiting: Lanes of worlds that must converge.
           iterations: Largest number of iterations.
           evaluations: Largest number of line-search evaluations.
           tolerance: Relative Newton decrement.
@@ -327,13 +331,13 @@ class Newton:
             alpha = self.line_search(slope, curvature, first, evaluations)
             residual = lanewise(_residual, slope, first, self.palm, now.object_motion)
             new = self.advance(now, step, alpha)
-            return [count + 1, *solid((new, residual), *self.dims)[0]]
+            return [count + 1, *solid((new, residual), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
             return (carry[0] < iterations) & anywhere(waiting & (carry[-1] > tolerance))
 
         far = lanewise(lambda a: jnp.full_like(a[0], 3e38), now.wrist)
-        start, rebuild = solid((now, far), *self.dims)
+        start, rebuild = solid((now, far), self.block.size)
         count, *arrays = jax.lax.while_loop(going, body, [jnp.int32(0), *start])
         now, residual = rebuild(arrays)
         return now, Quality(residual, count)

@@ -1,19 +1,21 @@
 """Named numbers in a kernel's memory, and loops that carry them."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.pallas.triton import debug_barrier
 
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, spread
 
 
 class Table:
-    """Names of the rows of an array (block, row, finger or 1, world of the block).
+    """Names of the rows of an array (block, row, lane or world of the block).
 
-    A block's numbers lie together in memory; one row is a number of every lane.
+    A block's numbers lie together in memory; one row is a number of every lane or world.
     """
 
     def __init__(self, wide: bool, **groups: tuple[int, tuple[int, ...]]):
@@ -43,33 +45,34 @@ class Table:
         pad = [(0, 0), (0, missing), (0, -stacked.shape[2] % block)]
         stacked = jnp.pad(stacked, pad, mode="edge")
         blocks = stacked.reshape(*stacked.shape[:2], -1, block)
-        return jnp.moveaxis(blocks, 2, 0)
+        return jnp.moveaxis(blocks, 2, 0).reshape(blocks.shape[2], self.rows, -1)
 
     def _row(self, name: str, item: Any) -> tuple[Any, tuple[int, ...]]:
         _, shape = self.groups[name]
         return self.offset[name] + item * int(np.prod(shape)), shape
 
-    def read(self, ref: Any, name: str, item: Any = 0) -> Lanes:
-        """Lanes of an item."""
+    def read(self, ref: Any, name: str, item: Any = 0, world: Any = None) -> Lanes:
+        """Lanes of an item; `world` is the world of each lane, for a table of worlds."""
         row, shape = self._row(name, item)
-        return lanes([ref[row + k] for k in range(int(np.prod(shape)))], shape, wide=self.wide)
+        where = () if self.wide else (world,)
+        values = [ref[(row + k, *where)] for k in range(int(np.prod(shape)))]
+        return lanes(values, shape, wide=self.wide)
 
-    def write(self, ref: Any, name: str, value: Lanes, item: Any = 0) -> None:
-        """Stores an item."""
+    def write(self, ref: Any, name: str, value: Lanes, item: Any = 0, world: Any = None) -> None:
+        """Stores an item; the lanes of a world store the same number."""
         row, _ = self._row(name, item)
-        lanes_shape = ref.shape[1:]
+        where = () if self.wide else (world,)
+        size = ref.shape[-1:] if self.wide else world.shape
         for k, part in enumerate(value.parts.ravel()):
-            ref[row + k] = spread(part, lanes_shape, value.dtype)
+            ref[(row + k, *where)] = spread(part, size, value.dtype)
 
 
-def solid(tree: Any, fingers: int, block: int) -> tuple[list[jax.Array], Callable]:
-    """Arrays of a tree of lanes, numbers filled in, and the function that rebuilds the tree."""
+def solid(tree: Any, size: int) -> tuple[list[jax.Array], Callable]:
+    """Arrays (size,) of a tree of lanes, numbers filled in, and what rebuilds the tree."""
     leaves, structure = jax.tree.flatten(tree, is_leaf=lambda x: isinstance(x, Lanes))
     arrays: list[jax.Array] = []
     for leaf in leaves:
-        wide = leaf.shape[-2] != 1
-        shape = (fingers if wide else 1, block)
-        arrays += [spread(p, shape, leaf.dtype) for p in leaf.parts.ravel()]
+        arrays += [spread(p, (size,), leaf.dtype) for p in leaf.parts.ravel()]
 
     def rebuild(values: Any) -> Any:
         rest, new = list(values), []
@@ -99,14 +102,55 @@ def full(triangle: Lanes) -> Lanes:
     return Lanes(parts, (6, 6, *triangle.shape[1:]), triangle.dtype)
 
 
-def sum_lanes(value: Lanes) -> Lanes:
-    """Sum over the fingers."""
-    parts = np.empty(value.parts.shape, object)
-    for index, part in np.ndenumerate(value.parts):
-        parts[index] = part.sum(0, keepdims=True)
-    return Lanes(parts, (*value.shape[:-2], 1, value.shape[-1]), value.dtype)
+class Block:
+    """The lanes of a block: finger by finger, the worlds of a finger together.
+
+    Attributes:
+      fingers: Number of fingers, a power of two.
+      worlds: Number of worlds.
+      size: Number of lanes.
+      world: World of each lane, shape (lane,).
+      finger: Finger of each lane, shape (lane,).
+    """
+
+    def __init__(self, fingers: int, worlds: int, *, barrier: bool):
+        """Makes the indices, inside a kernel; barrier: whether memory needs one."""
+        self.fingers, self.worlds, self.size = fingers, worlds, fingers * worlds
+        lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
+        self.world, self.finger = lane % worlds, lane // worlds
+        self._barrier = barrier
+
+    def share(self, arrays: list[jax.Array], ref: Any, row: int) -> list[list[jax.Array]]:
+        """Every finger's value of each array, on all lanes of the world; see `sum`."""
+        for k, array in enumerate(arrays):
+            ref[row + k] = array
+        if self._barrier:
+            debug_barrier()
+        found = [
+            [ref[row + k, self.world + f * self.worlds] for f in range(self.fingers)]
+            for k in range(len(arrays))
+        ]
+        if self._barrier:
+            debug_barrier()
+        return found
+
+    def sum(self, tree: Any, ref: Any, row: int) -> Any:
+        """Sums over the fingers, through memory: lanes do not see each other's registers.
+
+        Args:
+          tree: Lanes of a finger each.
+          ref: Memory of enough rows.
+          row: The first of them.
+        """
+        arrays, rebuild = solid(tree, self.size)
+        sums = [functools.reduce(jnp.add, parts) for parts in self.share(arrays, ref, row)]
+
+        def narrow(value: Lanes) -> Lanes:
+            return Lanes(value.parts, (*value.shape[:-2], 1, value.shape[-1]), value.dtype)
+
+        return jax.tree.map(narrow, rebuild(sums), is_leaf=lambda x: isinstance(x, Lanes))
 
 
 def anywhere(mask: jax.Array) -> jax.Array:
     """Whether any lane is true, a scalar."""
-    return jnp.max(jnp.max(mask.astype(jnp.int32), axis=1), axis=0) > 0
+    return jnp.max(mask.astype(jnp.int32)) > 0

@@ -21,6 +21,7 @@ from codesign_jax.engines.structured.fused.contacts import (
     sphere_on_table,
     zeros,
 )
+from codesign_jax.engines.structured.fused.launch import launch
 from codesign_jax.engines.structured.fused.newton import (
     Iterate,
     Memory,
@@ -213,7 +214,7 @@ class Program:
         )
 
     def pack_controls(self, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Commands of (world, time, nu): arm (block, time, 6, world), pressure (block, time, lane)."""
+        """Commands: arm (block, time, 6, world) and pressure (block, time, lane)."""
         worlds, steps, _ = ctrl.shape
         ctrl = jnp.pad(ctrl, [(0, -worlds % self.block), (0, 0), (0, 0)], mode="edge")
         blocks = jnp.moveaxis(ctrl.reshape(-1, self.block, steps, ctrl.shape[2]), 1, 3)
@@ -237,21 +238,17 @@ class Program:
         def spec(shape: tuple[int, ...]) -> pl.BlockSpec:
             return pl.BlockSpec((None, *shape[1:]), lambda i: (i, *[0] * (len(shape) - 1)))
 
-        params = {}
-        if not interpret:
-            from jax.experimental.pallas import triton
-
-            params = {"compiler_params": triton.CompilerParams(num_warps=1, num_stages=1)}
-        out = pl.pallas_call(
+        outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
+        call = pl.pallas_call(
             partial(self._kernel, steps, interpret),
             grid=(blocks,),
             in_specs=[spec(x.shape) for x in inputs],
             out_specs=[spec(s) for s in shapes],
-            out_shape=[jax.ShapeDtypeStruct(s, dtype) for s in shapes],
+            out_shape=outputs,
             interpret=interpret,
             name="grasp",
-            **params,
-        )(*inputs)
+        )
+        out = call(*inputs) if interpret else launch(call, inputs, outputs)
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(TRACE))[: ctrl.shape[0]]
         return {name: trace[..., k] for k, name in enumerate(TRACE)}
@@ -357,7 +354,7 @@ class Step:
 
     def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
         """Kinematics, inertia and smooth forces of palm, wrist and object."""
-        p, w, g = self.p, self.p.scene.hand.wrist, self.p.scene.gravity
+        w, g = self.p.scene.hand.wrist, self.p.scene.gravity
         names = ("palm_mass", "palm_centre", "palm_inertia", "wrist_damping", "wrist_armature")
         constants = self.constants(*names, "object_mass", "object_inertia")
 

@@ -117,7 +117,7 @@ class Block:
         """Makes the indices, inside a kernel; barrier: whether memory needs one."""
         self.fingers, self.worlds, self.size = fingers, worlds, fingers * worlds
         lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
-        self.world, self.finger = lane % worlds, lane // worlds
+        self.world, self.finger = jax.lax.rem(lane, worlds), jax.lax.div(lane, worlds)
         self._barrier = barrier
 
     def share(self, arrays: list[jax.Array], ref: Any, row: int) -> list[list[jax.Array]]:

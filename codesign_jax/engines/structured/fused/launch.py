@@ -1,0 +1,52 @@
+"""Runs a Pallas kernel on a GPU through `ptx`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from codesign_jax.engines.structured.fused import ptx
+
+
+def launch(call: Callable, inputs: tuple, outputs: list[jax.ShapeDtypeStruct]) -> list[jax.Array]:
+    """Returns call(*inputs), where call is a `pallas_call` with one grid axis and whole-array blocks.
+
+    Args:
+      call: The kernel as a function of arrays whose leading axis is the grid's.
+      inputs: Its arguments.
+      outputs: Shapes of its results.
+    """
+    avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in inputs]
+    equation = _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr)
+    shapes = [tuple(x.shape[1:]) for x in (*avals, *outputs)]
+    code = ptx.assemble(equation.params["jaxpr"], shapes, "grasp")
+    number = np.int32
+    return jax.ffi.ffi_call("__gpu$xla.gpu.ptx", outputs)(
+        *inputs,
+        name="grasp",
+        kernel_type="ptx",
+        kernel_data=code,
+        grid_x=number(outputs[0].shape[0]),
+        grid_y=number(1),
+        grid_z=number(1),
+        block_x=number(ptx.LANES),
+        block_y=number(1),
+        block_z=number(1),
+        shared_mem_bytes=number(0),
+        output_indices=tuple(range(len(inputs), len(shapes))),
+    )
+
+
+def _pallas_call(jaxpr: Any) -> Any:
+    """The kernel's equation, wherever it is nested."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "pallas_call":
+            return equation
+        for value in equation.params.values():
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                found = _pallas_call(inner)
+                if found is not None:
+                    return found
+    return None

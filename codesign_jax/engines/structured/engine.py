@@ -39,7 +39,7 @@ class StructuredEngine:
     name = "structured"
 
     def __init__(
-        self, scene: Scene, *, iterations: int = 8, evaluations: int = 4, tolerance: float = 1e-8
+        self, scene: Scene, *, iterations: int = 24, evaluations: int = 6, tolerance: float = 1e-6
     ):
         """Prepares the engine.
 
@@ -52,6 +52,7 @@ class StructuredEngine:
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.conditional = jax.default_backend() == "cpu"  # see Stages
+        self.fused = jax.default_backend() == "gpu"
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -147,9 +148,22 @@ class StructuredEngine:
         return total([every[:, f : f + 1] for f in range(n)]) / (n * links)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """See `Engine.rollout`."""
+        """See `Engine.rollout`; on a GPU in float32 one kernel runs it all, see `fused`."""
+        if self.fused and not trajectory and ctrl.dtype == jnp.float32:
+            return self._one_kernel(fields, ctrl)
         with jax.default_matmul_precision("highest"):
             return self._rollout(fields, ctrl, trajectory)
+
+    def _one_kernel(self, fields: ModelFields, ctrl: jax.Array) -> Trace:
+        from codesign_jax.engines.structured.fused import Limits, Program
+
+        # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
+        limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
+        found = Program(self.scene, limits).run(
+            hand_lanes(self.scene, fields), self.reset(fields), ctrl
+        )
+        qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
+        return Trace(found["distance"], found["height"], found["speed"], qpos)
 
     def _rollout(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
         hand, limits = hand_lanes(self.scene, fields), self.scene.limits

@@ -1,0 +1,5 @@
+"""The structured engine's rollout as one GPU kernel."""
+
+from codesign_jax.engines.structured.fused.kernel import TRACE, Limits, Program
+
+__all__ = ["TRACE", "Limits", "Program"]

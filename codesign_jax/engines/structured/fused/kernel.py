@@ -31,6 +31,7 @@ from codesign_jax.engines.structured.fused.newton import (
     relative,
     triangle,
 )
+from codesign_jax.engines.structured.fused.ptx import LANES
 from codesign_jax.engines.structured.fused.tables import Block, Table, anywhere
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.inertia import Body
@@ -61,18 +62,19 @@ class Limits(NamedTuple):
 class Program:
     """Tables and kernel of a scene's rollout for one size of block."""
 
-    def __init__(self, scene: Scene, limits: Limits, *, block: int = 8):
+    def __init__(self, scene: Scene, limits: Limits, *, block: int | None = None):
         """Lays out the memory.
 
         Args:
           scene: The scene.
           limits: How hard each step is solved.
-          block: Worlds of a block, a power of two.
+          block: Worlds of a block, a power of two; by default as many as fill a warp.
         """
         self.scene, self.limits, self.lay = scene, limits, layout(scene)
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()
-        self.num_fingers, self.block, self.size = n, block, self.fingers * block
+        self.num_fingers, self.block = n, block or LANES // self.fingers
+        self.size = self.fingers * self.block
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
         self.palm_groups = -(-len(palm_points(scene)) // self.fingers)
         self.sets = self._sets()
@@ -409,9 +411,7 @@ class Step:
             p.hand.read(self.hand, n) for n in ("mount", "base", "share", "stub_centre")
         )
         frame, origin = lanewise(kin._mount, at["frame"], mount, base)
-        weight = lanewise(
-            lambda f, s, share: share * apply_columns(f, s), at["frame"], stub, share
-        )
+        weight = lanewise(lambda f, s, share: share * apply_columns(f, s), at["frame"], stub, share)
         wide = zeros((6,), like)
         vel, bias, motion = (
             lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
@@ -435,9 +435,7 @@ class Step:
             for name, value in stored.items():
                 m.scratch.write(self.scratch, name, value, i)
             share = p.hand.read(self.hand, "share", i + 1)
-            middle = lanewise(
-                lambda m, c, s: m + s * c, middle, stored["body_centre"], share
-            )
+            middle = lanewise(lambda m, c, s: m + s * c, middle, stored["body_centre"], share)
             self._finger_contacts(i, carry, at, m, shape)
             return (*carry, middle)
 
@@ -539,9 +537,7 @@ class Step:
         size = lanewise(_largest, new)
 
         def link(i: Any, largest: Lanes) -> Lanes:
-            q, rate, acc = (
-                p.fine.read(self.fine, n, i) for n in ("finger", "finger_vel", "acc")
-            )
+            q, rate, acc = (p.fine.read(self.fine, n, i) for n in ("finger", "finger_vel", "acc"))
             rate, q, top = lanewise(partial(_turned, h), q, rate, acc)
             p.scratch.write(self.scratch, "new_finger", q, i)
             p.scratch.write(self.scratch, "new_finger_vel", rate, i)

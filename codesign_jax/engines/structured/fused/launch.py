@@ -10,7 +10,7 @@ from codesign_jax.engines.structured.fused import ptx
 
 
 def launch(call: Callable, inputs: tuple, outputs: list[jax.ShapeDtypeStruct]) -> list[jax.Array]:
-    """Returns call(*inputs), where call is a `pallas_call` with one grid axis and whole-array blocks.
+    """Returns call(*inputs), where call is a `pallas_call` over the leading axis of its arrays.
 
     Args:
       call: The kernel as a function of arrays whose leading axis is the grid's.

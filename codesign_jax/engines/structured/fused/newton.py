@@ -223,7 +223,9 @@ class Newton:
 
         none = zeros((), self.like)
         parent = lanewise(jnp.add, step.palm_motion, zeros((6,), self.like))
-        _, slope, curvature, touch = loop(self.links, one, (parent, none, none, none), self.block.size)
+        _, slope, curvature, touch = loop(
+            self.links, one, (parent, none, none, none), self.block.size
+        )
         for contacts in self.slots:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:

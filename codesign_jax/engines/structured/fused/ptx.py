@@ -41,7 +41,15 @@ class Ref(NamedTuple):
 
 _COMPARE = {"lt": "lt", "le": "le", "gt": "gt", "ge": "ge", "eq": "eq", "ne": "ne"}
 _INLINE = ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint")
-_SAME = ("broadcast_in_dim", "broadcast_to", "reshape", "squeeze", "stop_gradient", "copy", "optimization_barrier")
+_SAME = (
+    "broadcast_in_dim",
+    "broadcast_to",
+    "reshape",
+    "squeeze",
+    "stop_gradient",
+    "copy",
+    "optimization_barrier",
+)
 
 
 def kind_of(aval: Any) -> str:
@@ -226,9 +234,7 @@ class Assembler:
         which = index
         if index.kind != "pred":
             which = self.compute("pred", "setp.ne.s32", index, 0)
-        results = [
-            Value(kind_of(v.aval), self.register(kind_of(v.aval))) for v in equation.outvars
-        ]
+        results = [Value(kind_of(v.aval), self.register(kind_of(v.aval))) for v in equation.outvars]
         other, end = self.label(), self.label()
         self.emit(f"@!{self.operand(which)} bra.uni {other};")
         for branch, label in ((yes, other), (no, end)):

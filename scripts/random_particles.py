@@ -20,14 +20,14 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.types import Status
 
 
-def provenance() -> dict:
-    """Command, commit, versions and device that made a result."""
+def provenance(commit: str | None) -> dict:
+    """Command, commit, versions and device that made a result; commit: instead of git's."""
     git = subprocess.run(
         ["git", "rev-parse", "--verify", "-q", "HEAD"], capture_output=True, text=True, check=False
     )
     return {
         "command": " ".join(["python", *sys.argv]),
-        "commit": git.stdout.strip() or None,
+        "commit": commit or git.stdout.strip() or None,
         "python": platform.python_version(),
         "jax": jax.__version__,
         "device": jax.devices()[0].device_kind,
@@ -46,8 +46,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=100_000)
     parser.add_argument("--chunk", type=int, default=16_384)
-    parser.add_argument("--iterations", type=int, default=8)
-    parser.add_argument("--evaluations", type=int, default=6)
+    parser.add_argument("--iterations", type=int, default=24)
+    parser.add_argument("--evaluations", type=int, default=14)
+    parser.add_argument("--commit", help="where there is no repository to ask")
     parser.add_argument("--json", type=Path, required=True)
     args = parser.parse_args()
     the_scene = scene.load("paper")
@@ -62,7 +63,7 @@ def main() -> None:
         return rollout.simulate(the_scene, engine, jax.vmap(space.params)(designs), trials)[0]
 
     chunks = -(-args.worlds // args.chunk)
-    seconds, status, cost = [], [], []
+    seconds, status, cost, failures = [], [], [], []
     for c in range(chunks):
         designs = particles(space, c, args.chunk)
         start = time.perf_counter()
@@ -71,10 +72,14 @@ def main() -> None:
         status.append(np.asarray(result.status))
         cost.append(np.asarray(result.cost))
         print(f"chunk {c + 1}/{chunks}: {seconds[-1]:.1f} s, failed {(status[-1] != 0).sum()}")
+        for world in np.flatnonzero(status[-1])[:100]:
+            bits = Status(int(status[-1][world]))
+            bad = int(result.bad_step[world])
+            failures.append({"chunk": c, "world": int(world), "status": bits.name, "step": bad})
     bits, costs = np.concatenate(status), np.concatenate(cost)
     steady = float(np.median(seconds[1:] or seconds))
     result = {
-        **provenance(),
+        **provenance(args.commit),
         "worlds": int(bits.size),
         "steps_per_world": the_scene.num_steps,
         "iterations": args.iterations,
@@ -84,6 +89,8 @@ def main() -> None:
         "first_chunk_with_compile_s": seconds[0],
         "world_steps_per_s": args.chunk * the_scene.num_steps / steady,
         "grasps_per_s": args.chunk / steady,
+        "chunk": args.chunk,
+        "failures": failures,
     }
     args.json.parent.mkdir(parents=True, exist_ok=True)
     args.json.write_text(json.dumps(result, indent=2) + "\n")

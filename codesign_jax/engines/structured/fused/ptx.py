@@ -16,6 +16,7 @@ from jax.extend import core
 
 HEADER = ".version 7.8\n.target sm_80\n.address_size 64\n"
 LANES = 32
+LAUNCH = f".maxntid {LANES}, 1, 1\n"
 
 
 class Value(NamedTuple):
@@ -506,6 +507,6 @@ def assemble(jaxpr: Any, shapes: list[tuple[int, ...]], name: str) -> str:
     start = "mov.u32 %block, %ctaid.x;\nmov.u32 %lane, %tid.x;\n"
     body = "\n".join(asm.lines)
     return (
-        f"{HEADER}.visible .entry {name}({params})\n{{\n.reg .u32 %block;\n.reg .s32 %lane;\n"
+        f"{HEADER}.visible .entry {name}({params})\n{LAUNCH}{{\n.reg .u32 %block;\n.reg .s32 %lane;\n"
         f"{registers}{start}{body}\nret;\n}}\n"
     )

@@ -146,7 +146,8 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> G
 def _read(path: Path) -> Grid | None:
     """A stored grid, or None; a damaged file (zip has checksums) counts as none."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # NumPy leaves a damaged file open if it opens it itself.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             scalars = {k: float(file[k]) for k in ("cell", "error", "worst")}
             return Grid(origin=file["origin"], values=file["values"], **scalars)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):

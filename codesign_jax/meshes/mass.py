@@ -36,7 +36,7 @@ def body(vertices: np.ndarray, faces: np.ndarray) -> Body:
     tensor = np.asarray(unit["inertia"]) / unit["volume"] * scale**2
     axes = principal_axes(tensor)
     return Body(
-        volume=float(unit["volume"]) * scale**3,
+        volume=float(unit["volume"] * scale**3),
         centre=np.asarray(unit["center_mass"]) * scale + middle,
         axes=axes,
         inertia=np.diag(axes.T @ tensor @ axes).copy(),

@@ -6,6 +6,9 @@ trimesh's own need networkx, one more dependency.
 from collections import deque
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 _MERGE = 1e-5  # vertices closer than this fraction of the size are one
 
@@ -33,13 +36,15 @@ def repair(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _merge(vertices: np.ndarray, faces: np.ndarray, report: list[str]):
-    step = _MERGE * np.ptp(vertices, axis=0).max()
-    keys = np.round((vertices - vertices.min(0)) / max(step, 1e-300)).astype(np.int64)
-    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    if len(first) < len(vertices):
-        report.append(f"merged {len(vertices) - len(first)} vertices into their neighbours")
-        vertices, faces = vertices[first], index.reshape(-1)[faces]
-    return vertices, faces
+    near = _MERGE * np.ptp(vertices, axis=0).max()
+    pairs = cKDTree(vertices).query_pairs(near, output_type="ndarray")
+    if not len(pairs):
+        return vertices, faces
+    ones, n = np.ones(len(pairs), bool), len(vertices)
+    count, group = connected_components(coo_array((ones, tuple(pairs.T)), shape=(n, n)))
+    report.append(f"merged {n - count} vertices into their neighbours")
+    first = np.unique(group, return_index=True)[1]
+    return vertices[first], group[faces]
 
 
 def _drop(faces: np.ndarray, report: list[str]) -> np.ndarray:

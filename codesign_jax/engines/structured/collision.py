@@ -1,7 +1,6 @@
 """Contact geometry: spheres against the object and the table, the object on the table."""
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -111,7 +110,7 @@ def signed_distance(scene: Scene, hand: HandLanes, local: jax.Array) -> tuple[ja
         "box": _box,
         "cylinder": _cylinder,
         "sphere": _sphere,
-        "mesh": partial(mesh.signed_distance, scene, hand.shape),
+        "mesh": lambda size, p: mesh.signed_distance(hand.mesh, p),
     }
     kinds = [s.type for s in scene.objects.object]
     result = None
@@ -174,7 +173,7 @@ def object_on_table(
         "box": _box_corners,
         "cylinder": _rim_points,
         "sphere": _lowest_point,
-        "mesh": partial(mesh.table_points, scene, hand.shape[0]),
+        "mesh": lambda size, columns: mesh.table_points(hand.mesh, columns),
     }
     kinds = [s.type for s in scene.objects.object]
 

@@ -84,41 +84,78 @@ def tables(scene: Scene) -> Tables | None:
     return result
 
 
-def signed_distance(
-    scene: Scene, shape: jax.Array, size: jax.Array, p: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Signed distance and its unit gradient in the object's frame by trilinear interpolation.
+class MeshLanes(NamedTuple):
+    """The tables on the device, and each world's rows of them.
 
-    Beyond the grid, where no contact begins, the way back to it is added.
+    Attributes:
+      values: Grid values of all meshes [m], flat: of the scene, not of a world.
+      first: Index of the first value of the world's grid, shape (1, world).
+      nodes: Nodes along each axis, shape (3, 1, world).
+      origin: Position of the first node [m], shape (3, 1, world).
+      cell: Distance of the nodes [m], shape (1, world).
+      factor: Factor on the mesh's size, shape (1, world).
+      support: Support points of the mesh as large as it is [m], shape (3, point, world).
+    """
+
+    values: jax.Array
+    first: jax.Array
+    nodes: jax.Array
+    origin: jax.Array
+    cell: jax.Array
+    factor: jax.Array
+    support: jax.Array
+
+
+def mesh_lanes(scene: Scene, shape: jax.Array, size: jax.Array) -> MeshLanes | None:
+    """Looks up the meshes of a batch, once a rollout; None for a scene without meshes.
 
     Args:
       scene: The scene.
       shape: Index of each world's object, shape (1, world).
       size: Half sizes, shape (3, 1, world).
-      p: Points, shape (3, ..., world).
     """
     t = tables(scene)
-    assert t is not None
-    factor = size[0] / _row(t.half, shape, p.dtype)
-    origin, cell = _row(t.origin, shape, p.dtype), _row(t.cell, shape, p.dtype)
-    nodes = [jnp.asarray(t.nodes[:, k])[shape] for k in range(3)]
-    scaled = [(p[k] / factor - origin[k]) / cell for k in range(3)]
-    inside = [jnp.clip(x, 0.0, (n - 1).astype(p.dtype)) for x, n in zip(scaled, nodes, strict=True)]
-    index = [jnp.minimum(x.astype(jnp.int32), n - 2) for x, n in zip(inside, nodes, strict=True)]
-    part = [x - i.astype(p.dtype) for x, i in zip(inside, index, strict=True)]
-    corner = (index[0] * nodes[1] + index[1]) * nodes[2] + index[2] + jnp.asarray(t.first)[shape]
-    strides = (nodes[1] * nodes[2], nodes[2], jnp.ones_like(nodes[2]))
-    value, slope = _interpolate(jnp.asarray(t.values, p.dtype), corner, strides, part)
-    beyond = jnp.stack([x - q for x, q in zip(scaled, inside, strict=True)]) * cell
+    if t is None:
+        return None
+
+    def row(table: np.ndarray) -> jax.Array:
+        floating = np.issubdtype(table.dtype, np.floating)
+        picked = jnp.asarray(table, size.dtype if floating else None)[shape[0]]
+        return jnp.moveaxis(picked, 0, -1)
+
+    factor = size[0] / row(t.half)
+    return MeshLanes(
+        values=jnp.asarray(t.values, size.dtype),
+        first=row(t.first)[None],
+        nodes=row(t.nodes)[:, None],
+        origin=row(t.origin)[:, None],
+        cell=row(t.cell)[None],
+        factor=factor,
+        support=factor * jnp.moveaxis(row(t.support), 1, 0),
+    )
+
+
+def signed_distance(lanes: MeshLanes, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Signed distance and its unit gradient in the object's frame by trilinear interpolation.
+
+    Beyond the grid, where no contact begins, the way back to it is added.
+
+    Args:
+      lanes: The worlds' meshes.
+      p: Points, shape (3, ..., world).
+    """
+    axes, nodes = range(3), lanes.nodes
+    scaled = [(p[k] / lanes.factor - lanes.origin[k]) / lanes.cell for k in axes]
+    inside = [jnp.clip(scaled[k], 0.0, (nodes[k] - 1).astype(p.dtype)) for k in axes]
+    index = [jnp.minimum(inside[k].astype(jnp.int32), nodes[k] - 2) for k in axes]
+    part = [inside[k] - index[k].astype(p.dtype) for k in axes]
+    corner = lanes.first + (index[0] * nodes[1] + index[1]) * nodes[2] + index[2]
+    value, slope = _interpolate(lanes.values, corner, (nodes[1] * nodes[2], nodes[2]), part)
+    beyond = jnp.stack([scaled[k] - inside[k] for k in axes]) * lanes.cell
     back = jnp.sqrt(dot(beyond, beyond) + _FAR**2)
-    gradient = slope / cell + beyond / back
+    gradient = slope / lanes.cell + beyond / back
     length = jnp.sqrt(dot(gradient, gradient) + _FAR**2)
-    return factor * (value + back - _FAR), gradient / length
-
-
-def _row(table: np.ndarray, shape: jax.Array, dtype) -> jax.Array:
-    """Each world's row with its components in front, shape (..., 1, world)."""
-    return jnp.moveaxis(jnp.asarray(table, dtype)[shape], (0, 1), (-2, -1))
+    return lanes.factor * (value + back - _FAR), gradient / length
 
 
 def _interpolate(
@@ -130,7 +167,7 @@ def _interpolate(
     def edge(i: int, j: int) -> tuple[jax.Array, jax.Array]:
         """Interpolates along z on the cell's edge (i, j)."""
         at = corner + i * strides[0] + j * strides[1]
-        low, high = values[at], values[at + strides[2]]
+        low, high = values[at], values[at + 1]
         return low + z * (high - low), high - low
 
     (a, az), (b, bz), (c, cz), (d, dz) = edge(0, 0), edge(0, 1), edge(1, 0), edge(1, 1)
@@ -141,23 +178,17 @@ def _interpolate(
     return low + x * (high - low), slope
 
 
-def table_points(scene: Scene, shape: jax.Array, size: jax.Array, columns: jax.Array) -> jax.Array:
+def table_points(lanes: MeshLanes, columns: jax.Array) -> jax.Array:
     """Four support points that carry an object on a plane, from its centre, shape (3, 4, world).
 
     The lowest; the one farthest from it; then the farthest on either side of the line through both.
     Heights count against distances, so that higher points are taken only when no lower one is left.
 
     Args:
-      scene: The scene.
-      shape: Index of each world's object, shape (world,).
-      size: Half sizes, shape (3, world).
+      lanes: The worlds' meshes.
       columns: Columns of the object's orientation, shape (3, 3, world).
     """
-    t = tables(scene)
-    assert t is not None
-    local = jnp.moveaxis(jnp.asarray(t.support, size.dtype)[shape], 0, -1)  # (point, 3, world)
-    local = local * (size[0] / jnp.asarray(t.half, size.dtype)[shape])
-    point = jnp.stack([dot(columns[:, i], jnp.moveaxis(local, 1, 0)) for i in range(3)])
+    point = jnp.stack([dot(columns[:, i], lanes.support) for i in range(3)])
     height = _STEEPEST * point[2]
     first = _best(-height, point)
     away = point - first[:, None]

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from small import DATA, hand_world, nth, stack, still
 
 from codesign_jax import meshes, model, objects, parameters, rollout, scene, schema
+from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured import mesh as mesh_lanes
@@ -309,6 +310,16 @@ def test_what_cannot_be_repaired_is_still_refused(tmp_path):
     other.apply_translation([0.04, 0.05, 0])
     said = problems(tmp_path, trimesh.util.concatenate([box(), other]), repaired=True)
     assert any("more than two faces; even after the repair" in p for p in said)
+
+
+def test_users_are_told_of_repairs_and_errors(tmp_path):
+    mesh = box(40, 50, 60)
+    trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1]).export(tmp_path / "inverted.off")
+    entry = 'name = "a"; type = "mesh"; file = "inverted.off"; unit = "mm"; mass = 0.1; '
+    path = object_file(tmp_path, entry + "friction = 1; repair = true; voxel_error = 0.001")
+    notes = common.mesh_notes(scene.load("paper", object_set=path))
+    assert notes[0] == "object a: turned 12 of 12 faces, so that all point outwards"
+    assert notes[1].startswith("object a: distances on 2.5 mm cells, error near the surface")
 
 
 # --- the household set ---------------------------------------------------------------------------

@@ -250,7 +250,7 @@ def test_every_hand_and_object_set_builds(hand_name, object_set):
     assert np.isfinite(compiled.body_inertia).all() and (compiled.body_mass[1:] > 0).all()
 
 
-# Sets with meshes are stepped in test_meshes.py: stock MuJoCo does not take them.
+# Sets with meshes are stepped in test_mesh_grasps.py: stock MuJoCo does not take them.
 @pytest.mark.parametrize("object_set", [o for o in OBJECTS if of_primitives(o)])
 @pytest.mark.parametrize("hand_name", HANDS)
 def test_every_hand_and_object_set_steps_finitely(hand_name, object_set):

@@ -93,10 +93,11 @@ def mesh_notes(scene: Scene) -> list[str]:
     for shape in scene.objects.object:
         if shape.mesh:
             grid = shape.mesh.grid
+            cell, error, worst = (1e3 * v for v in (grid.cell, grid.error, grid.worst))
             notes += [f"object {shape.name}: {line}" for line in shape.mesh.repairs]
             notes.append(
-                f"object {shape.name}: distances on {grid.cell * 1e3:.2g} mm cells, error near the "
-                f"surface below {grid.error * 1e3:.2g} mm (99 %), {grid.worst * 1e3:.2g} mm at worst"
+                f"object {shape.name}: distances on {cell:.2g} mm cells, error near the surface "
+                f"below {error:.2g} mm (99 %), {worst:.2g} mm at worst"
             )
     return notes
 

@@ -81,10 +81,6 @@ def _stuck(scene: Scene, trace: Trace) -> jax.Array:
         return jnp.zeros((), bool)
     # A resting object's centre is at most its bounding radius above the table, whatever side it
     # lies on.
-    radius = max(np.linalg.norm(_half_extents(s.type, s.size)) for s in scene.objects.object)
+    radius = max(shape.radius for shape in scene.objects.object)
     resting = trace.height[-1] < radius * (1 + 4 * scene.objects.noise.size)
     return (trace.distance[-1] <= scene.cost.lost_distance) & ~resting
-
-
-def _half_extents(kind: str, size: tuple[float, ...]) -> tuple[float, ...]:
-    return {"box": size, "cylinder": size, "sphere": size[:1]}[kind]

@@ -2,11 +2,17 @@
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from codesign_jax import files, schema
 from codesign_jax.schema import choice, quantity
 
+if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitives need neither
+    from codesign_jax.meshes import Solid
+
 SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
+_MESH_KEYS = ("file", "unit", "density", "repair", "voxel_error")
+_MASS, _SIZE = ("kg", 0.001, 10.0), ("m", 0.002, 0.25)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,14 +36,62 @@ class Table:
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
-    """A primitive: half sizes of a box; radius, half height of a cylinder; radius of a sphere."""
+class _ShapeFile:
+    """Schema of an object in a file.
+
+    Attributes:
+      name: Name, unique in the set.
+      type: A primitive or "mesh".
+      friction: Coulomb coefficient of the hand on it.
+      size: Half sizes of a box; radius and half height of a cylinder; radius of a sphere.
+      mass: Mass; a mesh may give `density` instead.
+      density: Density of a mesh.
+      file: Mesh file, beside the object file if the path is relative.
+      unit: Unit of the mesh file's numbers, metres if not given.
+      repair: Whether to repair a mesh.
+      voxel_error: Bound on the error of a mesh's signed distance, 0.5 mm if not given.
+    """
 
     name: str
-    type: str = choice(*SIZES)
-    size: tuple[float, ...] = quantity("m", 0.002, 0.25)
-    mass: float = quantity("kg", 0.001, 10)
+    type: str = choice(*SIZES, "mesh")
     friction: float = quantity("", 0, 5)
+    size: tuple[float, ...] | None = quantity(*_SIZE, default=None)
+    mass: float | None = quantity(*_MASS, default=None)
+    density: float | None = quantity("kg/m^3", 10, 25000, default=None)
+    # Two objects are equal if their meshes are, wherever the files lie.
+    file: str | None = dataclasses.field(default=None, compare=False)
+    unit: str | None = choice("m", "cm", "mm", "in", default=None)
+    repair: bool | None = None
+    voxel_error: float | None = quantity("m", 5e-5, 5e-3, default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape(_ShapeFile):
+    """An object with its mass and, if it is a mesh, the mesh; see `load`."""
+
+    mass: float = quantity(*_MASS, default=0.0)
+    mesh: "Solid | None" = dataclasses.field(default=None, metadata={"in_file": False})
+
+    @property
+    def half_sizes(self) -> tuple[float, ...]:
+        """Three numbers that scale with the object [m]: `size`, or a mesh's half bounding box."""
+        return self.mesh.half_sizes if self.mesh else (*(self.size or ()), 0.0, 0.0)[:3]
+
+    @property
+    def radius(self) -> float:
+        """Distance of the farthest point from the centre [m]."""
+        return self.mesh.radius if self.mesh else sum(v**2 for v in self.half_sizes) ** 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class _ObjectSetFile:
+    """Schema of an object file."""
+
+    name: str
+    description: str
+    noise: Noise
+    table: Table
+    object: tuple[_ShapeFile, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,31 +106,71 @@ class ObjectSet:
 
 
 def load(name: str | Path) -> ObjectSet:
-    """Reads and checks an object set.
+    """Reads and checks an object set and its meshes.
 
     Args:
       name: Name of a built-in set, or a path ending in .toml.
 
     Raises:
-      SceneError: with every problem in the file.
+      SceneError: with every problem in the file and in its meshes.
     """
     path = files.find("objects", name)
     problems: list[str] = []
-    objects = schema.parse(ObjectSet, files.read(path), path.name, problems)
-    if objects is not None:
-        if not objects.object:
-            problems.append(f"{path.name}.object must name at least one object")
-        names = [shape.name for shape in objects.object]
-        for name in sorted({n for n in names if names.count(n) > 1}):
-            problems.append(
-                f"{path.name}.object {name}: the name is given {names.count(name)} times"
-            )
-        for shape in objects.object:
-            if len(shape.size) != SIZES[shape.type]:
-                problems.append(
-                    f"{path.name}.object {shape.name}: size of a {shape.type} has "
-                    f"{SIZES[shape.type]} values, not {len(shape.size)}"
-                )
-    if problems or objects is None:
+    parsed = schema.parse(_ObjectSetFile, files.read(path), path.name, problems)
+    if parsed is None:
         raise schema.SceneError(problems)
-    return objects
+    if not parsed.object:
+        problems.append(f"{path.name}.object must name at least one object")
+    names = [shape.name for shape in parsed.object]
+    for name in sorted({n for n in names if names.count(n) > 1}):
+        problems.append(f"{path.name}.object {name}: the name is given {names.count(name)} times")
+    shapes = [_shape(shape, path, problems) for shape in parsed.object]
+    if problems:
+        raise schema.SceneError(problems)
+    found = tuple(s for s in shapes if s is not None)
+    return ObjectSet(parsed.name, parsed.description, parsed.noise, parsed.table, found)
+
+
+def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
+    """Checks which keys go together, and reads the mesh."""
+    before, where = len(problems), f"{path.name}.object {given.name}"
+    kind = given.type
+    if kind == "mesh":
+        missing = [k for k in ("file",) if getattr(given, k) is None]
+        foreign = ["size"] if given.size is not None else []
+        if (given.mass is None) == (given.density is None):
+            problems.append(f"{where}: a mesh has either a mass or a density")
+    else:
+        missing = [k for k in ("size", "mass") if getattr(given, k) is None]
+        foreign = [k for k in _MESH_KEYS if getattr(given, k) is not None]
+        if given.size is not None and len(given.size) != SIZES[kind]:
+            problems.append(
+                f"{where}: size of a {kind} has {SIZES[kind]} values, not {len(given.size)}"
+            )
+    problems += [f"{where}: {key} of a {kind} is missing" for key in missing]
+    problems += [f"{where}: a {kind} has no {key}" for key in foreign]
+    values = {f.name: getattr(given, f.name) for f in dataclasses.fields(given)}
+    if len(problems) > before:
+        return None
+    return Shape(**values) if kind != "mesh" else _mesh_shape(values, path, where, problems)
+
+
+def _mesh_shape(values: dict, path: Path, where: str, problems: list[str]) -> Shape | None:
+    from codesign_jax import meshes
+
+    try:
+        mesh = meshes.load(
+            path.parent / values["file"],
+            unit=values["unit"] or "m",
+            repaired=bool(values["repair"]),
+            voxel_error=values["voxel_error"] or 5e-4,
+        )
+    except schema.SceneError as error:
+        problems += [f"{where}: {p}" for p in error.problems]
+        return None
+    # Written back as a mass, so that the same file read again gives the same object.
+    mass = values["density"] * mesh.volume if values["mass"] is None else values["mass"]
+    if problem := schema.range_problem(f"{where}: mass", mass, *_MASS):
+        problems.append(problem)
+        return None
+    return Shape(**values | {"mass": mass, "density": None, "mesh": mesh})

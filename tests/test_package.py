@@ -43,16 +43,18 @@ def run_installed(installed, program, cwd):
 def test_installed_wheel_finds_its_files(installed, tmp_path):
     program = """
 import json
-from codesign_jax import files, scene
+from codesign_jax import files, objects, scene
 found = {kind: {n: str(p) for n, p in files.available(kind).items()}
          for kind in ("hands", "objects", "scenes")}
 loaded = {name: scene.load(hand_name=name).num_fingers for name in found["hands"]}
-print(json.dumps([found, loaded]))
+meshes = {s.name: str(s.mesh.path) for s in objects.load("household").object}
+print(json.dumps([found, loaded, meshes]))
 """
-    found, fingers = run_installed(installed, program, tmp_path)
+    found, fingers, meshes = run_installed(installed, program, tmp_path)
     for kind, folder in (("hands", ROOT), ("objects", ROOT), ("scenes", ROOT / "codesign_jax")):
         assert set(found[kind]) == {p.stem for p in (folder / kind).glob("*.toml")}
         assert all(path.startswith(str(installed)) for path in found[kind].values())
+    assert len(meshes) == 8 and all(path.startswith(str(installed)) for path in meshes.values())
     assert fingers["pneuflex4"] == 4 and fingers["tripod3"] == 3
 
 

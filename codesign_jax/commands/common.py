@@ -12,6 +12,7 @@ import numpy as np
 
 from codesign_jax import schema
 from codesign_jax.parameters import DesignSpace
+from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
 
 
@@ -81,6 +82,24 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
     if problems:
         raise SceneError(problems)
     return np.clip(space.from_units(np.array(list(values.values()))), space.low, space.high)
+
+
+def mesh_notes(scene: Scene) -> list[str]:
+    """What a user should know about the scene's meshes: their repairs and their distances' errors.
+
+    Builds the distances, as the engine does.
+    """
+    notes = []
+    for shape in scene.objects.object:
+        if shape.mesh:
+            grid = shape.mesh.grid
+            cell, error, worst = (1e3 * v for v in (grid.cell, grid.error, grid.worst))
+            notes += [f"object {shape.name}: {line}" for line in shape.mesh.repairs]
+            notes.append(
+                f"object {shape.name}: distances on {cell:.2g} mm cells, error near the surface "
+                f"below {error:.2g} mm (99 %), {worst:.2g} mm at worst"
+            )
+    return notes
 
 
 def _number(text: str) -> float | None:

@@ -40,6 +40,8 @@ def main(options: "Evaluate") -> int:
     engine = make_engine(case.engine, case.scene)
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
+    for note in common.mesh_notes(case.scene):
+        console.print(note, markup=False)
     _evaluate(case, engine, options, console)
     if options.render:
         _render(case, engine, options, console)

@@ -38,6 +38,7 @@ def main(options: "Optimize") -> int:
         _dry_run(scene, settings)
         return 0
     plan = runs.prepare(scene, settings)
+    print("".join(f"{note}\n" for note in common.mesh_notes(scene)), end="")
     folder = options.out or _default_folder(scene, settings)
     try:
         result = runs.optimize(plan, folder, sys.argv, fresh=options.fresh)
@@ -100,6 +101,7 @@ def _dry_run(scene: Scene, settings: Settings) -> None:
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     engine, optimizer = make_engine(settings.engine, scene), codesign.make_filter(space)
+    print("".join(f"{note}\n" for note in common.mesh_notes(scene)), end="")
     evaluate = codesign.make_evaluate(scene, engine, space, 3)
     population = candidates(jax.random.key(settings.seed), optimizer.space, jnp.arange(4))
     compiled = evaluate.lower(population, jax.random.key(0)).compile()  # type: ignore[attr-defined]

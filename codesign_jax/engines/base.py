@@ -5,6 +5,8 @@ from typing import Protocol
 import jax
 
 from codesign_jax.model import ModelFields
+from codesign_jax.scene import Scene
+from codesign_jax.schema import SceneError
 from codesign_jax.types import Trace
 
 
@@ -31,3 +33,21 @@ class Engine(Protocol):
           there.
         """
         ...
+
+
+def refuse_meshes(scene: Scene, engine: str) -> None:
+    """Says which objects an engine that collides by MuJoCo's own geoms cannot simulate.
+
+    MuJoCo takes a mesh for its convex hull, and its vertices, unlike a primitive's sizes, cannot
+    differ between the worlds of a batch, as the size noise asks for.
+
+    Raises:
+      SceneError: with a line for each mesh in the scene.
+    """
+    problems = [
+        f"not supported by engine {engine}: object {shape.name!r} is a mesh; use engine structured"
+        for shape in scene.objects.object
+        if shape.mesh
+    ]
+    if problems:
+        raise SceneError(problems)

@@ -7,7 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import morphology
-from codesign_jax.model.layout import Layout, geom_bounds, layout, mounts, object_size
+from codesign_jax.model.layout import (
+    Layout,
+    geom_bounds,
+    layout,
+    mounts,
+    object_quat,
+    object_size,
+)
 from codesign_jax.model.spec import compile_template
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params, Trial
@@ -186,7 +193,6 @@ def _start(scene: Scene, params: Params, trial: Trial, rest: jax.Array) -> jax.A
     arm, tilt, dtype = params.arm, trial.arm_tilt, params.arm.dtype
     height = jnp.asarray(scene.arm.start_height, dtype)
     wrist = jnp.stack([arm[0], arm[1], height, arm[3] + tilt[0], arm[5], tilt[1] - arm[4]])
-    zero = jnp.zeros((), dtype)
-    quat = jnp.stack([jnp.cos(trial.yaw / 2), zero, zero, jnp.sin(trial.yaw / 2)])
     fingers = jnp.zeros(layout(scene).dofs.size, dtype)
-    return jnp.concatenate([wrist, fingers, trial.position, rest[None], quat]).astype(dtype)
+    parts = [wrist, fingers, trial.position, rest[None], object_quat(scene, trial)]
+    return jnp.concatenate(parts).astype(dtype)

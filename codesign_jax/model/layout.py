@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import morphology
+from codesign_jax.objects import Shape
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trial
 
@@ -113,18 +114,36 @@ def mounts(scene: Scene, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
 def object_size(scene: Scene, trial: Trial) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Geom sizes (shape, 3), mass, principal inertia (3,) and rest height of the object."""
     shapes = scene.objects.object
-    full = np.array([[*s.size, 0.0, 0.0][:3] for s in shapes])
+    full = np.array([s.half_sizes for s in shapes])
     size = trial.size * full
     mass = trial.mass * jnp.array([s.mass for s in shapes])[trial.shape]
-    unit = jnp.stack([_unit_inertia(s.type, size[i]) for i, s in enumerate(shapes)])[trial.shape]
-    rest = {"box": 2, "cylinder": 1, "sphere": 0}
-    height = jnp.stack([size[i, rest[s.type]] for i, s in enumerate(shapes)])[trial.shape]
+    unit = jnp.stack([_unit_inertia(s, size[i], trial.size) for i, s in enumerate(shapes)])
+    unit = unit[trial.shape]
+    height = trial.size * jnp.array([_rest_height(s) for s in shapes])[trial.shape]
     active = jnp.arange(len(shapes)) == trial.shape
     return jnp.where(active[:, None], size, INACTIVE * size), mass, mass * unit, height
 
 
-def _unit_inertia(kind: str, size: jax.Array) -> jax.Array:
-    """Principal inertia per mass of a solid primitive [m^2], shape (3,)."""
+def object_quat(scene: Scene, trial: Trial) -> jax.Array:
+    """Start orientation, shape (4,): upright, a mesh as in its file, turned by the yaw."""
+    upright = [s.mesh.upright if s.mesh else (1.0, 0.0, 0.0, 0.0) for s in scene.objects.object]
+    w, x, y, z = jnp.array(upright)[trial.shape]
+    c, s = jnp.cos(trial.yaw / 2), jnp.sin(trial.yaw / 2)
+    return jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
+
+
+def _rest_height(shape: Shape) -> float:
+    """Height of an object's centre on the table [m]."""
+    if shape.mesh:
+        return shape.mesh.rest_height
+    return shape.half_sizes[{"box": 2, "cylinder": 1, "sphere": 0}[shape.type]]
+
+
+def _unit_inertia(shape: Shape, size: jax.Array, factor: jax.Array) -> jax.Array:
+    """Principal inertia per mass of a solid [m^2], shape (3,)."""
+    kind = shape.type
+    if shape.mesh:
+        return jnp.array(shape.mesh.inertia) * factor**2
     if kind == "box":
         return jnp.stack(
             morphology.block_inertia(jnp.ones(()), 2 * size[0], 2 * size[1], 2 * size[2])
@@ -136,8 +155,8 @@ def _unit_inertia(kind: str, size: jax.Array) -> jax.Array:
 
 
 def geom_bounds(kind: str, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Bounding radius () and axis-aligned half extents (3,) of a primitive."""
-    if kind == "box":
+    """Bounding radius () and axis-aligned half extents (3,) of a geom; a mesh's is a box."""
+    if kind in ("box", "mesh"):
         return jnp.linalg.norm(size), size
     if kind == "cylinder":
         return jnp.hypot(size[0], size[1]), jnp.stack([size[0], size[0], size[1]])

@@ -14,6 +14,7 @@ from codesign_jax.model.layout import (
     contact_invweight,
     layout,
     mounts,
+    object_quat,
     object_size,
     palm_points,
 )
@@ -25,6 +26,9 @@ _GEOM = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    # MuJoCo's meshes are convex and of one size in all worlds: a model carries the bounding box
+    # instead, and engines that collide by MuJoCo's geoms refuse meshes (engines/base.py).
+    "mesh": mujoco.mjtGeom.mjGEOM_BOX,
 }
 
 
@@ -204,15 +208,21 @@ def _add_object(scene: Scene, spec: mujoco.MjSpec, trial: Trial, visual: bool) -
         np.asarray(v) for v in object_size(scene, jax.tree.map(np.asarray, trial))
     )
     body = spec.worldbody.add_body(name="object", pos=[*np.asarray(trial.position), float(rest)])
-    yaw = float(trial.yaw) / 2
-    body.quat = [np.cos(yaw), 0, 0, np.sin(yaw)]
+    body.quat = np.asarray(object_quat(scene, jax.tree.map(np.asarray, trial)))
     body.explicitinertial, body.mass, body.inertia = True, float(mass), inertia
     body.ipos, body.iquat = [0, 0, 0], [1, 0, 0, 0]
     body.add_freejoint(name="object")
     for i, shape in enumerate(scene.objects.object):
-        color = _COLORS["object"] if i == int(trial.shape) or not visual else (0, 0, 0, 0)
-        size = np.asarray(sizes[i])
-        body.add_geom(name=f"object_{i}", type=_GEOM[shape.type], size=size, rgba=color, **_PASSIVE)
+        active = i == int(trial.shape)
+        color = _COLORS["object"] if active or not visual else (0, 0, 0, 0)
+        geom = body.add_geom(name=f"object_{i}", type=_GEOM[shape.type], rgba=color, **_PASSIVE)
+        geom.size = np.asarray(sizes[i])
+        if shape.mesh and active and visual:
+            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"object_{i}"
+            vertices = shape.mesh.vertices * float(trial.size)
+            spec.add_mesh(
+                name=f"object_{i}", uservert=vertices.ravel(), userface=shape.mesh.faces.ravel()
+            )
 
 
 def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:

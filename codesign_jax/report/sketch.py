@@ -65,6 +65,8 @@ def _outline(scene: Scene, model: mujoco.MjModel, shape: int) -> list[np.ndarray
     turn = np.linspace(0, 2 * np.pi, 25)
     circle = np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
     kind = scene.objects.object[shape].type
+    if kind == "mesh":
+        return [_wires(model, f"object_{shape}")]
     if kind == "sphere":
         return [size[0] * np.roll(circle, k, axis=1) for k in range(3)]
     if kind == "cylinder":
@@ -75,3 +77,17 @@ def _outline(scene: Scene, model: mujoco.MjModel, shape: int) -> list[np.ndarray
     ring = np.column_stack([square, np.zeros(5)]) * size
     top = np.array([0, 0, size[2]])
     return [ring - top, ring + top, *(np.stack([p - top, p + top]) for p in ring[:4])]
+
+
+def _wires(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Edges of a mesh geom in its body's frame as one line [m], interrupted by rows of nan."""
+    geom = model.geom(name)
+    mesh = model.mesh(int(geom.dataid[0]))
+    vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
+    faces = model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]]
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, geom.quat)  # MuJoCo turns meshes into frames of its own
+    vertices = vertices @ turn.reshape(3, 3).T + geom.pos
+    pairs = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), 1)
+    ends = vertices[np.unique(pairs, axis=0)]
+    return np.concatenate([ends, np.full_like(ends[:, :1], np.nan)], 1).reshape(-1, 3)

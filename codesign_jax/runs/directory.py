@@ -1,6 +1,6 @@
 """The run folder: one run, one process at a time, and nothing in it that is not the run's.
 
-scene.toml, hand.toml, objects.toml   the resolved scene
+scene.toml, hand.toml, objects.toml   the resolved scene, with meshes/ if its objects have any
 provenance.json                       settings, code, versions, machine
 checkpoints/                          the last few episodes, see `checkpoint`
 episodes.csv particles.csv trials.csv tests.csv   results, see `tables`
@@ -30,7 +30,8 @@ from codesign_jax.schema import SceneError
 _LOCK = ".lock"
 _PROVENANCE = "provenance.json"
 _TABLES = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
-_OURS = {*scene_files.NAMES, _PROVENANCE, *_TABLES, "checkpoints", "events.log", "figures", _LOCK}
+_OURS = {*scene_files.NAMES, scene_files.MESHES, _PROVENANCE, *_TABLES, _LOCK}
+_OURS |= {"checkpoints", "events.log", "figures"}
 
 
 class RunDirectory:

@@ -6,23 +6,30 @@ from pathlib import Path
 from typing import Any
 
 from codesign_jax import scene as scenes
+from codesign_jax.objects import Shape
 from codesign_jax.scene import Scene
 
 NAMES = ("scene.toml", "hand.toml", "objects.toml")
+MESHES = "meshes"  # folder of the objects' meshes
 
 
 def scene_texts(scene: Scene) -> dict[str, str]:
     """Returns the three files of a resolved scene by name; the scene refers to the others."""
     top = _fields(scene) | {"hand": "hand.toml", "objects": "objects.toml"}
+    shapes = tuple(
+        dataclasses.replace(shape, file=_mesh_name(shape, i) if shape.mesh else None)
+        for i, shape in enumerate(scene.objects.object)
+    )
+    objects = dataclasses.replace(scene.objects, object=shapes)
     return {
         "scene.toml": _document(top, _units(scene) | {"gravity": "m/s^2"}),
         "hand.toml": _document(_fields(scene.hand), _units(scene.hand)),
-        "objects.toml": _document(_fields(scene.objects), _units(scene.objects)),
+        "objects.toml": _document(_fields(objects), _units(objects)),
     }
 
 
 def write_scene(scene: Scene, folder: Path) -> None:
-    """Writes a resolved scene; `scene.load(folder / "scene.toml")` returns an equal one.
+    """Writes a resolved scene, meshes included; `scene.load` of it returns an equal one.
 
     Args:
       scene: The scene.
@@ -33,8 +40,18 @@ def write_scene(scene: Scene, folder: Path) -> None:
     """
     for name, text in scene_texts(scene).items():
         (folder / name).write_text(text, encoding="utf-8")
+    for i, shape in enumerate(scene.objects.object):
+        if shape.mesh:
+            (folder / MESHES).mkdir(exist_ok=True)
+            (folder / _mesh_name(shape, i)).write_bytes(shape.mesh.path.read_bytes())
     if scenes.load(folder / "scene.toml") != scene:
         raise RuntimeError(f"{folder / 'scene.toml'} does not read back as it was written")
+
+
+def _mesh_name(shape: Shape, index: int) -> str:
+    """Names of objects are free text; numbers make file names everywhere."""
+    assert shape.mesh is not None
+    return f"{MESHES}/object_{index}{shape.mesh.path.suffix.lower()}"
 
 
 def _document(table: dict[str, Any], units: dict[str, str]) -> str:
@@ -69,7 +86,8 @@ def _fields(value: Any) -> dict[str, Any]:
     """Key-value pairs of a dataclass or a dictionary; TOML has no null, so None is left out."""
     if isinstance(value, dict):
         return value
-    pairs = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    fields = [f for f in dataclasses.fields(value) if f.metadata.get("in_file", True)]
+    pairs = {f.name: getattr(value, f.name) for f in fields}
     return {k: v for k, v in pairs.items() if v is not None}
 
 

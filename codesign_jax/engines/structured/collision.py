@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from codesign_jax.engines.structured import mesh
 from codesign_jax.engines.structured.contact import Cone, Contacts
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics
@@ -108,7 +109,12 @@ def signed_distance(scene: Scene, hand: HandLanes, local: jax.Array) -> tuple[ja
       hand: Sizes and shape index of the objects.
       local: Points, shape (3, ...).
     """
-    functions: dict[str, Callable] = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
+    functions: dict[str, Callable] = {
+        "box": _box,
+        "cylinder": _cylinder,
+        "sphere": _sphere,
+        "mesh": lambda size, p: mesh.signed_distance(hand.mesh, p),
+    }
     kinds = [s.type for s in scene.objects.object]
     result = None
     for kind in dict.fromkeys(kinds):
@@ -164,12 +170,13 @@ def object_on_table(
 
     The points are the four lower corners of a box; the lower rim's lowest point, its upper
     counterpart and two more on the lower rim, 120 degrees apart, of a cylinder; the lowest point of
-    a sphere (one slot).
+    a sphere (one slot); four spread-out ones among the lowest support points of a mesh.
     """
     functions: dict[str, Callable] = {
         "box": _box_corners,
         "cylinder": _rim_points,
         "sphere": _lowest_point,
+        "mesh": lambda size, columns: mesh.table_points(hand.mesh, columns),
     }
     kinds = [s.type for s in scene.objects.object]
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, solver
+from codesign_jax.engines.structured import collision, mesh, solver
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
@@ -48,7 +48,11 @@ class StructuredEngine:
           iterations: Largest number of Newton iterations a step.
           evaluations: Line-search evaluations an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
+
+        Raises:
+          SceneError: if a mesh's distance cannot be put on a grid.
         """
+        mesh.tables(scene)
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.conditional = jax.default_backend() == "cpu"  # see Stages

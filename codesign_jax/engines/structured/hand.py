@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.lanes import dot, total
+from codesign_jax.engines.structured.mesh import MeshLanes, mesh_lanes
 from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
 
@@ -39,6 +40,7 @@ class HandLanes(NamedTuple):
       object_inertia: Principal inertia, shape (3, 1, world).
       object_size: Sizes of the object's shape, shape (3, 1, world).
       shape: Index of the object's shape, shape (1, world).
+      mesh: Meshes of the worlds; None if the scene has none.
     """
 
     mount: jax.Array
@@ -63,6 +65,7 @@ class HandLanes(NamedTuple):
     object_inertia: jax.Array
     object_size: jax.Array
     shape: jax.Array
+    mesh: MeshLanes | None
 
 
 def rotation_columns(quat: jax.Array) -> jax.Array:
@@ -105,6 +108,7 @@ def hand_lanes(scene: Scene, fields: ModelFields) -> HandLanes:
     sizes, rbound = fields.geom_size[:, lay.object_geoms], fields.geom_rbound[:, lay.object_geoms]
     shape = jnp.argmax(rbound, axis=1)  # the one not shrunk to INACTIVE
     picked = jnp.take_along_axis(sizes, shape[:, None, None], axis=1)[:, 0]
+    object_size = last(picked)[:, None]
     no_spheres = lay.spheres.size == 0
     return HandLanes(
         mount=mount,
@@ -127,8 +131,9 @@ def hand_lanes(scene: Scene, fields: ModelFields) -> HandLanes:
         wrist_armature=last(fields.dof_armature[:, :6])[:, None],
         object_mass=last(fields.body_mass[:, lay.object])[None],
         object_inertia=last(fields.body_inertia[:, lay.object])[:, None],
-        object_size=last(picked)[:, None],
+        object_size=object_size,
         shape=shape[None],
+        mesh=mesh_lanes(scene, shape[None], object_size),
     )
 
 

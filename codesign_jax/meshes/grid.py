@@ -1,0 +1,166 @@
+"""Signed distance on a voxel grid, as fine as a bound on its interpolation error asks for."""
+
+import os
+import time
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+
+from codesign_jax.meshes import surface as surfaces
+from codesign_jax.meshes.surface import Surface
+
+# Contact spheres have radii of up to 12.5 mm (fingers of 25 mm height): no farther from the surface
+# does any contact begin.  The rest is for objects that the size noise shrinks.
+PAD = 0.014
+# The error grows in proportion to the cell at edges and with its square elsewhere.
+COARSEST = 0.0025
+MAX_NODES = 3_000_000  # 12 MB in float32
+_NEAR = 0.002  # how far from the surface "near the surface" goes [m]
+_FORMAT = 1  # of the files in the cache; change it with anything that changes a grid
+
+
+class Grid(NamedTuple):
+    """Signed distances at the nodes of a regular grid in the body's frame.
+
+    Attributes:
+      origin: Position of node (0, 0, 0) [m], shape (3,).
+      cell: Distance between neighbouring nodes [m].
+      values: Distances at the nodes [m], float32, shape (nx, ny, nz).
+      error: Error of interpolation that 99 % of points near the surface stay under [m].
+      worst: Largest error at any of these points [m]: sharp corners are rounded by so much.
+    """
+
+    origin: np.ndarray
+    cell: float
+    values: np.ndarray
+    error: float
+    worst: float
+
+
+def build(vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
+    """Builds the coarsest grid whose error near the surface stays under a bound.
+
+    The error is measured, not derived: trilinear interpolation against the exact distance at random
+    points within 2 mm of the surface, of which 99 % must be better than the bound.  The rest are at
+    corners where three edges meet; there the error is half a cell whatever the cell.
+
+    Args:
+      vertices: Positions in the body's frame [m], shape (vertex, 3).
+      faces: Vertex indices, shape (face, 3).
+      bound: Largest error [m].
+
+    Raises:
+      ValueError: if the grid would have more than `MAX_NODES` nodes.
+    """
+    surface = surfaces.prepare(vertices, faces)
+    points = near_surface(vertices, faces, 3000)
+    exact = surfaces.signed_distance(surface, points)
+    low, extent = vertices.min(0) - PAD, np.ptp(vertices, axis=0) + 2 * PAD
+    cell = _cell(surface, points, exact, low, bound)
+    while True:
+        shape = np.ceil(extent / cell).astype(int) + 1
+        if shape.prod() > MAX_NODES:
+            raise ValueError(
+                f"a grid of {cell * 1e3:.2g} mm cells, which a voxel_error of {bound * 1e3:.3g} mm "
+                f"needs, has {shape.prod():,} nodes, more than {MAX_NODES:,}"
+            )
+        values = surfaces.signed_distance(surface, _nodes(low, cell, shape), proven=False)
+        grid = Grid(low, cell, values.astype(np.float32).reshape(shape), 0.0, 0.0)
+        error = np.abs(interpolate(grid, points) - exact)
+        if np.quantile(error, 0.99) <= bound:
+            return grid._replace(error=float(np.quantile(error, 0.99)), worst=float(error.max()))
+        cell *= 0.9
+
+
+def near_surface(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
+    """Random points within 2 mm of the surface, uniform over its area, shape (point, 3)."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    points, face = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
+    offset = np.random.default_rng(0).uniform(-_NEAR, _NEAR, (count, 1))
+    return np.asarray(points) + offset * mesh.face_normals[face]
+
+
+def interpolate(grid: Grid, points: np.ndarray) -> np.ndarray:
+    """Trilinear interpolation at points inside the grid, shape (point,)."""
+    scaled = (points - grid.origin) / grid.cell
+    index = np.clip(np.floor(scaled).astype(int), 0, np.array(grid.values.shape) - 2)
+    corners = [grid.values[tuple((index + c).T)] for c in np.ndindex(2, 2, 2)]
+    return _blend(np.stack(corners, 1), scaled - index)
+
+
+def _blend(corners: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Weights values at a cell's corners, (point, 8) with z fastest, by the position in it."""
+    block = corners.reshape(-1, 2, 2, 2)
+    for k in range(3):
+        t = part[:, k].reshape(-1, *[1] * (2 - k))
+        block = block[:, 0] * (1 - t) + block[:, 1] * t
+    return block
+
+
+def _cell(
+    surface: Surface, points: np.ndarray, exact: np.ndarray, low: np.ndarray, bound: float
+) -> float:
+    """Cell that meets the bound, tried at a few points without building the grid."""
+    points, exact, cell = points[::4], exact[::4], COARSEST
+    while True:
+        base = low + np.floor((points - low) / cell) * cell
+        offsets = np.array(list(np.ndindex(2, 2, 2))) * cell
+        corners = (base[:, None] + offsets).reshape(-1, 3)
+        values = surfaces.signed_distance(surface, corners, proven=False).reshape(-1, 8)
+        error = np.abs(_blend(values, (points - base) / cell) - exact)
+        worst = np.quantile(error, 0.99)
+        if worst <= bound or cell < 2e-4:
+            return cell
+        cell *= max(0.5, min(0.95, bound / worst))
+
+
+def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
+    axes = [low[k] + cell * np.arange(shape[k]) for k in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
+    """As `build`, but what took longer than a second is kept on disk.
+
+    Args:
+      key: Digest of all that the grid depends on.
+      vertices: As for `build`.
+      faces: As for `build`.
+      bound: As for `build`.
+    """
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    path = root / "codesign-jax" / "meshes" / f"{key}-{_FORMAT}.npz"
+    stored = _read(path)
+    if stored is not None:
+        return stored
+    start = time.perf_counter()
+    grid = build(vertices, faces, bound)
+    if time.perf_counter() - start > 1.0:
+        _write(path, grid)
+    return grid
+
+
+def _read(path: Path) -> Grid | None:
+    """A stored grid, or None; a damaged file (zip has checksums) counts as none."""
+    try:
+        # NumPy leaves a damaged file open if it opens it itself.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            scalars = {k: float(file[k]) for k in ("cell", "error", "worst")}
+            return Grid(origin=file["origin"], values=file["values"], **scalars)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, grid: Grid) -> None:
+    """Writes beside and renames, so that nobody reads half a file; a full disk is no error."""
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, **grid._asdict())
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,63 @@
+"""Mass properties of a closed mesh and the frame in which its inertia is diagonal."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+# Products of inertia below this fraction of the trace are rounding of a symmetric body, whose axes
+# stay those of its file.
+_SYMMETRIC = 1e-6
+
+
+class Body(NamedTuple):
+    """A homogeneous body; its frame sits at the centre of mass along the principal axes.
+
+    Attributes:
+      volume: Volume [m^3].
+      centre: Centre of mass in the file's frame [m], shape (3,).
+      axes: Principal axes as columns, in the file's frame, a rotation, shape (3, 3).
+      inertia: Principal moments per mass [m^2], shape (3,).
+    """
+
+    volume: float
+    centre: np.ndarray
+    axes: np.ndarray
+    inertia: np.ndarray
+
+
+def body(vertices: np.ndarray, faces: np.ndarray) -> Body:
+    """Mass properties of a watertight mesh; vertices [m] in the file's frame."""
+    # Near the origin and of order one: products of five lengths in metres drown in rounding.
+    middle, scale = vertices.mean(0), np.ptp(vertices, axis=0).max()
+    unit = trimesh.Trimesh((vertices - middle) / scale, faces, process=False).mass_properties
+    tensor = np.asarray(unit["inertia"]) / unit["volume"] * scale**2
+    axes = principal_axes(tensor)
+    return Body(
+        volume=float(unit["volume"] * scale**3),
+        centre=np.asarray(unit["center_mass"]) * scale + middle,
+        axes=axes,
+        inertia=np.diag(axes.T @ tensor @ axes).copy(),
+    )
+
+
+def principal_axes(tensor: np.ndarray) -> np.ndarray:
+    """Rotation whose columns are the principal axes, of the 24 that are the nearest to none."""
+    off = np.abs(tensor - np.diag(np.diag(tensor))).max()
+    if off <= _SYMMETRIC * np.trace(tensor):
+        return np.eye(3)
+    vectors = np.linalg.eigh(tensor)[1]
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            axes = vectors[:, list(order)] * signs
+            if np.linalg.det(axes) > 0:
+                found.append(axes)
+    return max(found, key=np.trace)
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix, shape (4,)."""
+    return np.roll(Rotation.from_matrix(rotation).as_quat(canonical=True), 1)

@@ -1,0 +1,119 @@
+"""Repairs of a triangle mesh: only on request, and with a line for everything that was changed.
+
+trimesh's own need networkx, one more dependency.
+"""
+
+from collections import deque
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+_MERGE = 1e-5  # vertices closer than this fraction of the size are one
+
+
+def repair(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Merges vertices, drops degenerate and duplicate faces, turns faces alike and closes holes.
+
+    Args:
+      vertices: Positions, any unit, shape (vertex, 3).
+      faces: Vertex indices, shape (face, 3).
+
+    Returns:
+      Vertices, faces and what was changed, a line each; no line if nothing was.
+    """
+    report: list[str] = []
+    vertices, faces = _merge(vertices, faces, report)
+    faces = _drop(faces, report)
+    faces, part, turned = _turn_alike(faces)
+    vertices, faces, part = _close(vertices, faces, part, report)
+    faces, outwards = _turn_outwards(vertices, faces, part)
+    turned = np.concatenate([turned, np.zeros(len(faces) - len(turned), bool)]) ^ outwards
+    if turned.any():
+        report.append(f"turned {turned.sum()} of {len(faces)} faces, so that all point outwards")
+    return vertices, faces, report
+
+
+def _merge(vertices: np.ndarray, faces: np.ndarray, report: list[str]):
+    near = _MERGE * np.ptp(vertices, axis=0).max()
+    pairs = cKDTree(vertices).query_pairs(near, output_type="ndarray")
+    if not len(pairs):
+        return vertices, faces
+    ones, n = np.ones(len(pairs), bool), len(vertices)
+    count, group = connected_components(coo_array((ones, tuple(pairs.T)), shape=(n, n)))
+    report.append(f"merged {n - count} vertices into their neighbours")
+    first = np.unique(group, return_index=True)[1]
+    return vertices[first], group[faces]
+
+
+def _drop(faces: np.ndarray, report: list[str]) -> np.ndarray:
+    a, b, c = faces.T
+    _, first = np.unique(np.sort(faces, 1), axis=0, return_index=True)
+    once = np.isin(np.arange(len(faces)), first)
+    keep = (a != b) & (b != c) & (c != a) & once
+    if not keep.all():
+        report.append(f"dropped {(~keep).sum()} degenerate or duplicate faces")
+    return faces[keep]
+
+
+def half_edges(faces: np.ndarray) -> np.ndarray:
+    """Directed edges of the faces, edge k of face f in row 3 f + k, shape (3 face, 2)."""
+    return np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
+
+
+def _turn_alike(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Turns faces so that neighbours agree; also the part of each, and which were turned."""
+    edges = half_edges(faces)
+    _, which, count = np.unique(np.sort(edges, 1), axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(which.reshape(-1), kind="stable")
+    start = np.concatenate([[0], np.cumsum(count)])
+    neighbours: list[list[tuple[int, bool]]] = [[] for _ in faces]
+    for e in np.flatnonzero(count == 2):
+        i, j = order[start[e] : start[e + 1]]
+        same = bool((edges[i] == edges[j]).all())  # neighbours that agree run it in two directions
+        neighbours[i // 3].append((j // 3, same))
+        neighbours[j // 3].append((i // 3, same))
+    turned, part = np.zeros(len(faces), bool), np.full(len(faces), -1)
+    for seed in range(len(faces)):
+        if part[seed] >= 0:
+            continue
+        part[seed], queue = seed, deque([seed])
+        while queue:
+            f = queue.popleft()
+            for g, same in neighbours[f]:
+                if part[g] < 0:
+                    part[g], turned[g] = seed, turned[f] ^ same
+                    queue.append(g)
+    return np.where(turned[:, None], faces[:, ::-1], faces), part, turned
+
+
+def _close(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, report: list[str]):
+    """Closes each hole by a fan around its middle; holes that touch each other are left open."""
+    directed = {(int(i), int(j)): f // 3 for f, (i, j) in enumerate(half_edges(faces))}
+    rim = {i: j for (j, i) in directed if (i, j) not in directed}  # backwards, as the filling runs
+    while rim:
+        loop = [next(iter(rim))]
+        while rim and loop[-1] in rim:
+            loop.append(rim.pop(loop[-1]))
+        if loop[0] != loop[-1] or len(loop) < 4:
+            continue
+        loop.pop()
+        owner = part[directed[loop[1], loop[0]]]
+        if len(loop) == 3:
+            new = [loop]
+        else:
+            vertices = np.vstack([vertices, vertices[loop].mean(0)])
+            middle = len(vertices) - 1
+            new = [[a, b, middle] for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
+        faces, part = np.vstack([faces, new]), np.concatenate([part, [owner] * len(new)])
+        report.append(f"closed a hole of {len(loop)} edges")
+    return vertices, faces, part
+
+
+def _turn_outwards(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray):
+    """Turns every part that encloses a negative volume; also which faces were turned."""
+    a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
+    volume = np.einsum("fi,fi->f", a, np.cross(b, c))
+    inward = np.bincount(part, weights=volume, minlength=len(faces))[part] < 0
+    return np.where(inward[:, None], faces[:, ::-1], faces), inward

@@ -1,0 +1,181 @@
+"""A mesh file as a graspable body: read, checked, brought into its principal frame."""
+
+import dataclasses
+import functools
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from codesign_jax.meshes import grid, mass, repair, support
+from codesign_jax.schema import SceneError
+
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
+_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
+SMALLEST, LARGEST = 0.005, 0.5  # longest side of the bounding box [m]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Solid:
+    """A closed mesh in its own frame: origin at the centre of mass, axes principal.
+
+    Two are equal if they come from the same bytes in the same way, wherever the file lies.
+
+    Attributes:
+      path: The file.
+      digest: SHA-256 of the file and of how it was read.
+      vertices: Positions [m], shape (vertex, 3).
+      faces: Vertex indices, outwards, shape (face, 3).
+      volume: Volume [m^3].
+      inertia: Principal moments per mass [m^2].
+      upright: Orientation of the body in its file's frame, unit quaternion (w, x, y, z).
+      rest_height: Centre of mass above the lowest point, upright as in the file [m].
+      voxel_error: Bound on the error of the signed distance [m].
+      repairs: What a repair changed.
+    """
+
+    path: Path
+    digest: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    volume: float
+    inertia: tuple[float, ...]
+    upright: tuple[float, ...]
+    rest_height: float
+    voxel_error: float
+    repairs: tuple[str, ...]
+
+    def __eq__(self, other: object) -> bool:
+        """Compares the digests."""
+        return isinstance(other, Solid) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        """Hash of the digest."""
+        return hash(self.digest)
+
+    @functools.cached_property
+    def half_sizes(self) -> tuple[float, ...]:
+        """Half sizes of the bounding box along the principal axes [m]."""
+        return tuple(float(v) for v in np.ptp(self.vertices, axis=0) / 2)
+
+    @functools.cached_property
+    def radius(self) -> float:
+        """Distance of the farthest vertex from the centre of mass [m]."""
+        return float(np.linalg.norm(self.vertices, axis=1).max())
+
+    @functools.cached_property
+    def support(self) -> np.ndarray:
+        """Points that can touch a plane [m], shape (point, 3)."""
+        return support.support_points(self.vertices)
+
+    @functools.cached_property
+    def grid(self) -> grid.Grid:
+        """Signed distances; built when first asked for.
+
+        Raises:
+          SceneError: if the bound asks for too fine a grid, or the surface cuts through itself.
+        """
+        try:
+            built = grid.cached(self.digest, self.vertices, self.faces, self.voxel_error)
+        except ValueError as error:
+            raise SceneError([f"{self.path.name}: {error}"]) from error
+        # Where parts overlap, the mesh counts a volume twice and the distance has inner walls.
+        filled = np.clip(0.5 - built.values / built.cell, 0.0, 1.0).sum() * built.cell**3
+        if abs(filled - self.volume) > 0.1 * self.volume:
+            raise SceneError(
+                [
+                    f"{self.path.name}: the surface encloses {self.volume * 1e6:.1f} cm^3 but "
+                    f"{filled * 1e6:.1f} cm^3 lie inside it: it cuts through itself"
+                ]
+            )
+        return built
+
+
+def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
+    """Reads and checks a mesh in any format that trimesh knows.
+
+    Args:
+      path: The file.
+      unit: Unit of its numbers, one of `UNITS`.
+      repaired: Whether to repair what can be.
+      voxel_error: Bound on the error of the signed distance [m].
+
+    Raises:
+      SceneError: with every problem of the mesh.
+    """
+    vertices, faces, digest = _read(path)
+    repairs: list[str] = []
+    if repaired:
+        vertices, faces, repairs = repair.repair(vertices, faces)
+    problems = _size_problems(np.ptp(vertices, axis=0).max(), unit)
+    problems += surface_problems(vertices, faces, repaired)
+    if problems:
+        raise SceneError([f"{path.name}: {p}" for p in problems])
+    vertices = vertices * UNITS[unit]
+    body = mass.body(vertices, faces)
+    options = f"{unit} {repaired} {voxel_error!r}"
+    return Solid(
+        path=path,
+        digest=hashlib.sha256(f"{digest} {options}".encode()).hexdigest(),
+        vertices=(vertices - body.centre) @ body.axes,
+        faces=faces,
+        volume=body.volume,
+        inertia=tuple(float(v) for v in body.inertia),
+        upright=tuple(float(v) for v in mass.quaternion(body.axes)),
+        rest_height=float(body.centre[2] - vertices[:, 2].min()),
+        voxel_error=voxel_error,
+        repairs=tuple(repairs),
+    )
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """Vertices in the file's unit, faces, and the digest of the bytes."""
+    if not path.is_file():
+        raise SceneError([f"no file {str(path)!r}"])
+    try:
+        mesh = trimesh.load_mesh(str(path))
+        # Seams of texture and shading are no holes.
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    except Exception as error:  # every format has its own parser with its own exceptions
+        raise SceneError([f"{path.name}: cannot be read as a mesh: {error}"]) from error
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise SceneError([f"{path.name}: has no faces, or positions that are not numbers"])
+    return vertices, faces, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _size_problems(longest: float, unit: str) -> list[str]:
+    if SMALLEST <= longest * UNITS[unit] <= LARGEST:
+        return []
+    message = (
+        f"is {longest * UNITS[unit]:.3g} m long in unit = {unit!r}, outside "
+        f"[{SMALLEST * 1e3:g}, {LARGEST * 1e3:g}] mm"
+    )
+    for other in ("mm", "m", "cm", "in"):
+        if SMALLEST <= longest * UNITS[other] <= LARGEST:
+            return [f"{message}; looks like {_NAMES[other]}: set unit = {other!r}"]
+    return [message]
+
+
+def surface_problems(vertices: np.ndarray, faces: np.ndarray, repaired: bool = False) -> list[str]:
+    """Returns why the faces do not bound a body, a line for each reason."""
+    edges = repair.half_edges(faces)
+    which, count = np.unique(np.sort(edges, 1), axis=0, return_inverse=True, return_counts=True)[1:]
+    problems = []
+    if (count == 1).any():
+        problems.append(f"not watertight: {(count == 1).sum()} edges belong to one face only")
+    if (count > 2).any():
+        problems.append(f"{(count > 2).sum()} edges belong to more than two faces")
+    forward = np.bincount(which.reshape(-1), weights=np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    if clashing := int(((count == 2) & (forward != 0)).sum()):
+        problems.append(f"faces point to different sides at {clashing} edges")
+    a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
+    volume = np.einsum("fi,fi", a, np.cross(b, c)) / 6
+    smallest = 1e-6 * np.ptp(vertices, axis=0).max() ** 3
+    if not problems and volume < -smallest:
+        problems.append("inside out: its faces point inwards")
+    elif not problems and volume < smallest:
+        problems.append("encloses no volume")
+    hint = "; even after the repair" if repaired else "; repair = true tries to mend it"
+    return [p + hint for p in problems]

@@ -1,0 +1,136 @@
+"""Exact signed distance to a closed triangle mesh, in NumPy with a k-d tree of SciPy.
+
+trimesh's own proximity query needs rtree, one more dependency; SciPy is there wherever JAX is.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+_CHUNK = 1 << 14  # points at once: the pairs' arrays stay in the cache
+
+
+class Surface(NamedTuple):
+    """A closed mesh prepared for distance queries.
+
+    Attributes:
+      corner: Corners of each face, shape (face, 3, 3).
+      edge: Vector from each corner to the next, same shape.
+      inward: Normal of each edge in its face, pointing inwards, same shape.
+      normal: Unit normal of each face, shape (face, 3).
+      edge_normal: Sum of the normals of both faces at an edge, shape (face, 3, 3).
+      corner_normal: Angle-weighted normal of each corner's vertex, shape (face, 3, 3).
+      tree: Centroids of pieces of the faces.
+      piece: Face of each piece, shape (piece,).
+      reach: Largest distance between a piece's centroid and one of its points [m].
+    """
+
+    corner: np.ndarray
+    edge: np.ndarray
+    inward: np.ndarray
+    normal: np.ndarray
+    edge_normal: np.ndarray
+    corner_normal: np.ndarray
+    tree: cKDTree
+    piece: np.ndarray
+    reach: float
+
+
+def prepare(vertices: np.ndarray, faces: np.ndarray) -> Surface:
+    """Prepares a watertight mesh with outward normals and without degenerate faces.
+
+    The sign of a distance comes from the normal at the closest point, which at edges and vertices
+    is the sum over the faces there, weighted by their angles (Baerentzen and Aanaes 2005).
+
+    Args:
+      vertices: Positions [m], shape (vertex, 3).
+      faces: Vertex indices, shape (face, 3).
+    """
+    corner = vertices[faces]
+    edge = np.roll(corner, -1, 1) - corner
+    normal = np.cross(edge[:, 0], edge[:, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    unit = edge / np.linalg.norm(edge, axis=2, keepdims=True)
+    cosine = -(unit * np.roll(unit, 1, 1)).sum(2)
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    at_vertex = np.zeros_like(vertices)
+    np.add.at(at_vertex, faces, angle[..., None] * normal[:, None])
+    ends = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2)
+    _, which = np.unique(ends, axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    at_edge = np.zeros((which.max() + 1, 3))
+    np.add.at(at_edge, which, np.repeat(normal, 3, 0))
+    # Long faces are cut into pieces, else their centroids say little about where they are.
+    longest = np.sqrt(2 * np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1).sum() / 2000)
+    cut = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=20, return_index=True)
+    points, pieces, piece = cut[0], cut[1], cut[-1]
+    centroid = points[pieces].mean(1)
+    reach = np.linalg.norm(points[pieces] - centroid[:, None], axis=2).max()
+    inward = np.cross(normal[:, None], edge)
+    return Surface(
+        corner, edge, inward, normal, at_edge[which].reshape(-1, 3, 3), at_vertex[faces],
+        cKDTree(centroid), np.asarray(piece), float(reach),
+    )  # fmt: skip
+
+
+def signed_distance(surface: Surface, points: np.ndarray, *, proven: bool = True) -> np.ndarray:
+    """Signed distances [m], negative inside, shape (point,).
+
+    Args:
+      surface: The prepared mesh.
+      points: Positions [m], shape (point, 3).
+      proven: Whether to look on until no face that was left out can be nearer.  Without, the faces
+        of the eight nearest pieces decide, ten times as fast and rarely wrong.
+    """
+    chunks = np.array_split(points, len(points) // _CHUNK + 1)
+    return np.concatenate([_chunk(surface, p, proven) for p in chunks])
+
+
+def _chunk(surface: Surface, points: np.ndarray, proven: bool) -> np.ndarray:
+    """Tries the faces of the nearest pieces; twice as many where a nearer face may be left."""
+    square, face = np.full(len(points), np.inf), np.zeros(len(points), int)
+    left, count = np.arange(len(points)), 8
+    while left.size:
+        count = min(count, len(surface.piece))
+        away, index = surface.tree.query(points[left], k=count)
+        away, candidates = away.reshape(len(left), -1), surface.piece[index].reshape(len(left), -1)
+        new = _squares(surface, candidates, points[left][:, None])
+        best = new.argmin(1)
+        rows = np.arange(len(left))
+        square[left], face[left] = new[rows, best], candidates[rows, best]
+        # Whatever was not tried is at least this far away.
+        certain = away[:, -1] - surface.reach >= np.sqrt(square[left])
+        left = left[~certain] if proven and count < len(surface.piece) else left[:0]
+        count *= 2
+    return np.sqrt(square) * _sign(surface, face, points)
+
+
+def _squares(surface: Surface, face: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Squared distances of points, broadcasting to (..., 3), to the faces of indices (...)."""
+    away = points[..., None, :] - surface.corner[face]
+    edge = surface.edge[face]
+    along = np.einsum("...i,...i", away, edge) / np.einsum("...i,...i", edge, edge)
+    off = away - np.clip(along, 0.0, 1.0)[..., None] * edge
+    nearest = np.einsum("...i,...i", off, off).min(-1)
+    height = np.einsum("...i,...i", away[..., 0, :], surface.normal[face])
+    inside = (np.einsum("...i,...i", away, surface.inward[face]) >= 0).all(-1)
+    return np.where(inside, height**2, nearest)
+
+
+def _sign(surface: Surface, face: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Sign of the distance, from the normal at the closest point of each point's nearest face."""
+    rows = np.arange(len(face))
+    away, edge = points[:, None] - surface.corner[face], surface.edge[face]
+    along = np.clip((away * edge).sum(2) / (edge * edge).sum(2), 0.0, 1.0)
+    off = away - along[..., None] * edge
+    k = (off * off).sum(2).argmin(1)
+    t, off = along[rows, k], off[rows, k]
+    normal = surface.edge_normal[face, k]
+    normal = np.where((t == 0)[:, None], surface.corner_normal[face, k], normal)
+    normal = np.where((t == 1)[:, None], surface.corner_normal[face, (k + 1) % 3], normal)
+    side = (off * normal).sum(1)
+    inside = ((away * surface.inward[face]).sum(2) >= 0).all(1)
+    side = np.where(inside, (away[:, 0] * surface.normal[face]).sum(1), side)
+    return np.where(side < 0, -1.0, 1.0)

@@ -1,0 +1,286 @@
+"""Meshes: mass and distance against closed forms, what is refused, what a repair says."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+from solids import box, bracket, object_file
+
+from codesign_jax import meshes, objects, scene, schema
+from codesign_jax.commands import common
+from codesign_jax.engines.structured import collision
+from codesign_jax.meshes import grid, mass, repair, surface
+
+
+def solid(tmp_path, mesh, *, unit="m", repaired=False, voxel_error=5e-4):
+    path = tmp_path / "object.off"  # keeps shared vertices and all digits, unlike STL
+    mesh.export(path, digits=17)
+    return meshes.load(path, unit=unit, repaired=repaired, voxel_error=voxel_error)
+
+
+def problems(tmp_path, mesh, **options):
+    with pytest.raises(schema.SceneError) as caught:
+        solid(tmp_path, mesh, **options)
+    return caught.value.problems
+
+
+# --- mass properties -----------------------------------------------------------------------------
+
+
+def test_mass_of_a_box_in_any_pose(tmp_path):
+    """Exact up to the rounding of moments over lengths, whatever the pose in the file."""
+    mesh, half = box(), np.array([0.02, 0.025, 0.03])
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.3, 0.9, -0.5]).as_matrix()
+    pose[:3, 3] = [0.1, -0.2, 0.05]
+    mesh.apply_transform(pose)
+    found = solid(tmp_path, mesh)
+    assert found.volume == pytest.approx(8 * half.prod(), rel=1e-12)
+    expected = (half**2).sum() / 3 - half**2 / 3
+    np.testing.assert_allclose(np.sort(found.inertia), np.sort(expected), rtol=1e-9)
+    np.testing.assert_allclose(np.sort(found.half_sizes), half, rtol=1e-9)
+    turned = np.zeros(9)
+    mujoco.mju_quat2Mat(turned, found.upright)
+    back = found.vertices @ turned.reshape(3, 3).T + pose[:3, 3]
+    np.testing.assert_allclose(back, mesh.vertices, atol=1e-12)
+    assert found.rest_height == pytest.approx(pose[2, 3] - mesh.vertices[:, 2].min(), rel=1e-9)
+
+
+def test_mass_of_round_bodies(tmp_path):
+    """A prism of n sides and a geodesic ball, against cylinder and sphere."""
+    n, r, h = 96, 0.03, 0.036
+    found = solid(tmp_path, trimesh.creation.cylinder(r, 2 * h, sections=n))
+    area = np.sin(2 * np.pi / n) / (2 * np.pi / n)  # of a regular polygon over its circle
+    assert found.volume == pytest.approx(2 * np.pi * r**2 * h * area, rel=1e-9)
+    # The faceting takes (2 pi / n)^2 / 3 = 0.14 % off the second moment, the height takes nothing.
+    across = r**2 / 4 + h**2 / 3
+    np.testing.assert_allclose(found.inertia, [across, across, r**2 / 2], rtol=2e-3)
+    found = solid(tmp_path, trimesh.creation.icosphere(4, r))
+    # 5120 faces with edges of 0.07 r lie up to (0.07 r)^2 / (6 r) = 0.08 % r below the sphere.
+    assert found.volume == pytest.approx(4 / 3 * np.pi * r**3, rel=3e-3)
+    np.testing.assert_allclose(found.inertia, 0.4 * r**2, rtol=3e-3)
+
+
+def test_axes_of_a_symmetric_body_stay_those_of_the_file():
+    np.testing.assert_array_equal(mass.principal_axes(np.diag([2.0, 2.0, 1.0])), np.eye(3))
+    tensor = np.array([[2.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 3.0]])
+    axes = mass.principal_axes(tensor)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert (np.diag(axes) > 0.9).all()  # turned by the few degrees that it takes, not renamed
+
+
+# --- distance ------------------------------------------------------------------------------------
+
+
+def test_exact_distance_of_a_box_and_a_ball():
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (3000, 3))
+    mesh, half = box(), np.array([0.02, 0.025, 0.03])
+    found = surface.signed_distance(surface.prepare(mesh.vertices, mesh.faces), points)
+    with jax.enable_x64(True):
+        expected = collision._box(jnp.asarray(half)[:, None], jnp.asarray(points.T))[0]
+    np.testing.assert_allclose(found, expected, atol=1e-15)
+    ball = trimesh.creation.icosphere(3, 0.03)
+    found = surface.signed_distance(surface.prepare(ball.vertices, ball.faces), points)
+    # 1280 faces with corners up to 0.1 r from their middles lie 0.1^2 / 2 r below the sphere.
+    error = found - (np.linalg.norm(points, axis=1) - 0.03)
+    assert -1e-12 < error.min() and error.max() < 0.005 * 0.03
+
+
+def test_exact_distance_is_the_least_over_all_faces():
+    """Nothing that the tree leaves out is nearer, inside, outside and in the corner of an L."""
+    mesh = bracket()
+    prepared = surface.prepare(mesh.vertices, mesh.faces)
+    points = np.random.default_rng(1).uniform(-0.02, 0.08, (500, 3))
+    found = surface.signed_distance(prepared, points)
+    every = np.broadcast_to(np.arange(len(mesh.faces)), (500, len(mesh.faces)))
+    least = np.sqrt(surface._squares(prepared, every, points[:, None]).min(1))
+    np.testing.assert_allclose(np.abs(found), least, atol=1e-15)
+    x, y, z = points.T
+    inside = (0 < y) & (y < 0.044) & (0 < x) & (x < 0.064) & (0 < z) & (z < 0.064)
+    inside &= (x < 0.022) | (z < 0.022)
+    np.testing.assert_array_equal(found < 0, inside)
+
+
+@pytest.mark.parametrize("bound", [5e-4, 3e-4])
+def test_voxel_error_is_what_is_said(bound):
+    """On an L, at points that the grid was not chosen by."""
+    mesh = bracket()
+    built = grid.build(mesh.vertices, mesh.faces, bound)
+    assert built.error <= bound < built.worst
+    rng = np.random.default_rng(2)
+    points, face = trimesh.sample.sample_surface(mesh, 2000, seed=3)[:2]
+    points = points + rng.uniform(-0.002, 0.002, (2000, 1)) * mesh.face_normals[face]
+    exact = surface.signed_distance(surface.prepare(mesh.vertices, mesh.faces), points)
+    error = np.abs(grid.interpolate(built, points) - exact)
+    # The quantile of 2000 points scatters by a few per cent.
+    assert np.quantile(error, 0.99) < 1.1 * bound and error.max() < 0.6 * built.cell
+    # Where the centres of contact spheres are, the distance is smooth: far better than at edges.
+    far = points + 0.008 * mesh.face_normals[face]
+    exact = surface.signed_distance(surface.prepare(mesh.vertices, mesh.faces), far)
+    convex = exact > 0.005  # not in the L's inner corner
+    error = np.abs(grid.interpolate(built, far) - exact)[convex]
+    assert np.quantile(error, 0.99) < 0.3 * bound
+
+
+def test_grids_are_stored_and_damaged_files_are_not_used(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    mesh = box()
+    times = itertools.count(0.0, 2.0)  # every call of the clock is two seconds later
+    monkeypatch.setattr(grid.time, "perf_counter", lambda: next(times))
+    first = grid.cached("key", mesh.vertices, mesh.faces, 2e-3)
+    [path] = (tmp_path / "codesign-jax" / "meshes").iterdir()
+    monkeypatch.setattr(grid, "build", lambda *_: pytest.fail("built again"))
+    again = grid.cached("key", mesh.vertices, mesh.faces, 2e-3)
+    np.testing.assert_array_equal(first.values, again.values)
+    assert first.cell == again.cell and first.error == again.error
+    path.write_bytes(path.read_bytes()[:-100])
+    monkeypatch.setattr(grid, "build", lambda *_: first)
+    assert grid.cached("key", mesh.vertices, mesh.faces, 2e-3) is first
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+def test_open_inverted_and_flipped(tmp_path):
+    mesh = box()
+    faces = mesh.faces.copy()
+    (problem,) = problems(tmp_path, trimesh.Trimesh(mesh.vertices, faces[1:]))
+    assert "object.off: not watertight: 3 edges" in problem and "repair = true" in problem
+    (problem,) = problems(tmp_path, trimesh.Trimesh(mesh.vertices, faces[:, ::-1]))
+    assert "inside out" in problem
+    faces[0] = faces[0, ::-1]
+    (problem,) = problems(tmp_path, trimesh.Trimesh(mesh.vertices, faces))
+    assert "faces point to different sides at 3 edges" in problem
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "hint"),
+    [
+        (60.0, "m", "looks like millimetres: set unit = 'mm'"),
+        (0.06, "mm", "looks like metres: set unit = 'm'"),
+        (2.4, "mm", "looks like centimetres: set unit = 'cm'"),
+    ],
+)
+def test_unit_slips(tmp_path, size, unit, hint):
+    (problem,) = problems(tmp_path, box(size, size, size), unit=unit)
+    assert hint in problem
+
+
+def test_no_unit_fits(tmp_path):
+    (problem,) = problems(tmp_path, box(1e6, 1e6, 1e6))
+    assert "outside [5, 500] mm" in problem and "looks like" not in problem
+
+
+def test_all_problems_at_once(tmp_path):
+    """Of the file and of its meshes."""
+    mesh = box(60, 60, 60)
+    trimesh.Trimesh(mesh.vertices, mesh.faces[1:]).export(tmp_path / "open.off")
+    (tmp_path / "broken.stl").write_text("this is no mesh")
+    path = object_file(
+        tmp_path,
+        'name = "a"; type = "mesh"; file = "open.off"; mass = 0.1; friction = 0.8',
+        'name = "b"; type = "mesh"; file = "none.stl"; mass = 0.1; friction = 0.8',
+        'name = "c"; type = "mesh"; file = "broken.stl"; mass = 0.1; friction = 0.8',
+        'name = "d"; type = "mesh"; size = [0.1]; friction = 0.8',
+        'name = "e"; type = "box"; size = [0.03]; file = "open.off"; friction = 0.8',
+    )
+    with pytest.raises(schema.SceneError) as caught:
+        objects.load(path)
+    said = caught.value.problems
+    for expected in (
+        "object a: open.off: is 60 m long",
+        "object a: open.off: not watertight",
+        "object b: no file",
+        "object c: broken.stl:",
+        "object d: a mesh has either a mass or a density",
+        "object d: file of a mesh is missing",
+        "object d: a mesh has no size",
+        "object e: size of a box has 3 values, not 1",
+        "object e: mass of a box is missing",
+        "object e: a box has no file",
+    ):
+        assert sum(expected in p for p in said) == 1, (expected, said)
+    assert len(said) == 10
+
+
+def test_a_surface_that_cuts_through_itself(tmp_path):
+    """Two overlapping boxes are watertight and wound alike, but no body."""
+    other = box()
+    other.apply_translation([0.02, 0.01, 0])
+    found = solid(tmp_path, trimesh.util.concatenate([box(), other]), voxel_error=1e-3)
+    with pytest.raises(schema.SceneError, match="cuts through itself"):
+        _ = found.grid
+
+
+def test_too_fine_a_grid(tmp_path, monkeypatch):
+    monkeypatch.setattr(grid, "MAX_NODES", 1000)
+    with pytest.raises(schema.SceneError, match="more than 1,000"):
+        _ = solid(tmp_path, box(), voxel_error=1e-3).grid
+
+
+def test_density_becomes_a_mass(tmp_path):
+    box(40, 50, 60).export(tmp_path / "box.stl")
+    entry = 'name = "a"; type = "mesh"; file = "box.stl"; unit = "mm"; friction = 0.8; '
+    shape = objects.load(object_file(tmp_path, entry + "density = 1000")).object[0]
+    assert shape.mass == pytest.approx(0.12) and shape.density is None
+    box(4, 5, 6).export(tmp_path / "box.stl")
+    with pytest.raises(schema.SceneError, match=r"a: mass = 0.00012\d* is outside"):
+        objects.load(object_file(tmp_path, entry + "density = 1000"))
+
+
+# --- repair --------------------------------------------------------------------------------------
+
+
+def test_repair_mends_and_says_what(tmp_path):
+    mesh = box()
+    faces = mesh.faces[mesh.face_normals[:, 2] < 0.5].copy()  # a square hole
+    faces[3] = faces[3, ::-1]
+    vertices = np.vstack([mesh.vertices, mesh.vertices[faces[5, 0]] + 1e-7])
+    faces[5, 0] = len(vertices) - 1  # a seam
+    faces = np.vstack([faces, faces[7]])  # a face twice
+    torn = trimesh.Trimesh(vertices, faces, process=False)
+    said = problems(tmp_path, torn)
+    assert any("not watertight" in p for p in said)
+    mended = solid(tmp_path, torn, repaired=True)
+    assert mended.volume == pytest.approx(mesh.volume, rel=1e-5)
+    assert mended.repairs == (
+        "merged 1 vertices into their neighbours",
+        "dropped 1 degenerate or duplicate faces",
+        "closed a hole of 4 edges",
+        "turned 1 of 14 faces, so that all point outwards",
+    )
+
+
+def test_repair_of_a_good_mesh_changes_nothing(tmp_path):
+    mesh = bracket()
+    vertices, faces, report = repair.repair(mesh.vertices, mesh.faces)
+    assert not report
+    np.testing.assert_array_equal(faces, mesh.faces)
+    np.testing.assert_array_equal(vertices, mesh.vertices)
+    inverted = trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1])
+    assert solid(tmp_path, inverted, repaired=True).repairs == (
+        "turned 20 of 20 faces, so that all point outwards",
+    )
+
+
+def test_what_cannot_be_repaired_is_still_refused(tmp_path):
+    """Two boxes that share an edge: four faces meet there, and no order of them is right."""
+    other = box()
+    other.apply_translation([0.04, 0.05, 0])
+    said = problems(tmp_path, trimesh.util.concatenate([box(), other]), repaired=True)
+    assert any("more than two faces; even after the repair" in p for p in said)
+
+
+def test_users_are_told_of_repairs_and_errors(tmp_path):
+    mesh = box(40, 50, 60)
+    trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1]).export(tmp_path / "inverted.off")
+    entry = 'name = "a"; type = "mesh"; file = "inverted.off"; unit = "mm"; mass = 0.1; '
+    path = object_file(tmp_path, entry + "friction = 1; repair = true; voxel_error = 0.001")
+    notes = common.mesh_notes(scene.load("paper", object_set=path))
+    assert notes[0] == "object a: turned 12 of 12 faces, so that all point outwards"
+    assert notes[1].startswith("object a: distances on 2.5 mm cells, error near the surface")

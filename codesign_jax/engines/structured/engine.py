@@ -1,12 +1,13 @@
 """Step and rollout of the structured engine behind the common interface."""
 
+import copy
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, solver
+from codesign_jax.engines.structured import collision, implicit, solver
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
@@ -39,7 +40,13 @@ class StructuredEngine:
     name = "structured"
 
     def __init__(
-        self, scene: Scene, *, iterations: int = 8, evaluations: int = 4, tolerance: float = 1e-8
+        self,
+        scene: Scene,
+        *,
+        iterations: int = 8,
+        evaluations: int = 4,
+        tolerance: float = 1e-8,
+        checkpoint: bool = True,
     ):
         """Prepares the engine.
 
@@ -48,9 +55,12 @@ class StructuredEngine:
           iterations: Largest number of Newton iterations a step.
           evaluations: Line-search evaluations an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
+          checkpoint: Whether the derivative of a rollout stores only states and accelerations and
+            repeats the rest of each step; costs nothing without a derivative.
         """
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
+        self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
 
     def reset(self, fields: ModelFields) -> State:
@@ -124,7 +134,7 @@ class StructuredEngine:
         # The compiler does not know that a shape's index is never negative.
         run = Stages(hand.shape[0, 0] >= 0 if self.conditional else None)
         problem, velocity = self.problem(run, hand, state, ctrl)
-        solution = solver.solve(
+        solution = implicit.solve(
             run,
             problem,
             velocity,
@@ -153,10 +163,11 @@ class StructuredEngine:
 
     def _rollout(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
         hand, limits = hand_lanes(self.scene, fields), self.scene.limits
+        step = self._checkpointed() if self.checkpoint else self.step
 
         def body(carry, u):
             state, speed = carry
-            new, info = self.step(hand, state, u)
+            new, info = step(hand, state, u)
             away = state.position - info.centre
             entry = Trace(
                 jnp.sqrt(total([away[i, 0] ** 2 for i in range(3)])),
@@ -174,6 +185,13 @@ class StructuredEngine:
         start = (self.reset(fields), jnp.zeros(ctrl.shape[0], ctrl.dtype))
         _, trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 0, -1))
         return Trace(*(jnp.moveaxis(v, 0, 1) for v in trace))
+
+    def _checkpointed(self):
+        """The step with a derivative that stores little; see `implicit.checkpointed`."""
+        solved = copy.copy(self)
+        solved.iterations = 0
+        limit = self.scene.limits.speed
+        return implicit.checkpointed(self.step, solved.step, lambda s: self._speed(s) <= limit)
 
     def _speed(self, state: State) -> jax.Array:
         """Largest absolute generalized velocity; not finite if any velocity or position is not."""
@@ -206,7 +224,8 @@ def _turn(quat: jax.Array, omega: jax.Array, h: float) -> jax.Array:
     square = total([omega[i] ** 2 for i in range(3)])
     speed = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     half = 0.5 * h * jnp.where(square > 0, speed, 0.0)
-    axis = omega / speed * jnp.sin(half)
+    # Without rotation the quotient is zero but its derivative is not.
+    axis = jnp.where(square > 0, omega / speed * jnp.sin(half), 0.5 * h * omega)
     w, x, y, z = quat
     a, (b, c, d) = jnp.cos(half), axis
     turned = jnp.stack(

@@ -93,7 +93,7 @@ def fit_material(
     measured: jax.Array,
     guess: Material,
     *,
-    steps: int = 60,
+    steps: int = 120,
     rate: float = 0.1,
 ) -> Fit:
     """Fits the material to measured tips by Adam on its logarithms.

@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--pressure", type=float, default=60e3)
     parser.add_argument("--noise", type=float, default=3e-4, help="standard deviation [m]")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--steps", type=int, default=120)
     parser.add_argument("--figure", type=Path, default=Path("runs") / "fit_material.png")
     args = parser.parse_args()
     the_scene = finger_scene(args.links, args.timestep)

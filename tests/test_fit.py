@@ -23,7 +23,7 @@ def script():
 
 @pytest.mark.slow
 def test_material_is_recovered_from_another_engines_noisy_tips():
-    """Within 1 %: a noise of 0.3 mm on 200 samples; 1 mm gave errors of 0.4 and 1.2 %."""
+    """Within 1 %: 0.3 mm of noise leave 0.01 and 0.2 %; 40 steps are not converged (1.7 %)."""
     study = script()
     scene = study.finger_scene(links=3, timestep=0.005)
     ctrl = study.pressure_step(scene, 60e3, 1.0)
@@ -31,7 +31,7 @@ def test_material_is_recovered_from_another_engines_noisy_tips():
     guess = fit.Material(jnp.asarray(50e3), jnp.asarray(0.006))
     measured = study.measure(scene, ctrl, truth, 3e-4, seed=0)
     fields = study.world_fields(scene)
-    found = fit.fit_material(StructuredEngine(scene), fields, ctrl, measured, guess, steps=40)
+    found = fit.fit_material(StructuredEngine(scene), fields, ctrl, measured, guess, steps=120)
     error = jax.tree.map(lambda a, b: float(a / b - 1), found.material, truth)
     print(error, np.asarray(found.loss)[[0, -1]])
     assert max(abs(e) for e in error) < 0.01

@@ -1,12 +1,13 @@
 """Step and rollout of the structured engine behind the common interface."""
 
+import copy
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, mesh, solver
+from codesign_jax.engines.structured import collision, implicit, mesh, solver
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
@@ -39,7 +40,14 @@ class StructuredEngine:
     name = "structured"
 
     def __init__(
-        self, scene: Scene, *, iterations: int = 24, evaluations: int = 6, tolerance: float = 1e-6
+        self,
+        scene: Scene,
+        *,
+        iterations: int = 24,
+        evaluations: int = 6,
+        tolerance: float = 1e-6,
+        checkpoint: bool = True,
+        fused: bool | None = None,
     ):
         """Prepares the engine.
 
@@ -48,15 +56,20 @@ class StructuredEngine:
           iterations: Largest number of Newton iterations a step.
           evaluations: Line-search evaluations an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
+          checkpoint: Whether the derivative of a rollout stores only states and accelerations and
+            repeats the rest of each step; costs nothing without a derivative.
+          fused: Whether one GPU kernel runs a rollout (float32, primitive shapes, no trajectory);
+            it has no derivative. By default on a GPU.
 
         Raises:
-          SceneError: if a mesh's distance cannot be put on a grid.
+          SceneError: If a mesh's distance cannot be put on a grid.
         """
         mesh.tables(scene)
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
+        self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
-        self.fused = jax.default_backend() == "gpu"
+        self.fused = jax.default_backend() == "gpu" if fused is None else fused
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -129,7 +142,7 @@ class StructuredEngine:
         # The compiler does not know that a shape's index is never negative.
         run = Stages(hand.shape[0, 0] >= 0 if self.conditional else None)
         problem, velocity = self.problem(run, hand, state, ctrl)
-        solution = solver.solve(
+        solution = implicit.solve(
             run,
             problem,
             velocity,
@@ -153,7 +166,8 @@ class StructuredEngine:
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`; on a GPU in float32 one kernel runs it all, see `fused`."""
-        if self.fused and not trajectory and ctrl.dtype == jnp.float32:
+        primitive = all(o.type != "mesh" for o in self.scene.objects.object)
+        if self.fused and primitive and not trajectory and ctrl.dtype == jnp.float32:
             return self._one_kernel(fields, ctrl)
         with jax.default_matmul_precision("highest"):
             return self._rollout(fields, ctrl, trajectory)
@@ -171,10 +185,11 @@ class StructuredEngine:
 
     def _rollout(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
         hand, limits = hand_lanes(self.scene, fields), self.scene.limits
+        step = self._checkpointed() if self.checkpoint else self.step
 
         def body(carry, u):
             state, speed = carry
-            new, info = self.step(hand, state, u)
+            new, info = step(hand, state, u)
             away = state.position - info.centre
             entry = Trace(
                 jnp.sqrt(total([away[i, 0] ** 2 for i in range(3)])),
@@ -192,6 +207,13 @@ class StructuredEngine:
         start = (self.reset(fields), jnp.zeros(ctrl.shape[0], ctrl.dtype))
         _, trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 0, -1))
         return Trace(*(jnp.moveaxis(v, 0, 1) for v in trace))
+
+    def _checkpointed(self):
+        """The step with a derivative that stores little; see `implicit.checkpointed`."""
+        solved = copy.copy(self)
+        solved.iterations = 0
+        limit = self.scene.limits.speed
+        return implicit.checkpointed(self.step, solved.step, lambda s: self._speed(s) <= limit)
 
     def _speed(self, state: State) -> jax.Array:
         """Largest absolute generalized velocity; not finite if any velocity or position is not."""
@@ -224,7 +246,8 @@ def _turn(quat: jax.Array, omega: jax.Array, h: float) -> jax.Array:
     square = total([omega[i] ** 2 for i in range(3)])
     speed = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     half = 0.5 * h * jnp.where(square > 0, speed, 0.0)
-    axis = omega / speed * jnp.sin(half)
+    # Without rotation the quotient is zero but its derivative is not.
+    axis = jnp.where(square > 0, omega / speed * jnp.sin(half), 0.5 * h * omega)
     w, x, y, z = quat
     a, (b, c, d) = jnp.cos(half), axis
     turned = jnp.stack(

@@ -24,22 +24,22 @@ class Stages:
 
     def __init__(self, predicate: jax.Array | None):
         """Takes a scalar, true at run time, that the compiler does not know; None: barriers."""
-        self._predicate = predicate
+        self.predicate = predicate
 
     def __call__(self, function: Callable, *args: Any) -> Any:
         """Returns function(*args), computed once; both are pytrees of arrays."""
-        if self._predicate is None:
+        if self.predicate is None:
             return jax.lax.optimization_barrier(function(*args))
         shapes = jax.eval_shape(function, *args)
 
         def never(*_: Any) -> Any:
             return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
 
-        return jax.lax.cond(self._predicate, function, never, *args)
+        return jax.lax.cond(self.predicate, function, never, *args)
 
     def only_if(self, condition: jax.Array) -> "Stages":
         """Stages that return zeros when a scalar is false; with barriers they always run."""
-        return Stages(None if self._predicate is None else condition)
+        return Stages(None if self.predicate is None else condition)
 
 
 def total(terms: Sequence[jax.Array]) -> jax.Array:

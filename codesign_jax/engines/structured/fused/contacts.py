@@ -185,7 +185,7 @@ class BoundContacts:
 
 def sphere_on_object(scene: Scene, size, shape, columns, position, centre, radius):
     """Point, normal and gap of spheres (3, k, ...) against the object."""
-    hand = SimpleNamespace(object_size=size, shape=shape.astype(jnp.int32))
+    hand = SimpleNamespace(object_size=size, shape=shape.astype(jnp.int32), mesh=None)
     kin = SimpleNamespace(object=columns, object_pos=position)
     c = collision.spheres_on_object(scene, hand, kin, direct, centre, radius)  # type: ignore[arg-type]
     return c.point, c.normal, c.distance[None]

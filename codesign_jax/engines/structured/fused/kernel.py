@@ -498,7 +498,7 @@ class Step:
         def compute(size, kind, columns, position, height):
             from types import SimpleNamespace
 
-            hand = SimpleNamespace(object_size=size, shape=kind.astype(jnp.int32))
+            hand = SimpleNamespace(object_size=size, shape=kind.astype(jnp.int32), mesh=None)
             frame = SimpleNamespace(object=columns, object_pos=position)
             run = lambda f, *a: f(*a)  # noqa: E731
             c = collision.object_on_table(run, self.p.scene, hand, frame, height)  # type: ignore[arg-type]

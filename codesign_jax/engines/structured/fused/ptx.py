@@ -507,6 +507,7 @@ def assemble(jaxpr: Any, shapes: list[tuple[int, ...]], name: str) -> str:
     start = "mov.u32 %block, %ctaid.x;\nmov.u32 %lane, %tid.x;\n"
     body = "\n".join(asm.lines)
     return (
-        f"{HEADER}.visible .entry {name}({params})\n{LAUNCH}{{\n.reg .u32 %block;\n.reg .s32 %lane;\n"
+        f"{HEADER}.visible .entry {name}({params})\n{LAUNCH}{{\n"
+        f".reg .u32 %block;\n.reg .s32 %lane;\n"
         f"{registers}{start}{body}\nret;\n}}\n"
     )

@@ -1,0 +1,168 @@
+"""Reverse-mode derivatives of the structured engine: implicit solve and steps that store little.
+
+The accelerations a of a step are where the gradient of its objective vanishes,
+  F(a, theta) = M a - tau - J' f(J a - aref) = 0,
+with theta all data of the step.  By the implicit function theorem a cotangent v of a gives theta
+the cotangent -lambda' dF/dtheta with H lambda = v, and H = dF/da is the symmetric matrix of the
+last Newton step: one more elimination, however many iterations the solution took.  lambda' F, the
+power of the unbalanced forces along the virtual accelerations lambda, is a scalar that the
+factored form gives without J or M.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import solver
+from codesign_jax.engines.structured.contact import Contacts, respond
+from codesign_jax.engines.structured.hand import HandLanes
+from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, sum_items
+from codesign_jax.engines.structured.solver import Forces, Problem, Solution, Spatial
+
+
+def solve(
+    run: Stages,
+    problem: Problem,
+    velocity: Spatial,
+    start: Acc,
+    *,
+    iterations: int,
+    evaluations: int,
+    tolerance: float,
+) -> Solution:
+    """`solver.solve` with a reverse-mode derivative; the same values.
+
+    The accelerations are differentiable in problem and velocity.  The warm start gets no gradient:
+    the solution does not depend on it.  Residual and iterations pass none.
+
+    Args:
+      run: Runs the stages.
+      problem: The problem.
+      velocity: Spatial velocities of the bodies.
+      start: Warm start.
+      iterations: As in `solver.solve`; 0 takes the start for the solution.
+      evaluations: As in `solver.solve`.
+      tolerance: As in `solver.solve`.
+    """
+    # Numbers of the scene stay numbers: as arguments they would become arrays of another type.
+    leaves, tree = jax.tree.flatten((run.predicate, problem, velocity, start))
+    traced = [isinstance(v, jax.Array) for v in leaves]
+
+    def parts(arrays: list[jax.Array]) -> tuple[Stages, Problem, Spatial, Acc]:
+        given = iter(arrays)
+        filled = [next(given) if t else v for v, t in zip(leaves, traced, strict=True)]
+        predicate, *rest = jax.tree.unflatten(tree, filled)
+        return Stages(predicate), *rest
+
+    @jax.custom_vjp
+    def converged(arrays: list[jax.Array]) -> Solution:
+        run, problem, velocity, start = parts(arrays)
+        if not iterations:
+            return Solution(start, jnp.zeros_like(start.wrist[0]), jnp.zeros((), jnp.int32))
+        limits = {"iterations": iterations, "evaluations": evaluations, "tolerance": tolerance}
+        return solver.solve(run, problem, velocity, start, **limits)
+
+    def forward(arrays: list[jax.Array]):
+        solution = converged(arrays)
+        return solution, (arrays, solution.acc)
+
+    def backward(saved: tuple, cotangent: Solution):
+        arrays, acc = saved
+        run, problem, velocity, _ = parts(arrays)
+        virtual = adjoint(run, problem, velocity, acc, cotangent.acc)
+
+        def power(arrays: list[jax.Array]) -> jax.Array:
+            run, problem, velocity, _ = parts(arrays)
+            return residual_power(run, problem, velocity, acc, virtual).sum()
+
+        value, pull = jax.vjp(power, arrays)
+        return pull(-jnp.ones_like(value))
+
+    converged.defvjp(forward, backward)
+    return converged([v for v, t in zip(leaves, traced, strict=True) if t])
+
+
+def adjoint(run: Stages, problem: Problem, velocity: Spatial, acc: Acc, cotangent: Acc) -> Acc:
+    """Solves H lambda = cotangent by the elimination of a Newton step at the solution acc."""
+    motion = solver.propagate(run, problem.kin, acc)
+    pushes = {}
+    for name, c in problem.contacts.items():
+        active = run.only_if(c.active.any())
+        jar = active(lambda *v, name=name: _jar(name, *v), c, motion, velocity)
+        inertia, wrench = solver._push(active, name, c, jar)
+        pushes[name] = inertia, jnp.zeros_like(wrench)
+    turning, moving = cotangent.object[:3], cotangent.object[3:]
+    # The object's accelerations are at its centre, its spatial force at the origin.
+    force = Forces(
+        palm=jnp.zeros_like(motion.palm),
+        link=jnp.zeros_like(motion.link),
+        object=spatial(turning + cross(problem.kin.object_pos, moving), moving),
+        wrist=cotangent.wrist,
+        finger=cotangent.finger,
+    )
+    return solver.newton_step(run, problem, force, pushes)[0]
+
+
+def residual_power(
+    run: Stages, problem: Problem, velocity: Spatial, acc: Acc, virtual: Acc
+) -> jax.Array:
+    """Power lambda' F of the unbalanced forces at acc along virtual, shape (1, world)."""
+    motion = solver.propagate(run, problem.kin, acc)
+    along = solver.propagate(run, problem.kin, virtual)
+    inertial = solver.inertial_forces(run, problem, acc, motion)
+    force = Forces(*(m - s for m, s in zip(inertial, problem.smooth, strict=True)))
+    power = solver.work(run, force, virtual, along)
+    for name, c in problem.contacts.items():
+
+        def pushed(c: Contacts, motion: Spatial, velocity: Spatial, along: Spatial, name=name):
+            force = respond(c, _jar(name, c, motion, velocity)).force
+            return sum_items(dot(force, c.relative(solver.relative(name, along))))
+
+        active = run.only_if(c.active.any())
+        power = power - active(pushed, c, motion, velocity, along)
+    return power
+
+
+def _jar(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Array:
+    """J a - aref of a set of contacts."""
+    speed = c.relative(solver.relative(name, velocity))
+    return c.relative(solver.relative(name, motion)) - c.reference(speed)
+
+
+def checkpointed(step: Callable, resume: Callable, good: Callable[[State], jax.Array]) -> Callable:
+    """Returns the step with a derivative that stores only its inputs and its accelerations.
+
+    The backward pass repeats the step from its known solution, that is all of it but the solver's
+    iterations.  A world whose step failed passes no gradient; zero times a derivative that is not
+    finite would spoil its whole past.
+
+    Args:
+      step: Maps hand, state and controls to state and info with the accelerations as `acc`.
+      resume: The same step if the state's warm start is the solution.
+      good: Tells from the new state which worlds' steps succeeded, shape (world,).
+    """
+
+    @jax.custom_vjp
+    def light(hand: HandLanes, state: State, ctrl: jax.Array):
+        return step(hand, state, ctrl)
+
+    def forward(hand: HandLanes, state: State, ctrl: jax.Array):
+        new, info = step(hand, state, ctrl)
+        return (new, info), (hand, state._replace(acc=info.acc), ctrl)
+
+    def backward(saved: tuple, cotangent: Any):
+        (new, _), pull = jax.vjp(resume, *saved)
+        fine = good(new)
+
+        def keep(v: jax.Array) -> jax.Array:
+            if v.dtype == jax.dtypes.float0 or not v.size:
+                return v
+            return jnp.where(fine, v, 0)
+
+        return jax.tree.map(keep, pull(cotangent))
+
+    light.defvjp(forward, backward)
+    return light

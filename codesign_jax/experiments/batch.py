@@ -4,7 +4,8 @@ Masks and keys are data.  Run r of every strategy has the root key `jax.random.k
 draws from it as `codesign optimize --seed` does, so that one run of the batch is that command's.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,10 +28,10 @@ MAX_SCREENS = 100
 class _Programs(NamedTuple):
     """What is compiled beside the simulation; the leading axes are (strategy, run)."""
 
-    move: object
-    select: object
-    noise: object
-    screen: object
+    move: Callable[..., Any]
+    select: Callable[..., Any]
+    noise: Callable[..., Any]
+    screen: Callable[..., Any]
 
 
 class Batch:

@@ -6,6 +6,7 @@ import json
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +16,8 @@ from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome
 
-Arrays = dict[str, np.ndarray]
-"""Arrays by name, `step` (the steps done) among them."""
+Arrays = dict[str, Any]
+"""NumPy arrays by name, `step` (the steps done) among them."""
 
 KEPT = np.iinfo(np.uint16).max
 """`lost_step` of a trial in which the object was not lost."""

@@ -1,0 +1,157 @@
+"""Sizes of the experiments (paper Secs. VI.3 to VI.5) and what their runs differ in: the masks."""
+
+import dataclasses
+
+import numpy as np
+
+from codesign_jax.optimize import schedule
+from codesign_jax.parameters import DesignSpace
+
+
+@dataclasses.dataclass(frozen=True)
+class Strategies:
+    """Optimisation strategies compared over many runs (Figs. 7 and 9).
+
+    Attributes:
+      name: Name of the experiment.
+      preset: Design space of the hand.
+      strategies: Names for `optimize.schedule`.
+      runs: Runs of each strategy; run r has the root key `seed + r` in every strategy.
+      particles: Particles of a run.
+      episodes: Episodes of a run.
+      trials: Trials of a particle in an episode.
+      test_trials: Further trials of each final particle, a multiple of `trials`.
+    """
+
+    name: str
+    preset: str
+    strategies: tuple[str, ...]
+    runs: int
+    particles: int
+    episodes: int
+    trials: int
+    test_trials: int
+
+    def __post_init__(self) -> None:
+        """Checks the sizes.
+
+        Raises:
+          ValueError: If the tests are not whole rounds of an episode's trials.
+        """
+        if self.test_trials % self.trials:
+            raise ValueError(f"{self.test_trials=} must be a multiple of {self.trials=}")
+
+    @property
+    def rounds(self) -> int:
+        """Rounds of `trials` trials that the final test takes."""
+        return self.test_trials // self.trials
+
+    @property
+    def num_runs(self) -> int:
+        """Runs of all strategies."""
+        return len(self.strategies) * self.runs
+
+    @property
+    def worlds(self) -> int:
+        """Grasps of one episode, or of one round of the final test, over all runs."""
+        return self.num_runs * self.particles * self.trials
+
+    @property
+    def grasps(self) -> int:
+        """Grasps of episodes and final tests, without those that screen the seeds."""
+        return self.worlds * (self.episodes + self.rounds)
+
+    def first(self) -> tuple[str, ...]:
+        """Domain in which each run starts: either one in turn, so equally often (Sec. VI.4)."""
+        return tuple(("morphology", "control")[r % 2] for r in range(self.runs))
+
+    def masks(self, space: DesignSpace) -> np.ndarray:
+        """Returns which parameters are open, bool, shape (strategy, run, episode, parameter)."""
+        domain = np.array(space.is_morphology)
+        return np.array(
+            [
+                [schedule(s, domain, self.episodes, first) for first in self.first()]  # type: ignore[arg-type]
+                for s in self.strategies
+            ]
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Landscape:
+    """The cost on a grid over a design space of two parameters (Fig. 8).
+
+    Attributes:
+      name: Name of the experiment.
+      preset: Design space of the hand, of two parameters.
+      points: Grid points along either parameter, bounds included.
+      trials: Trials of each point; every point meets the same ones.
+      block: Trials simulated in one step.
+    """
+
+    name: str
+    preset: str
+    points: int
+    trials: int
+    block: int = 6
+
+    @property
+    def steps(self) -> int:
+        """Steps of at most `block` trials of every point."""
+        return -(-self.trials // self.block)
+
+    @property
+    def worlds(self) -> int:
+        """Grasps of one whole step."""
+        return self.points**2 * min(self.block, self.trials)
+
+    @property
+    def grasps(self) -> int:
+        """Grasps of the experiment."""
+        return self.points**2 * self.trials
+
+
+SWITCHES = tuple(f"switch-{k}" for k in (1, 2, 4, 8, 16, 32))
+
+PAPER: dict[str, Strategies | Landscape] = {
+    "2d": Strategies("2d", "2d", ("single", *SWITCHES, "concurrent"), 30, 10, 64, 6, 36),
+    "23d": Strategies("23d", "23d", ("single", "switch-1", "concurrent"), 30, 60, 128, 6, 72),
+    "landscape": Landscape("landscape", "2d", 60, 36),
+}
+
+PAPER_GRASPS = {"2d": 1_008_000, "landscape": 129_600, "23d": 4_536_000}
+"""The paper's counts; its 1,000,800 of the 2D experiment is a digit swap, see docs/results.md."""
+TOTAL_GRASPS = sum(PAPER_GRASPS.values())
+
+# Two links and few runs: the whole path in seconds.  Four links: some minutes on two cores.
+SMALL: dict[str, dict[str, Strategies | Landscape]] = {
+    "tiny": {
+        "2d": Strategies("2d", "2d", ("single", "concurrent"), 2, 2, 2, 3, 3),
+        "23d": Strategies("23d", "23d", ("single", "concurrent"), 2, 2, 2, 3, 3),
+        "landscape": Landscape("landscape", "2d", 2, 3, 3),
+    },
+    "cpu": {
+        "2d": Strategies(
+            "2d", "2d", ("single", "switch-1", "switch-4", "concurrent"), 2, 4, 8, 3, 6
+        ),
+        "23d": Strategies("23d", "23d", ("single", "concurrent"), 2, 6, 8, 3, 6),
+        "landscape": Landscape("landscape", "2d", 10, 3, 3),
+    },
+}
+OVERRIDES = {
+    "paper": {},
+    "tiny": {"discretization": {"links": 2}},
+    "cpu": {"discretization": {"links": 4}},
+}
+"""What the sizes change in the scene; the paper's change nothing."""
+
+
+def experiment(name: str, size: str = "paper") -> Strategies | Landscape:
+    """Returns an experiment by name in the paper's or a smaller size.
+
+    Raises:
+      RuntimeError: If the paper's sizes do not give the paper's counts.
+    """
+    for known, expected in PAPER_GRASPS.items():
+        if PAPER[known].grasps != expected:
+            raise RuntimeError(f"{known}: {PAPER[known].grasps} grasps, the paper has {expected}")
+    return (PAPER if size == "paper" else SMALL[size])[name]

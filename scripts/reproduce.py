@@ -1,0 +1,100 @@
+"""Repeats the paper's experiments and redraws its figures.
+
+python scripts/reproduce.py 2d --out runs/reproduction           # on a GPU; again to resume
+python scripts/reproduce.py 2d --out runs/small --size cpu       # minutes on a CPU
+python scripts/reproduce.py figures --data docs/data/reproduction
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from codesign_jax import codesign, parameters, scene
+from codesign_jax.commands import common
+from codesign_jax.engines import NAMES, make_engine
+from codesign_jax.experiments import Batch, Grid, Stop, Worlds, drive, plan, record, results
+from codesign_jax.experiments.worlds import LIMIT, chunking
+from codesign_jax.schema import SceneError
+
+
+def parse() -> argparse.Namespace:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("experiment", choices=[*plan.PAPER, "figures"])
+    parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
+    parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
+    parser.add_argument("--preset", dest="size", choices=list(plan.OVERRIDES), help="as --size")
+    parser.add_argument("--engine", choices=NAMES, default="structured")
+    parser.add_argument("--seed", type=int, default=0, help="seed of run 0")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
+    parser.add_argument("--devices", type=int, default=1)
+    parser.add_argument("--every", type=int, help="steps between saves; by default 20 s")
+    parser.add_argument("--minutes", type=float, help="save and stop after this time")
+    parser.add_argument("--fresh", action="store_true", help="delete an earlier state")
+    parser.add_argument("--commit", help="commit of the code where there is no git")
+    parser.add_argument("--trials", type=Path, help="write every trial to this .npz")
+    parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
+    parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
+    parser.add_argument("--page", type=Path, help="page whose table is filled in")
+    return parser.parse_args()
+
+
+def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], int]:
+    """Returns the experiment, the settings its state must belong to, and its grasps."""
+    the_plan = plan.experiment(args.experiment, args.size)
+    overrides = plan.OVERRIDES[args.size] | common.parse_overrides(args.set)
+    the_scene = scene.load("paper", overrides=overrides)
+    space = parameters.design_space(the_scene.hand, the_plan.preset)
+    chunk, calls = chunking(the_plan.worlds, args.chunk, args.devices)
+    engine = make_engine(args.engine, the_scene)
+    worlds = Worlds(the_scene, engine, space, chunk=chunk, devices=args.devices)
+    print(f"{args.experiment}: {the_plan.grasps:,} grasps, {the_plan.worlds:,} a step in {calls}")
+    print(f"call(s) of {chunk:,} worlds; the paper's total is {plan.TOTAL_GRASPS:,}", flush=True)
+    settings = record.settings(the_plan, the_scene, args.engine, args.seed, chunk)
+    if isinstance(the_plan, plan.Landscape):
+        return Grid(the_plan, the_scene, worlds, seed=args.seed), settings, the_plan.grasps
+    batch = Batch(the_plan, the_scene, worlds, codesign.make_filter(space), seed=args.seed)
+    return batch, settings, the_plan.grasps
+
+
+def simulate(args: argparse.Namespace) -> int:
+    """Runs or resumes an experiment; 3 is the exit status of one that was stopped."""
+    common.use_compilation_cache()
+    experiment, settings, grasps = build(args)
+    state = args.out / f"{args.experiment}.state.npz"
+    if args.fresh:
+        state.unlink(missing_ok=True)
+    stop = Stop(every=args.every, minutes=args.minutes)
+    done = drive(experiment, state, settings, stop=stop, say=lambda s: print(s, flush=True))
+    if not done.finished:
+        print(f"stopped; the same command resumes from {state}")
+        return 3
+    notes = results.provenance(settings, done, grasps, command=sys.argv, commit=args.commit)
+    for path in results.write(
+        args.out, args.experiment, results.summarize(experiment, done.record), notes
+    ):
+        print(path)
+    if args.trials:
+        print(results.write_trials(args.trials, done.record))
+    return 0
+
+
+def main() -> int:
+    """Runs the command and returns the exit status."""
+    args = parse()
+    if args.experiment != "figures":
+        return simulate(args)
+    from codesign_jax.experiments import report
+
+    print(report.make(args.data, args.figures, args.page))
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (record.StateError, SceneError) as error:
+        sys.exit(f"error: {error}")

@@ -12,9 +12,14 @@ from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
 from codesign_jax.engines.structured.lanes import Stages, total
+from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
+
+
+LANES = 60
+"""Worlds in flight on a core: their arrays fit its L2 cache."""
 
 
 class StepInfo(NamedTuple):
@@ -39,7 +44,14 @@ class StructuredEngine:
     name = "structured"
 
     def __init__(
-        self, scene: Scene, *, iterations: int = 8, evaluations: int = 4, tolerance: float = 1e-8
+        self,
+        scene: Scene,
+        *,
+        iterations: int = 24,
+        evaluations: int = 6,
+        tolerance: float = 1e-6,
+        lanes: int | None = None,
+        burst: int = 3,
     ):
         """Prepares the engine.
 
@@ -48,10 +60,15 @@ class StructuredEngine:
           iterations: Largest number of Newton iterations a step.
           evaluations: Line-search evaluations an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
+          lanes: Worlds in flight at once, see `stream`; 0 steps all worlds in unison, which can be
+            differentiated. By default `LANES` on a CPU and 0 elsewhere.
+          burst: Newton iterations of a round of the stream.
         """
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.conditional = jax.default_backend() == "cpu"  # see Stages
+        self.lanes = (LANES if self.conditional else 0) if lanes is None else lanes
+        self.burst = burst
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -119,7 +136,9 @@ class StructuredEngine:
         found["object_table"] = collision.object_on_table(run, scene, hand, kin, height)
         return found
 
-    def step(self, hand: HandLanes, state: State, ctrl: jax.Array) -> tuple[State, StepInfo]:
+    def step(
+        self, hand: HandLanes, state: State, ctrl: jax.Array, *, iterations: int | None = None
+    ) -> tuple[State, StepInfo]:
         """Advances a batch by one time step under controls of shape (nu, world)."""
         # The compiler does not know that a shape's index is never negative.
         run = Stages(hand.shape[0, 0] >= 0 if self.conditional else None)
@@ -129,7 +148,7 @@ class StructuredEngine:
             problem,
             velocity,
             state.acc,
-            iterations=self.iterations,
+            iterations=iterations or self.iterations,
             evaluations=self.evaluations,
             tolerance=self.tolerance,
         )
@@ -149,7 +168,29 @@ class StructuredEngine:
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`."""
         with jax.default_matmul_precision("highest"):
+            if self.lanes:
+                return self._stream(fields, ctrl, trajectory)
             return self._rollout(fields, ctrl, trajectory)
+
+    def _stream(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
+        def advance(hand: HandLanes, state: State, u: jax.Array):
+            new, info = self.step(hand, state, u, iterations=self.burst)
+            resumed = state._replace(acc=info.acc)
+            # Not `<=`: a world that is no longer finite must advance, to fail.
+            solved = ~(info.residual[0] > self.tolerance)
+            return new, resumed, solved, info.centre
+
+        queue = Queue(hand_lanes(self.scene, fields), self.reset(fields), ctrl)
+        return stream(
+            self.scene,
+            queue,
+            advance,
+            self._speed,
+            self.qpos,
+            lanes=self.lanes,
+            max_rounds=-(-self.iterations // self.burst),
+            trajectory=trajectory,
+        )
 
     def _rollout(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
         hand, limits = hand_lanes(self.scene, fields), self.scene.limits

@@ -328,7 +328,7 @@ def solve(
     }
 
     def body(carry):
-        acc, motion, jar, _, count = carry
+        acc, motion, jar, before, count = carry
         inertial = inertial_forces(run, problem, acc, motion)
         force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))
         pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items()}
@@ -340,14 +340,16 @@ def solve(
             for n, c in contacts.items()
         }
         alpha = line_search(runs, contacts, jar, jar_step, slope, curvature, evaluations)
-        decrement = _decrement(slope, pushes, step_motion)
+        # A world that is done stays as it is, so that its result does not depend on the others.
+        done = before <= tolerance
+        alpha = jnp.where(done, 0.0, alpha)
+        residual = _decrement(slope, pushes, step_motion) / _scale(problem, motion)
 
         def advance(old, new):
             return jax.tree.map(lambda a, p: a + alpha * p, old, new)
 
-        scale = _scale(problem, motion)
         acc, motion, jar = advance((acc, motion, jar), (step, step_motion, jar_step))
-        return acc, motion, jar, decrement / scale, count + 1
+        return acc, motion, jar, jnp.where(done, before, residual), count + 1
 
     def going(carry):
         return (carry[4] < iterations) & jnp.any(carry[3] > tolerance)

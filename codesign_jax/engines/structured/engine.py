@@ -11,6 +11,7 @@ from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
+from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
@@ -169,10 +170,10 @@ class StructuredEngine:
         """See `Engine.rollout`."""
         with jax.default_matmul_precision("highest"):
             if self.lanes:
-                return self._stream(fields, ctrl, trajectory)
+                return on_all_cores(partial(self._stream, trajectory=trajectory), fields, ctrl)
             return self._rollout(fields, ctrl, trajectory)
 
-    def _stream(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
+    def _stream(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
         def advance(hand: HandLanes, state: State, u: jax.Array):
             new, info = self.step(hand, state, u, iterations=self.burst)
             resumed = state._replace(acc=info.acc)

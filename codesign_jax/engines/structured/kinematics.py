@@ -12,7 +12,14 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, rotation_columns
-from codesign_jax.engines.structured.lanes import Stages, cross, motion_cross, rotate, spatial
+from codesign_jax.engines.structured.lanes import (
+    Stages,
+    cross,
+    motion_cross,
+    rotate,
+    scan_links,
+    spatial,
+)
 
 # Axis of the frame about which each hinge turns, in the order bend (y), lateral (z), twist (x).
 _HINGE = {"bend": 1, "lateral": 2, "twist": 0}
@@ -110,7 +117,7 @@ def kinematics(
     over = (hand.offset, *trig, state.finger_vel)
     lanes = jnp.zeros_like(hand.offset[0])
     first = (origin, frame, vel + lanes, bias + lanes)
-    _, (origins, frames, vels, biases, axes) = jax.lax.scan(next_link, first, over)
+    _, (origins, frames, vels, biases, axes) = scan_links(next_link, first, over)
     columns, position, object_vel = run(_object, state)
     return Kinematics(
         palm=palm,

@@ -42,6 +42,32 @@ class Stages:
         return Stages(None if self._predicate is None else condition)
 
 
+def scan_links(step: Callable, first: Any, links: Any, *, reverse: bool = False) -> tuple[Any, Any]:
+    """`jax.lax.scan` whose slices are contiguous rows to the compiler.
+
+    XLA's CPU loops that slice an array of five axes at a dynamic index are not vectorised, those
+    that slice one of two axes are: a copy of 34 kB takes 2 instead of 8 microseconds.
+    """
+
+    def flat(x: jax.Array) -> jax.Array:
+        return x.reshape(x.shape[0], -1)
+
+    arrays, treedef = jax.tree.flatten(links)
+    shapes, out_shapes = [x.shape[1:] for x in arrays], []
+
+    def body(carry: Any, rows: list) -> tuple[Any, Any]:
+        parts = [x.reshape(s) for x, s in zip(rows, shapes, strict=True)]
+        link = jax.tree.unflatten(treedef, parts)
+        carry, out = step(carry, link)
+        out_shapes[:] = [x.shape for x in jax.tree.leaves(out)]
+        return carry, jax.tree.map(lambda x: x.reshape(-1), out)
+
+    last, rows = jax.lax.scan(body, first, [flat(x) for x in arrays], reverse=reverse)
+    leaves, out_def = jax.tree.flatten(rows)
+    whole = [x.reshape(x.shape[0], *s) for x, s in zip(leaves, out_shapes, strict=True)]
+    return last, jax.tree.unflatten(out_def, whole)
+
+
 def total(terms: Sequence[jax.Array]) -> jax.Array:
     """Sum of a short list."""
     result = terms[0]

@@ -26,6 +26,7 @@ from codesign_jax.engines.structured.lanes import (
     Stages,
     cross,
     dot,
+    scan_links,
     spatial,
     sum_axis,
     sum_fingers,
@@ -92,7 +93,7 @@ def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
         return motion, motion
 
     first = palm + jnp.zeros_like(kin.vel[:, 0])
-    _, links = jax.lax.scan(step, first, (kin.axes, acc.finger))
+    _, links = scan_links(step, first, (kin.axes, acc.finger))
     angular = acc.object[:3]
     obj = spatial(angular, acc.object[3:] + cross(kin.object_pos, angular))
     return Spatial(palm, jnp.moveaxis(links, 0, 1), obj)
@@ -163,14 +164,15 @@ def newton_step(
     kin, hand = problem.kin, problem.hand
 
     def next_joint(node: el.Quadratic, link: tuple):
-        matrix, push, terms, axes, arm, tau = link
-        return el.eliminate(run, run(_add_link, node, matrix, push, terms), axes, arm, tau)
+        own, axes, arm, tau = link
+        return el.eliminate(run, run(_add_link, node, own), axes, arm, tau)
 
+    # Sums over all links at once: the recursion then slices fewer arrays.
     terms = {n: v for n, v in pushes.items() if n.startswith("finger")}
-    own = (problem.matrix.link, force.link, terms)
+    own = run(_own, problem.matrix.link, force.link, terms)
     own = jax.tree.map(lambda v: jnp.moveaxis(v, -3, 0), own)
-    links = (*own, kin.axes, hand.armature, force.finger)
-    node, factors = jax.lax.scan(next_joint, _nothing(force.link[:, 0]), links, reverse=True)
+    links = (own, kin.axes, hand.armature, force.finger)
+    node, factors = scan_links(next_joint, _nothing(force.link[:, 0]), links, reverse=True)
     node = run(_add_palm, node, problem.matrix, force, pushes)
     arm = hand.wrist_armature
     node, hinges = el.eliminate(run, node, kin.wrist_axes, arm[3:], force.wrist[3:])
@@ -185,7 +187,7 @@ def newton_step(
         return motion, (a, motion)
 
     first_link = palm + jnp.zeros_like(force.link[:, 0])
-    _, (fingers, motions) = jax.lax.scan(next_link, first_link, (kin.axes, factors))
+    _, (fingers, motions) = scan_links(next_link, first_link, (kin.axes, factors))
     at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
     acc = Acc(jnp.concatenate([first, second]), fingers, at_centre)
     return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
@@ -197,17 +199,28 @@ def _nothing(like: jax.Array) -> el.Quadratic:
     return el.Quadratic(matrix, matrix, matrix, jnp.zeros_like(like), jnp.zeros_like(like))
 
 
-def _add_link(node: el.Quadratic, matrix: jax.Array, push: jax.Array, terms: dict) -> el.Quadratic:
+class Own(NamedTuple):
+    """A link's own inertia and contacts: P, C and Q alike, r and r_o; None without the object."""
+
+    matrix: jax.Array
+    push: jax.Array
+    coupling: jax.Array | None
+    wrench: jax.Array | None
+
+
+def _own(matrix: jax.Array, push: jax.Array, terms: dict) -> Own:
+    """Sums inertia, forces and contacts of the links."""
+    for inertia, wrench in terms.values():
+        matrix, push = matrix + inertia, push + wrench
+    return Own(matrix, push, *terms.get("finger_object", (None, None)))
+
+
+def _add_link(node: el.Quadratic, own: Own) -> el.Quadratic:
     """Adds a link's own inertia, forces and contacts to what its children left."""
     p, c, q, r, ro = node
-    p, r = p + matrix, r + push
-    if "finger_table" in terms:
-        inertia, wrench = terms["finger_table"]
-        p, r = p + inertia, r + wrench
-    if "finger_object" in terms:
-        inertia, wrench = terms["finger_object"]
-        p, c, q = p + inertia, c + inertia, q + inertia
-        r, ro = r + wrench, ro - wrench
+    p, r = p + own.matrix, r + own.push
+    if own.coupling is not None:
+        c, q, ro = c + own.coupling, q + own.coupling, ro - own.wrench
     return el.Quadratic(p, c, q, r, ro)
 
 

@@ -1,4 +1,4 @@
-"""Worlds shared between the CPU's cores, which JAX sees as devices if it is told so at the start."""
+"""Worlds shared between a CPU's cores, which JAX sees as devices if told so at the start."""
 
 import os
 from collections.abc import Callable
@@ -35,14 +35,12 @@ def on_all_cores(function: Callable[..., Any], *args: Any) -> Any:
     """
     worlds = jax.tree.leaves(args)[0].shape[0]
     devices = jax.devices("cpu") if jax.default_backend() == "cpu" else []
-    cores = min(len(devices), worlds // _SMALLEST)
-    if cores < 2:
+    cores = len(devices)
+    if cores < 2 or worlds < cores * _SMALLEST:
         return function(*args)
     share = -(-worlds // cores)
     order = np.arange(share * cores).reshape(share, cores).T.ravel()
-    mesh = Mesh(np.array(devices), ("core",)) if cores == len(devices) else None
-    if mesh is None:
-        return function(*args)
+    mesh = Mesh(np.array(devices), ("core",))
     dealt = jax.tree.map(lambda v: jnp.take(v, order % worlds, axis=0), args)
     spec = PartitionSpec("core")
     shared = jax.shard_map(

@@ -8,16 +8,15 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import collision, solver
 from codesign_jax.engines.structured.contact import Contacts
+from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
-from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
-
 
 LANES = 60
 """Worlds in flight on a core: their arrays fit its L2 cache."""

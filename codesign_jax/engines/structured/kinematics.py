@@ -108,7 +108,7 @@ def kinematics(
     trig = run(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
 
     def next_link(carry, link):
-        (origin, frame, vel, bias), (offset, cos, sin, rate) = carry, link
+        (origin, frame, vel, bias), ((offset, cos, sin, rate), _) = carry, link
         turn = partial(_turn_link, axis_names)
         origin, frame, subspace = run(turn, origin, frame, offset, cos, sin)
         vel, bias = run(_link_velocity, vel, bias, subspace, rate)

@@ -89,7 +89,7 @@ def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
     palm = run(palm_motion, acc.wrist, kin.wrist_axes)
 
     def step(parent: jax.Array, link: tuple):
-        motion = run(next_link, parent, *link)
+        motion = run(next_link, parent, *link[0])
         return motion, motion
 
     first = palm + jnp.zeros_like(kin.vel[:, 0])
@@ -164,15 +164,14 @@ def newton_step(
     kin, hand = problem.kin, problem.hand
 
     def next_joint(node: el.Quadratic, link: tuple):
-        own, axes, arm, tau = link
+        (axes, arm, tau), own = link
         return el.eliminate(run, run(_add_link, node, own), axes, arm, tau)
 
     # Sums over all links at once: the recursion then slices fewer arrays.
     terms = {n: v for n, v in pushes.items() if n.startswith("finger")}
     own = run(_own, problem.matrix.link, force.link, terms)
-    own = jax.tree.map(lambda v: jnp.moveaxis(v, -3, 0), own)
-    links = (own, kin.axes, hand.armature, force.finger)
-    node, factors = scan_links(next_joint, _nothing(force.link[:, 0]), links, reverse=True)
+    links = (kin.axes, hand.armature, force.finger)
+    node, factors = scan_links(next_joint, _nothing(force.link[:, 0]), links, own, reverse=True)
     node = run(_add_palm, node, problem.matrix, force, pushes)
     arm = hand.wrist_armature
     node, hinges = el.eliminate(run, node, kin.wrist_axes, arm[3:], force.wrist[3:])
@@ -183,7 +182,7 @@ def newton_step(
     second, palm = run(el.substitute, kin.wrist_axes, hinges, palm, obj)
 
     def next_link(parent: jax.Array, link: tuple):
-        a, motion = run(el.substitute, *link, parent, obj)
+        a, motion = run(el.substitute, *link[0], parent, obj)
         return motion, (a, motion)
 
     first_link = palm + jnp.zeros_like(force.link[:, 0])

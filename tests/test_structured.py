@@ -146,7 +146,7 @@ def test_a_stream_of_worlds_equals_all_in_unison():
 
         (unison, whole), _ = outcomes(0, params)
         (streamed, trace), (back, _) = outcomes(4, params)
-    assert 0 < (unison.cost == 0).sum() < len(lengths)  # some hold it, some do not
+    assert np.ptp(unison.cost) > 1.0  # they end at very different times
     # A resumed iteration recomputes what it would have carried: rounding, grown over a grasp.
     np.testing.assert_allclose(streamed.cost, unison.cost, atol=0.03)
     np.testing.assert_array_equal(streamed.status, unison.status)

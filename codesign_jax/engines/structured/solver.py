@@ -199,27 +199,33 @@ def _nothing(like: jax.Array) -> el.Quadratic:
 
 
 class Own(NamedTuple):
-    """A link's own inertia and contacts: P, C and Q alike, r and r_o; None without the object."""
+    """A link's own inertia, forces and contacts.
+
+    Attributes:
+      matrix: Inertia with that of all contacts, shape (6, 6, link, finger, world).
+      push: Force with that of all contacts, shape (6, link, finger, world).
+      object: The contacts with the object alone, alike, if the scene has them.
+    """
 
     matrix: jax.Array
     push: jax.Array
-    coupling: jax.Array | None
-    wrench: jax.Array | None
+    object: tuple[jax.Array, jax.Array] | None
 
 
 def _own(matrix: jax.Array, push: jax.Array, terms: dict) -> Own:
     """Sums inertia, forces and contacts of the links."""
     for inertia, wrench in terms.values():
         matrix, push = matrix + inertia, push + wrench
-    return Own(matrix, push, *terms.get("finger_object", (None, None)))
+    return Own(matrix, push, terms.get("finger_object"))
 
 
 def _add_link(node: el.Quadratic, own: Own) -> el.Quadratic:
     """Adds a link's own inertia, forces and contacts to what its children left."""
     p, c, q, r, ro = node
     p, r = p + own.matrix, r + own.push
-    if own.coupling is not None:
-        c, q, ro = c + own.coupling, q + own.coupling, ro - own.wrench
+    if own.object is not None:
+        coupling, wrench = own.object
+        c, q, ro = c + coupling, q + coupling, ro - wrench
     return el.Quadratic(p, c, q, r, ro)
 
 

@@ -1,12 +1,15 @@
 """The structured engine against MuJoCo C: one step in contact, and free motion step by step."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import control, model
+from codesign_jax import control, model, rollout
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.hand import hand_lanes
@@ -120,3 +123,47 @@ def test_float32_is_close_to_float64():
             assert float(info.residual.max()) < 1e-6
     error = np.linalg.norm(results[1] - results[0]) / np.linalg.norm(results[0])
     assert error < 1e-4
+
+
+def test_a_stream_of_worlds_equals_all_in_unison():
+    """Early ends, bursts and the lanes' other worlds change no verdict and no trace before it."""
+    with jax.enable_x64(True):
+        scene = small.pinch("cylinder")
+        world, trial = small.hand_world(scene, pressure=190e3)
+        lengths = np.linspace(0.07, 0.13, 10)
+        arm = world.arm + 0.08 * (np.arange(6) == 2)
+        params = small.stack(
+            *[world._replace(length=0 * world.length + x, arm=arm) for x in lengths]
+        )
+        trials = small.stack(*[trial] * len(lengths))
+
+        def outcomes(lanes, params):
+            engine = StructuredEngine(scene, tolerance=1e-16, iterations=30, lanes=lanes)
+            run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t))
+            back = jax.tree.map(lambda v: v[::-1], params)
+            found = run(params, trials), run(back, trials) if lanes else (None, None)
+            return jax.tree.map(np.asarray, found)
+
+        (unison, whole), _ = outcomes(0, params)
+        (streamed, trace), (back, _) = outcomes(4, params)
+    assert np.ptp(unison.cost) > 1.0  # they end at very different times
+    # A resumed iteration recomputes what it would have carried: rounding, grown over a grasp.
+    np.testing.assert_allclose(streamed.cost, unison.cost, atol=0.03)
+    np.testing.assert_array_equal(streamed.status, unison.status)
+    np.testing.assert_allclose(trace.distance[:, :300], whole.distance[:, :300], atol=1e-6)
+    np.testing.assert_array_equal(back.cost[::-1], streamed.cost)  # other lanes, other company
+
+
+def test_cores_share_the_worlds():
+    """Every world's result comes back to its place, whatever the number of worlds."""
+    program = """
+from codesign_jax.engines.structured import cores
+import jax, jax.numpy as jnp
+jax.config.update("jax_num_cpu_devices", 3)
+for count in (5, 24, 32):
+    x = {"a": jnp.arange(count), "b": jnp.ones((count, 2)) * jnp.arange(count)[:, None]}
+    same = jax.jit(lambda x: cores.on_all_cores(lambda y: (2 * y["a"], y["b"]), x))(x)
+    assert (same[0] == 2 * jnp.arange(count)).all() and (same[1] == x["b"]).all()
+    assert len(same[0].devices()) == (3 if count >= 24 else 1)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

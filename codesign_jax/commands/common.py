@@ -1,5 +1,6 @@
 """What the commands share: overrides, designs and JAX's compilation cache."""
 
+import contextlib
 import math
 import os
 import tomllib
@@ -14,6 +15,17 @@ from codesign_jax import schema
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
+
+
+def use_all_cores(engine: str | None) -> None:
+    """Shares the structured engine's worlds between the cores; the others see to it themselves."""
+    if engine != "structured":
+        return
+    from codesign_jax.engines.structured import cores
+
+    # JAX has been used before: whoever did chose the devices.
+    with contextlib.suppress(RuntimeError):
+        cores.use_all_cores()
 
 
 def use_compilation_cache() -> None:

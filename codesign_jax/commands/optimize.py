@@ -33,6 +33,7 @@ def main(options: "Optimize") -> int:
       SceneError: If something is wrong with the input; nothing was created then.
     """
     common.use_compilation_cache()
+    common.use_all_cores(options.engine)
     scene, settings = resolve(options)
     if options.dry_run:
         _dry_run(scene, settings)

@@ -9,13 +9,18 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import collision, implicit, mesh, solver
 from codesign_jax.engines.structured.contact import Contacts
+from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
 from codesign_jax.engines.structured.lanes import Stages, total
+from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
+
+LANES = 60
+"""Worlds in flight on a core: their arrays fit its L2 cache."""
 
 
 class StepInfo(NamedTuple):
@@ -46,8 +51,11 @@ class StructuredEngine:
         iterations: int = 24,
         evaluations: int = 6,
         tolerance: float = 1e-6,
+        differentiable: bool = False,
         checkpoint: bool = True,
         fused: bool | None = None,
+        lanes: int | None = None,
+        burst: int = 3,
     ):
         """Prepares the engine.
 
@@ -56,10 +64,15 @@ class StructuredEngine:
           iterations: Largest number of Newton iterations a step.
           evaluations: Line-search evaluations an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
+          differentiable: Whether `rollout` can be differentiated: all worlds step in unison. Needs
+            a tighter tolerance, as the derivative is that of the solution.
           checkpoint: Whether the derivative of a rollout stores only states and accelerations and
             repeats the rest of each step; costs nothing without a derivative.
-          fused: Whether one GPU kernel runs a rollout (float32, primitive shapes, no trajectory);
-            it has no derivative. By default on a GPU.
+          fused: Whether one GPU kernel runs a rollout (float32, primitive shapes, no trajectory).
+            By default on a GPU.
+          lanes: Worlds in flight at once, see `stream`; 0 steps all worlds in unison. By default
+            `LANES` on a CPU and 0 elsewhere.
+          burst: Newton iterations of a round of the stream.
 
         Raises:
           SceneError: If a mesh's distance cannot be put on a grid.
@@ -69,7 +82,10 @@ class StructuredEngine:
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
-        self.fused = jax.default_backend() == "gpu" if fused is None else fused
+        fused = jax.default_backend() == "gpu" if fused is None else fused
+        lanes = (LANES if self.conditional else 0) if lanes is None else lanes
+        self.fused, self.lanes = fused and not differentiable, 0 if differentiable else lanes
+        self.burst = burst
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -137,7 +153,9 @@ class StructuredEngine:
         found["object_table"] = collision.object_on_table(run, scene, hand, kin, height)
         return found
 
-    def step(self, hand: HandLanes, state: State, ctrl: jax.Array) -> tuple[State, StepInfo]:
+    def step(
+        self, hand: HandLanes, state: State, ctrl: jax.Array, *, iterations: int | None = None
+    ) -> tuple[State, StepInfo]:
         """Advances a batch by one time step under controls of shape (nu, world)."""
         # The compiler does not know that a shape's index is never negative.
         run = Stages(hand.shape[0, 0] >= 0 if self.conditional else None)
@@ -147,7 +165,7 @@ class StructuredEngine:
             problem,
             velocity,
             state.acc,
-            iterations=self.iterations,
+            iterations=iterations or self.iterations,
             evaluations=self.evaluations,
             tolerance=self.tolerance,
         )
@@ -170,6 +188,8 @@ class StructuredEngine:
         if self.fused and primitive and not trajectory and ctrl.dtype == jnp.float32:
             return self._one_kernel(fields, ctrl)
         with jax.default_matmul_precision("highest"):
+            if self.lanes:
+                return on_all_cores(partial(self._stream, trajectory=trajectory), fields, ctrl)
             return self._rollout(fields, ctrl, trajectory)
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array) -> Trace:
@@ -182,6 +202,26 @@ class StructuredEngine:
         )
         qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
         return Trace(found["distance"], found["height"], found["speed"], qpos)
+
+    def _stream(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
+        def advance(hand: HandLanes, state: State, u: jax.Array):
+            new, info = self.step(hand, state, u, iterations=self.burst)
+            resumed = state._replace(acc=info.acc)
+            # Not `<=`: a world that is no longer finite must advance, to fail.
+            solved = ~(info.residual[0] > self.tolerance)
+            return new, resumed, solved, info.centre
+
+        queue = Queue(hand_lanes(self.scene, fields), self.reset(fields), ctrl)
+        return stream(
+            self.scene,
+            queue,
+            advance,
+            self._speed,
+            self.qpos,
+            lanes=self.lanes,
+            max_rounds=-(-self.iterations // self.burst),
+            trajectory=trajectory,
+        )
 
     def _rollout(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
         hand, limits = hand_lanes(self.scene, fields), self.scene.limits

@@ -12,7 +12,14 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, rotation_columns
-from codesign_jax.engines.structured.lanes import Stages, cross, motion_cross, rotate, spatial
+from codesign_jax.engines.structured.lanes import (
+    Stages,
+    cross,
+    motion_cross,
+    rotate,
+    scan_links,
+    spatial,
+)
 
 # Axis of the frame about which each hinge turns, in the order bend (y), lateral (z), twist (x).
 _HINGE = {"bend": 1, "lateral": 2, "twist": 0}
@@ -101,7 +108,7 @@ def kinematics(
     trig = run(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
 
     def next_link(carry, link):
-        (origin, frame, vel, bias), (offset, cos, sin, rate) = carry, link
+        (origin, frame, vel, bias), ((offset, cos, sin, rate), _) = carry, link
         turn = partial(_turn_link, axis_names)
         origin, frame, subspace = run(turn, origin, frame, offset, cos, sin)
         vel, bias = run(_link_velocity, vel, bias, subspace, rate)
@@ -110,7 +117,7 @@ def kinematics(
     over = (hand.offset, *trig, state.finger_vel)
     lanes = jnp.zeros_like(hand.offset[0])
     first = (origin, frame, vel + lanes, bias + lanes)
-    _, (origins, frames, vels, biases, axes) = jax.lax.scan(next_link, first, over)
+    _, (origins, frames, vels, biases, axes) = scan_links(next_link, first, over)
     columns, position, object_vel = run(_object, state)
     return Kinematics(
         palm=palm,

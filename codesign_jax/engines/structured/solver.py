@@ -26,6 +26,7 @@ from codesign_jax.engines.structured.lanes import (
     Stages,
     cross,
     dot,
+    scan_links,
     spatial,
     sum_axis,
     sum_fingers,
@@ -88,11 +89,11 @@ def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
     palm = run(palm_motion, acc.wrist, kin.wrist_axes)
 
     def step(parent: jax.Array, link: tuple):
-        motion = run(next_link, parent, *link)
+        motion = run(next_link, parent, *link[0])
         return motion, motion
 
     first = palm + jnp.zeros_like(kin.vel[:, 0])
-    _, links = jax.lax.scan(step, first, (kin.axes, acc.finger))
+    _, links = scan_links(step, first, (kin.axes, acc.finger))
     angular = acc.object[:3]
     obj = spatial(angular, acc.object[3:] + cross(kin.object_pos, angular))
     return Spatial(palm, jnp.moveaxis(links, 0, 1), obj)
@@ -163,14 +164,14 @@ def newton_step(
     kin, hand = problem.kin, problem.hand
 
     def next_joint(node: el.Quadratic, link: tuple):
-        matrix, push, terms, axes, arm, tau = link
-        return el.eliminate(run, run(_add_link, node, matrix, push, terms), axes, arm, tau)
+        (axes, arm, tau), own = link
+        return el.eliminate(run, run(_add_link, node, own), axes, arm, tau)
 
+    # Sums over all links at once: the recursion then slices fewer arrays.
     terms = {n: v for n, v in pushes.items() if n.startswith("finger")}
-    own = (problem.matrix.link, force.link, terms)
-    own = jax.tree.map(lambda v: jnp.moveaxis(v, -3, 0), own)
-    links = (*own, kin.axes, hand.armature, force.finger)
-    node, factors = jax.lax.scan(next_joint, _nothing(force.link[:, 0]), links, reverse=True)
+    own = run(_own, problem.matrix.link, force.link, terms)
+    links = (kin.axes, hand.armature, force.finger)
+    node, factors = scan_links(next_joint, _nothing(force.link[:, 0]), links, own, reverse=True)
     node = run(_add_palm, node, problem.matrix, force, pushes)
     arm = hand.wrist_armature
     node, hinges = el.eliminate(run, node, kin.wrist_axes, arm[3:], force.wrist[3:])
@@ -181,11 +182,11 @@ def newton_step(
     second, palm = run(el.substitute, kin.wrist_axes, hinges, palm, obj)
 
     def next_link(parent: jax.Array, link: tuple):
-        a, motion = run(el.substitute, *link, parent, obj)
+        a, motion = run(el.substitute, *link[0], parent, obj)
         return motion, (a, motion)
 
     first_link = palm + jnp.zeros_like(force.link[:, 0])
-    _, (fingers, motions) = jax.lax.scan(next_link, first_link, (kin.axes, factors))
+    _, (fingers, motions) = scan_links(next_link, first_link, (kin.axes, factors))
     at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
     acc = Acc(jnp.concatenate([first, second]), fingers, at_centre)
     return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
@@ -197,17 +198,34 @@ def _nothing(like: jax.Array) -> el.Quadratic:
     return el.Quadratic(matrix, matrix, matrix, jnp.zeros_like(like), jnp.zeros_like(like))
 
 
-def _add_link(node: el.Quadratic, matrix: jax.Array, push: jax.Array, terms: dict) -> el.Quadratic:
+class Own(NamedTuple):
+    """A link's own inertia, forces and contacts.
+
+    Attributes:
+      matrix: Inertia with that of all contacts, shape (6, 6, link, finger, world).
+      push: Force with that of all contacts, shape (6, link, finger, world).
+      object: The contacts with the object alone, alike, if the scene has them.
+    """
+
+    matrix: jax.Array
+    push: jax.Array
+    object: tuple[jax.Array, jax.Array] | None
+
+
+def _own(matrix: jax.Array, push: jax.Array, terms: dict) -> Own:
+    """Sums inertia, forces and contacts of the links."""
+    for inertia, wrench in terms.values():
+        matrix, push = matrix + inertia, push + wrench
+    return Own(matrix, push, terms.get("finger_object"))
+
+
+def _add_link(node: el.Quadratic, own: Own) -> el.Quadratic:
     """Adds a link's own inertia, forces and contacts to what its children left."""
     p, c, q, r, ro = node
-    p, r = p + matrix, r + push
-    if "finger_table" in terms:
-        inertia, wrench = terms["finger_table"]
-        p, r = p + inertia, r + wrench
-    if "finger_object" in terms:
-        inertia, wrench = terms["finger_object"]
-        p, c, q = p + inertia, c + inertia, q + inertia
-        r, ro = r + wrench, ro - wrench
+    p, r = p + own.matrix, r + own.push
+    if own.object is not None:
+        coupling, wrench = own.object
+        c, q, ro = c + coupling, q + coupling, ro - wrench
     return el.Quadratic(p, c, q, r, ro)
 
 
@@ -328,7 +346,7 @@ def solve(
     }
 
     def body(carry):
-        acc, motion, jar, _, count = carry
+        acc, motion, jar, before, count = carry
         inertial = inertial_forces(run, problem, acc, motion)
         force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))
         pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items()}
@@ -340,14 +358,16 @@ def solve(
             for n, c in contacts.items()
         }
         alpha = line_search(runs, contacts, jar, jar_step, slope, curvature, evaluations)
-        decrement = _decrement(slope, pushes, step_motion)
+        # A world that is done stays as it is, so that its result does not depend on the others.
+        done = before <= tolerance
+        alpha = jnp.where(done, 0.0, alpha)
+        residual = _decrement(slope, pushes, step_motion) / _scale(problem, motion)
 
         def advance(old, new):
             return jax.tree.map(lambda a, p: a + alpha * p, old, new)
 
-        scale = _scale(problem, motion)
         acc, motion, jar = advance((acc, motion, jar), (step, step_motion, jar_step))
-        return acc, motion, jar, decrement / scale, count + 1
+        return acc, motion, jar, jnp.where(done, before, residual), count + 1
 
     def going(carry):
         return (carry[4] < iterations) & jnp.any(carry[3] > tolerance)

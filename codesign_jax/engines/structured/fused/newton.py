@@ -326,12 +326,18 @@ class Newton:
           tolerance: Relative Newton decrement.
         """
 
+        def hold(before, alpha, residual):
+            # A world that had converged stays, so that it does not depend on its neighbours.
+            going = before > tolerance
+            return jnp.where(going, alpha, 0.0), jnp.where(going, residual, before)
+
         def body(carry: list) -> list:
-            count, now = carry[0], rebuild(carry[1:])[0]
+            count, (now, before) = carry[0], rebuild(carry[1:])
             step = self.at_palm(now, self.backward())
             slope, curvature, first = self.forward(now, step)
             alpha = self.line_search(slope, curvature, first, evaluations)
             residual = lanewise(_residual, slope, first, self.palm, now.object_motion)
+            alpha, residual = lanewise(hold, before, alpha, residual)
             new = self.advance(now, step, alpha)
             return [count + 1, *solid((new, residual), self.block.size)[0]]
 

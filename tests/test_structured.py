@@ -1,5 +1,6 @@
 """The structured engine against MuJoCo C: one step in contact, and free motion step by step."""
 
+import dataclasses
 import subprocess
 import sys
 
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import control, model, rollout
+from codesign_jax import control, cost, model, rollout
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.hand import hand_lanes
@@ -125,33 +126,40 @@ def test_float32_is_close_to_float64():
     assert error < 1e-4
 
 
-def test_a_stream_of_worlds_equals_all_in_unison():
-    """Early ends, bursts and the lanes' other worlds change no verdict and no trace before it."""
+def test_streamed_worlds():
+    """Early ends change no verdict, the lanes' other worlds no bit, and the motion is the same."""
     with jax.enable_x64(True):
         scene = small.pinch("cylinder")
+        # On the way to this distance nothing is ever decided: every world runs to the end.
+        patient = dataclasses.replace(
+            scene, cost=dataclasses.replace(scene.cost, lost_distance=1e3)
+        )
         world, trial = small.hand_world(scene, pressure=190e3)
         lengths = np.linspace(0.07, 0.13, 10)
         arm = world.arm + 0.08 * (np.arange(6) == 2)
         params = small.stack(
             *[world._replace(length=0 * world.length + x, arm=arm) for x in lengths]
         )
+        back = jax.tree.map(lambda v: v[::-1], params)
         trials = small.stack(*[trial] * len(lengths))
 
-        def outcomes(lanes, params):
+        def traces(scene, lanes, *batches):
             engine = StructuredEngine(scene, tolerance=1e-16, iterations=30, lanes=lanes)
-            run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t))
-            back = jax.tree.map(lambda v: v[::-1], params)
-            found = run(params, trials), run(back, trials) if lanes else (None, None)
-            return jax.tree.map(np.asarray, found)
+            run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t)[1])
+            return [jax.tree.map(np.asarray, run(p, trials)) for p in batches]
 
-        (unison, whole), _ = outcomes(0, params)
-        (streamed, trace), (back, _) = outcomes(4, params)
-    assert np.ptp(unison.cost) > 1.0  # they end at very different times
-    # A resumed iteration recomputes what it would have carried: rounding, grown over a grasp.
-    np.testing.assert_allclose(streamed.cost, unison.cost, atol=0.03)
-    np.testing.assert_array_equal(streamed.status, unison.status)
-    np.testing.assert_allclose(trace.distance[:, :300], whole.distance[:, :300], atol=1e-6)
-    np.testing.assert_array_equal(back.cost[::-1], streamed.cost)  # other lanes, other company
+        (unison,) = traces(scene, 0, params)
+        early, reverse = traces(scene, 4, params, back)
+        (full,) = traces(patient, 4, params)
+        read = jax.vmap(lambda t: cost.outcome(scene, t))
+        short, long = (jax.tree.map(np.asarray, read(t)) for t in (early, full))
+    assert np.ptp(short.cost) > 1.0  # they end at very different times
+    for field, whole in zip(short, long, strict=True):
+        np.testing.assert_array_equal(field, whole)
+    np.testing.assert_array_equal(reverse.distance[::-1], early.distance)
+    # Resumed iterations differ by rounding. From the lift on slipping multiplies a difference by
+    # ten every three steps, a change of 1e-14 in the length as well, so the comparison ends there.
+    np.testing.assert_allclose(full.distance[:, :380], unison.distance[:, :380], atol=1e-10)
 
 
 def test_cores_share_the_worlds():

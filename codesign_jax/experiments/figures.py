@@ -53,7 +53,8 @@ def convergence(study: Study, path: Path) -> Path:
     """Draws Figs. 7b and 9b: median episodes to convergence, with the quartiles.
 
     Runs that did not converge take part as slower than all others; above the upper line is where
-    they are.  Hollow dots are medians of the converged runs alone.
+    they are.  Hollow dots are medians of the converged runs alone, whose number
+    stands under the strategy.
     """
     figure, axes = _axes()
     episodes, limit = study.convergence(), study.plan["episodes"]
@@ -67,11 +68,9 @@ def convergence(study: Study, path: Path) -> Path:
     ]
     axes.plot(at, alone, "o", mfc="none", color="tab:orange", ms=9, label="converged runs alone")
     axes.axhline(limit, color="black", lw=1, ls="--")
-    axes.text(at[-1] + 0.45, limit, "not converged ", ha="right", va="bottom", fontsize=8)
-    for x, count in zip(at, converged.sum(1), strict=True):
-        axes.text(x, 0.5, f"{count}/{episodes.shape[1]}", ha="center", va="bottom", fontsize=8)
-    axes.set(ylabel="episodes until converged", ylim=(0, 1.15 * limit))
-    _strategies(axes, study)
+    axes.text(len(at) - 0.55, limit, "not converged", ha="right", va="bottom", fontsize=8)
+    axes.set(ylabel="episodes until converged", ylim=(0, 1.15 * limit), xlim=(-0.5, len(at) - 0.5))
+    _strategies(axes, study, [f"{n}/{episodes.shape[1]}" for n in converged.sum(1)])
     return _save(figure, path)
 
 
@@ -103,8 +102,11 @@ def _axes(width: float = 6.0, height: float = 3.4):
     return figure, figure.add_subplot()
 
 
-def _strategies(axes, study: Study) -> None:
-    axes.set_xticks(range(len(study.strategies)), [label(s) for s in study.strategies])
+def _strategies(axes, study: Study, below: list[str] | None = None) -> None:
+    labels = [label(s) for s in study.strategies]
+    if below:
+        labels = [f"{name}\n{text}" for name, text in zip(labels, below, strict=True)]
+    axes.set_xticks(range(len(labels)), labels)
     axes.set_xlabel("strategy (s.d.: single domain; number of switches; conc.: concurrent)")
     axes.legend(frameon=False, fontsize=8, loc="best")
 

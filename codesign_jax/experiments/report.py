@@ -135,13 +135,14 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
 
 
 def _growth_row(two: Study, many: Study) -> tuple[str, str]:
-    few = statistics.median(two.convergence()[-1] * two.per_episode)
-    most = statistics.median(many.convergence()[-1] * many.per_episode)
     parameters = len(many.data["parameters"]) / len(two.data["parameters"])
-    growth = most.value / few.value if np.isfinite([most.value, few.value]).all() else np.nan
+    growth = statistics.ratio_of_medians(
+        many.convergence()[-1] * many.per_episode, two.convergence()[-1] * two.per_episode
+    )
+    text = "not defined" if np.isnan(growth.value) else _interval(growth, 3)
     return (
         "2 to 23 parameters: 11.5 times the parameters, 14.6 times the simulations",
-        f"{parameters:.1f} times the parameters, {growth:.1f} times the simulations",
+        f"{parameters:.1f} times the parameters, {text} times the simulations",
     )
 
 
@@ -178,12 +179,13 @@ def _percent(rate: Interval) -> str:
     return f"{100 * rate.value:.0f} % [{100 * rate.low:.0f}, {100 * rate.high:.0f}]"
 
 
-def _interval(value: Interval) -> str:
-    return f"{_number(value.value)} [{_number(value.low)}, {_number(value.high)}]"
+def _interval(value: Interval, digits: int = 10) -> str:
+    middle, low, high = (_number(v, digits) for v in value)
+    return f"{middle} [{low}, {high}]"
 
 
-def _number(value: float) -> str:
-    return "never" if not np.isfinite(value) else f"{value:,.10g}"
+def _number(value: float, digits: int = 10) -> str:
+    return "never" if np.isposinf(value) else f"{value:,.{digits}g}"
 
 
 def _p(value: float) -> str:

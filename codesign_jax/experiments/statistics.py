@@ -95,13 +95,16 @@ def wilson(successes: int, total: int) -> Interval:
     return Interval(p, min(p, max(0.0, centre - half)), max(p, min(1.0, centre + half)))
 
 
-def quantile(values: np.ndarray, q: float, axis: int = -1) -> np.ndarray:
-    """Quantile of numbers some of which are infinite: the mean of two neighbours or one of them.
+def quantile(values: np.ndarray, q: float) -> np.ndarray:
+    """Quantile over the last axis, also where numbers are infinite.
 
-    Interpolation would turn an infinite neighbour of weight zero into nan.
+    The median of an even count is the mean of two, elsewhere it is one of the numbers: NumPy's
+    "averaged_inverted_cdf", whose interpolation turns two infinite neighbours into nan.
     """
-    with np.errstate(invalid="ignore"):
-        return np.quantile(values, q, axis=axis, method="averaged_inverted_cdf")
+    rank = values.shape[-1] * q
+    first, second = (max(int(np.ceil(rank)) - 1, 0), min(int(rank), values.shape[-1] - 1))
+    ordered = np.sort(values, axis=-1)
+    return (ordered[..., first] + ordered[..., second]) / 2
 
 
 def bootstrap(values: np.ndarray, statistic, *, seed: int = 0) -> Interval:
@@ -125,6 +128,17 @@ def bootstrap(values: np.ndarray, statistic, *, seed: int = 0) -> Interval:
 def median(values: np.ndarray, *, seed: int = 0) -> Interval:
     """Median over runs with its bootstrap interval; values have shape (run,)."""
     return bootstrap(values, lambda v: quantile(v, 0.5), seed=seed)
+
+
+def ratio_of_medians(a: np.ndarray, b: np.ndarray) -> Interval:
+    """Median of a over that of b, of independent runs, with its bootstrap interval."""
+    draws = np.random.default_rng(0)
+    drawn = [quantile(v[draws.integers(0, v.size, (_RESAMPLES, v.size))], 0.5) for v in (a, b)]
+    with np.errstate(invalid="ignore"):
+        ratios = np.nan_to_num(drawn[0] / drawn[1], nan=np.inf, posinf=np.inf)
+        value = float(quantile(a, 0.5) / quantile(b, 0.5))
+    low, high = (float(quantile(ratios, q)) for q in (0.025, 0.975))
+    return Interval(value, low, high)
 
 
 def mcnemar(a: np.ndarray, b: np.ndarray) -> float:

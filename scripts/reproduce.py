@@ -87,8 +87,10 @@ def main() -> int:
     args = parse()
     if args.experiment != "figures":
         return simulate(args)
-    from codesign_jax.experiments import report
-
+    try:
+        from codesign_jax.experiments import report
+    except ModuleNotFoundError as error:
+        sys.exit(f"error: {error.name} is missing: pip install 'codesign-jax[study]'")
     print(report.make(args.data, args.figures, args.page))
     return 0
 

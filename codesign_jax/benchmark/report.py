@@ -83,6 +83,10 @@ def measured(results: dict[str, Any], kind: str) -> list[dict[str, Any]]:
     ]
 
 
+def _head(names: str) -> list[list[str]]:
+    return [[str(name) for name in names.split(", ")]]
+
+
 def _number(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
 
@@ -97,7 +101,7 @@ def grasp_table(results: dict[str, Any]) -> list[list[str]]:
     """Whole grasps: rates, compile time, memory and verdicts."""
     head = "engine, setting, worlds, grasps/s, nominal steps/s, simulated steps/s, simulated share"
     head += ", compile s (cached), memory MiB, same verdict, rank correlation, stops early"
-    rows = [head.split(", ")]
+    rows = _head(head)
     for r in measured(results, "grasp"):
         a, early = r.get("agreement", {}), r["stops_early"]
         rows.append(
@@ -122,7 +126,7 @@ def grasp_table(results: dict[str, Any]) -> list[list[str]]:
 def window_table(results: dict[str, Any]) -> list[list[str]]:
     """Short rollouts in contact, with the errors of the accelerations."""
     errors = {(r["engine"], r["setting"]): r for r in measured(results, "residual")}
-    rows = ["engine, setting, worlds, steps, steps/s, error median, error 99 %".split(", ")]
+    rows = _head("engine, setting, worlds, steps, steps/s, error median, error 99 %")
     for r in measured(results, "window"):
         e = errors.get((r["engine"], r["setting"]), {})
         rows.append(
@@ -142,7 +146,7 @@ def window_table(results: dict[str, Any]) -> list[list[str]]:
 def quality_table(results: dict[str, Any]) -> list[list[str]]:
     """Iterations and decrements of the structured engine."""
     head = "setting, iterations mean, largest, at the cap, decrement median, 99 %, above tolerance"
-    rows = [head.split(", ")]
+    rows = _head(head)
     for r in measured(results, "quality"):
         rows.append(
             [

@@ -2,6 +2,8 @@
 
 Importing this module needs the package `warp`; MJX brings MuJoCo Warp itself along.
 """
+# pyright: reportInvalidTypeForm=false
+# Warp's kernels declare their arrays by calls in annotations.
 
 import time
 from importlib import import_module
@@ -19,8 +21,8 @@ try:
 except ImportError:
     mjw = import_module("mujoco.mjx.third_party.mujoco_warp")
 
-# Contacts and constraint rows that Warp allocates for each world.  Its documentation asks for as few
-# as are never exceeded; `overflow` says if they were.
+# Contacts and constraint rows that Warp allocates for each world.  Its documentation asks for as
+# few as are never exceeded; Warp prints a warning if they are.
 CONTACTS, ROWS = 64, 192
 # Not in Warp's model: it derives the inertia of free bodies.
 _ABSENT = ("start", "dof_M0")

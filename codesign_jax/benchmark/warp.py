@@ -5,10 +5,12 @@ Importing this module needs the package `warp`; MJX brings MuJoCo Warp itself al
 # pyright: reportInvalidTypeForm=false
 # Warp's kernels declare their arrays by calls in annotations.
 
+import copy
 import time
 from importlib import import_module
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from codesign_jax.model import ModelFields, compile_template, layout
@@ -84,7 +86,9 @@ class WarpProgram:
           trajectory: Whether to return qpos of every step, by way of the host.
         """
         self.trajectory, self.worlds, self.steps = trajectory, *ctrl.shape[:2]
-        template, lay = compile_template(scene), layout(scene)
+        template, lay = copy.deepcopy(compile_template(scene)), layout(scene)
+        # Warp never resets a world and refuses the flag that asks for that.
+        template.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         begin = time.perf_counter()
         names = [n for n in ModelFields._fields if n not in _ABSENT]
         self.model = mjw.put_model(template, dict.fromkeys(names, self.worlds))

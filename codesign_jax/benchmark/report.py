@@ -8,7 +8,7 @@ import numpy as np
 
 from codesign_jax.benchmark import peers, statistics, work
 
-_KEY = ("engine", "setting", "kind", "worlds", "variant", "growth")
+KEY = ("engine", "setting", "kind", "worlds", "variant", "growth")
 
 
 def reference_key() -> str:
@@ -38,7 +38,7 @@ def add(results: dict[str, Any], record: dict[str, Any], reference: list[float])
         record["agreement"] = statistics.agreement(costs, reference, work.TRIALS)
 
     def key(r: dict[str, Any]) -> list:
-        return [r.get(k) for k in _KEY]
+        return [r.get(k) for k in KEY]
 
     kept = [r for r in results["records"] if key(r) != key(record)]
     results["records"] = [*kept, record]
@@ -171,6 +171,10 @@ def growth_table(results: dict[str, Any]) -> list[list[str]]:
             slope = exponent(*map(list, zip(*upper, strict=True))) if len(upper) > 1 else None
             text = ", ".join(f"{int(n)}: {cost:,.3g}" for n, cost in points)
             rows.append([engine, name, text, _number(slope, ".2f")])
+    for r in results["records"]:
+        if r.get("growth") and "hand_name" in r["variant"] and "median_s" in r:
+            cost = 1e6 / r["nominal_world_steps_per_s"]
+            rows.append([r["engine"], "hand", f"{r['variant']['hand_name']}: {cost:,.3g}", "–"])
     return rows
 
 

@@ -48,7 +48,7 @@ def _velocity(
     qvel: wp.array2d(dtype=float), step: wp.array(dtype=int), out: wp.array3d(dtype=float)
 ):
     world = wp.tid()
-    top = 0.0
+    top = wp.float32(0.0)  # a plain literal would be a constant to Warp
     for i in range(qvel.shape[1]):
         value = wp.abs(qvel[world, i])
         if not (value <= top):

@@ -9,12 +9,13 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
-.PHONY: demo test test-slow notebooks lint format types clean help
+.PHONY: demo test test-slow notebooks benchmark lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
+	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
 	@echo "make format      ruff format          make clean       remove what make built"
 
 demo: $(STAMP)
@@ -28,6 +29,11 @@ test-slow: $(STAMP)
 
 notebooks: $(STAMP)
 	$(BIN)/python scripts/run_notebooks.py
+
+# About 40 minutes; a file that exists is extended.
+BENCHMARK ?= runs/benchmark.json
+benchmark: $(STAMP)
+	$(BIN)/python scripts/benchmark.py --json $(BENCHMARK) $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(CHECKED)

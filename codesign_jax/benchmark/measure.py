@@ -1,0 +1,138 @@
+"""Times, memory and provenance of a measurement."""
+
+import datetime
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+
+def provenance() -> dict:
+    """Command, commit, versions, device and date."""
+    device = jax.devices()[0]
+    return {
+        "command": " ".join(["python", *sys.argv]),
+        "commit": commit(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+        "numpy": np.__version__,
+        "warp": warp_version(),
+        "platform": device.platform,
+        "device": device.device_kind,
+        "cpu": cpu_name(),
+        "cpus": len(os.sched_getaffinity(0)),
+        "load": os.getloadavg()[0],
+    }
+
+
+def commit() -> str | None:
+    """The checkout's commit, "+" behind it if files differ; None outside a checkout."""
+
+    def git(*command: str) -> str:
+        run = subprocess.run(["git", *command], capture_output=True, text=True, check=False)
+        return run.stdout.strip()
+
+    name = git("rev-parse", "--verify", "-q", "HEAD")
+    changed = git("status", "--porcelain", "--untracked-files=no") if name else ""
+    return name + ("+" if changed else "") if name else None
+
+
+def warp_version() -> str | None:
+    """Warp's version if it is installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("warp-lang")
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def cpu_name() -> str:
+    """The processor's name as the system gives it."""
+    try:
+        with open("/proc/cpuinfo") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if "model name" in line]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor()
+
+
+def peak_memory() -> int:
+    """Largest memory so far [byte]: of the device if it counts, else of this process."""
+    stats = jax.devices()[0].memory_stats() or {}
+    if "peak_bytes_in_use" in stats:
+        return int(stats["peak_bytes_in_use"])
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+class JaxProgram:
+    """A function of arrays, compiled; runs return its results on the host's clock."""
+
+    def __init__(self, function: Callable, *args: Any):
+        """Compiles the function for its arguments; the persistent cache must be off or empty."""
+        self.function, self.args = function, args
+        self.compiled, self.times = self._compile()
+
+    def _compile(self) -> tuple[Any, dict]:
+        start = time.perf_counter()
+        lowered = jax.jit(self.function).lower(*self.args)
+        middle = time.perf_counter()
+        compiled = lowered.compile()
+        end = time.perf_counter()
+        return compiled, {"trace_s": middle - start, "compile_s": end - middle}
+
+    def cached_compile(self) -> float:
+        """Seconds of a second compile that finds the first one in the persistent cache."""
+        jax.clear_caches()
+        return self._compile()[1]["compile_s"]
+
+    def run(self) -> tuple[Any, float]:
+        """Runs once; returns results and seconds."""
+        start = time.perf_counter()
+        result = jax.block_until_ready(self.compiled(*self.args))
+        return result, time.perf_counter() - start
+
+
+def use_fresh_cache() -> None:
+    """Points JAX's persistent compilation cache at a new folder."""
+    jax.config.update("jax_compilation_cache_dir", tempfile.mkdtemp(prefix="benchmark-cache-"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def repeat(run: Callable[[], tuple[Any, float]], repeats: int, until: float) -> tuple[Any, dict]:
+    """Runs once to warm up and then repeatedly.
+
+    Args:
+      run: Returns results and seconds.
+      repeats: Timed runs.
+      until: `time.monotonic` after which no further run is begun.
+
+    Returns:
+      Results of the last run, and all seconds; "seconds" holds the warm-up if there was no time for
+      more.
+    """
+    result, first = run()
+    seconds: list[float] = []
+    while len(seconds) < repeats and time.monotonic() + first < until:
+        result, taken = run()
+        seconds.append(taken)
+    kept = seconds or [first]
+    return result, {
+        "first_s": first,
+        "seconds": kept,
+        "median_s": statistics.median(kept),
+        "warm": bool(seconds),
+    }

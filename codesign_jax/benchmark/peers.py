@@ -1,0 +1,75 @@
+"""Engines and the settings at which they are measured."""
+
+import inspect
+from typing import Any
+
+import jax
+
+from codesign_jax.engines import Engine, make_engine
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.scene import Scene
+
+# "equal" solves the scene's own tolerance; "documented" is what the engine's documentation advises:
+# MuJoCo's defaults for C and for Warp; for MJX as few iterations as remain stable, often one (its
+# own speed test: one, with four line-search iterations).
+_MUJOCO_DEFAULT = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8}
+SOLVERS: dict[str, dict[str, dict[str, Any]]] = {
+    "mujoco": {"equal": {}, "documented": _MUJOCO_DEFAULT},
+    "mjx": {"equal": {}, "documented": {"iterations": 1, "ls_iterations": 4}},
+    "warp": {"equal": {}, "documented": _MUJOCO_DEFAULT},
+}
+# Arguments of the structured engine, whose tolerance is its own (a relative Newton decrement).
+STRUCTURED: dict[str, dict[str, Any]] = {
+    "default": {},
+    "tight": {"iterations": 48, "tolerance": 1e-8},
+    "loose": {"iterations": 6, "tolerance": 1e-4},
+    "unison": {"lanes": 0},
+}
+REFERENCE = {"iterations": 300, "ls_iterations": 100, "tolerance": 1e-15}
+"""Solver values at which MuJoCo C finds the solution to rounding."""
+
+
+def settings(engine: str) -> list[str]:
+    """Names of an engine's settings."""
+    return list(STRUCTURED if engine == "structured" else SOLVERS[engine])
+
+
+def solver_values(engine: str, setting: str) -> dict[str, Any]:
+    """Values of the scene's solver table for an engine at a setting."""
+    if engine == "reference":
+        return REFERENCE
+    return {} if engine == "structured" else SOLVERS[engine][setting]
+
+
+def build(engine: str, setting: str, scene: Scene) -> Engine:
+    """Builds an engine behind the common interface.
+
+    Args:
+      engine: Name.
+      setting: Name of the setting; the scene must have its solver values already.
+      scene: The scene.
+    """
+    if engine == "reference":
+        return make_engine("mujoco", scene)
+    if engine != "structured":
+        return make_engine(engine, scene)
+    arguments = dict(STRUCTURED[setting])
+    known = inspect.signature(StructuredEngine.__init__).parameters
+    if setting == "unison" and "lanes" not in known:
+        arguments.pop("lanes")
+    built = StructuredEngine(scene, **arguments)
+    if setting == "unison" and hasattr(built, "fused"):
+        built.fused = False  # the batch engine instead of the kernel, whose blocks run on their own
+    return built
+
+
+def how(engine: str, setting: str) -> str:
+    """What runs, in words."""
+    if engine != "structured":
+        return {"mujoco": "MuJoCo C, float64, all cores", "mjx": "stock MJX (JAX)"}.get(
+            engine, "MuJoCo Warp, one CUDA graph a step"
+        )
+    on_gpu = jax.default_backend() == "gpu"
+    if setting == "unison":
+        return "XLA, all worlds step in unison"
+    return "one kernel a rollout" if on_gpu else "XLA"

@@ -1,0 +1,158 @@
+"""MuJoCo Warp on the same fields and controls: a captured graph of one step, launched repeatedly.
+
+Importing this module needs the package `warp`; MJX brings MuJoCo Warp itself along.
+"""
+# pyright: reportInvalidTypeForm=false
+# Warp's kernels declare their arrays by calls in annotations.
+
+import copy
+import time
+from importlib import import_module
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax.scene import Scene
+from codesign_jax.types import Trace
+
+wp: Any = import_module("warp")
+try:
+    mjw: Any = import_module("mujoco_warp")
+except ImportError:
+    mjw = import_module("mujoco.mjx.third_party.mujoco_warp")
+
+# Contacts and constraint rows that Warp allocates for each world.  Its documentation asks for as
+# few as are never exceeded; Warp prints a warning if they are.
+CONTACTS, ROWS = 64, 192
+# Not in Warp's model: it derives the inertia of free bodies.
+_ABSENT = ("start", "dof_M0")
+
+
+@wp.kernel
+def _count(step: wp.array(dtype=int)):
+    step[0] = step[0] + 1
+
+
+@wp.kernel
+def _command(
+    table: wp.array3d(dtype=float), step: wp.array(dtype=int), ctrl: wp.array2d(dtype=float)
+):
+    world, k = wp.tid()
+    ctrl[world, k] = table[step[0], world, k]
+
+
+@wp.kernel
+def _velocity(
+    qvel: wp.array2d(dtype=float), step: wp.array(dtype=int), out: wp.array3d(dtype=float)
+):
+    world = wp.tid()
+    top = wp.float32(0.0)  # a plain literal would be a constant to Warp
+    for i in range(qvel.shape[1]):
+        value = wp.abs(qvel[world, i])
+        if not (value <= top):
+            top = value
+    out[step[0], world, 2] = top
+
+
+@wp.kernel
+def _places(
+    xipos: wp.array2d(dtype=wp.vec3),
+    weights: wp.array(dtype=float),
+    thing: int,
+    step: wp.array(dtype=int),
+    out: wp.array3d(dtype=float),
+):
+    world = wp.tid()
+    centre = wp.vec3(0.0, 0.0, 0.0)
+    for i in range(weights.shape[0]):
+        centre = centre + weights[i] * xipos[world, i]
+    place = xipos[world, thing]
+    out[step[0], world, 0] = wp.length(place - centre)
+    out[step[0], world, 1] = place[2]
+
+
+class WarpProgram:
+    """A rollout of worlds; has the times and the `run` of `measure.JaxProgram`."""
+
+    def __init__(self, scene: Scene, fields: ModelFields, ctrl: np.ndarray, *, trajectory: bool):
+        """Puts model and data on the device and captures a step.
+
+        Args:
+          scene: The scene.
+          fields: Model fields and start states, leading axis (world,).
+          ctrl: Controls, shape (world, time, nu).
+          trajectory: Whether to return qpos of every step, by way of the host.
+        """
+        self.trajectory, self.worlds, self.steps = trajectory, *ctrl.shape[:2]
+        template, lay = copy.deepcopy(compile_template(scene)), layout(scene)
+        # Warp never resets a world and refuses the flag that asks for that.
+        template.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        begin = time.perf_counter()
+        names = [n for n in ModelFields._fields if n not in _ABSENT]
+        self.model = mjw.put_model(template, dict.fromkeys(names, self.worlds))
+        for name in names:
+            self._assign(name, np.asarray(getattr(fields, name), np.float32))
+        self.data = mjw.make_data(template, nworld=self.worlds, nconmax=CONTACTS, njmax=ROWS)
+        self.start = wp.array(np.asarray(fields.start, np.float32), dtype=float)
+        table = np.ascontiguousarray(np.moveaxis(np.asarray(ctrl, np.float32), 1, 0))
+        self.table = wp.array(table, dtype=float)
+        self.weights = wp.array(lay.centre_weights.astype(np.float32), dtype=float)
+        self.thing = int(lay.object)
+        self.index = wp.zeros(1, dtype=int)
+        self.out = wp.zeros((self.steps, self.worlds, 3), dtype=float)
+        middle = time.perf_counter()
+        self._reset()
+        self._step()  # compiles the kernels
+        self.graph = None
+        if wp.get_device().is_cuda:
+            with wp.ScopedCapture() as capture:
+                self._step()
+            self.graph = capture.graph
+        wp.synchronize()
+        self.times = {"trace_s": middle - begin, "compile_s": time.perf_counter() - middle}
+
+    def _assign(self, name: str, value: np.ndarray) -> None:
+        array = getattr(self.model, name)
+        array.assign(value.reshape(array.numpy().shape))
+
+    def _reset(self) -> None:
+        self.index.zero_()
+        self.out.zero_()
+        for name in ("qvel", "qacc_warmstart", "time"):
+            getattr(self.data, name).zero_()
+        wp.copy(self.data.qpos, self.start)
+
+    def _step(self) -> None:
+        data, at = self.data, self.index
+        wp.launch(_command, data.ctrl.shape, [self.table, at], [data.ctrl])
+        wp.launch(_velocity, self.worlds, [data.qvel, at], [self.out])
+        mjw.step(self.model, data)
+        # Positions computed by a step belong to the state before it.
+        wp.launch(_places, self.worlds, [data.xipos, self.weights, self.thing, at], [self.out])
+        wp.launch(_count, 1, [], [at])
+
+    def run(self) -> tuple[Trace, float]:
+        """Runs once; returns the trace, leading axes (world, time), and seconds."""
+        self._reset()
+        states = []
+        wp.synchronize()
+        begin = time.perf_counter()
+        for _ in range(self.steps):
+            if self.trajectory:
+                states.append(self.data.qpos.numpy())
+            if self.graph is None:
+                self._step()
+            else:
+                wp.capture_launch(self.graph)
+        wp.synchronize()
+        seconds = time.perf_counter() - begin
+        out = np.moveaxis(self.out.numpy(), 0, 1)
+        qpos = np.stack(states, 1) if states else np.zeros((*out.shape[:2], 0), np.float32)
+        return Trace(out[..., 0], out[..., 1], out[..., 2], qpos), seconds
+
+    def memory(self) -> int:
+        """Largest memory of the device's pool so far [byte]; 0 where Warp does not count it."""
+        device = wp.get_device()
+        return int(wp.get_mempool_used_mem_high(device)) if device.is_cuda else 0

@@ -67,7 +67,7 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def run_case(case: dict[str, Any], grace: float = 60.0) -> list[dict[str, Any]]:
+def run_case(case: dict[str, Any], grace: float = 120.0) -> list[dict[str, Any]]:
     """Runs a case in a process of its own; returns its records, or what went wrong as one."""
     named = {k: case[k] for k in ("engine", "setting", "kind", "variant", "growth") if k in case}
     # Warp allocates beside JAX, which otherwise takes most of the device's memory.
@@ -92,7 +92,8 @@ def run_case(case: dict[str, Any], grace: float = 60.0) -> list[dict[str, Any]]:
             problem = f"stopped after {case['seconds'] + grace:.0f} s"
         lines = files[1].read_text().splitlines() if files[1].exists() else []
     records = [json.loads(line) for line in lines]
-    return records + ([{**named, "problem": problem}] if problem else [])
+    complete = len(records) >= len(case.get("worlds", [0]))  # stopped on its way out
+    return records + ([{**named, "problem": problem}] if problem and not complete else [])
 
 
 def chosen(names: list[str], available: set[str]) -> list[tuple[str, str]]:
@@ -137,7 +138,7 @@ def plan(args: argparse.Namespace, kind: str, available: set[str]) -> list[dict[
         for name in args.growth_engines:
             for changed in GROWTH if name in available else ():
                 more = {"variant": changed, "growth": True, "cached": False}
-                add(name, first[name], "window", [small["growth"]], 0.5, **more)
+                add(name, first[name], "window", [small["growth"]], 1.0, **more)
     return cases
 
 

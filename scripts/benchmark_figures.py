@@ -41,7 +41,8 @@ lose their object, and designs around 64 mm and an arm height of 0 mm, which hol
   `unison` steps all worlds together.
 * Compile times are a fresh process's with empty caches, tracing included; in brackets with the
   program in the persistent cache. Rates are medians of the repeats without it. Warp's do not
-  include the making of the model fields and the costs, the others' do.
+  include the making of the model fields and the costs, the others' do; its kernels are cached on
+  disk, so that only the first of its cases compiles cold.
 * Memory is the device's peak on a GPU and the process's resident set on a CPU.
 """
 

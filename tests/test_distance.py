@@ -79,20 +79,20 @@ def engine_contacts(kind, position, quat, centre):
 
 @pytest.mark.parametrize("kind", small.SHAPES)
 def test_distances_equal_mujoco(kind):
-    """Distance and normal outside, where MuJoCo's answer is exact; the distance inside as well."""
+    """Distance and normal of spheres outside the object."""
     position, quat, centre = poses(kind, 7)
     want, normal = reference(kind, position, quat, centre)
     got = engine_contacts(kind, position, quat, centre)
     gap = np.asarray(got.distance)[0]
     outside = gap > 1e-6
     assert 0.2 < outside.mean() < 0.99  # both kinds of poses are tried
-    # MuJoCo's convex distance stops at its option ccd_tolerance = 1e-6, spheres are closed form.
-    np.testing.assert_allclose(gap[outside], want[outside], rtol=0, atol=2e-6)
+    # Both are closed forms in float64; they differ by rounding of lengths below a metre.
+    np.testing.assert_allclose(gap[outside], want[outside], rtol=0, atol=1e-14)
     found = np.asarray(got.normal)[:, 0].T
-    # The witness points give the direction; two of them 1e-6 wrong, a gap apart, turn it.
+    # The witness points give the direction; two of them wrong by rounding, a gap apart, turn it.
     angle = np.linalg.norm(found - normal, axis=1)
     near = outside & (gap > 1e-3)
-    assert np.all(angle[near] < 5e-6 / gap[near] + 1e-6)
+    assert np.all(angle[near] < 1e-14 / gap[near])
     # Contact points lie half way between the surfaces.
     point = np.asarray(got.point)[:, 0].T
     back = centre - point
@@ -107,4 +107,4 @@ def test_penetrations_equal_mujoco(kind):
     gap = np.asarray(engine_contacts(kind, position, quat, centre).distance)[0]
     inside = gap < -1e-6
     assert inside.sum() > 100
-    np.testing.assert_allclose(gap[inside], want[inside], rtol=0, atol=2e-6)
+    np.testing.assert_allclose(gap[inside], want[inside], rtol=0, atol=1e-14)

@@ -141,14 +141,14 @@ class WarpProgram:
         begin = time.perf_counter()
         for _ in range(self.steps):
             if self.trajectory:
-                states.append(self.data.qpos.numpy())
+                states.append(np.array(self.data.qpos.numpy()))
             if self.graph is None:
                 self._step()
             else:
                 wp.capture_launch(self.graph)
         wp.synchronize()
         seconds = time.perf_counter() - begin
-        out = np.moveaxis(self.out.numpy(), 0, 1)
+        out = np.array(np.moveaxis(self.out.numpy(), 0, 1))
         qpos = np.stack(states, 1) if states else np.zeros((*out.shape[:2], 0), np.float32)
         return Trace(out[..., 0], out[..., 1], out[..., 2], qpos), seconds
 

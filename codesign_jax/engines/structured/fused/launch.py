@@ -22,7 +22,7 @@ def launch(call: Callable, inputs: tuple, outputs: list[jax.ShapeDtypeStruct]) -
     shapes = [tuple(x.shape[1:]) for x in (*avals, *outputs)]
     code = ptx.assemble(equation.params["jaxpr"], shapes, "grasp")
     number = np.int32
-    return jax.ffi.ffi_call("__gpu$xla.gpu.ptx", outputs)(
+    results = jax.ffi.ffi_call("__gpu$xla.gpu.ptx", outputs)(
         *inputs,
         name="grasp",
         kernel_type="ptx",
@@ -36,6 +36,7 @@ def launch(call: Callable, inputs: tuple, outputs: list[jax.ShapeDtypeStruct]) -
         shared_mem_bytes=number(0),
         output_indices=tuple(range(len(inputs), len(shapes))),
     )
+    return list(results)
 
 
 def _pallas_call(jaxpr: Any) -> Any:

@@ -124,7 +124,7 @@ class Newton:
         def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes):
             link = make_body(*body)
             push = smooth - link.times(motion)
-            node = solver._add_link(node, link.matrix(), push, pushes)
+            node = solver._add_link(node, solver._own(link.matrix(), push, pushes))
             return el.eliminate(direct, node, axes, arm, tau - arm * acc)
 
         def step(i: Any, node: el.Quadratic) -> el.Quadratic:

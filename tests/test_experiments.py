@@ -3,6 +3,9 @@
 import copy
 import dataclasses
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -35,6 +38,7 @@ from codesign_jax.types import Outcome
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
 SEED = 5
+SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce.py"
 TIMES = ("seconds", "processes")
 
 
@@ -341,3 +345,24 @@ def test_what_was_not_run_is_said(tmp_path):
     text = report.make(tmp_path, tmp_path / "figures")
     assert text.count("not run") == 3
     assert figures.label("switch-16") == "16"
+
+
+@pytest.mark.slow
+def test_the_script_stops_resumes_and_draws(tmp_path):
+    def call(*arguments):
+        command = [sys.executable, str(SCRIPT), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    run = ["2d", "--size", "tiny", "--engine", "mujoco", "--out", str(tmp_path)]
+    stopped = call(*run, "--minutes", "0")
+    assert stopped.returncode == 3, stopped.stderr
+    done = call(*run, "--trials", str(tmp_path / "trials.npz"), "--commit", "abc")
+    assert done.returncode == 0 and "resuming after step 0/3" in done.stdout, done.stderr
+    notes = json.loads((tmp_path / "2d.json").read_text())
+    assert (notes["commit"], notes["grasps"], notes["processes"]) == ("abc", 72, 2)
+    with np.load(tmp_path / "trials.npz") as trials:
+        assert trials["status"].shape == (2, 2, 2, 2, 3)
+    drawn = call("figures", "--data", str(tmp_path), "--figures", str(tmp_path / "figures"))
+    assert drawn.returncode == 0 and (tmp_path / "figures" / "fig7a_success.png").exists()
+    refused = call(*run, "--seed", "7")
+    assert refused.returncode == 1 and "--fresh" in refused.stderr

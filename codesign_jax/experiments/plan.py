@@ -136,10 +136,10 @@ SMALL: dict[str, dict[str, Strategies | Landscape]] = {
         "landscape": Landscape("landscape", "2d", 12, 6),
     },
 }
-OVERRIDES: dict[str, dict[str, dict[str, int]]] = {
-    "paper": {},
-    "tiny": {"discretization": {"links": 2}},
-    "cpu": {"discretization": {"links": 4}},
+OVERRIDES = {
+    "paper": (),
+    "tiny": ("discretization.links=2",),
+    "cpu": ("discretization.links=4",),
 }
 """What the sizes change in the scene; the paper's change nothing."""
 

@@ -45,7 +45,7 @@ def parse() -> argparse.Namespace:
 def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], int]:
     """Returns the experiment, the settings its state must belong to, and its grasps."""
     the_plan = plan.experiment(args.experiment, args.size)
-    overrides = plan.OVERRIDES[args.size] | common.parse_overrides(args.set)
+    overrides = common.parse_overrides([*plan.OVERRIDES[args.size], *args.set])
     the_scene = scene.load("paper", overrides=overrides)
     space = parameters.design_space(the_scene.hand, the_plan.preset)
     chunk, calls = chunking(the_plan.worlds, args.chunk, args.devices)

@@ -72,12 +72,13 @@ class Batch:
           RuntimeError: If a run finds no particle that is poor enough.
         """
         p, width = self.plan, self.worlds.space.num_parameters
+        before = self.worlds.grasps
         seeds, cost, drawn = self._seeds()
         s, r, n, e, t = len(p.strategies), p.runs, p.particles, p.episodes, p.trials
         particles = np.broadcast_to(seeds[None, :, None], (s, r, n, width))
         return {
             "step": np.int64(0),
-            "screened": np.int64(self.worlds.grasps),
+            "screened": np.int64(self.worlds.grasps - before),
             "particles": np.array(particles, np.float32),
             "cost": np.zeros((s, r, e, n), np.float32),
             "lost_step": np.zeros((s, r, e, n, t), np.uint16),

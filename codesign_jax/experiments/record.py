@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -85,11 +84,11 @@ def load(path: Path, settings: dict[str, object]) -> Arrays:
       StateError: If the file is damaged or belongs to something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            record = {name: file[name] for name in file.files}
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError) as error:
-        raise StateError(f"{path} cannot be read: {error}") from error
-    expected, found = str(record.pop("_digest", "")), json.loads(str(record.pop("_settings", "{}")))
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            record = {name: arrays[name] for name in arrays.files}
+        expected, found = str(record.pop("_digest")), json.loads(str(record.pop("_settings")))
+    except Exception as error:  # damaged files raise whatever the parser at that byte raises
+        raise StateError(f"{path} cannot be read ({type(error).__name__})") from error
     if digest(record) != expected:
         raise StateError(f"{path} is damaged: its digest differs")
     wanted = json.loads(json.dumps(settings))

@@ -38,7 +38,7 @@ def chunking(worlds: int, limit: int = LIMIT, devices: int = 1) -> Chunking:
       limit: Largest number of worlds in one call.
       devices: Devices that share a call; the size is a multiple of it.
     """
-    calls = -(-worlds // max(limit, devices))
+    calls = -(-worlds // max(limit - limit % devices, devices))
     each = -(-worlds // calls)
     return Chunking(-(-each // devices) * devices, calls)
 

@@ -1,0 +1,373 @@
+"""One time step of a block of worlds, inside the kernel."""
+
+from functools import partial
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import collision, inertia
+from codesign_jax.engines.structured import kinematics as kin
+from codesign_jax.engines.structured.engine import _turn
+from codesign_jax.engines.structured.fused.contacts import (
+    direct,
+    sphere_on_object,
+    sphere_on_table,
+    zeros,
+)
+from codesign_jax.engines.structured.fused.newton import (
+    Iterate,
+    Memory,
+    Newton,
+    Palm,
+    loop,
+    relative,
+    triangle,
+)
+from codesign_jax.engines.structured.fused.tables import Block
+from codesign_jax.engines.structured.hand import apply_columns
+from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.kinematics import State
+from codesign_jax.engines.structured.lanes import cross, spatial, total
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.scene import Scene
+
+if TYPE_CHECKING:
+    from codesign_jax.engines.structured.fused.kernel import Program
+
+
+class Step:
+    """One time step of a block."""
+
+    def __init__(
+        self,
+        program: "Program",
+        block: Block,
+        hand: Any,
+        world: Any,
+        fine: Any,
+        rest: Any,
+        scratch: Any,
+    ):
+        """Takes the kernel's lanes and memory."""
+        self.p, self.block, self.hand, self.world = program, block, hand, world
+        self.fine, self.rest, self.scratch = fine, rest, scratch
+
+    def constants(self, *names: str) -> list[Lanes]:
+        """Constants of worlds."""
+        return [self.p.world.read(self.world, n, 0, self.block.world) for n in names]
+
+    def advance(self, arm: Lanes, pressure: Lanes, waiting: Any, speed: Any):
+        """Advances the block.
+
+        Args:
+          arm: Commands of the arm frame, shape (6, 1, world).
+          pressure: Chamber pressures, lanes.
+          waiting: Worlds whose convergence is waited for.
+          speed: Largest velocity before the step.
+
+        Returns:
+          Trace entries distance, height, residual and iterations; speed after the step; whether
+          the step is good.
+        """
+        p, scene = self.p, self.p.scene
+        state = {n: p.rest.read(self.rest, n, 0, self.block.world) for n in p.rest.groups}
+        geometry = self._palm(state, arm)
+        size, shape = self.constants("object_size", "shape")
+        friction = lanewise(
+            lambda s: collision.object_friction(scene, s.astype(jnp.int32)).astype(s.dtype), shape
+        )
+        bound = {c.name: c.bind(p.scratch, self.scratch, friction) for c in p.sets}
+        memory = Memory(p.hand, self.hand, p.fine, self.fine, p.scratch, self.scratch, bound)
+        now, centre = self._forward(state, geometry, pressure, memory, (size, shape))
+        newton = Newton(p.links, self.block, memory, geometry["palm"])
+        now, quality = newton.solve(now, waiting, *p.limits)
+        distance = lanewise(_distance, state["position"], state["wrist"], centre).lane
+        height = state["position"][2].lane
+        new_speed, good = self._integrate(state, geometry, now, height, speed)
+        count = jnp.full_like(height, quality.count)
+        return (distance, height, quality.residual.lane, count), new_speed, good
+
+    def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
+        """Kinematics, inertia and smooth forces of palm, wrist and object."""
+        w, g = self.p.scene.hand.wrist, self.p.scene.gravity
+        names = ("palm_mass", "palm_centre", "palm_inertia", "wrist_damping", "wrist_armature")
+        constants = self.constants(*names, "object_mass", "object_inertia")
+
+        def compute(state: dict, arm, mass, centre, tensor, damping, armature, obj, principal):
+            frame, axes, vel, bias = kin._wrist(state["wrist"], state["wrist_vel"])
+            s = State(**{k: state.get(k) for k in State._fields})
+            columns, position, object_vel = kin._object(s)
+            half = jnp.stack([apply_columns(frame, tensor[i]) for i in range(3)], 1)
+            turned = jnp.stack([apply_columns(frame, half[j]) for j in range(3)])
+            palm = Body(mass, apply_columns(frame, centre), turned)
+            thing = Body(obj, position, inertia.principal_tensor(columns, principal))
+            spin = jnp.concatenate([jnp.zeros_like(object_vel[:3])] * 2)
+            turning = spatial(object_vel[:3], -cross(object_vel[:3], position))
+            stiffness = [w.linear_stiffness] * 3 + [w.angular_stiffness] * 3
+            error = arm - state["wrist"]
+            spring = jnp.stack([stiffness[i] * error[i] for i in range(6)])
+            start = State(**{k: None for k in State._fields})._replace(wrist=state["acc_wrist"])
+            moving = spatial(jnp.zeros_like(start.wrist[:3]), start.wrist[:3])
+            palm_motion = moving + total([axes[k] * start.wrist[3 + k] for k in range(3)])
+            a = state["acc_object"]
+            object_motion = spatial(a[:3], a[3:] + cross(position, a[:3]))
+            return {
+                "frame": frame,
+                "vel": vel,
+                "bias": bias,
+                "columns": columns,
+                "object_vel": object_vel,
+                "now": Iterate(state["acc_wrist"], a, palm_motion, object_motion),
+                "palm": Palm(
+                    palm,
+                    thing,
+                    palm.smooth_force(vel, bias, g),
+                    thing.smooth_force(turning, spin, g),
+                    spring - damping * state["wrist_vel"],
+                    armature,
+                    axes,
+                    position,
+                ),
+            }
+
+        return lanewise(compute, state, arm, *constants)
+
+    def _forward(self, state: dict, at: dict, pressure: Lanes, m: Memory, shape: tuple):
+        """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
+
+        Returns:
+          The warm start and the hand's centre in the palm's frame.
+        """
+        p, now = self.p, at["now"]
+        like = jnp.zeros((p.size,), self.fine.dtype)
+        mount, base, share, stub = (
+            p.hand.read(self.hand, n) for n in ("mount", "base", "share", "stub_centre")
+        )
+        frame, origin = lanewise(kin._mount, at["frame"], mount, base)
+        weight = lanewise(lambda f, s, share: share * apply_columns(f, s), at["frame"], stub, share)
+        wide = zeros((6,), like)
+        vel, bias, motion = (
+            lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
+        )
+
+        def link(i: Any, carry: tuple) -> tuple:
+            origin, frame, vel, bias, motion, middle = carry
+            names = ("offset", "mass", "centre", "inertia", "stiffness", "damping")
+            constants = [p.hand.read(self.hand, n, i) for n in names]
+            gain = p.hand.read(self.hand, "gain")
+            joint = [p.fine.read(self.fine, n, i) for n in ("finger", "finger_vel", "acc")]
+            out = lanewise(
+                partial(_link, p.scene, self.p.lay.axes),
+                (origin, frame, vel, bias, motion),
+                constants,
+                joint,
+                gain,
+                pressure,
+            )
+            carry, stored = out
+            for name, value in stored.items():
+                m.scratch.write(self.scratch, name, value, i)
+            share = p.hand.read(self.hand, "share", i + 1)
+            middle = lanewise(lambda m, c, s: m + s * c, middle, stored["body_centre"], share)
+            self._finger_contacts(i, carry, at, m, shape)
+            return (*carry, middle)
+
+        start = (origin, frame, vel, bias, motion, weight)
+        middle = loop(p.links, link, start, p.size)[-1]
+        self._slot_contacts(state, at, m, shape)
+        count = p.num_fingers * p.links
+        middle = self.block.sum(middle, self.scratch, p.scratch.offset["sums"])
+        return now, lanewise(lambda c: c / count, middle)
+
+    def _finger_contacts(self, i: Any, carry: tuple, at: dict, m: Memory, shape: tuple) -> None:
+        p, now = self.p, at["now"]
+        if not p.k:
+            return
+        origin, frame, vel, _, motion = carry
+        sphere, radius = (p.hand.read(self.hand, n, i) for n in ("sphere", "radius"))
+        centre = lanewise(
+            lambda o, f, s: o[:, None] + apply_columns(f[:, :, None], s), origin, frame, sphere
+        )
+        for name in ("finger_object", "finger_table"):
+            if name in m.contacts:
+                geometry = self._geometry(name, centre, radius, at, shape)
+                moves = (
+                    relative(name, motion, now.palm_motion, now.object_motion),
+                    relative(name, vel, at["vel"], at["object_vel"]),
+                )
+                m.contacts[name].create(i, geometry, *moves)
+
+    def _geometry(self, name: str, centre: Lanes, radius: Lanes, at: dict, shape: tuple):
+        scene = self.p.scene
+        if name.endswith("_object"):
+            function = partial(sphere_on_object, scene)
+            return lanewise(function, *shape, at["columns"], at["palm"].position, centre, radius)
+        height = self.p.rest.read(self.rest, "wrist", 0, self.block.world)[2]
+        return lanewise(partial(sphere_on_table, scene), height, centre, radius)
+
+    def _slot_contacts(self, state: dict, at: dict, m: Memory, shape: tuple) -> None:
+        p, now = self.p, at["now"]
+
+        def create(name: str, i: Any, geometry: Any) -> None:
+            moves = (
+                relative(name, None, now.palm_motion, now.object_motion),
+                relative(name, None, at["vel"], at["object_vel"]),
+            )
+            m.contacts[name].create(i, geometry, *moves)
+
+        for i in range(p.palm_groups if "palm_object" in m.contacts else 0):
+            point, radius = (p.hand.read(self.hand, n, i) for n in ("palm_point", "palm_radius"))
+            centre = lanewise(lambda f, s: apply_columns(f[:, :, None], s), at["frame"], point)
+            for name in ("palm_object", "palm_table"):
+                create(name, i, self._geometry(name, centre, radius, at, shape))
+        slots = self._table_points(state, at, shape)
+        for i in range(m.contacts["object_table"].set.count):
+            part = [slots[k] for k in range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))]
+            create("object_table", i, self._deal(part))
+
+    def _table_points(self, state: dict, at: dict, shape: tuple) -> list[tuple]:
+        """Point, normal and gap of each slot of the object on the table, lanes of a world."""
+
+        def compute(size, kind, columns, position, height):
+            hand = SimpleNamespace(object_size=size, shape=kind.astype(jnp.int32), mesh=None)
+            frame = SimpleNamespace(object=columns, object_pos=position)
+            c = collision.object_on_table(direct, self.p.scene, hand, frame, height)  # type: ignore[arg-type]
+            return [
+                (c.point[:, k : k + 1], c.normal[:, k : k + 1], c.distance[None, k : k + 1])
+                for k in range(c.distance.shape[0])
+            ]
+
+        height = state["wrist"][2]
+        return lanewise(compute, *shape, at["columns"], at["palm"].position, height)
+
+    def _deal(self, slots: list[tuple]) -> tuple[Lanes, Lanes, Lanes]:
+        """Deals the slots (component, 1, world) out to the finger lanes."""
+        p = self.p
+        away = jnp.full((p.size,), 1e3, self.fine.dtype)
+        dealt = []
+        for field in range(3):
+            values = [s[field] for s in slots]
+            parts = []
+            for c in range(values[0].parts.shape[0]):
+                lane = away
+                for k, value in enumerate(values):
+                    lane = jnp.where(self.block.finger == k, value.parts[c].item(), lane)
+                parts.append(lane)
+            dealt.append(lanes(parts, (len(parts), 1), wide=True))
+        return tuple(dealt)  # type: ignore[return-value]
+
+    def _integrate(self, state: dict, at: dict, now: Iterate, height: Any, speed: Any):
+        """Semi-implicit Euler; a step that fails leaves the state as it was.
+
+        Returns:
+          Largest velocity after the step, and whether the step is good, shapes (1, world).
+        """
+        p, h = self.p, self.p.scene.discretization.timestep
+        new = lanewise(partial(_moved, h), state, at["columns"], now.wrist, now.object)
+        size = lanewise(_largest, new)
+
+        def link(i: Any, largest: Lanes) -> Lanes:
+            q, rate, acc = (p.fine.read(self.fine, n, i) for n in ("finger", "finger_vel", "acc"))
+            rate, q, top = lanewise(partial(_turned, h), q, rate, acc)
+            p.scratch.write(self.scratch, "new_finger", q, i)
+            p.scratch.write(self.scratch, "new_finger_vel", rate, i)
+            return lanewise(_worse, largest, top)
+
+        like = jnp.zeros((p.size,), self.fine.dtype)
+        fingers = loop(p.links, link, zeros((), like), p.size).lane
+        largest = size.lane
+        row = p.scratch.offset["sums"]
+        for mine in self.block.share([fingers], self.scratch, row)[0]:
+            largest = _worse(largest, mine)
+        limit = p.scene.limits
+        good = (speed <= limit.speed) & (largest <= limit.speed)
+        good = good & (height >= -limit.penetration)
+        acc = {"acc_wrist": now.wrist, "acc_object": now.object}
+        for name, value in {**new, **acc}.items():
+            kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
+            p.rest.write(self.rest, name, kept, 0, self.block.world)
+
+        def store(i: Any, x: Any) -> Any:
+            for name in ("finger", "finger_vel"):
+                value = p.scratch.read(self.scratch, f"new_{name}", i)
+                old = p.fine.read(self.fine, name, i)
+                kept = lanewise(jnp.where, lanes([good], (), wide=False), value, old)
+                p.fine.write(self.fine, name, kept, i)
+            return x
+
+        jax.lax.fori_loop(0, p.links, store, jnp.int32(0))
+        return largest, good
+
+
+def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, pressure):
+    """A link's kinematics, inertia and forces."""
+    origin, frame, vel, bias, motion = parent
+    offset, mass, centre, principal, stiffness, damping = constants
+    q, rate, acc = joint
+    cos, sin = jnp.cos(q), jnp.sin(q)
+    origin, frame, axes = kin._turn_link(names, origin, frame, offset, cos, sin)
+    vel, bias = kin._link_velocity(vel, bias, axes, rate)
+    motion = motion + total([axes[k] * acc[k] for k in range(axes.shape[0])])
+    body = Body(
+        mass,
+        origin + apply_columns(frame, centre),
+        inertia.principal_tensor(frame, principal),
+    )
+    tau = -stiffness * q - damping * rate
+    tau = jnp.concatenate([tau[:1] + gain * pressure, tau[1:]])
+    stored = {
+        "axes": axes,
+        "body_centre": body.centre,
+        "tensor": triangle(body.tensor),
+        "motion": motion,
+        "smooth": body.smooth_force(vel, bias, scene.gravity),
+        "tau": tau,
+    }
+    return (origin, frame, vel, bias, motion), stored
+
+
+def _distance(position, wrist, centre):
+    away = position - wrist[:3] - centre
+    return jnp.sqrt(total([away[i] ** 2 for i in range(3)]))
+
+
+def _moved(h: float, state: dict, columns, wrist, obj) -> dict:
+    """Wrist and object after the step; see `engine.integrate`."""
+    local = jnp.stack([total([columns[k, i] * obj[i] for i in range(3)]) for k in range(3)])
+    wrist_vel = state["wrist_vel"] + h * wrist
+    linear, angular = state["linear_vel"] + h * obj[3:], state["angular_vel"] + h * local
+    return {
+        "wrist": state["wrist"] + h * wrist_vel,
+        "position": state["position"] + h * linear,
+        "quat": _turn(state["quat"], angular, h),
+        "wrist_vel": wrist_vel,
+        "linear_vel": linear,
+        "angular_vel": angular,
+    }
+
+
+def _worse(a: jax.Array, b: jax.Array) -> jax.Array:
+    """The larger one, or what is not finite."""
+    return jnp.where((b > a) | (b != b), b, a)
+
+
+def _largest(new: dict):
+    velocities = [new[n] for n in ("wrist_vel", "linear_vel", "angular_vel")]
+    top = jnp.abs(velocities[0][0])
+    for value in velocities:
+        for i in range(value.shape[0]):
+            top = _worse(top, jnp.abs(value[i]))
+    places = [new["wrist"][i] for i in range(6)] + [new["position"][i] for i in range(3)]
+    place = total(places + [new["quat"][i] for i in range(4)])
+    return jnp.where(place == place, top, place)
+
+
+def _turned(h: float, q, rate, acc):
+    rate = rate + h * acc
+    q = q + h * rate
+    top = jnp.abs(rate[0])
+    for k in range(1, rate.shape[0]):
+        top = _worse(top, jnp.abs(rate[k]))
+    return rate, q, top

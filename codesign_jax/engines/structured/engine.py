@@ -188,7 +188,8 @@ class StructuredEngine:
         if self.fused and primitive and not trajectory and ctrl.dtype == jnp.float32:
             return self._one_kernel(fields, ctrl)
         with jax.default_matmul_precision("highest"):
-            if self.lanes:
+            # The stream moves worlds between lanes; a mesh's grid belongs to no world.
+            if self.lanes and primitive:
                 return on_all_cores(partial(self._stream, trajectory=trajectory), fields, ctrl)
             return self._rollout(fields, ctrl, trajectory)
 

@@ -6,7 +6,6 @@ import platform
 import resource
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,7 +20,8 @@ def provenance() -> dict:
     """Command, commit, versions, device and date."""
     device = jax.devices()[0]
     return {
-        "command": " ".join(["python", *sys.argv]),
+        # A case's own process has temporary files for arguments: they say nothing later.
+        "command": "python -m codesign_jax.benchmark",
         "commit": commit(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),

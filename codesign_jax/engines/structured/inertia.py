@@ -103,6 +103,21 @@ def principal_tensor(columns: jax.Array, principal: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
+def turned_tensor(frame: jax.Array, tensor: jax.Array) -> jax.Array:
+    """R T R' of a tensor T (3, 3, ...), R given by its columns."""
+    # Rows of T first, then columns of T R'.
+    half = jnp.stack([apply_columns(frame, tensor[i]) for i in range(3)], 1)
+    return jnp.stack([apply_columns(frame, half[j]) for j in range(3)])
+
+
+def object_force(body: Body, vel: jax.Array, gravity: float) -> jax.Array:
+    """`Body.smooth_force` of the object, from its spatial velocity, shape (6, ...)."""
+    # The object's coordinates are its own velocity components: no acceleration is left at zero.
+    spin = jnp.concatenate([jnp.zeros_like(vel[:3])] * 2)
+    turning = spatial(vel[:3], -cross(vel[:3], body.centre))
+    return body.smooth_force(turning, spin, gravity)
+
+
 def bodies(run: Stages, hand: HandLanes, kin: Kinematics) -> Bodies:
     """Inertia of all bodies at the present positions."""
 
@@ -110,9 +125,7 @@ def bodies(run: Stages, hand: HandLanes, kin: Kinematics) -> Bodies:
         return origin + apply_columns(frame, hand.centre), principal_tensor(frame, hand.inertia)
 
     def rest(palm: jax.Array, obj: jax.Array):
-        # R T R' of the palm's tensor T, rows of T first, then columns of T R'.
-        half = jnp.stack([apply_columns(palm, hand.palm_inertia[i]) for i in range(3)], 1)
-        tensor = jnp.stack([apply_columns(palm, half[j]) for j in range(3)])
+        tensor = turned_tensor(palm, hand.palm_inertia)
         return (
             apply_columns(palm, hand.palm_centre),
             tensor,
@@ -153,14 +166,11 @@ def smooth_forces(
     wrist = stiffness[:, None, None] * (arm - state.wrist) - hand.wrist_damping * state.wrist_vel
     finger = -hand.stiffness * state.finger - hand.damping * state.finger_vel
     finger = jnp.concatenate([finger[:, :1] + hand.gain * pressure, finger[:, 1:]], 1)
-    # The object's coordinates are its own velocity components: no acceleration is left at zero.
-    spin = jnp.concatenate([jnp.zeros_like(kin.object_vel[:3])] * 2)
-    turning = spatial(kin.object_vel[:3], -cross(kin.object_vel[:3], kin.object_pos))
     links = run(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
     return Smooth(
         palm=body.palm.smooth_force(kin.palm_vel, kin.palm_bias, g),
         link=links,
-        object=body.object.smooth_force(turning, spin, g),
+        object=object_force(body.object, kin.object_vel, g),
         wrist=wrist,
         finger=finger,
     )

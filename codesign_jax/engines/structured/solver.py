@@ -76,26 +76,33 @@ class Solution(NamedTuple):
     iterations: jax.Array
 
 
+def palm_motion(wrist: jax.Array, axes: jax.Array) -> jax.Array:
+    """The palm's spatial acceleration of the wrist's slides and hinges."""
+    moving = spatial(jnp.zeros_like(wrist[:3]), wrist[:3])
+    return moving + total([axes[k] * wrist[3 + k] for k in range(3)])
+
+
+def next_motion(parent: jax.Array, axes: jax.Array, a: jax.Array) -> jax.Array:
+    """A link's spatial acceleration from its parent's and its joint's."""
+    return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
+
+
+def object_motion(acc: jax.Array, position: jax.Array) -> jax.Array:
+    """The object's spatial acceleration from that at its centre."""
+    return spatial(acc[:3], acc[3:] + cross(position, acc[:3]))
+
+
 def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
     """Spatial accelerations J a of all bodies, without velocity terms."""
-
-    def palm_motion(wrist: jax.Array, axes: jax.Array):
-        moving = spatial(jnp.zeros_like(wrist[:3]), wrist[:3])
-        return moving + total([axes[k] * wrist[3 + k] for k in range(3)])
-
-    def next_link(parent: jax.Array, axes: jax.Array, a: jax.Array):
-        return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
-
     palm = run(palm_motion, acc.wrist, kin.wrist_axes)
 
     def step(parent: jax.Array, link: tuple):
-        motion = run(next_link, parent, *link[0])
+        motion = run(next_motion, parent, *link[0])
         return motion, motion
 
     first = palm + jnp.zeros_like(kin.vel[:, 0])
     _, links = scan_links(step, first, (kin.axes, acc.finger))
-    angular = acc.object[:3]
-    obj = spatial(angular, acc.object[3:] + cross(kin.object_pos, angular))
+    obj = object_motion(acc.object, kin.object_pos)
     return Spatial(palm, jnp.moveaxis(links, 0, 1), obj)
 
 
@@ -265,6 +272,21 @@ def _push(stages: Stages, name: str, c: Contacts, jar: jax.Array) -> tuple[jax.A
     return stages(summed, c, response.hessian, response.force)
 
 
+FAR = 3e38
+"""No upper end of a bracket yet; finite, as a GPU kernel has no test for infinity."""
+
+
+def refine(
+    alpha: jax.Array, low: jax.Array, high: jax.Array, first: jax.Array, second: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Next step length and bracket from the derivatives at alpha: Newton, else bisection."""
+    low, high = jnp.where(first <= 0, alpha, low), jnp.where(first > 0, alpha, high)
+    guess = alpha - first / jnp.maximum(second, 1e-30)
+    inside = (guess >= low) & (guess <= high)
+    middle = jnp.where(high > 1e30, 2.0 * low, 0.5 * (low + high))
+    return jnp.where(inside, guess, middle), low, high
+
+
 def line_search(
     run: dict[str, Stages],
     contacts: dict[str, Contacts],
@@ -299,13 +321,9 @@ def line_search(
         for n, c in contacts.items():
             f, s = run[n](summed, c, rays[n], alpha)
             first, second = first + f, second + s
-        low, high = jnp.where(first <= 0, alpha, low), jnp.where(first > 0, alpha, high)
-        guess = alpha - first / jnp.maximum(second, 1e-30)
-        inside = (guess >= low) & (guess <= high)
-        middle = jnp.where(jnp.isinf(high), 2.0 * low, 0.5 * (low + high))
-        return jnp.where(inside, guess, middle), low, high
+        return refine(alpha, low, high, first, second)
 
-    start = (jnp.ones_like(slope), jnp.zeros_like(slope), jnp.full_like(slope, jnp.inf))
+    start = (jnp.ones_like(slope), jnp.zeros_like(slope), jnp.full_like(slope, FAR))
     return jax.lax.fori_loop(0, evaluations, evaluate, start)[0]
 
 
@@ -391,7 +409,11 @@ def _decrement(slope: jax.Array, pushes: dict, step: Spatial) -> jax.Array:
     return jnp.maximum(pushed, 0.0)
 
 
+def scale(mass: jax.Array, palm: jax.Array, motion: jax.Array) -> jax.Array:
+    """See `_scale`: of the object's and the palm's mass and the object's motion."""
+    return 100.0 * (mass + palm) + mass * dot(motion[3:], motion[3:])
+
+
 def _scale(problem: Problem, motion: Spatial) -> jax.Array:
     """Typical size of the objective: object and palm at g, plus the object's present motion."""
-    mass, palm = problem.hand.object_mass, problem.hand.palm_mass
-    return 100.0 * (mass + palm) + mass * dot(motion.object[3:], motion.object[3:])
+    return scale(problem.hand.object_mass, problem.hand.palm_mass, motion.object)

@@ -114,9 +114,8 @@ class Newton:
         return self.block.sum(tree, m.scratch_ref, m.scratch.offset["sums"])
 
     def body_of(self, item: Any) -> list[Lanes]:
-        """Mass, centre and tensor of a link, the tensor as (3, 3)."""
-        mass, centre, tensor = self.read("mass", "body_centre", "tensor", item=item)
-        return [mass, centre, tensor]
+        """Arguments of `make_body` for a link."""
+        return self.read("mass", "body_centre", "tensor", item=item)
 
     def backward(self) -> el.Quadratic:
         """Eliminates the fingers from their tips; returns the sum over the fingers."""
@@ -268,18 +267,11 @@ class Newton:
                 lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
             )
 
-        def refine(alpha, low, high, first, second):
-            low, high = jnp.where(first <= 0, alpha, low), jnp.where(first > 0, alpha, high)
-            guess = alpha - first / jnp.maximum(second, 1e-30)
-            inside = (guess >= low) & (guess <= high)
-            middle = jnp.where(high > 1e30, 2.0 * low, 0.5 * (low + high))
-            return jnp.where(inside, guess, middle), low, high
-
         def body(carry: list) -> list:
             count, arrays = carry[0], carry[1:]
             alpha, low, high, _ = rebuild(arrays)
             one, two = evaluate(alpha)
-            new = lanewise(refine, alpha, low, high, one, two)
+            new = lanewise(solver.refine, alpha, low, high, one, two)
             return [count + 1, *solid((*new, one), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
@@ -289,7 +281,7 @@ class Newton:
         goal = 1e-3 * jnp.abs(lanewise(jnp.add, slope, first).lane)
         one = lanewise(jnp.ones_like, slope)
         none = lanewise(jnp.zeros_like, slope)
-        far = lanewise(lambda x: jnp.full_like(x, 3e38), slope)
+        far = lanewise(lambda x: jnp.full_like(x, solver.FAR), slope)
         start, rebuild = solid((one, none, far, far), self.block.size)
         return rebuild(jax.lax.while_loop(going, body, [jnp.int32(0), *start])[1:])[0]
 
@@ -364,6 +356,5 @@ def triangle(tensor: jax.Array) -> jax.Array:
 
 
 def _residual(slope, first, palm: Palm, motion):
-    scale = 100.0 * (palm.object.mass + palm.palm.mass)
-    scale = scale + palm.object.mass * dot(motion[3:], motion[3:])
+    scale = solver.scale(palm.object.mass, palm.palm.mass, motion)
     return jnp.maximum(-slope - first, 0.0) / scale

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, inertia
+from codesign_jax.engines.structured import collision, inertia, solver
 from codesign_jax.engines.structured import kinematics as kin
-from codesign_jax.engines.structured.engine import _turn
+from codesign_jax.engines.structured.engine import integrate
 from codesign_jax.engines.structured.fused.contacts import (
     direct,
     sphere_on_object,
@@ -29,7 +29,7 @@ from codesign_jax.engines.structured.fused.tables import Block
 from codesign_jax.engines.structured.hand import apply_columns
 from codesign_jax.engines.structured.inertia import Body
 from codesign_jax.engines.structured.kinematics import State
-from codesign_jax.engines.structured.lanes import cross, spatial, total
+from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
 
@@ -99,32 +99,26 @@ class Step:
             frame, axes, vel, bias = kin._wrist(state["wrist"], state["wrist_vel"])
             s = State(**{k: state.get(k) for k in State._fields})
             columns, position, object_vel = kin._object(s)
-            half = jnp.stack([apply_columns(frame, tensor[i]) for i in range(3)], 1)
-            turned = jnp.stack([apply_columns(frame, half[j]) for j in range(3)])
+            turned = inertia.turned_tensor(frame, tensor)
             palm = Body(mass, apply_columns(frame, centre), turned)
             thing = Body(obj, position, inertia.principal_tensor(columns, principal))
-            spin = jnp.concatenate([jnp.zeros_like(object_vel[:3])] * 2)
-            turning = spatial(object_vel[:3], -cross(object_vel[:3], position))
             stiffness = [w.linear_stiffness] * 3 + [w.angular_stiffness] * 3
             error = arm - state["wrist"]
             spring = jnp.stack([stiffness[i] * error[i] for i in range(6)])
-            start = State(**{k: None for k in State._fields})._replace(wrist=state["acc_wrist"])
-            moving = spatial(jnp.zeros_like(start.wrist[:3]), start.wrist[:3])
-            palm_motion = moving + total([axes[k] * start.wrist[3 + k] for k in range(3)])
-            a = state["acc_object"]
-            object_motion = spatial(a[:3], a[3:] + cross(position, a[:3]))
+            acc = state["acc_wrist"], state["acc_object"]
+            motions = solver.palm_motion(acc[0], axes), solver.object_motion(acc[1], position)
             return {
                 "frame": frame,
                 "vel": vel,
                 "bias": bias,
                 "columns": columns,
                 "object_vel": object_vel,
-                "now": Iterate(state["acc_wrist"], a, palm_motion, object_motion),
+                "now": Iterate(*acc, *motions),
                 "palm": Palm(
                     palm,
                     thing,
                     palm.smooth_force(vel, bias, g),
-                    thing.smooth_force(turning, spin, g),
+                    inertia.object_force(thing, object_vel, g),
                     spring - damping * state["wrist_vel"],
                     armature,
                     axes,
@@ -309,7 +303,7 @@ def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, 
     cos, sin = jnp.cos(q), jnp.sin(q)
     origin, frame, axes = kin._turn_link(names, origin, frame, offset, cos, sin)
     vel, bias = kin._link_velocity(vel, bias, axes, rate)
-    motion = motion + total([axes[k] * acc[k] for k in range(axes.shape[0])])
+    motion = solver.next_motion(motion, axes, acc)
     body = Body(
         mass,
         origin + apply_columns(frame, centre),
@@ -334,18 +328,12 @@ def _distance(position, wrist, centre):
 
 
 def _moved(h: float, state: dict, columns, wrist, obj) -> dict:
-    """Wrist and object after the step; see `engine.integrate`."""
-    local = jnp.stack([total([columns[k, i] * obj[i] for i in range(3)]) for k in range(3)])
-    wrist_vel = state["wrist_vel"] + h * wrist
-    linear, angular = state["linear_vel"] + h * obj[3:], state["angular_vel"] + h * local
-    return {
-        "wrist": state["wrist"] + h * wrist_vel,
-        "position": state["position"] + h * linear,
-        "quat": _turn(state["quat"], angular, h),
-        "wrist_vel": wrist_vel,
-        "linear_vel": linear,
-        "angular_vel": angular,
-    }
+    """Wrist and object after the step."""
+    names = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
+    # The fingers' joints are moved link by link, see `_turned`.
+    old = State(finger=0.0, finger_vel=0.0, acc=None, **{n: state[n] for n in names})  # type: ignore[arg-type]
+    new = integrate(old, SimpleNamespace(object=columns), kin.Acc(wrist, 0.0, obj), h)  # type: ignore[arg-type]
+    return {n: getattr(new, n) for n in names}
 
 
 def _worse(a: jax.Array, b: jax.Array) -> jax.Array:

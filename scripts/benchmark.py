@@ -64,6 +64,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--budget", type=float, default=2400.0, help="seconds in all")
     parser.add_argument("--quick", action="store_true", help="a few worlds and steps: does it run?")
+    parser.add_argument("--commit", help="commit of the code, where there is no repository to ask")
     return parser.parse_args()
 
 
@@ -114,6 +115,7 @@ def plan(args: argparse.Namespace, kind: str, available: set[str]) -> list[dict[
         "distinct": DISTINCT,
         "steps": small["steps"],
         "reference": small["reference"],
+        "commit": args.commit,
     }
     cases = []
 
@@ -151,6 +153,7 @@ def reference(args: argparse.Namespace, results: dict, count: int) -> list[float
         return stored["costs"]
     case = {"engine": "reference", "setting": "converged", "kind": "grasp", "worlds": [count]}
     limits = {"repeats": 0, "reference": count, "seconds": args.budget, "cached": False}
+    limits["commit"] = args.commit
     [record] = run_case({**case, **limits})
     if "costs" not in record:
         raise SystemExit(f"The reference failed: {record.get('problem')}")
@@ -170,6 +173,7 @@ def main() -> None:
     begin = time.monotonic()
     results = json.loads(args.json.read_text()) if args.json.exists() else {"records": []}
     probe = {"engine": "structured", "setting": "default", "kind": "probe", "seconds": 120.0}
+    probe["commit"] = args.commit
     [found] = run_case(probe)
     if "problem" in found:
         raise SystemExit(found["problem"])

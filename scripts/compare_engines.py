@@ -76,6 +76,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=2000)
     parser.add_argument("--mjx-trials", type=int, default=120, help="0 leaves stock MJX out")
     parser.add_argument("--chunk", type=int, default=500)
+    parser.add_argument("--commit", help="commit of the code, where there is no repository to ask")
     parser.add_argument("--json", type=Path, required=True)
     args = parser.parse_args()
     scene = work.variant()
@@ -86,7 +87,7 @@ def main() -> None:
         found[name], seconds[name] = costs(scene, name, count, min(args.chunk, count))
         print(f"{name}: {count} grasps in {seconds[name]:.0f} s", flush=True)
     pairs = {n: compare(found[n], found["mujoco"]) for n in found if n != "mujoco"}
-    result = {**measure.provenance(), "seconds": seconds, "against_mujoco": pairs}
+    result = {**measure.provenance(commit=args.commit), "seconds": seconds, "against_mujoco": pairs}
     args.json.parent.mkdir(parents=True, exist_ok=True)
     args.json.write_text(json.dumps(result, indent=1) + "\n")
     for name, pair in pairs.items():

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from codesign_jax import control, cost, model, parameters, rollout, scene
+from codesign_jax.benchmark import measure
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.fused import Limits, Program
@@ -89,7 +90,7 @@ def main() -> None:
     """Runs the comparison and writes the rows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--commit")
+    parser.add_argument("--commit", help="commit of the code, where there is no repository to ask")
     args = parser.parse_args()
     here, moved = worlds(0.0), worlds(1e-6)
     oracle = jax.jit(MujocoEngine(SCENE).rollout)
@@ -100,10 +101,7 @@ def main() -> None:
         name = "kernel {}/{}/{:g}".format(*limits)
         rows.append(row(name, trace, reference, **notes))
     result = {
-        "command": "python scripts/convergence.py --json " + str(args.json),
-        "commit": args.commit,
-        "device": jax.devices()[0].device_kind,
-        "jax": jax.__version__,
+        **measure.provenance(commit=args.commit),
         "rows": rows,
     }
     args.json.write_text(json.dumps(result, indent=1) + "\n")

@@ -5,9 +5,6 @@ python scripts/random_particles.py --worlds 100000 --json docs/data/random_parti
 
 import argparse
 import json
-import platform
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -16,22 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import parameters, rollout, scene
+from codesign_jax.benchmark import measure
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.types import Status
-
-
-def provenance(commit: str | None) -> dict:
-    """Command, commit, versions and device that made a result; commit: instead of git's."""
-    git = subprocess.run(
-        ["git", "rev-parse", "--verify", "-q", "HEAD"], capture_output=True, text=True, check=False
-    )
-    return {
-        "command": " ".join(["python", *sys.argv]),
-        "commit": commit or git.stdout.strip() or None,
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-    }
 
 
 def particles(space: parameters.DesignSpace, seed: int, count: int) -> jax.Array:
@@ -79,7 +63,7 @@ def main() -> None:
     bits, costs = np.concatenate(status), np.concatenate(cost)
     steady = float(np.median(seconds[1:] or seconds))
     result = {
-        **provenance(args.commit),
+        **measure.provenance(commit=args.commit),
         "worlds": int(bits.size),
         "steps_per_world": the_scene.num_steps,
         "iterations": args.iterations,

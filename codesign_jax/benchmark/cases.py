@@ -30,7 +30,9 @@ class Case:
         self.until = time.monotonic() + values["seconds"]
         solver = peers.solver_values(self.engine, self.setting)
         self.scene = work.variant(**values.get("variant", {}), solver=solver)
-        self.provenance = measure.provenance()
+        # The arguments are temporary files: they say nothing later.
+        command = "python -m codesign_jax.benchmark"
+        self.provenance = measure.provenance(command=command, commit=values.get("commit"))
 
     def write(self, record: dict[str, Any]) -> None:
         """Appends a record; at once, so that a killed case keeps what it has."""

@@ -5,7 +5,7 @@ import os
 import platform
 import resource
 import statistics
-import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -15,14 +15,20 @@ import jax
 import mujoco
 import numpy as np
 
+from codesign_jax.provenance import git_state
 
-def provenance() -> dict:
-    """Command, commit, versions, device and date."""
+
+def provenance(*, command: str | None = None, commit: str | None = None) -> dict:
+    """Command, commit, versions, device and date.
+
+    Args:
+      command: Command line, instead of this process's.
+      commit: Commit of the code, for a machine without its repository.
+    """
     device = jax.devices()[0]
     return {
-        # A case's own process has temporary files for arguments: they say nothing later.
-        "command": "python -m codesign_jax.benchmark",
-        "commit": commit(),
+        "command": command or " ".join(["python", *sys.argv]),
+        **git_state(commit),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "jax": jax.__version__,
@@ -35,18 +41,6 @@ def provenance() -> dict:
         "cpus": len(os.sched_getaffinity(0)),
         "load": os.getloadavg()[0],
     }
-
-
-def commit() -> str | None:
-    """The checkout's commit, "+" behind it if files differ; None outside a checkout."""
-
-    def git(*command: str) -> str:
-        run = subprocess.run(["git", *command], capture_output=True, text=True, check=False)
-        return run.stdout.strip()
-
-    name = git("rev-parse", "--verify", "-q", "HEAD")
-    changed = git("status", "--porcelain", "--untracked-files=no") if name else ""
-    return name + ("+" if changed else "") if name else None
 
 
 def warp_version() -> str | None:

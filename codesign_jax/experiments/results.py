@@ -10,7 +10,7 @@ from codesign_jax.experiments.batch import Batch
 from codesign_jax.experiments.driver import Drive
 from codesign_jax.experiments.landscape import Grid
 from codesign_jax.experiments.record import KEPT, Arrays
-from codesign_jax.runs.provenance import environment, git_state
+from codesign_jax.provenance import environment, git_state
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status
 
@@ -114,7 +114,7 @@ def provenance(
     """
     return {
         "command": " ".join(["python", *command]),
-        **({"commit": commit} if commit else git_state()),
+        **git_state(commit),
         **environment(),
         "settings": settings,
         "grasps": grasps,

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from codesign_jax import scene as scenes
+from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs import scene_files
-from codesign_jax.runs.provenance import environment, git_state
 from codesign_jax.runs.settings import Settings
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError

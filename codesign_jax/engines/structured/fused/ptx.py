@@ -40,7 +40,7 @@ class Ref(NamedTuple):
     shape: tuple[int, ...]
 
 
-_COMPARE = {"lt": "lt", "le": "le", "gt": "gt", "ge": "ge", "eq": "eq", "ne": "ne"}
+_COMPARE = ("lt", "le", "gt", "ge", "eq", "ne")
 _INLINE = ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint")
 _SAME = (
     "broadcast_in_dim",
@@ -467,7 +467,7 @@ _RULES: dict[str, Callable] = {
     "sin": _sine(0),
     "cos": _sine(1),
     "sign": _sign,
-    **{name: _compare(test) for name, test in _COMPARE.items()},
+    **{name: _compare(name) for name in _COMPARE},
     "and": _logic("and"),
     "or": _logic("or"),
     "xor": _logic("xor"),

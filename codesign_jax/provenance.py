@@ -32,8 +32,14 @@ def environment() -> dict[str, object]:
     }
 
 
-def git_state() -> dict[str, object]:
-    """Returns commit and cleanliness of the checkout that the package runs from, if it is one."""
+def git_state(known: str | None = None) -> dict[str, object]:
+    """Returns commit and cleanliness of the checkout that the package runs from, if it is one.
+
+    Args:
+      known: The commit, for a copy of the code without its repository; taken as it is.
+    """
+    if known:
+        return {"commit": known}
     folder = Path(__file__).parent
     commit = _git(folder, "rev-parse", "HEAD")
     # An installed package may lie in a folder that belongs to somebody else's repository.

@@ -45,7 +45,7 @@ class Optimize:
     first: Literal["morphology", "control"] = "morphology"
     """Domain of the first episode with single and switch-K."""
     engine: Text = None
-    """Engine that simulates, such as mujoco (C, float64, all cores, the default) or mjx (JAX)."""
+    """Engine that simulates: structured (ours, the default), mujoco (C, float64) or mjx (stock)."""
     particles: Count = None
     """Particles; the paper's 10 in 2d, 60 otherwise."""
     trials: Count = None
@@ -92,7 +92,7 @@ class Evaluate:
     """Scene: a built-in name or a .toml file."""
     overrides: Overrides = ()
     engine: Text = None
-    """Engine that simulates; default: the run's, or mujoco."""
+    """Engine that simulates; default: the run's, or structured."""
     trials: int = 6
     """Trials, taking turns between the objects."""
     seed: int = 0

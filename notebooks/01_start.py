@@ -59,7 +59,7 @@ for name, unit, (low, high), body in zip(
 # closed over.  Worlds are the leading axis, here one of each object without noise.
 
 # %%
-engine = make_engine("mujoco", grasping)
+engine = make_engine("structured", grasping)
 design = space.from_units(np.array([100.0, 30.0]))  # mm, mm
 trials = jax.tree.map(
     lambda *values: jnp.stack(values),

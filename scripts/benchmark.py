@@ -141,6 +141,8 @@ def plan(args: argparse.Namespace, kind: str, available: set[str]) -> list[dict[
             for changed in GROWTH if name in available else ():
                 more = {"variant": changed, "growth": True, "cached": False}
                 add(name, first[name], "window", [small["growth"]], 1.0, **more)
+                if name == "structured":
+                    add(name, first[name], "quality", [small["growth"]], 0.7, **more)
     return cases
 
 

@@ -19,7 +19,7 @@ from codesign_jax.runs.record import to_arrays
 
 EPISODES = 40
 RUN = [
-    *("optimize", "--scene", str(TINY), "--seed", "3"),
+    *("optimize", "--scene", str(TINY), "--seed", "3", "--engine", "mujoco"),
     *("--particles", "4", "--trials", "2", "--episodes", str(EPISODES), "--test-trials", "4"),
 ]
 RESULTS = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
@@ -345,7 +345,8 @@ def test_evaluate_refuses_wrong_input(arguments, part, workplace, capsys):
 
 def test_bounds_themselves_are_designs(capsys):
     space_low = ["length=10", "arm_z=-50"]
-    assert command("evaluate", "--scene", TINY, "--design", *space_low, "--trials", "1") == 0
+    engine = ["--engine", "mujoco", "--trials", "1"]
+    assert command("evaluate", "--scene", TINY, "--design", *space_low, *engine) == 0
 
 
 def test_checkpoints_are_written_every_episode(finished):

@@ -115,7 +115,8 @@ def test_cost_evolution_of_an_unfinished_run(tmp_path):
 def test_evaluate_renders(name, tmp_path, monkeypatch, capsys, no_opengl):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     out = tmp_path / name
-    assert cli.main(["evaluate", "--scene", str(TINY), "--trials", "1", "--render", str(out)]) == 0
+    run = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--trials", "1"]
+    assert cli.main([*run, "--render", str(out)]) == 0
     assert out.exists() and f"picture: {out}" in capsys.readouterr().out
 
 

@@ -2,6 +2,7 @@
 
 import json
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -217,7 +218,8 @@ def quantiles(errors: np.ndarray) -> dict:
 def quality(case: Case) -> dict:
     """Newton iterations and decrements of the structured engine's steps over whole grasps.
 
-    On a GPU those of the kernel; elsewhere those of the batch engine in contact.
+    On a GPU those of the kernel; elsewhere those of the batch engine in contact.  A case of growth
+    has the short rollouts in contact that its times are of.
     """
     from codesign_jax.engines.structured import fused
     from codesign_jax.engines.structured.hand import hand_lanes
@@ -225,15 +227,19 @@ def quality(case: Case) -> dict:
     worlds = case.values["worlds"][0]
     engine: Any = peers.build(case.engine, case.setting, case.scene)
     limits = (engine.iterations, max(engine.evaluations, 14), engine.tolerance)
+    short = partial(work.window, case.scene, worlds, case.values["steps"])
     if jax.default_backend() == "gpu":
-        fields, ctrl = work.inputs(case.scene, work.make_worlds(case.scene, worlds))
+        whole = partial(work.make_worlds, case.scene, worlds)
+        grown = case.values.get("growth")
+        distinct = case.values["distinct"]
+        fields, ctrl = short(distinct=distinct) if grown else work.inputs(case.scene, whole())
         program = fused.Program(case.scene, fused.Limits(*limits))
         found = jax.jit(lambda f, c: program.run(hand_lanes(case.scene, f), engine.reset(f), c))(
             fields, ctrl
         )
         iterations, residual = (np.asarray(found[n]) for n in ("iterations", "residual"))
     else:
-        fields, ctrl = work.window(case.scene, worlds, case.values["steps"], distinct=worlds)
+        fields, ctrl = short(distinct=worlds)
 
         def body(carry: tuple, u: jax.Array) -> tuple:
             state, info = engine.step(carry[0], carry[1], u)

@@ -68,7 +68,8 @@ def growth(results: dict[str, Any], name: str) -> dict[str, list[tuple[float, fl
     """Microseconds of a world's step by engine, for a variant's key, sorted by its value."""
     found: dict[str, list[tuple[float, float]]] = {}
     for r in results["records"]:
-        if r.get("growth") and name in r["variant"] and "median_s" in r:
+        # A first run loads the program: a case without a second one has no cost to show.
+        if r.get("growth") and name in r["variant"] and r.get("warm"):
             cost = 1e6 / r["nominal_world_steps_per_s"]
             found.setdefault(r["engine"], []).append((r["variant"][name], cost))
     return {engine: sorted(points) for engine, points in found.items()}
@@ -164,17 +165,29 @@ def quality_table(results: dict[str, Any]) -> list[list[str]]:
 
 def growth_table(results: dict[str, Any]) -> list[list[str]]:
     """Microseconds of a world's step against links, fingers and spheres."""
-    rows = [["engine", "against", "µs a world and step", "exponent"]]
+    rows = [["engine", "against", "µs a world and step", "exponent", "Newton iterations"]]
+    counts = {
+        (r["engine"], *next(iter(r["variant"].items()))): r["iterations_mean"]
+        for r in results["records"]
+        if r.get("growth") and "iterations_mean" in r
+    }
     for name in ("links", "fingers", "spheres"):
         for engine, points in growth(results, name).items():
             upper = [p for p in points if name != "links" or p[0] >= 10]
             slope = exponent(*map(list, zip(*upper, strict=True))) if len(upper) > 1 else None
             text = ", ".join(f"{int(n)}: {cost:,.3g}" for n, cost in points)
-            rows.append([engine, name, text, _number(slope, ".2f")])
+            done = [
+                f"{int(n)}: {counts[k]:.2f}"
+                for n, _ in points
+                if (k := (engine, name, n)) in counts
+            ]
+            rows.append([engine, name, text, _number(slope, ".2f"), ", ".join(done) or "–"])
     for r in results["records"]:
         if r.get("growth") and "hand_name" in r["variant"] and "median_s" in r:
             cost = 1e6 / r["nominal_world_steps_per_s"]
-            rows.append([r["engine"], "hand", f"{r['variant']['hand_name']}: {cost:,.3g}", "–"])
+            rows.append(
+                [r["engine"], "hand", f"{r['variant']['hand_name']}: {cost:,.3g}", "–", "–"]
+            )
     return rows
 
 

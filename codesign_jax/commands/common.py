@@ -19,7 +19,7 @@ from codesign_jax.schema import SceneError
 
 def use_all_cores(engine: str | None) -> None:
     """Shares the structured engine's worlds between the cores; the others see to it themselves."""
-    if engine != "structured":
+    if engine not in (None, "structured"):
         return
     from codesign_jax.engines.structured import cores
 

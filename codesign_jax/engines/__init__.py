@@ -4,9 +4,8 @@ from codesign_jax import schema
 from codesign_jax.engines.base import Engine
 from codesign_jax.scene import Scene
 
-# The structured engine becomes the default once its benchmark and its convergence study stand.
-NAMES = ("mjx", "mujoco", "structured")
-DEFAULT = "mujoco"
+NAMES = ("structured", "mujoco", "mjx")
+DEFAULT = "structured"
 
 
 def make_engine(name: str, scene: Scene) -> Engine:

@@ -30,12 +30,14 @@ class Stages:
         """Returns function(*args), computed once; both are pytrees of arrays."""
         if self.predicate is None:
             return jax.lax.optimization_barrier(function(*args))
-        shapes = jax.eval_shape(function, *args)
+        # Traced once for both the shapes and the branch: tracing is most of a cached compile.
+        traced = jax.jit(function, inline=True)
+        shapes = jax.eval_shape(traced, *args)
 
         def never(*_: Any) -> Any:
             return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
 
-        return jax.lax.cond(self.predicate, function, never, *args)
+        return jax.lax.cond(self.predicate, traced, never, *args)
 
     def only_if(self, condition: jax.Array) -> "Stages":
         """Stages that return zeros when a scalar is false; with barriers they always run."""

@@ -60,6 +60,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--worlds", nargs="+", type=int, help="batch sizes instead of the usual")
     parser.add_argument("--growth-engines", nargs="+", default=["structured", "mujoco"])
+    parser.add_argument("--against", nargs="+", help="growth against these only, such as links")
     parser.add_argument("--reference", type=Path, help="file to take the reference costs from")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--budget", type=float, default=2400.0, help="seconds in all")
@@ -139,6 +140,8 @@ def plan(args: argparse.Namespace, kind: str, available: set[str]) -> list[dict[
         first = {name: peers.settings(name)[0] for name in available}
         for name in args.growth_engines:
             for changed in GROWTH if name in available else ():
+                if args.against and not changed.keys() & set(args.against):
+                    continue
                 more = {"variant": changed, "growth": True, "cached": False}
                 add(name, first[name], "window", [small["growth"]], 1.0, **more)
                 if name == "structured":

@@ -12,12 +12,12 @@ from pathlib import Path
 from codesign_jax import cli
 
 FOLDER = Path("runs") / "demo"
-SIZES = ["--particles", "10", "--trials", "6", "--episodes", "14", "--test-trials", "18"]
+SIZES = ["--particles", "10", "--trials", "6", "--episodes", "20", "--test-trials", "18"]
 
 
 def main() -> int:
     """Runs the demo and returns the exit status: 0 only if a final particle passed its test."""
-    run = ["optimize", "--preset", "2d", *SIZES, "--seed", "0", "--out", str(FOLDER)]
+    run = ["optimize", "--preset", "2d", *SIZES, "--seed", "13", "--out", str(FOLDER)]
     status = cli.main([*run, *sys.argv[1:]])
     if status:
         return status

@@ -69,10 +69,10 @@ VARIANTS = (
     Variant("friction +30 %", friction=1.3),
     Variant("stiffness -20 %", stiffness=0.8),
     Variant("stiffness +20 %", stiffness=1.2),
-    Variant("1 ms, 20 links", overrides=FINE),
+    Variant("1 ms and 20 links", overrides=FINE),
     Variant("unseen meshes", objects="household"),
     Variant("MuJoCo C", engine="mujoco", best=True, blocks=2),
-    Variant("MuJoCo C, 1 ms, 20 links", engine="mujoco", best=True, overrides=FINE, blocks=2),
+    Variant("MuJoCo C at 1 ms and 20 links", engine="mujoco", best=True, overrides=FINE, blocks=2),
 )
 """The variants; the names of those of MuJoCo C are what they are compared by."""
 

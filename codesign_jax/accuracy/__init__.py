@@ -1,0 +1,1 @@
+"""What accuracy costs in time: errors and times of settings against a converged reference."""

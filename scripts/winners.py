@@ -19,7 +19,7 @@ from codesign_jax import scene
 from codesign_jax.experiments import record, winners
 from codesign_jax.experiments.winners import VARIANTS, Variant
 from codesign_jax.experiments.worlds import LIMIT
-from codesign_jax.runs.provenance import environment, git_state
+from codesign_jax.provenance import environment, git_state
 from codesign_jax.schema import SceneError
 
 # Runs, particles of a run, blocks of trials, trials of a block (all shapes of a set equally often).

@@ -42,7 +42,10 @@ EFFECTS: Mapping[str, Effect] = {
     "finger_table": Effect("fingers touch the table"),
     "palm_table": Effect("the palm touches the table"),
     "object_table": Effect("the object rests on the table"),
-    "friction": Effect("of all contacts: none, coulomb, or full with torsion and rolling"),
+    "friction": Effect(
+        "of all contacts: none, coulomb, or full with torsion and rolling",
+        {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},
+    ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),
     "neo_hookean": Effect("rubber at large strain: fingers soften as they bend"),

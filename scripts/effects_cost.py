@@ -53,7 +53,7 @@ def _measure(path: Path, parts: list[str], *, quick: bool) -> None:
     results: dict[str, Any] = {"effects": {}}
     if path.exists():
         results = json.loads(path.read_text(encoding="utf-8"))
-    results["provenance"] = provenance() | {"command": "python scripts/effects_cost.py"}
+    results["provenance"] = provenance(command="python scripts/effects_cost.py")
     if "decisions" in parts:
         _decisions(everything, results, path, quick=quick)
     if "programs" in parts:

@@ -86,8 +86,10 @@ def test_steps_equal_mujocos(name):
                 acc = (np.asarray(engine.qvel(new))[0] - qvel) / scene.discretization.timestep
                 scale = max(np.linalg.norm(data.qacc), 100.0)
                 error = np.linalg.norm(acc - data.qacc) / scale
-                # As in test_structured.
-                assert error < 1e-8, (k, data.ncon, error)
+                # As in test_structured; MuJoCo's rigid arm gives way by the hand's forces over
+                # 1e9 kg, which stiff fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
+                bound = 1e-8 if scene.effects.wrist else 1e-7
+                assert error < bound, (k, data.ncon, error)
                 most = max(most, data.ncon)
             mujoco.mj_step(oracle, data)
     if scene.effects.finger_object and scene.effects.object_table:

@@ -9,13 +9,12 @@ import numpy as np
 from codesign_jax.benchmark.report import markdown
 from codesign_jax.effects import EFFECTS, ENGINES
 
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 REFERENCE = "as it is"
 
 
 def draw(results: dict[str, Any], path: Path) -> None:
     """Time of a step and success rate of the scene with each effect turned over."""
-    rows = results["effects"]
+    rows = {n: r for n, r in results["effects"].items() if "ratio" in r and "success" in r}
     names = [*(n for n in rows if n != REFERENCE), REFERENCE][::-1]
     figure = matplotlib.figure.Figure(figsize=(9.6, 5.2), dpi=120, layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -63,55 +62,66 @@ def support_table() -> list[list[str]]:
 
 
 def measured_table(results: dict[str, Any]) -> list[list[str]]:
-    """A row for each change of the scene."""
+    """A row for each change of the scene; what was not measured is a dash."""
     head = ["change", "equations", "kFLOP", "XLA kFLOP", "XLA kB", "µs a step", "time ×"]
     table = [[*head, "success (95 %)", "same verdict", "rank corr."]]
     rows = results["effects"]
     for name, r in rows.items():
         same = " (same program)" if _same(rows, name) else ""
-        low, high = r["ratio_quartiles"]
-        rank = r["rank_correlation"]
-        table.append(
-            [
-                name + same,
-                str(r["equations"]),
-                *(f"{r[k] / 1e3:.1f}" for k in ("flops", "xla_flops", "xla_bytes")),
+        program = ["–"] * 6
+        if "ratio" in r:
+            low, high = r["ratio_quartiles"]
+            program = [str(r["equations"])]
+            program += [f"{r[k] / 1e3:.1f}" for k in ("flops", "xla_flops", "xla_bytes")]
+            program += [
                 f"{r['step_seconds'] * 1e6:.1f}",
                 f"{r['ratio']:.2f} ({low:.2f}–{high:.2f})",
+            ]
+        decision = ["–"] * 3
+        if "success" in r:
+            rank = r["rank_correlation"]
+            decision = [
                 f"{r['success']:.3f} ({r['success_low']:.3f}–{r['success_high']:.3f})",
                 f"{r['same_verdict']:.3f}",
                 "–" if rank is None else f"{rank:.3f}",
             ]
-        )
+        table.append([name + same, *program, *decision])
     return table
 
 
 def _same(rows: dict[str, Any], name: str) -> bool:
-    return name != REFERENCE and rows[name]["program"] == rows[REFERENCE]["program"]
+    mine, reference = (rows[n].get("program") for n in (name, REFERENCE))
+    return name != REFERENCE and mine is not None and mine == reference
 
 
 def write(results: dict[str, Any], page: Path) -> None:
-    """Puts the tables between the page's two marks.
+    """Puts the tables between the page's marks; what stands around them stays.
 
     Args:
       results: The measured file.
-      page: A page with the marks; what stands around them stays.
+      page: A page with the marks of "measured" and "support".
 
     Raises:
       ValueError: If the page lacks a mark.
     """
-    text = page.read_text(encoding="utf-8")
-    before, mark, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (mark and end):
-        raise ValueError(f"{page} lacks {BEGIN} or {END}")
     p = results["provenance"]
-    load = "–".join(f"{results[k][0]:.1f}" for k in ("load_before", "load_after"))
-    worlds = results["effects"][REFERENCE]["worlds"]
+    load = [f"{results[k][0]:.1f}" for k in ("load_before", "load_after") if k in results]
+    worlds = results["effects"][REFERENCE].get("worlds", 0)
     note = (
-        f"{worlds} grasps ({worlds // results['trials']} designs × {results['trials']} trials), "
-        f"{p['cpus']} cores of {p['cpu']}, jax {p['jax']}, MuJoCo {p['mujoco']}, commit "
-        f"{p['commit']}, load of the machine {load}."
+        f"{worlds} grasps, {results.get('trials')} trials a design; {p['cpus']} cores of {p['cpu']}"
+        f", jax {p['jax']}, MuJoCo {p['mujoco']}, commit {p['commit']}; load of the machine while "
+        f"timing: {' to '.join(load) or 'not timed'}."
     )
-    made = "\n\n".join((BEGIN, note, markdown(measured_table(results)), END))
-    page.write_text(before + made + after, encoding="utf-8")
+    text = page.read_text(encoding="utf-8")
+    text = _between(text, "measured", note + "\n\n" + markdown(measured_table(results)))
+    page.write_text(_between(text, "support", markdown(support_table())), encoding="utf-8")
+
+
+def _between(text: str, name: str, made: str) -> str:
+    """The text with what stands between a pair of marks replaced."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    before, mark, rest = text.partition(begin)
+    _, last, after = rest.partition(end)
+    if not (mark and last):
+        raise ValueError(f"no {begin} ... {end} in the page")
+    return f"{before}{begin}\n\n{made}\n\n{end}{after}"

@@ -9,13 +9,14 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
-.PHONY: demo test test-slow notebooks benchmark lint format types clean help
+.PHONY: demo test test-slow notebooks benchmark effects lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
+	@echo "make effects     what each effect costs and decides: docs/effects.md"
 	@echo "make format      ruff format          make clean       remove what make built"
 
 demo: $(STAMP)
@@ -34,6 +35,10 @@ notebooks: $(STAMP)
 BENCHMARK ?= runs/benchmark.json
 benchmark: $(STAMP)
 	$(BIN)/python scripts/benchmark.py --json $(BENCHMARK) $(ARGS)
+
+# About 15 minutes on two idle cores.
+effects: $(STAMP)
+	$(BIN)/python scripts/effects_cost.py $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(CHECKED)

@@ -107,6 +107,24 @@ class Evaluate:
         return evaluate.main(self)
 
 
+@dataclasses.dataclass
+class Scenes:
+    """List scenes and their effects: on, off, or unsupported by an engine."""
+
+    name: Annotated[
+        str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help_behavior_hint="")
+    ] = None
+    """Scene: a built-in name or a .toml file; default: all built-in ones."""
+    engine: Text = None
+    """Show this engine only."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import scenes
+
+        return scenes.main(self)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Parses the command line, runs the command and returns the exit status.
 
@@ -117,7 +135,7 @@ def main(arguments: list[str] | None = None) -> int:
       arguments: Arguments without the program's name; default: those of the process.
     """
     command = tyro.cli(
-        Optimize | Evaluate,  # type: ignore[arg-type]
+        Optimize | Evaluate | Scenes,  # type: ignore[arg-type]
         args=arguments,
         prog="codesign",
         description="Co-design of soft hand morphology and control.",

@@ -14,15 +14,25 @@ from codesign_jax.schema import choice, quantity
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """What is simulated; an effect that is off has no joint, contact or branch in the program."""
+    """What is simulated; an effect that is off has no joint, contact or branch in the program.
+
+    `codesign_jax.effects` says what each means and which engines have it.
+    """
 
     lateral_bending: bool = True
     twist: bool = True
+    wrist: bool = True
     finger_object: bool = True
+    palm_object: bool = True
     finger_table: bool = True
-    palm_contact: bool = True
+    palm_table: bool = True
+    object_table: bool = True
+    friction: str = choice("none", "coulomb", "full", default="coulomb")
     disturb: bool = True
     ungrasp: bool = True
+    neo_hookean: bool = False
+    pressure_dynamics: bool = False
+    gravity: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,13 +68,28 @@ class Cost:
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """MuJoCo's soft contact as the rubber skin's own numbers; see `model.contact_invweight`."""
+    """MuJoCo's soft contact as the rubber skin's own numbers; see `model.contact_invweight`.
+
+    A contact of normal force N resists spin with `torsional_friction` N and rolling with
+    `rolling_friction` N, both lengths as in MuJoCo, if the effect `friction` is "full".
+    """
 
     normal_stiffness: float = quantity("N/m", 10, 1e6)
     time_constant: float = quantity("s", 1e-4, 1)
     impedance: float = quantity("", 0.01, 0.9999)
     friction_ratio: float = quantity("", 0.01, 1000)
     finger_table_friction: float = quantity("", 0, 5)
+    torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
+    rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pneumatics:
+    """Dynamics of the chambers' pressure, used with the effect `pressure_dynamics`."""
+
+    lag: float = quantity("s", 0, 10, default=0.1)
+    rate: float = quantity("Pa/s", 1e3, 1e9, default=400e3)
+    maximum: float = quantity("Pa", 1e3, 1e6, default=200e3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,6 +138,12 @@ class Scene:
     discretization: Discretization
     solver: Solver
     limits: Limits
+    pneumatics: Pneumatics = Pneumatics()
+
+    @property
+    def gravity_on(self) -> float:
+        """Gravity as simulated: 0 if the effect is off [m/s^2]."""
+        return self.gravity if self.effects.gravity else 0.0
 
     @property
     def num_fingers(self) -> int:
@@ -156,7 +187,8 @@ class _SceneFile:
     discretization: Discretization
     solver: Solver
     limits: Limits
-    gravity: float = quantity("m/s^2", 0, 100)
+    pneumatics: Pneumatics = Pneumatics()
+    gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
 
 
 def load(

@@ -43,7 +43,10 @@ SCENES = {
     ),
     "bending only": lambda: pinch(effects__lateral_bending=False, effects__twist=False),
     "no finger contact": lambda: pinch(
-        effects__finger_object=False, effects__finger_table=False, effects__palm_contact=False
+        effects__finger_object=False,
+        effects__finger_table=False,
+        effects__palm_object=False,
+        effects__palm_table=False,
     ),
     "one link": lambda: pinch("cylinder", links=1),
 }
@@ -210,7 +213,8 @@ def free_scene(**discretization):
         links=5,
         effects__finger_object=False,
         effects__finger_table=False,
-        effects__palm_contact=False,
+        effects__palm_object=False,
+        effects__palm_table=False,
         **settings,
     )
 

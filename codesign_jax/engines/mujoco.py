@@ -7,8 +7,9 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
+from codesign_jax import effects
 from codesign_jax.engines.base import refuse_meshes
-from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
 
@@ -35,6 +36,7 @@ class MujocoEngine:
           num_threads: Threads to use; 0 for all cores.
         """
         refuse_meshes(scene, self.name)
+        effects.refuse(scene.effects, self.name)
         self.scene = scene
         self.template = compile_template(scene)
         self.num_threads = num_threads
@@ -53,7 +55,7 @@ class MujocoEngine:
 
     def _run(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
         dtype = np.asarray(ctrl).dtype
-        fields = ModelFields(*(np.asarray(v, np.float64) for v in fields))
+        fields = jax.tree.map(lambda v: np.asarray(v, np.float64), fields)
         with self._lock:
             trace = self._simulate(fields, np.asarray(ctrl, np.float64), trajectory)
         return Trace(*(v.astype(dtype) for v in trace))
@@ -73,8 +75,11 @@ class MujocoEngine:
         trace = Trace(distance, height, speed, np.zeros((worlds, steps, nq * trajectory)))
         start, end = (round(t / scene.discretization.timestep) for t in scene.window)
         going = np.arange(worlds)
-        for first in range(0, steps, _CHUNK):
-            part = slice(first, min(first + _CHUNK, steps))
+        chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
+        for first in range(0, steps, chunk):
+            part = slice(first, min(first + chunk, steps))
+            if scene.effects.neo_hookean:
+                _apply_softening(scene, batch, fields, going)
             new, taken = self._advance(batch, going, ctrl[going, part], trajectory)
             for array, values in zip(trace, new, strict=True):
                 array[going, part] = values
@@ -131,14 +136,22 @@ class MujocoEngine:
         return Trace(distance, middle[..., 2], speed, qpos), taken
 
 
+def _apply_softening(
+    scene: Scene, batch: mujoco.batch.Batch, fields: ModelFields, ids: np.ndarray
+) -> None:
+    """Applies the moments of the neo-Hookean law at the worlds' present angles."""
+    bend = layout(scene).dofs[..., 0]
+    angles = batch.bind("qpos")[ids][:, bend]
+    mine = jax.tree.map(lambda v: v[ids], fields)
+    batch.bind("qfrc_applied")[ids[:, None, None], bend] = softening_moments(scene, mine, angles)
+
+
 def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:
     """Gives every simulation of a batch its model fields and start state."""
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
-    for name in ModelFields._fields:
-        if name == "start":
-            batch.bind("qpos")[:] = fields.start
-        else:
-            batch.expand(name)[:] = getattr(fields, name)
+    batch.bind("qpos")[:] = fields.start
+    for name, value in fields.of_model.items():
+        batch.expand(name)[:] = value
     batch.bind("qacc_warmstart")[:] = 0.0
 
 
@@ -147,7 +160,6 @@ def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:
     import copy
 
     model = copy.deepcopy(compile_template(scene))
-    for name in ModelFields._fields:
-        if name != "start":
-            getattr(model, name)[:] = np.asarray(getattr(fields, name), np.float64)
+    for name, value in fields.of_model.items():
+        getattr(model, name)[:] = np.asarray(value, np.float64)
     return model

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from codesign_jax import effects
 from codesign_jax.engines.structured import collision, implicit, mesh, solver
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
@@ -16,7 +17,8 @@ from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, k
 from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
-from codesign_jax.scene import Scene
+from codesign_jax.model.layout import palm_touches
+from codesign_jax.scene import Effects, Scene
 from codesign_jax.types import Trace
 
 LANES = 60
@@ -68,8 +70,8 @@ class StructuredEngine:
             a tighter tolerance, as the derivative is that of the solution.
           checkpoint: Whether the derivative of a rollout stores only states and accelerations and
             repeats the rest of each step; costs nothing without a derivative.
-          fused: Whether one GPU kernel runs a rollout (float32, primitive shapes, no trajectory).
-            By default on a GPU.
+          fused: Whether one GPU kernel runs a rollout (float32, primitive shapes, no trajectory,
+            effects of `in_kernel`). By default on a GPU.
           lanes: Worlds in flight at once, see `stream`; 0 steps all worlds in unison. By default
             `LANES` on a CPU and 0 elsewhere.
           burst: Newton iterations of a round of the stream.
@@ -77,6 +79,7 @@ class StructuredEngine:
         Raises:
           SceneError: If a mesh's distance cannot be put on a grid.
         """
+        effects.refuse(scene.effects, self.name)
         mesh.tables(scene)
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
@@ -131,7 +134,13 @@ class StructuredEngine:
         matrix = solver.Matrices(*(run(lambda b: b.matrix(), b) for b in body))
         contacts = self._contacts(run, hand, kin, state.wrist[2])
         velocity = solver.Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-        return solver.Problem(hand, kin, body, matrix, smooth, contacts), velocity
+        arm = None if self.scene.effects.wrist else self._arm(state, ctrl)
+        return solver.Problem(hand, kin, body, matrix, smooth, contacts, arm), velocity
+
+    def _arm(self, state: State, ctrl: jax.Array) -> jax.Array:
+        """Acceleration of the palm's coordinates that ends the step at the arm frame."""
+        h = self.scene.discretization.timestep
+        return ((ctrl[:6, None] - state.wrist) / h - state.wrist_vel) / h
 
     def _contacts(
         self, run: Stages, hand: HandLanes, kin: Kinematics, height: jax.Array
@@ -146,11 +155,14 @@ class StructuredEngine:
                 found["finger_object"] = on_object(run, spheres, hand.radius)
             if e.finger_table:
                 found["finger_table"] = on_table(spheres, hand.radius)
-        if e.palm_contact:
+        if palm_touches(scene):
             palm, radius = collision.palm_spheres(scene, kin), scene.hand.palm.contact_radius
-            found["palm_object"] = on_object(run, palm, radius)
-            found["palm_table"] = on_table(palm, radius)
-        found["object_table"] = collision.object_on_table(run, scene, hand, kin, height)
+            if e.palm_object:
+                found["palm_object"] = on_object(run, palm, radius)
+            if e.palm_table:
+                found["palm_table"] = on_table(palm, radius)
+        if e.object_table:
+            found["object_table"] = collision.object_on_table(run, scene, hand, kin, height)
         return found
 
     def step(
@@ -170,6 +182,8 @@ class StructuredEngine:
             tolerance=self.tolerance,
         )
         h = self.scene.discretization.timestep
+        if problem.arm is not None:
+            solution = solution._replace(acc=solution.acc._replace(wrist=problem.arm))
         new = run(lambda s, k, a: integrate(s, k, a, h), state, problem.kin, solution.acc)
         centre = self._centre(hand, problem.kin, problem.body) + state.wrist[:3]
         return new, StepInfo(solution.acc, solution.residual, solution.iterations, centre)
@@ -185,7 +199,8 @@ class StructuredEngine:
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`; on a GPU in float32 one kernel runs it all, see `fused`."""
         primitive = all(o.type != "mesh" for o in self.scene.objects.object)
-        if self.fused and primitive and not trajectory and ctrl.dtype == jnp.float32:
+        fits = self.fused and primitive and in_kernel(self.scene.effects)
+        if fits and not trajectory and ctrl.dtype == jnp.float32:
             return self._one_kernel(fields, ctrl)
         with jax.default_matmul_precision("highest"):
             # The stream moves worlds between lanes; a mesh's grid belongs to no world.
@@ -260,6 +275,11 @@ class StructuredEngine:
         """Largest absolute generalized velocity; not finite if any velocity or position is not."""
         qvel, qpos = self.qvel(state), self.qpos(state)
         return jnp.abs(qvel).max(1) + 0.0 * qpos.sum(1)
+
+
+def in_kernel(e: Effects) -> bool:
+    """Whether the fused kernel simulates a scene's effects; the batch form simulates all."""
+    return e.wrist and e.object_table and e.friction == "coulomb" and not e.neo_hookean
 
 
 def integrate(state: State, kin: Kinematics, acc: Acc, h: float) -> State:

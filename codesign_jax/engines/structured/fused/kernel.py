@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.hand import HandLanes
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanewise import lanes
 from codesign_jax.model import layout
-from codesign_jax.model.layout import palm_points
+from codesign_jax.model.layout import palm_points, palm_touches
 from codesign_jax.scene import Scene
 
 TRACE = ("distance", "height", "speed", "residual", "iterations")
@@ -70,15 +70,15 @@ class Program:
             sets.append(make("finger_object", self.links, k))
         if k and e.finger_table:
             sets.append(make("finger_table", self.links, k))
-        if e.palm_contact:
-            sets += [make(n, self.palm_groups, 1) for n in ("palm_object", "palm_table")]
+        on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
+        sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
         return [*sets, make("object_table", -(-4 // self.fingers), 1)]
 
     def _tables(self) -> None:
         n, a = self.links, self.axes
         one: tuple[int, ...] = ()
         spheres = {"sphere": (n, (3, self.k)), "radius": (n, (self.k,))} if self.k else {}
-        if self.scene.effects.palm_contact:
+        if palm_touches(self.scene):
             spheres |= {
                 "palm_point": (self.palm_groups, (3, 1)),
                 "palm_radius": (self.palm_groups, (1,)),
@@ -148,7 +148,7 @@ class Program:
         # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
         share = jnp.ones((self.links + 1, *lane), dtype)
         arrays["share"] = share.at[jnp.array([0, self.links])].set(0.5)
-        if self.scene.effects.palm_contact:
+        if palm_touches(self.scene):
             arrays |= self._palm_slots(worlds, dtype)
         extra = self.fingers - n
         if extra:

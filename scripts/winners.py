@@ -90,6 +90,7 @@ def main() -> int:
     todo.sort(key=lambda task: task.block)
     settings = {
         "size": args.size,
+        "particles": "the best of each run first",
         "scene_sha256": record.scene_hash(scene.load("paper")),
         "set": list(args.set),
     }

@@ -73,7 +73,7 @@ class Study:
         found = self.times.get((name, of))
         if found is None and setting.keep_contact:  # refused: drawn where it would have been
             return self.cost(engine, Setting(**{**vars(setting), "keep_contact": False}))
-        return found and found["s_per_simulated_s"]
+        return None if found is None else found["s_per_simulated_s"]
 
     def points(self, part: str) -> list[Point]:
         """Settings with error and cost.

@@ -8,8 +8,8 @@ from codesign_jax.experiments import figures, statistics
 from codesign_jax.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
 from codesign_jax.experiments.statistics import RULES, Interval, Study
 
-MARK = "results"
-"""Name of the marks between which a page's table is replaced: <!-- NAME:begin -->, :end."""
+BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
+"""Marks between which a page's table is replaced."""
 
 _THRESHOLDS = (0.1, 0.5, 1.0)
 _HEAD = "| the paper | here |\n|---|---|"
@@ -42,7 +42,7 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     return text
 
 
-def fill(page: Path, text: str, mark: str = MARK) -> None:
+def fill(page: Path, text: str, mark: str = "results") -> None:
     """Replaces what stands between the marks of a page.
 
     Args:

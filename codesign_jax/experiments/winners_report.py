@@ -12,10 +12,13 @@ from codesign_jax.experiments import statistics, winners
 from codesign_jax.experiments.record import Arrays
 from codesign_jax.experiments.report import fill
 from codesign_jax.experiments.statistics import Interval
-from codesign_jax.experiments.winners import STANDARD, Finals
+from codesign_jax.experiments.winners import STANDARD, VARIANTS, Finals
 
 MARK = "winners"
 """Name of the marks in the page."""
+
+NOTHING = Interval(np.nan, np.nan, np.nan)
+"""Where no run succeeded."""
 
 _COLORS = {"23d": "tab:blue", "2d": "tab:orange"}
 
@@ -101,16 +104,17 @@ def _row(
     standard: tuple[np.ndarray, np.ndarray] | None,
 ) -> Row:
     runs, particles, trials = cost.shape
-    top = _best(finals, cost), _best(finals, status)
+    top = cost[:, 0], status[:, 0]  # the best particle of each run is its first
     won = finals.successful
     good = solved(*top)
     kept = (top[0] < SUCCESS_COST) & (top[1] == 0)
     p = same = None
     shared = None if standard is None else standard[0].shape[-1]
-    # Meshes are other objects: their trials are not the standard's.
-    if name != STANDARD and standard is not None and shared and "mesh" not in name:
+    # Other objects have trials of their own.
+    other_objects = {v.name for v in VARIANTS if v.objects}
+    if shared and standard and won.any() and name != STANDARD and name not in other_objects:
         n = min(trials, shared)
-        other = [_best(finals, v[..., :n]) for v in standard]
+        other = [v[:, 0, :n] for v in standard]
         mine = [v[:, :n] for v in top]
         p = statistics.mcnemar(solved(*mine)[won], solved(*other)[won])
         theirs = (other[0] < SUCCESS_COST) & (other[1] == 0)
@@ -123,21 +127,14 @@ def _row(
         (int(good[won].sum()), int(won.sum())),
         p,
         statistics.bootstrap(by_run, lambda v: v.mean(-1)) if particles > 1 else None,
-        statistics.bootstrap(kept[won].mean(1), lambda v: v.mean(-1)),
+        statistics.bootstrap(kept[won].mean(1), lambda v: v.mean(-1)) if won.any() else NOTHING,
         same,
         float((status != 0).mean()),
     )
 
 
-def _best(finals: Finals, values: np.ndarray) -> np.ndarray:
-    """Values of the best particle of each run, shape (run, trial)."""
-    if values.shape[1] == 1:
-        return values[:, 0]
-    return np.take_along_axis(values, finals.best[:, None, None], 1)[:, 0]
-
-
 def _percent(value: Interval | None) -> str:
-    if value is None:
+    if value is None or np.isnan(value.value):
         return "–"
     return f"{100 * value.value:.0f} % [{100 * value.low:.0f}, {100 * value.high:.0f}]"
 

@@ -13,7 +13,7 @@ import pytest
 import scipy.stats
 from small import pinch, still
 
-from codesign_jax import model, parameters, scene, schema
+from codesign_jax import cli, model, parameters, scene, schema
 from codesign_jax.accuracy import (
     beam,
     decision,
@@ -28,6 +28,7 @@ from codesign_jax.accuracy import (
 from codesign_jax.accuracy.settings import STANDARD, Setting, one_at_a_time
 from codesign_jax.accuracy.store import Case, Store
 from codesign_jax.accuracy.timing import name
+from codesign_jax.commands import optimize
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.hand import hand_lanes
 
@@ -59,6 +60,14 @@ def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
     mistaken.write_text('description = "x"\n[discretization]\nlink = 3\n[solver]\n')
     with pytest.raises(schema.SceneError, match="links"):
         scene.load("paper", accuracy=mistaken)
+
+
+def test_the_command_line_takes_a_preset(capsys):
+    found, _ = optimize.resolve(cli.Optimize(accuracy="fast", overrides=("solver.iterations=7",)))
+    assert found.discretization == scene.Discretization(0.01, 5, 2)
+    assert found.solver.iterations == 7
+    assert cli.main(["evaluate", "--accuracy", "finest"]) == 2
+    assert "'finest' unknown; did you mean 'fast'" in capsys.readouterr().err
 
 
 # --- settings ------------------------------------------------------------------------------------

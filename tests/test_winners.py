@@ -64,7 +64,8 @@ def test_a_call_is_an_evaluation_of_these_particles(finals):
     key = stream_key(jax.random.key(0), winners.STREAM_WINNERS, 1)
     trials = rollout.sample_trials(scene, key, 3)
     params = jax.vmap(space.params)(finals.chosen(True)[:, 0])
-    expected = rollout.evaluate(scene, make_engine("mujoco", scene), params, trials)
+    engine = make_engine("mujoco", scene)
+    expected = jax.jit(lambda p, t: rollout.evaluate(scene, engine, p, t))(params, trials)
     cost = found["23d|MuJoCo C|1|cost"]
     assert cost.shape == (2, 1, 3)
     np.testing.assert_array_equal(cost[:, 0], np.asarray(expected.cost).astype(np.float16))

@@ -64,8 +64,8 @@ def make(data: Path, pictures: Path, page: Path | None) -> str:
         results = {k: file[k] for k in file.files}
     tables = {}
     for name in dict.fromkeys(k.split("|")[0] for k in results if "|" in k):
-        shape = results[f"{name}|{STANDARD}|0|cost"].shape
-        finals = winners.finals(data, name, shape[0], shape[1])
+        shapes = [results[k].shape for k in results if k.startswith(name) and k.endswith("cost")]
+        finals = winners.finals(data, name, *np.max(shapes, axis=0)[:2])
         tables[name] = (finals, rows(results, finals))
     figure(tables, pictures / "winners.png")
     text = "\n\n".join(_markdown(*table) for table in tables.values())

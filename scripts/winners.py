@@ -99,7 +99,7 @@ def main() -> int:
     )
     notes = {
         "command": " ".join(["python", *sys.argv]),
-        **({"commit": args.commit} if args.commit else git_state()),
+        **git_state(args.commit),
         **environment(),
         "settings": settings,
     }

@@ -25,7 +25,7 @@ from codesign_jax.accuracy import (
     tip,
     worlds,
 )
-from codesign_jax.accuracy.settings import STANDARD, Setting, one_at_a_time
+from codesign_jax.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
 from codesign_jax.accuracy.store import Case, Store
 from codesign_jax.accuracy.timing import name
 from codesign_jax.commands import optimize
@@ -46,6 +46,10 @@ def test_the_standard_preset_is_the_scene_and_the_study_s_default():
 def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
     fine = scene.load("paper", accuracy="reference")
     assert fine.discretization == scene.Discretization(0.001, 20, 1)
+    for preset_name, setting in PRESETS.items():
+        preset = scene.load("paper", accuracy=preset_name).discretization
+        assert preset == setting.scene().discretization
+        assert setting in one_at_a_time("structured")
     fast = scene.load("paper", accuracy="fast", overrides={"discretization": {"links": 7}})
     assert (fast.discretization.links, fast.discretization.spheres_per_link) == (7, 2)
 

@@ -4,7 +4,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib.figure
+import matplotlib.lines
 import numpy as np
+
+from codesign_jax.accuracy.settings import LINKS, TIMESTEPS, Setting
 
 COLORS = {"structured": "tab:blue", "mujoco": "tab:green", "mjx": "tab:orange"}
 MARKERS = {
@@ -37,10 +40,8 @@ class Point(NamedTuple):
     error: float
 
 
-def knob(setting: Any) -> str:
+def knob(setting: Setting) -> str:
     """What a setting changes of the standard one."""
-    from codesign_jax.accuracy.settings import Setting
-
     base, found = Setting(engine=setting.engine), []
     for name, fields in {
         "time step": ("timestep", "keep_contact"),
@@ -89,7 +90,9 @@ def diagram(panels: dict[str, list[Point]], path: Path, title: str) -> None:
                 )  # fmt: skip
             for i in chosen:
                 where = mine[i].cost, max(mine[i].error, floor)
-                axis.annotate(mine[i].label, where, fontsize=5.5, xytext=(4, 4),
+                # Labels above and below in turn, where the points of a front lie close.
+                away = (4, 4) if chosen.index(i) % 2 else (4, -9)
+                axis.annotate(mine[i].label, where, fontsize=5.5, xytext=away,
                               textcoords="offset points")  # fmt: skip
             failed = [p for p in points if p.engine == engine and not np.isfinite(p.error)]
             for p in failed:
@@ -130,7 +133,10 @@ def convergence(lines: dict[str, list[tuple[float, float]]], path: Path) -> None
             axis.loglog(*zip(*sorted(points), strict=True), marker="o", ms=4, label=label)
     left.set(xlabel="time step [ms]", ylabel="error")
     right.set(xlabel="length of a link / length of the finger", ylabel="error")
+    left.set_xticks(TIMESTEPS, [f"{t:g}" for t in TIMESTEPS])
+    right.set_xticks([1 / n for n in LINKS], [f"1/{n}" for n in LINKS])
     for axis in (left, right):
+        axis.xaxis.minorticks_off()
         if axis.lines:
             axis.legend(frameon=False, fontsize=7)
         axis.grid(alpha=0.3, which="both", lw=0.4)

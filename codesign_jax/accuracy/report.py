@@ -9,7 +9,7 @@ import numpy as np
 
 from codesign_jax.accuracy import figures, statistics
 from codesign_jax.accuracy.figures import Point
-from codesign_jax.accuracy.settings import Setting
+from codesign_jax.accuracy.settings import PRESETS, Setting
 from codesign_jax.accuracy.statistics import Records
 from codesign_jax.benchmark.report import markdown
 from codesign_jax.experiments.report import fill
@@ -151,6 +151,9 @@ def _section(study: Study, name: str, title: str, docs: Path) -> str:
         rows = _decisions_table(study, population)
         if len(rows) > 1:
             parts.append(f"**Decisions: {words}**\n\n" + markdown(rows))
+    rows = _presets_table(study)
+    if len(rows) > 1:
+        parts.append("**From preset to preset**\n\n" + markdown(rows))
     floors = _floors(study)
     if len(floors) > 1:
         parts.append("**What chaos and noise alone do**\n\n" + markdown(floors))
@@ -279,6 +282,19 @@ def _decisions_table(study: Study, population: str) -> list[list[str]]:
         if statistics.bad(r):
             head = [r["of"].engine, r["of"].label, "refused or failed"]
             rows.append([*head, *[""] * len(_DECISION)])
+    return rows
+
+
+def _presets_table(study: Study) -> list[list[str]]:
+    """Decisions from preset to preset, the coarser beside the finer."""
+    rows = [["presets", "population", *_DECISION]]
+    names = list(PRESETS)
+    for population in POPULATIONS:
+        for a, b in ((0, 1), (1, 2), (0, 2)):
+            costs = [study.grasps.get((PRESETS[names[i]], False, population)) for i in (a, b)]
+            if costs[0] is not None and costs[1] is not None:
+                what = f"{names[a]} against {names[b]}"
+                rows.append(_row([what, population], statistics.compare(*costs)))
     return rows
 
 

@@ -39,6 +39,8 @@ class Optimize:
     """Object set: a built-in name or a .toml file; default: the scene's."""
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
+    accuracy: Text = None
+    """Discretization and solver instead of the scene's: fast, standard, reference, or a .toml."""
     overrides: Overrides = ()
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control."""
@@ -90,6 +92,8 @@ class Evaluate:
     """Object set: a built-in name or a .toml file; default: the scene's."""
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
+    accuracy: Text = None
+    """Discretization and solver instead of the scene's: fast, standard, reference, or a .toml."""
     overrides: Overrides = ()
     engine: Text = None
     """Engine that simulates; default: the run's, or structured."""

@@ -114,6 +114,15 @@ class Solver:
 
 
 @dataclasses.dataclass(frozen=True)
+class Accuracy:
+    """Values of a preset of accuracy; docs/accuracy.md has its measured errors and cost."""
+
+    description: str
+    discretization: dict
+    solver: dict
+
+
+@dataclasses.dataclass(frozen=True)
 class Limits:
     """Bounds beyond which a world has failed although its numbers are finite."""
 
@@ -196,6 +205,7 @@ def load(
     *,
     hand_name: str | Path | None = None,
     object_set: str | Path | None = None,
+    accuracy: str | Path | None = None,
     overrides: dict[str, dict[str, Any]] | None = None,
 ) -> Scene:
     """Reads a scene with its hand and objects.
@@ -204,20 +214,23 @@ def load(
       name: Name of a built-in scene, or a path ending in .toml.
       hand_name: Hand to use instead of the scene's.
       object_set: Object set to use instead of the scene's.
-      overrides: Values by table and key that replace the file's, e.g. {"discretization": {"links":
-        5}}.
+      accuracy: Preset of discretization and solver to use instead of the scene's: "fast",
+        "standard", "reference", or a path ending in .toml; see `load_accuracy`.
+      overrides: Values by table and key that replace the file's and the preset's, e.g.
+        {"discretization": {"links": 5}}.
 
     Raises:
       SceneError: with every problem of the scene, the hand and the objects.
     """
     path = files.find("scenes", name)
     table = files.read(path)
-    for group, values in (overrides or {}).items():
+    problems: list[str] = []
+    changes = [_preset(accuracy, problems), overrides or {}]
+    for group, values in (item for change in changes for item in change.items()):
         if isinstance(values, dict):
             table[group] = {**table.get(group, {}), **values}
         else:
             table[group] = values
-    problems: list[str] = []
     parsed = schema.parse(_SceneFile, table, path.name, problems)
     parts = {}
     for key, loader, chosen in (
@@ -237,6 +250,35 @@ def load(
         raise schema.SceneError(problems)
     names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
     return Scene(**parts, **{n: getattr(parsed, n) for n in names})
+
+
+def load_accuracy(name: str | Path) -> Accuracy:
+    """Reads a preset of discretization and solver; its values are checked with the scene's.
+
+    Args:
+      name: Name of a built-in preset, or a path ending in .toml.
+
+    Raises:
+      SceneError: with every problem of the file.
+    """
+    path = files.find("accuracy", name)
+    problems: list[str] = []
+    preset = schema.parse(Accuracy, files.read(path), path.name, problems)
+    if problems or preset is None:
+        raise schema.SceneError(problems)
+    return preset
+
+
+def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str, Any]]:
+    """Overrides of a preset of accuracy; none without a name or with problems."""
+    if name is None:
+        return {}
+    try:
+        preset = load_accuracy(name)
+    except schema.SceneError as error:
+        problems += error.problems
+        return {}
+    return {"discretization": preset.discretization, "solver": preset.solver}
 
 
 def _beside(path: Path, name: str) -> str | Path:

@@ -90,6 +90,7 @@ def main() -> int:
     todo.sort(key=lambda task: task.block)
     settings = {
         "size": args.size,
+        "particles": "the best of each run first",
         "scene_sha256": record.scene_hash(scene.load("paper")),
         "set": list(args.set),
     }
@@ -98,7 +99,7 @@ def main() -> int:
     )
     notes = {
         "command": " ".join(["python", *sys.argv]),
-        **({"commit": args.commit} if args.commit else git_state()),
+        **git_state(args.commit),
         **environment(),
         "settings": settings,
     }

@@ -73,6 +73,7 @@ def _from_flags(options: "Evaluate") -> _Case:
         options.scene,
         hand_name=options.hand,
         object_set=options.objects,
+        accuracy=options.accuracy,
         overrides=common.parse_overrides(options.overrides),
     )
     space = design_space(scene.hand, options.preset)
@@ -82,7 +83,7 @@ def _from_flags(options: "Evaluate") -> _Case:
 
 def _from_run(options: "Evaluate") -> _Case:
     """The final particle of a run that tested best, or the last episode's best without a test."""
-    if options.design or options.hand or options.objects or options.overrides:
+    if any((options.design, options.hand, options.objects, options.accuracy, options.overrides)):
         raise SceneError(["--run brings its own design and scene; leave out the flags for them"])
     folder: Path = options.run_folder  # type: ignore[assignment]
     scene, settings = runs.read_run(folder)

@@ -64,6 +64,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
             options.scene,
             hand_name=options.hand,
             object_set=options.objects,
+            accuracy=options.accuracy,
             overrides=common.parse_overrides(options.overrides),
         )
     except SceneError as error:

@@ -7,6 +7,7 @@ import numpy as np
 from codesign_jax import control, cost, model
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Scene
+from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Trace, Trial
 
 
@@ -66,7 +67,8 @@ def simulate(
     fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
     ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)
     trace = engine.rollout(fields, ctrl, trajectory=trajectory)
-    return jax.vmap(lambda t: cost.outcome(scene, t))(trace), trace
+    initial = invalid_start(scene, fields)
+    return jax.vmap(lambda t, i: cost.outcome(scene, t, i))(trace, initial), trace
 
 
 def evaluate(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Outcome:

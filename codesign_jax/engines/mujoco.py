@@ -10,12 +10,13 @@ import numpy as np
 from codesign_jax.engines.base import refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
-from codesign_jax.types import Trace
+from codesign_jax.types import Status, Trace
 
 # Steps between looking at the worlds: a lost object or a failed world stops being simulated at this
 # grain.
 _CHUNK = 25
 _TIME = int(mujoco.mjtState.mjSTATE_TIME)
+_FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
 class MujocoEngine:
@@ -46,7 +47,14 @@ class MujocoEngine:
         worlds, steps = ctrl.shape[:2]
         like = jax.ShapeDtypeStruct((worlds, steps), ctrl.dtype)
         nq = self.template.nq if trajectory else 0
-        shapes = Trace(like, like, like, jax.ShapeDtypeStruct((worlds, steps, nq), ctrl.dtype))
+        shapes = Trace(
+            like,
+            like,
+            like,
+            jax.ShapeDtypeStruct((worlds, steps, nq), ctrl.dtype),
+            jax.ShapeDtypeStruct((worlds, steps), np.int32),
+            jax.ShapeDtypeStruct((worlds, self.template.nq + self.template.nv), ctrl.dtype),
+        )
         return jax.pure_callback(
             lambda f, c: self._run(f, c, trajectory), shapes, fields, ctrl, vmap_method="sequential"
         )
@@ -56,7 +64,9 @@ class MujocoEngine:
         fields = ModelFields(*(np.asarray(v, np.float64) for v in fields))
         with self._lock:
             trace = self._simulate(fields, np.asarray(ctrl, np.float64), trajectory)
-        return Trace(*(v.astype(dtype) for v in trace))
+        return Trace(
+            *(v if v.dtype == np.int32 else v.astype(dtype) for v in trace)  # type: ignore[union-attr]
+        )
 
     def _batch(self, num_worlds: int) -> mujoco.batch.Batch:
         if num_worlds not in self._batches:
@@ -70,13 +80,15 @@ class MujocoEngine:
         batch = self._batch(worlds)
         write_fields(batch, fields)
         distance, height, speed = np.zeros((3, worlds, steps))
-        trace = Trace(distance, height, speed, np.zeros((worlds, steps, nq * trajectory)))
+        status = np.zeros((worlds, steps), np.int32)
+        qpos, last = np.zeros((worlds, steps, nq * trajectory)), np.zeros((worlds, nq + batch.model.nv))
+        trace = Trace(distance, height, speed, qpos, status, last)
         start, end = (round(t / scene.discretization.timestep) for t in scene.window)
         going = np.arange(worlds)
         for first in range(0, steps, _CHUNK):
             part = slice(first, min(first + _CHUNK, steps))
-            new, taken = self._advance(batch, going, ctrl[going, part], trajectory)
-            for array, values in zip(trace, new, strict=True):
+            new, taken, states = self._advance(batch, going, ctrl[going, part], trajectory)
+            for array, values in zip(trace[:-1], new[:-1], strict=True):
                 array[going, part] = values
             # The cost window's end counts as lost only strictly inside it, as in `cost.outcome`.
             time = np.arange(part.start, part.stop)
@@ -86,10 +98,17 @@ class MujocoEngine:
             stopped = batch.warning[going, :, 0].any(1)
             done = lost.any(1) | failed.any(1) | (new.height < -scene.limits.penetration).any(1)
             done |= stopped
-            for array in trace:
+            bad = failed | (new.height < -scene.limits.penetration)
+            # Up to the step before the first bad entry, or to the last step that was taken.
+            good = np.where(bad.any(1), bad.argmax(1) - 1, taken - 1)
+            last[going] = states[np.arange(len(going)), np.maximum(good, 0)]
+            for array in trace[:-1]:
                 array[going[done], part.stop :] = array[going[done], part.stop - 1][:, None]
             for world, count in zip(going[stopped], taken[stopped], strict=True):
                 trace.speed[world, first + count :] = np.nan
+            full = batch.warning[:, _FULL, 0].any(1)[going]
+            for world, count in zip(going[full], taken[full], strict=True):
+                trace.status[world, first + count - 1] |= int(Status.CONTACT_OVERFLOW)
             going = going[~done]
             if not going.size:
                 break
@@ -97,12 +116,13 @@ class MujocoEngine:
 
     def _advance(
         self, batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool
-    ) -> tuple[Trace, np.ndarray]:
+    ) -> tuple[Trace, np.ndarray, np.ndarray]:
         """Steps the given worlds through a chunk.
 
         Returns:
-          The chunk's trace, whose entry k describes the state before step k, and the steps taken by
-          each world: fewer than asked for where MuJoCo stopped.
+          The chunk's trace, whose entry k describes the state before step k; the steps taken by
+          each world, fewer than asked for where MuJoCo stopped; and qpos and qvel of the states
+          that the entries describe.
         """
         lay = layout(self.scene)
         before = batch.bind("qvel")[ids][:, None], batch.bind("qpos")[ids][:, None]
@@ -110,7 +130,7 @@ class MujocoEngine:
             ctrl.shape[1],
             ctrl,
             control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
-            record=("xipos", "qvel", _TIME, *(("qpos",) if trajectory else ())),
+            record=("xipos", "qvel", "qpos", "solver_niter", _TIME),
             ids=ids,
         )
         # Where a world stopped, its records repeat, and so does their time.
@@ -122,13 +142,13 @@ class MujocoEngine:
         qvel = np.concatenate([before[0], record["qvel"][:, :-1]], 1)
         with np.errstate(invalid="ignore"):
             speed = np.abs(qvel).max(-1)
-        qpos = (
-            np.concatenate([before[1], record["qpos"][:, :-1]], 1)
-            if trajectory
-            else xipos[:, :, 0, :0]
-        )
+        qpos = np.concatenate([before[1], record["qpos"][:, :-1]], 1)
         distance = np.linalg.norm(middle - centre, axis=-1)
-        return Trace(distance, middle[..., 2], speed, qpos), taken
+        capped = record["solver_niter"].max(-1) >= self.scene.solver.iterations
+        status = np.where(capped, int(Status.SOLVER_CAP), 0)
+        kept = qpos if trajectory else qpos[..., :0]
+        states = np.concatenate([qpos, qvel], -1)
+        return Trace(distance, middle[..., 2], speed, kept, status), taken, states
 
 
 def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from codesign_jax import types
 from codesign_jax.codesign import FinalTest
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.runs.record import History
@@ -57,7 +58,7 @@ def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: F
       test: Their test.
     """
     head = ["particle", "test_cost", "trials", "failed_trials", "success", *design_columns(space)]
-    failed = np.asarray(test.trials.status) != 0
+    failed = types.failed(np.asarray(test.trials.status))
     rows = (
         [i, _number(test.cost[i]), failed.shape[1], failed[i].sum(), int(test.success[i]), *design]
         for i, design in enumerate(_designs(space, particles))
@@ -83,7 +84,7 @@ def _best(designs: list[str]) -> list[str]:
 def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[list]:
     for e in span:
         best = int(np.argmin(history.cost[e]))
-        failed = int((history.trials.status[e] != 0).sum())
+        failed = int(types.failed(history.trials.status[e]).sum())
         size = 1 / (history.weight[e] ** 2).sum()
         costs = [_number(history.cost[e].mean()), _number(history.cost[e, best])]
         yield [e, *costs, failed, _number(size), *_designs(space, history.population[e])[best]]

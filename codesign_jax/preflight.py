@@ -127,7 +127,9 @@ def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Repo
     if any(sound):
         keep = np.array(sound)
         kept = Params(*(v[keep] for v in designs))
-        report.refusals.extend(_overlaps(scene, kept, [n for n, s in zip(names, sound, strict=True) if s]))
+        report.refusals.extend(
+            _overlaps(scene, kept, [n for n, s in zip(names, sound, strict=True) if s])
+        )
         report.notes.append(_step_note(scene, kept))
     return report
 
@@ -142,16 +144,17 @@ def _scene_warnings(scene: Scene) -> list[str]:
     rate = scene.arm.shake_frequency
     if scene.effects.disturb and rate * h * SHAKE_STEPS > 1:
         found.append(
-            f"arm.shake_frequency = {rate:g} Hz has {1 / (rate * h):.1f} time steps of {h:g} s in a "
-            f"period: below {SHAKE_STEPS} the shaking is not the sine asked for"
+            f"arm.shake_frequency = {rate:g} Hz has {1 / (rate * h):.1f} time steps of {h:g} s in "
+            f"a period: below {SHAKE_STEPS} the shaking is not the sine asked for"
         )
     for shape in scene.objects.object:
-        sunk = shape.mass * scene.gravity / (2 * scene.contact.normal_stiffness)
+        stiffness = scene.contact.normal_stiffness
+        sunk = shape.mass * scene.gravity / (2 * stiffness)
         if sunk > SINK:
             found.append(
-                f"object {shape.name!r} of {shape.mass:g} kg sinks {1e3 * sunk:.1f} mm into the table "
-                f"on one contact: contact.normal_stiffness = {scene.contact.normal_stiffness:g} N/m "
-                "is soft for its weight"
+                f"object {shape.name!r} of {shape.mass:g} kg sinks {1e3 * sunk:.1f} mm into the "
+                f"table on one contact: contact.normal_stiffness = {stiffness:g} N/m is soft for "
+                "its weight"
             )
     return found
 

@@ -84,8 +84,18 @@ def evaluate(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Out
     Returns:
       Outcomes, every array of shape (particle, trial).
     """
+    return evaluate_to_end(scene, engine, params, trials)[0]
+
+
+def evaluate_to_end(
+    scene: Scene, engine: Engine, params: Params, trials: Trial
+) -> tuple[Outcome, jax.Array | None]:
+    """As `evaluate`, with the states at the end, shape (particle, trial, nq + nv).
+
+    They are None if the engine does not tell them.
+    """
     particles, count = params.length.shape[0], trials.yaw.shape[0]
     worlds_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
     worlds_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
-    result, _ = simulate(scene, engine, worlds_p, worlds_t)
-    return jax.tree.map(lambda v: v.reshape(particles, count), result)
+    result, trace = simulate(scene, engine, worlds_p, worlds_t)
+    return jax.tree.map(lambda v: v.reshape(particles, count, *v.shape[1:]), (result, trace.last))

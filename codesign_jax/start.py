@@ -38,9 +38,10 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
 
 
 def depth(scene: Scene, fields: ModelFields) -> jax.Array:
-    """Deepest overlap of any contact at the start [m], shape (world,); not finite if a field is not.
+    """Deepest overlap of any contact at the start [m], shape (world,).
 
-    The structured engine's contacts serve every engine: same spheres, shapes and pairs.
+    The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
+    are straight.
     """
     engine = StructuredEngine(scene)
     state, hand = engine.reset(fields), hand_lanes(scene, fields)

@@ -71,7 +71,9 @@ def main() -> None:
         seconds.append(time.perf_counter() - start)
         status.append(np.asarray(result.status))
         cost.append(np.asarray(result.cost))
-        print(f"chunk {c + 1}/{chunks}: {seconds[-1]:.1f} s, failed {types.failed(status[-1]).sum()}")
+        print(
+            f"chunk {c + 1}/{chunks}: {seconds[-1]:.1f} s, failed {types.failed(status[-1]).sum()}"
+        )
         for world in np.flatnonzero(types.failed(status[-1]))[:100]:
             bits = Status(int(status[-1][world]))
             bad = int(result.bad_step[world])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, rollout, runs, schema
+from codesign_jax import codesign, engines, rollout, runs, schema, types
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common
 from codesign_jax.cost import particle_cost
@@ -112,10 +112,10 @@ def _evaluate(case: _Case, engine: engines.Engine, options: "Evaluate", console:
         if not cost.size:
             continue
         lost = np.isfinite(outcomes.lost_time[0, k :: len(names)]).sum()
-        failed = ", ".join(sorted({runs.status_names(s) for s in status if s}))
+        counts = runs.status_counts(status)
         console.print(
             f"{name:>12}: mean cost {cost.mean():.3f} over {cost.size} trials, {lost} lost, "
-            f"{(status != 0).sum()} failed" + (f" ({failed})" if failed else "")
+            f"{types.failed(status).sum()} failed" + (f" ({counts})" if counts else "")
         )
     total = float(particle_cost(case.scene, outcomes)[0])
     verdict = "success" if total < codesign.SUCCESS_COST else "no success"

@@ -80,39 +80,42 @@ class MujocoEngine:
         batch = self._batch(worlds)
         write_fields(batch, fields)
         distance, height, speed = np.zeros((3, worlds, steps))
-        status = np.zeros((worlds, steps), np.int32)
-        qpos, last = np.zeros((worlds, steps, nq * trajectory)), np.zeros((worlds, nq + batch.model.nv))
-        trace = Trace(distance, height, speed, qpos, status, last)
+        status, qpos = (
+            np.zeros((worlds, steps), np.int32),
+            np.zeros((worlds, steps, nq * trajectory)),
+        )
+        series = (distance, height, speed, qpos, status)
+        last = np.concatenate([fields.start, np.zeros((worlds, self.template.nv))], 1)
         start, end = (round(t / scene.discretization.timestep) for t in scene.window)
         going = np.arange(worlds)
         for first in range(0, steps, _CHUNK):
             part = slice(first, min(first + _CHUNK, steps))
             new, taken, states = self._advance(batch, going, ctrl[going, part], trajectory)
-            for array, values in zip(trace[:-1], new[:-1], strict=True):
+            for array, values in zip(series, new[:-1], strict=True):
                 array[going, part] = values
             # The cost window's end counts as lost only strictly inside it, as in `cost.outcome`.
             time = np.arange(part.start, part.stop)
             lost = (new.distance >= scene.cost.lost_distance) & (time >= start) & (time < end)
             failed = ~np.isfinite(new.speed) | (new.speed > scene.limits.speed)
             # MuJoCo warned (a bad control, state or inertia, a full contact list) and stopped.
-            stopped = batch.warning[going, :, 0].any(1)
-            done = lost.any(1) | failed.any(1) | (new.height < -scene.limits.penetration).any(1)
-            done |= stopped
-            bad = failed | (new.height < -scene.limits.penetration)
-            # Up to the step before the first bad entry, or to the last step that was taken.
-            good = np.where(bad.any(1), bad.argmax(1) - 1, taken - 1)
-            last[going] = states[np.arange(len(going)), np.maximum(good, 0)]
-            for array in trace[:-1]:
+            stopped = batch.warning[going, :, 0].any(1) | (taken == 0)
+            failed |= new.height < -scene.limits.penetration
+            done = lost.any(1) | failed.any(1) | stopped
+            # The entry before the first bad one, which may be the last chunk's, or the last taken.
+            good = np.where(failed.any(1), failed.argmax(1) - 1, taken - 1)
+            here = good >= 0
+            last[going[here]] = states[here, good[here]]
+            for array in series:
                 array[going[done], part.stop :] = array[going[done], part.stop - 1][:, None]
             for world, count in zip(going[stopped], taken[stopped], strict=True):
-                trace.speed[world, first + count :] = np.nan
+                speed[world, first + count :] = np.nan
             full = batch.warning[:, _FULL, 0].any(1)[going]
             for world, count in zip(going[full], taken[full], strict=True):
-                trace.status[world, first + count - 1] |= int(Status.CONTACT_OVERFLOW)
+                status[world, first + count - 1] |= int(Status.CONTACT_OVERFLOW)
             going = going[~done]
             if not going.size:
                 break
-        return trace
+        return Trace(*series, last)
 
     def _advance(
         self, batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool
@@ -126,15 +129,10 @@ class MujocoEngine:
         """
         lay = layout(self.scene)
         before = batch.bind("qvel")[ids][:, None], batch.bind("qpos")[ids][:, None]
-        record = batch.rollout(
-            ctrl.shape[1],
-            ctrl,
-            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
-            record=("xipos", "qvel", "qpos", "solver_niter", _TIME),
-            ids=ids,
-        )
+        record, raised = _rollout(batch, ids, ctrl)
         # Where a world stopped, its records repeat, and so does their time.
         taken = 1 + np.count_nonzero(np.diff(record[_TIME][..., 0], axis=1), axis=1)
+        taken[raised] = 0
         xipos = record["xipos"]
         centre = np.tensordot(xipos, lay.centre_weights, axes=(2, 0))
         middle = xipos[:, :, lay.object]
@@ -146,9 +144,44 @@ class MujocoEngine:
         distance = np.linalg.norm(middle - centre, axis=-1)
         capped = record["solver_niter"].max(-1) >= self.scene.solver.iterations
         status = np.where(capped, int(Status.SOLVER_CAP), 0)
+        status[raised, 0] |= int(Status.CONTACT_OVERFLOW)
         kept = qpos if trajectory else qpos[..., :0]
         states = np.concatenate([qpos, qvel], -1)
         return Trace(distance, middle[..., 2], speed, kept, status), taken, states
+
+
+def _rollout(
+    batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray
+) -> tuple[dict, np.ndarray]:
+    """Records of a chunk, and which worlds MuJoCo gave up for want of memory, shape (world,) bool.
+
+    Contacts, constraints and solver share one arena.  Where it is full MuJoCo leaves out contacts
+    and warns, or raises; records of the latter worlds are not numbers.
+
+    Raises:
+      SimulationError: For any other error.
+    """
+    m, shape = batch.model, (len(ids), ctrl.shape[1])
+    names = {"xipos": (m.nbody, 3), "qvel": (m.nv,), "qpos": (m.nq,), _TIME: (1,)}
+    record = {name: np.full((*shape, *size), np.nan) for name, size in names.items()}
+    record["solver_niter"] = np.zeros((*shape, mujoco.mjNISLAND), np.int32)
+    raised = np.zeros(len(ids), bool)
+    try:
+        batch.rollout(
+            ctrl.shape[1],
+            ctrl,
+            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+            record=tuple(record),
+            ids=ids,
+            out=record,
+        )
+    except mujoco.batch.SimulationError as error:
+        raised = np.isin(ids, error.ids)
+        if not all("out of memory" in str(batch.error(int(i))) for i in error.ids):
+            raise
+        for values in (v for v in record.values() if v.dtype != np.int32):
+            values[raised] = np.nan
+    return record, raised
 
 
 def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:

@@ -45,6 +45,7 @@ def write_episodes(
     head = ["episode", "particle", "cost", "weight", "next_copies_particle", *designs]
     _write(folder / "particles.csv", head, _particles(history, space, span), start)
     head = ["episode", "particle", "trial", "object", "cost", "lost_time_s", "status"]
+    head.append("first_bad_step")
     _write(folder / "trials.csv", head, _trials(history, scene, span), start)
 
 
@@ -77,6 +78,12 @@ def status_names(status: int) -> str:
     return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
 
 
+def status_counts(status: np.ndarray) -> str:
+    """How often each status bit is set, e.g. "SPEED 1, SOLVER_CAP 3"; empty if none is."""
+    counts = {bit.name: int(((status & bit) != 0).sum()) for bit in Status if bit}
+    return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+
+
 def _best(designs: list[str]) -> list[str]:
     return [f"best_{name}" for name in designs]
 
@@ -102,7 +109,10 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
     for e in span:
         for i, t in np.ndindex(*history.trials.cost.shape[1:]):
             numbers = [_number(trials.cost[e, i, t]), _number(trials.lost_time[e, i, t])]
-            yield [e, i, t, names[t % len(names)], *numbers, status_names(trials.status[e, i, t])]
+            status = status_names(trials.status[e, i, t])
+            bad_step = int(trials.bad_step[e, i, t])
+            row = [e, i, t, names[t % len(names)], *numbers, status]
+            yield [*row, bad_step if bad_step >= 0 else ""]
 
 
 def _designs(space: DesignSpace, population: np.ndarray) -> list[list[str]]:

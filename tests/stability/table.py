@@ -90,7 +90,17 @@ def case(
         name = f"{measure.__name__}-{engine}"
         variants = tuple(itertools.product(steps, widths))
         CASES[name] = Case(
-            number, name, title, invariant, engine, unit, variants, quick, lower, failures or {}, measure
+            number,
+            name,
+            title,
+            invariant,
+            engine,
+            unit,
+            variants,
+            quick,
+            lower,
+            failures or {},
+            measure,
         )
         return measure
 
@@ -167,8 +177,11 @@ def _line(count: int, precision: str, part: list[dict[str, Any]]) -> str:
     bounds = sorted({number(r["bound"]) for r in part})
     sign = ">=" if first["lower"] else "<="
     least = min(math.inf if r["margin"] is None else r["margin"] for r in part)
-    verdict = "" if all(r["passed"] for r in part) else "**fails**: " + "; ".join(
-        sorted({r["failure"] or "not explained" for r in part if not r["passed"]})
+    verdict = (
+        ""
+        if all(r["passed"] for r in part)
+        else "**fails**: "
+        + "; ".join(sorted({r["failure"] or "not explained" for r in part if not r["passed"]}))
     )
     notes = "; ".join(sorted({r["note"] for r in part if r["note"]}))
     text = " ".join(filter(None, (verdict, notes)))

@@ -203,7 +203,9 @@ class StructuredEngine:
         )
         qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
         status = self._status(found["residual"])
-        return Trace(found["distance"], found["height"], found["speed"], qpos, status, self._flat(end))
+        return Trace(
+            found["distance"], found["height"], found["speed"], qpos, status, self._flat(end)
+        )
 
     def _stream(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
         def advance(hand: HandLanes, state: State, u: jax.Array):

@@ -141,9 +141,9 @@ def stream(
     )
     held = jnp.minimum(jnp.arange(steps)[None], record.last[:, None])
     values = jnp.take_along_axis(record.values, held[:, :, None], axis=1)
-    entries = (values[..., k] for k in range(ROW - 1))
-    status = values[..., ROW - 1].astype(jnp.int32)
-    return Trace(*entries, values[..., ROW:], status, record.state)
+    distance, height, speed, status = (values[..., k] for k in range(ROW))
+    bits = status.astype(jnp.int32)
+    return Trace(distance, height, speed, values[..., ROW:], bits, record.state)
 
 
 def _first(queue: Queue, lanes: int) -> Lanes:

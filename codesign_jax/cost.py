@@ -29,14 +29,14 @@ def outcome(scene: Scene, trace: Trace, initial: jax.Array | int = 0) -> Outcome
     window = (time >= start - slack) & (time < end - slack)
     lost_step = _first(window & (trace.distance >= scene.cost.lost_distance))
     bits = _failures(scene, trace)
-    bits = bits.at[0].set(bits[0] | initial)
+    bits = bits.at[0].set(bits[0] | jnp.asarray(initial, jnp.int32))
     bad_step = _first(bits != 0)
     bad = bad_step < lost_step
     lost = (lost_step < steps) & ~bad
     lost_time = jnp.where(lost, lost_step * scene.discretization.timestep, jnp.inf).astype(dtype)
     cost = scene.cost.maximum * (end - jnp.where(lost, lost_time, end)) / (end - start)
-    status = jnp.where(bad, bits[jnp.minimum(bad_step, steps - 1)], 0)
-    status = jnp.where(_stuck(scene, trace) & ~lost & ~bad, int(Status.STUCK), status)
+    stuck = _bit(_stuck(scene, trace) & ~lost & ~bad, Status.STUCK)
+    status = bad * bits[jnp.minimum(bad_step, steps - 1)] | stuck
     status |= _warnings(trace, jnp.minimum(bad_step, lost_step))
     cost = jnp.where(failed(status), scene.cost.maximum, cost)
     return Outcome(cost.astype(dtype), status, lost_time, jnp.where(bad, bad_step, -1))
@@ -72,13 +72,18 @@ def _first(condition: jax.Array) -> jax.Array:
 def _failures(scene: Scene, trace: Trace) -> jax.Array:
     """Status bits of every step, shape (time,) int32."""
     finite = jnp.isfinite(trace.speed) & jnp.isfinite(trace.distance)
-    bits = jnp.where(finite, 0, int(Status.NONFINITE))
-    bits |= jnp.where(trace.speed > scene.limits.speed, int(Status.SPEED), 0)
     below = trace.height < -scene.limits.penetration
-    bits |= jnp.where(below, int(Status.PENETRATION), 0)
+    bits = _bit(~finite, Status.NONFINITE)
+    bits |= _bit(trace.speed > scene.limits.speed, Status.SPEED) | _bit(below, Status.PENETRATION)
     if trace.status is not None:
-        bits |= jnp.where(failed(trace.status), trace.status, 0)
-    return bits.astype(jnp.int32)
+        told = jnp.asarray(trace.status, jnp.int32)
+        bits |= jnp.where(failed(told), told, jnp.zeros_like(told))
+    return bits
+
+
+def _bit(condition: jax.Array, bit: Status) -> jax.Array:
+    """The bit where the condition holds, int32 in every mode of JAX."""
+    return condition.astype(jnp.int32) * np.int32(bit)
 
 
 def _warnings(trace: Trace, decided: jax.Array) -> jax.Array:
@@ -89,7 +94,7 @@ def _warnings(trace: Trace, decided: jax.Array) -> jax.Array:
     steps = trace.status.shape[0]
     counts = np.arange(steps) < jnp.minimum(decided, steps - 1)
     warned = counts & ((trace.status & int(WARNINGS)) != 0)
-    return jnp.where(warned.any(), int(WARNINGS), 0).astype(jnp.int32)
+    return _bit(warned.any(), WARNINGS)
 
 
 def _stuck(scene: Scene, trace: Trace) -> jax.Array:

@@ -130,7 +130,7 @@ case(
     2,
     "roll-up to a full circle",
     "tip to root over length",
-    quick=((1.0, "float32"), (1.0, "float64")),
+    quick=((1.0, "float32"),),
 )(roll_up)
 case(2, "roll-up to a full circle", "tip to root over length", engine="mujoco")(roll_up)
 
@@ -171,13 +171,13 @@ def bend_45(engine, step, precision):
     """
     worst = 0.0
     for load, expected in ((300, (58.84, 22.33, 40.08)), (600, (47.23, 15.79, 53.37))):
-        finger = Finger(20, length=np.pi / 4, bending_only=False, timestep=0.01 * step)
+        finger = Finger(60, length=np.pi / 4, bending_only=False, timestep=0.01 * step)
         m, dofs = finger.model, finger.layout.dofs[0]
         beam = finger.beam.bending
         spacing, h = finger.length / finger.links, m.opt.timestep
         k = beam / spacing
         m.jnt_stiffness[dofs] = k
-        beta = 0.05
+        beta = 1.0  # near critical for the first mode of 0.2 Hz, to be at rest soon
         m.dof_damping[dofs] = beta * k + h * k
         m.dof_armature[dofs] = h * (beta * k + h * k)
         m.qpos_spring[dofs[:, 1]] = np.pi / 4 / finger.links
@@ -185,9 +185,8 @@ def bend_45(engine, step, precision):
         force = load * 100.0**2 / 8.333e5 * beam
         position, _ = finger.settle(force=(0, 0, force), steps=60000)
         # Theirs: the root's tangent is their y, the centre of curvature on their x, load along z.
-        got = 100 * np.array([position[0], position[1], position[2]])
-        worst = max(worst, np.abs(got[[1, 0, 2]] / np.array(expected)[[1, 0, 2]] - 1).max())
-    return Found(worst, 0.015, "base step 2 ms")
+        worst = max(worst, np.abs(100 * position / np.array(expected) - 1).max())
+    return Found(worst, 0.015, "60 links, base step 2 ms")
 
 
 def free_vibration(engine, step, precision):
@@ -204,8 +203,8 @@ def free_vibration(engine, step, precision):
 
 
 vibration = (4, "free vibration, 100 periods", "largest energy over the first")
-case(*vibration, quick=((1.0, "float32"),))(free_vibration)
-case(*vibration, engine="mujoco")(free_vibration)
+case(*vibration)(free_vibration)
+case(*vibration, engine="mujoco", quick=((1.0, "float64"),))(free_vibration)
 
 
 def vibration_frequency(engine, step, precision):
@@ -234,7 +233,8 @@ def damped_release(engine, step, precision):
     history = rod.run(np.zeros(round(2 / rod.h)), np.full(10, np.pi / 10))
     k = rod.model.jnt_stiffness[rod.joints]
     energy = np.r_[0.5 * (k * (np.pi / 10) ** 2).sum(), rod.energy(history)]
-    return Found(np.diff(energy).max() / energy[0], {"float64": 1e-12, "float32": 1e-6}[precision])
+    rise = max(np.diff(energy).max(), 0.0)
+    return Found(rise / energy[0], {"float64": 1e-12, "float32": 1e-6}[precision])
 
 
 release = (5, "damped release", "largest rise of energy in a step over the first")

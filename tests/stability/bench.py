@@ -63,9 +63,11 @@ def pinch(**settings) -> Scene:
 
 
 @functools.cache
-def bench(base: Scene, engine: str, step: float, precision: str) -> "Bench":
+def bench(
+    base: Scene, engine: str, step: float, precision: str, tolerance: float = 1e-6
+) -> "Bench":
     """One bench for each scene, engine, time step and precision: it is compiled once."""
-    return Bench(refined(base, step), engine, precision)
+    return Bench(refined(base, step), engine, precision, tolerance)
 
 
 @contextlib.contextmanager
@@ -84,7 +86,9 @@ def floats(wide: bool):
 class Bench:
     """A scene in one engine and precision."""
 
-    def __init__(self, the_scene: Scene, engine: str, precision: str):
+    def __init__(self, the_scene: Scene, engine: str, precision: str, tolerance: float = 1e-6):
+        """Tolerance: the structured engine's; MuJoCo's is the scene's."""
+        self.tolerance = tolerance
         self.scene, self.engine, self.wide = the_scene, engine, precision == "float64"
         assert self.wide or engine == "structured"  # MuJoCo C is built for float64
         self.h = the_scene.discretization.timestep
@@ -156,7 +160,7 @@ class Bench:
     def _program(self, worlds: int):
         """Compiled start and chunk of steps for a number of worlds."""
         if worlds not in self._programs:
-            engine = StructuredEngine(self.scene)
+            engine = StructuredEngine(self.scene, tolerance=self.tolerance)
 
             def start(fields, qvel):
                 state = engine.reset(fields)

@@ -6,7 +6,7 @@ docs/stability.md.  A case that fails stands in the table with its cause.
 
 import pytest
 
-from tests.stability import beam, table, touch  # noqa: F401  (they register their cases)
+from tests.stability import beam, decision, grasp, table, touch  # noqa: F401  (they register their cases)
 
 
 def variants():

@@ -129,6 +129,22 @@ class Scenes:
         return scenes.main(self)
 
 
+@dataclasses.dataclass
+class Replay:
+    """Replay a failed world of a run: simulate it again, and its last good state in MuJoCo C."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A file of the run folder's failures/, or the run folder, whose failed worlds are listed."""
+    engine: Text = None
+    """Engine that simulates; default: the run's."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import replay
+
+        return replay.main(self)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Parses the command line, runs the command and returns the exit status.
 
@@ -139,7 +155,7 @@ def main(arguments: list[str] | None = None) -> int:
       arguments: Arguments without the program's name; default: those of the process.
     """
     command = tyro.cli(
-        Optimize | Evaluate | Scenes,  # type: ignore[arg-type]
+        Optimize | Evaluate | Scenes | Replay,  # type: ignore[arg-type]
         args=arguments,
         prog="codesign",
         description="Co-design of soft hand morphology and control.",

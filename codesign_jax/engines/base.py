@@ -29,8 +29,8 @@ class Engine(Protocol):
 
         Returns:
           The trace of every world, every array with a leading world axis.  A world that fails is
-          frozen at its last good state; its trace shows the failure at the failing step and stays
-          there.
+          frozen at its last good state, which the trace returns; its trace shows the failure at
+          the failing step and stays there.
         """
         ...
 

@@ -83,4 +83,5 @@ class MjxEngine:
 
         zero = jnp.zeros(self.template.nv, ctrl.dtype)
         start = _Carry(fields.start, zero, zero, jnp.zeros((), ctrl.dtype))
-        return jax.lax.scan(body, start, ctrl)[1]
+        end, trace = jax.lax.scan(body, start, ctrl)
+        return trace._replace(last=jnp.concatenate([end.qpos, end.qvel]))

@@ -19,7 +19,7 @@ from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Effects, Scene
-from codesign_jax.types import Trace
+from codesign_jax.types import Status, Trace
 
 LANES = 60
 """Worlds in flight on a core: their arrays fit its L2 cache."""
@@ -132,7 +132,7 @@ class StructuredEngine:
         body = bodies(run, hand, kin)
         smooth = smooth_forces(run, hand, kin, body, state, ctrl, self.scene)
         matrix = solver.Matrices(*(run(lambda b: b.matrix(), b) for b in body))
-        contacts = self._contacts(run, hand, kin, state.wrist[2])
+        contacts = self.contacts(run, hand, kin, state.wrist[2])
         velocity = solver.Spatial(kin.palm_vel, kin.vel, kin.object_vel)
         arm = None if self.scene.effects.wrist else self._arm(state, ctrl)
         return solver.Problem(hand, kin, body, matrix, smooth, contacts, arm), velocity
@@ -142,7 +142,7 @@ class StructuredEngine:
         h = self.scene.discretization.timestep
         return ((ctrl[:6, None] - state.wrist) / h - state.wrist_vel) / h
 
-    def _contacts(
+    def contacts(
         self, run: Stages, hand: HandLanes, kin: Kinematics, height: jax.Array
     ) -> dict[str, Contacts]:
         """Contacts that the scene's effects call for, by pair of bodies."""
@@ -213,11 +213,14 @@ class StructuredEngine:
 
         # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
         limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
-        found = Program(self.scene, limits).run(
+        found, end = Program(self.scene, limits).simulate(
             hand_lanes(self.scene, fields), self.reset(fields), ctrl
         )
         qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
-        return Trace(found["distance"], found["height"], found["speed"], qpos)
+        status = self._status(found["residual"])
+        return Trace(
+            found["distance"], found["height"], found["speed"], qpos, status, self._flat(end)
+        )
 
     def _stream(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
         def advance(hand: HandLanes, state: State, u: jax.Array):
@@ -234,6 +237,7 @@ class StructuredEngine:
             advance,
             self._speed,
             self.qpos,
+            self._flat,
             lanes=self.lanes,
             max_rounds=-(-self.iterations // self.burst),
             trajectory=trajectory,
@@ -252,6 +256,7 @@ class StructuredEngine:
                 state.position[2, 0],
                 speed,
                 self.qpos(state) if trajectory else jnp.zeros((u.shape[1], 0), u.dtype),
+                self._status(info.residual[0]),
             )
             new_speed = self._speed(new)
             was_good = speed <= limits.speed
@@ -261,8 +266,9 @@ class StructuredEngine:
             return (state, jnp.where(was_good, new_speed, speed)), entry
 
         start = (self.reset(fields), jnp.zeros(ctrl.shape[0], ctrl.dtype))
-        _, trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 0, -1))
-        return Trace(*(jnp.moveaxis(v, 0, 1) for v in trace))
+        (end, _), trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 0, -1))
+        trace = jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), trace)
+        return trace._replace(last=self._flat(end))
 
     def _checkpointed(self):
         """The step with a derivative that stores little; see `implicit.checkpointed`."""
@@ -270,6 +276,14 @@ class StructuredEngine:
         solved.iterations = 0
         limit = self.scene.limits.speed
         return implicit.checkpointed(self.step, solved.step, lambda s: self._speed(s) <= limit)
+
+    def _status(self, residual: jax.Array) -> jax.Array:
+        """SOLVER_CAP where a step ended above the tolerance, int32 of the residual's shape."""
+        return jnp.where(residual > self.tolerance, int(Status.SOLVER_CAP), 0).astype(jnp.int32)
+
+    def _flat(self, state: State) -> jax.Array:
+        """Generalized positions and velocities, shape (world, nq + nv)."""
+        return jnp.concatenate([self.qpos(state), self.qvel(state)], 1)
 
     def _speed(self, state: State) -> jax.Array:
         """Largest absolute generalized velocity; not finite if any velocity or position is not."""

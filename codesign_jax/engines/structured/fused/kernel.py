@@ -18,7 +18,7 @@ from codesign_jax.engines.structured.fused.ptx import LANES
 from codesign_jax.engines.structured.fused.step import Step
 from codesign_jax.engines.structured.fused.tables import Block, Table, anywhere
 from codesign_jax.engines.structured.hand import HandLanes
-from codesign_jax.engines.structured.kinematics import State
+from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanewise import lanes
 from codesign_jax.model import layout
 from codesign_jax.model.layout import palm_points, palm_touches
@@ -210,6 +210,12 @@ class Program:
         self, hand: HandLanes, state: State, ctrl: jax.Array, *, interpret: bool = False
     ) -> dict[str, jax.Array]:
         """Runs a rollout; returns `TRACE` by name, shape (world, time)."""
+        return self.simulate(hand, state, ctrl, interpret=interpret)[0]
+
+    def simulate(
+        self, hand: HandLanes, state: State, ctrl: jax.Array, *, interpret: bool = False
+    ) -> tuple[dict[str, jax.Array], State]:
+        """Runs a rollout; returns `TRACE` by name, shape (world, time), and the last states."""
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         blocks, steps, dtype = inputs[0].shape[0], ctrl.shape[1], ctrl.dtype
         shapes = [
@@ -235,7 +241,15 @@ class Program:
         out = call(*inputs) if interpret else launch(call, inputs, outputs)
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(TRACE))[: ctrl.shape[0]]
-        return {name: trace[..., k] for k, name in enumerate(TRACE)}
+        found = {name: trace[..., k] for k, name in enumerate(TRACE)}
+        return found, self.unpack_state(out[0], out[1], ctrl.shape[0])
+
+    def unpack_state(self, fine: jax.Array, rest: jax.Array, worlds: int) -> State:
+        """Inverse of `pack_state`."""
+        wide = self.fine.unpack(fine, self.fingers, self.num_fingers, worlds)
+        narrow = self.rest.unpack(rest, 1, 1, worlds)
+        acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
+        return State(**wide, **narrow, acc=acc)
 
     def _kernel(self, steps: int, interpret: bool, *refs: Any) -> None:
         hand, world, fine0, rest0, arm, pressure, fine, rest, scratch, trace = refs

@@ -31,14 +31,13 @@ STEPS = 20
 
 def variants(scene: Scene) -> dict[str, Scene]:
     """The scene with each effect turned over, and without contacts, by what changed."""
-    changes: dict[str, dict[str, Any]] = {}
+    changes: dict[str, dict[str, Any]] = {"all contacts off": dict.fromkeys(CONTACTS, False)}
     for field in dataclasses.fields(scene.effects):
         now = getattr(scene.effects, field.name)
         for value in field.metadata.get("options", (not now,)):
             if value != now:
                 word = {True: "on", False: "off"}.get(value, value)
                 changes[f"{field.name} {word}"] = {field.name: value}
-    changes["all contacts off"] = dict.fromkeys(CONTACTS, False)
     return {
         name: dataclasses.replace(scene, effects=dataclasses.replace(scene.effects, **change))
         for name, change in changes.items()
@@ -137,17 +136,19 @@ class Program(NamedTuple):
     """A compiled program of `STEPS` steps, what it does, and its arguments.
 
     Attributes:
-      run: The program.
+      run: The program; None if it was not to be compiled.
       args: Its arguments.
       record: Size, and a digest of the text from which it was compiled.
     """
 
-    run: Callable
+    run: Callable | None
     args: tuple
     record: dict[str, Any]
 
 
-def compile_steps(scene: Scene, worlds: Worlds, at: Moment, compiled: dict[str, Any]) -> Program:
+def compile_steps(
+    scene: Scene, worlds: Worlds, at: Moment, compiled: dict[str, Any], *, new: bool = True
+) -> Program:
     """Compiles steps of the structured engine from a state of the grasps.
 
     Args:
@@ -156,6 +157,7 @@ def compile_steps(scene: Scene, worlds: Worlds, at: Moment, compiled: dict[str, 
       at: Where they are.
       compiled: Programs by digest: effects that are not in the step give the same text, and the
         same program.
+      new: Whether a program that is not among them is compiled.
     """
     engine = StructuredEngine(scene, lanes=0, fused=False)
     fields, ctrl = inputs(scene, worlds)
@@ -169,17 +171,16 @@ def compile_steps(scene: Scene, worlds: Worlds, at: Moment, compiled: dict[str, 
     size = program_size(engine.step, hand, state, rows[0])
     lowered = jax.jit(steps).lower(hand, state, rows)
     digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
-    if digest not in compiled:
+    each = hand.shape.shape[1]
+    record = {"equations": size.equations, "flops": size.flops / each, "program": digest}
+    if digest not in compiled and new:
         compiled[digest] = lowered.compile()
-    analysis = compiled[digest].cost_analysis()
-    record = {
-        "equations": size.equations,
-        "flops": size.flops / hand.shape.shape[1],
-        "xla_flops": analysis["flops"] / hand.shape.shape[1],
-        "xla_bytes": analysis["bytes accessed"] / hand.shape.shape[1],
-        "program": digest,
-    }
-    return Program(compiled[digest], (hand, state, rows), record)
+    program = compiled.get(digest)
+    if program is not None:
+        analysis = program.cost_analysis()
+        record["xla_flops"] = analysis["flops"] / each
+        record["xla_bytes"] = analysis["bytes accessed"] / each
+    return Program(program, (hand, state, rows), record)
 
 
 def state_at(engine: StructuredEngine, fields: ModelFields, at: Moment) -> State:
@@ -207,7 +208,7 @@ def measure(programs: dict[str, Program], repeats: int) -> dict[str, list[float]
     """Times programs in turn, so that a busy machine slows all alike.
 
     Args:
-      programs: The programs.
+      programs: Compiled programs.
       repeats: Rounds over all of them.
 
     Returns:
@@ -216,6 +217,7 @@ def measure(programs: dict[str, Program], repeats: int) -> dict[str, list[float]
     times: dict[str, list[float]] = {name: [] for name in programs}
     for _ in range(repeats + 1):
         for name, program in programs.items():
+            assert program.run is not None
             worlds = program.args[0].shape.shape[1]
             begin = time.perf_counter()
             jax.block_until_ready(program.run(*program.args))

@@ -14,38 +14,32 @@ REFERENCE = "as it is"
 
 def draw(results: dict[str, Any], path: Path) -> None:
     """Time of a step and success rate of the scene with each effect turned over."""
-    rows = {n: r for n, r in results["effects"].items() if "ratio" in r and "success" in r}
+    rows = results["effects"]
     names = [*(n for n in rows if n != REFERENCE), REFERENCE][::-1]
-    figure = matplotlib.figure.Figure(figsize=(9.6, 5.2), dpi=120, layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(9.6, 5.6), dpi=120, layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    place = np.arange(len(names))
-    for axis, value, low, high in (
-        (left, *_columns(rows, names, "ratio", "ratio_quartiles")),
-        (right, *_columns(rows, names, "success", None)),
+    for axis, field, bounds in (
+        (left, "ratio", lambda r: r["ratio_quartiles"]),
+        (right, "success", lambda r: (r["success_low"], r["success_high"])),
     ):
-        axis.errorbar(value, place, xerr=[value - low, high - value], fmt="o", ms=4, capsize=2)
-        axis.axvline(value[0], color="black", lw=0.8, ls="--")
+        place = [k for k, n in enumerate(names) if field in rows[n]]
+        value = np.array([rows[names[k]][field] for k in place])
+        low, high = np.array([bounds(rows[names[k]]) for k in place]).T
+        # A share of 0 or 1 lies on its interval's end but for rounding.
+        error = np.maximum([value - low, high - value], 0.0)
+        axis.errorbar(value, place, xerr=error, fmt="o", ms=4, capsize=2)
+        axis.axvline(rows[REFERENCE][field], color="black", lw=0.8, ls="--")
         axis.grid(axis="x", alpha=0.3)
-    flops = np.array([rows[n]["flops"] for n in names]) / rows[REFERENCE]["flops"]
+    place = [k for k, n in enumerate(names) if "flops" in rows[n]]
+    flops = np.array([rows[names[k]]["flops"] for k in place]) / rows[REFERENCE]["flops"]
     left.plot(flops, place, "x", color="tab:orange", ms=5, label="operations of one iteration")
     left.plot([], [], "o", color="tab:blue", label="time, median and quartiles")
     left.legend(frameon=False, fontsize=8)
-    left.set_yticks(place, names)
+    left.set_yticks(range(len(names)), names)
     left.set(xlabel="a step, relative to the scene as it is", xlim=(0, None))
     right.set(xlabel="success rate with 95 % interval")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
-
-
-def _columns(rows: dict, names: list[str], field: str, bounds: str | None) -> tuple:
-    value = np.array([rows[n][field] for n in names])
-    pairs = [
-        rows[n][bounds] if bounds else (rows[n]["success_low"], rows[n]["success_high"])
-        for n in names
-    ]
-    low, high = np.array(pairs).T
-    # A median of ratios lies between their quartiles; a share at 0 or 1 on its interval's end.
-    return value, np.minimum(low, value), np.maximum(high, value)
 
 
 def support_table() -> list[list[str]]:

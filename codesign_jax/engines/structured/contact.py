@@ -32,9 +32,9 @@ class Cone(NamedTuple):
     """
 
     normal: jax.Array | float
-    tangent: jax.Array | float | None
-    friction: jax.Array | float | None
-    ratio: jax.Array | float | None
+    tangent: jax.Array | float
+    friction: jax.Array | float
+    ratio: jax.Array | float
     spring: float
     damper: float
     spin: jax.Array | float | None = None
@@ -179,9 +179,9 @@ class Line(NamedTuple):
 
     n0: jax.Array
     n1: jax.Array
-    uu: jax.Array | None
-    uv: jax.Array | None
-    vv: jax.Array | None
+    uu: jax.Array
+    uv: jax.Array
+    vv: jax.Array
 
 
 def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> Line:

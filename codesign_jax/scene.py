@@ -23,6 +23,7 @@ class Effects:
     palm_contact: bool = True
     disturb: bool = True
     ungrasp: bool = True
+    surface: str = choice("spheres", "hull", default="spheres")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,11 +70,17 @@ class Contact:
 
 @dataclasses.dataclass(frozen=True)
 class Discretization:
-    """Time step, segments a finger (the paper's ten links) and contact spheres on each link."""
+    """Time step, segments a finger (the paper's ten links) and density of the contact points.
+
+    Each link has `spheres_per_link` spheres or, with the surface "hull", `hull_rings` rings of
+    `hull_points` vertices, a multiple of four.
+    """
 
     timestep: float = quantity("s", 1e-5, 0.05)
     links: int = quantity("", 1, 200)
     spheres_per_link: int = quantity("", 1, 20)
+    hull_rings: int = quantity("", 1, 20, default=2)
+    hull_points: int = quantity("", 4, 80, default=8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,6 +230,11 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
         problems.append(
             f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
             f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
+        )
+    if scene.discretization.hull_points % 4:
+        problems.append(
+            f"{where}.discretization.hull_points = {scene.discretization.hull_points} "
+            "must be a multiple of 4: every side of the section has as many"
         )
     if scene.contact.time_constant < 2 * h:
         problems.append(

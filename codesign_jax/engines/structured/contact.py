@@ -42,12 +42,15 @@ class Contacts(NamedTuple):
       normal: Unit normals, shape (3, ...).
       distance: Signed distance [m], negative in contact, shape (...).
       cone: Their parameters.
+      lever: Of points that follow a joint's rotation in part, see `hull`, the arm at which they do,
+        shape (3, ...).
     """
 
     point: jax.Array
     normal: jax.Array
     distance: jax.Array
     cone: Cone
+    lever: jax.Array | None = None
 
     @property
     def active(self) -> jax.Array:
@@ -55,8 +58,9 @@ class Contacts(NamedTuple):
         return self.distance < 0
 
     def relative(self, motion: jax.Array) -> jax.Array:
-        """Point motion, (3, ...), of a relative spatial motion, (6, ...)."""
-        return motion[3:] + cross(motion[:3], self.point)
+        """Point motion, (3, ...), of a relative spatial motion, (6, ...), or (9, ...) with a lever."""
+        moved = motion[3:6] + cross(motion[:3], self.point)
+        return moved if self.lever is None else moved + cross(motion[6:], self.lever)
 
     def reference(self, velocity: jax.Array) -> jax.Array:
         """Reference acceleration aref from the relative point velocity, shape (3, ...)."""
@@ -166,17 +170,30 @@ def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, 
 
 
 def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
-    """X'KX with X = [-[r], 1]: a contact's Hessian in spatial accelerations, rows (6, 6, ...)."""
+    """X'KX with X = [-[r], 1]: a contact's Hessian in spatial accelerations, rows (6, 6, ...).
+
+    With a lever X = [-[r], 1, -[lever]], rows (9, 9, ...).
+    """
     xx, xy, xz, yy, yz, zz = hessian
     k = [jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])]
     r = contacts.point
+    if contacts.lever is not None:
+        arm = contacts.lever
+        rows = [*_crossed(r, k), *k, *_crossed(arm, k)]
+        return jnp.stack([jnp.concatenate([cross(r, w), w, cross(arm, w)]) for w in rows])
     # Rows of [r]K, then of -[r]K[r]: cross products, never the skew matrix's zeros.
-    y = [r[1] * k[2] - r[2] * k[1], r[2] * k[0] - r[0] * k[2], r[0] * k[1] - r[1] * k[0]]
+    y = _crossed(r, k)
     upper = [jnp.concatenate([cross(r, row), row]) for row in y]
     lower = [jnp.concatenate([jnp.stack([y[j][i] for j in range(3)]), k[i]]) for i in range(3)]
     return jnp.stack(upper + lower)
 
 
+def _crossed(r: jax.Array, k: list[jax.Array]) -> list[jax.Array]:
+    """Rows of [r]K from those of K."""
+    return [r[1] * k[2] - r[2] * k[1], r[2] * k[0] - r[0] * k[2], r[0] * k[1] - r[1] * k[0]]
+
+
 def contact_wrench(contacts: Contacts, force: jax.Array) -> jax.Array:
-    """Spatial force (moment about the origin, force), shape (6, ...)."""
-    return jnp.concatenate([cross(contacts.point, force), force])
+    """Spatial force (moment about the origin, force), (6, ...); with a lever its moment as well."""
+    parts = [cross(contacts.point, force), force]
+    return jnp.concatenate(parts + ([cross(contacts.lever, force)] if contacts.lever is not None else []))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, implicit, mesh, solver
+from codesign_jax.engines.structured import collision, hull, implicit, mesh, solver
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
@@ -146,6 +146,12 @@ class StructuredEngine:
                 found["finger_object"] = on_object(run, spheres, hand.radius)
             if e.finger_table:
                 found["finger_table"] = on_table(spheres, hand.radius)
+        if e.surface == "hull" and (e.finger_object or e.finger_table):
+            skin = run(lambda h, k: hull.vertices(scene, h, k), hand, kin)
+            if e.finger_object:
+                found["hull_object"] = hull.attach(on_object(run, skin.point, 0.0), skin)
+            if e.finger_table:
+                found["hull_table"] = hull.attach(on_table(skin.point, 0.0), skin)
         if e.palm_contact:
             palm, radius = collision.palm_spheres(scene, kin), scene.hand.palm.contact_radius
             found["palm_object"] = on_object(run, palm, radius)
@@ -184,14 +190,19 @@ class StructuredEngine:
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`; on a GPU in float32 one kernel runs it all, see `fused`."""
-        primitive = all(o.type != "mesh" for o in self.scene.objects.object)
-        if self.fused and primitive and not trajectory and ctrl.dtype == jnp.float32:
+        batched = self._needs_batch()
+        if self.fused and not batched and not trajectory and ctrl.dtype == jnp.float32:
             return self._one_kernel(fields, ctrl)
         with jax.default_matmul_precision("highest"):
-            # The stream moves worlds between lanes; a mesh's grid belongs to no world.
-            if self.lanes and primitive:
+            if self.lanes and not batched:
                 return on_all_cores(partial(self._stream, trajectory=trajectory), fields, ctrl)
             return self._rollout(fields, ctrl, trajectory)
+
+    def _needs_batch(self) -> bool:
+        """Whether the scene has what neither the kernel nor the stream knows."""
+        # The stream moves worlds between lanes; a mesh's grid belongs to no world.
+        meshes = any(o.type == "mesh" for o in self.scene.objects.object)
+        return meshes or self.scene.effects.surface == "hull"
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array) -> Trace:
         from codesign_jax.engines.structured.fused import Limits, Program

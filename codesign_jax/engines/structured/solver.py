@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
+from codesign_jax.engines.structured import hull
 from codesign_jax.engines.structured.contact import (
     Contacts,
     contact_inertia,
@@ -106,9 +107,19 @@ def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
     return Spatial(palm, jnp.moveaxis(links, 0, 1), obj)
 
 
+def on_links(name: str) -> bool:
+    """Whether the items of a set of contacts are of links or joints, several of each."""
+    return name.startswith(("finger", "hull"))
+
+
 def relative(name: str, motion: Spatial) -> jax.Array:
     """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
     obj = motion.object
+    if name.startswith("hull"):
+        moved = hull.across_joints(motion.palm, motion.link)
+        if name == "hull_object":
+            moved = jnp.concatenate([moved[:6] - obj[:, None], moved[6:]])
+        return moved[:, :, None]
     if name == "finger_object":
         return jnp.stack([motion.link[i] - obj[i] for i in range(6)])[:, :, None]
     return {
@@ -171,14 +182,20 @@ def newton_step(
     kin, hand = problem.kin, problem.hand
 
     def next_joint(node: el.Quadratic, link: tuple):
-        (axes, arm, tau), own = link
-        return el.eliminate(run, run(_add_link, node, own), axes, arm, tau)
+        (axes, arm, tau), (own, joint) = link
+        return el.eliminate(run, run(_add_link, node, own), axes, arm, tau, joint)
 
     # Sums over all links at once: the recursion then slices fewer arrays.
     terms = {n: v for n, v in pushes.items() if n.startswith("finger")}
-    own = run(_own, problem.matrix.link, force.link, terms)
+    skin = {n: v for n, v in pushes.items() if n.startswith("hull")}
+    joints = run(hull.joint_terms, kin.axes, skin) if skin else None
+    terms |= _of_links(skin, slice(1, None))
+    own = run(_own, problem.matrix.link, force.link, terms), joints
     links = (kin.axes, hand.armature, force.finger)
     node, factors = scan_links(next_joint, _nothing(force.link[:, 0]), links, own, reverse=True)
+    if skin:  # what the first joints' rows add to the palm
+        zero = jnp.zeros_like(node.p), jnp.zeros_like(node.r)
+        node = run(lambda n, s: _add_link(n, _own(*zero, _of_links(s, 0))), node, skin)
     node = run(_add_palm, node, problem.matrix, force, pushes)
     arm = hand.wrist_armature
     node, hinges = el.eliminate(run, node, kin.wrist_axes, arm[3:], force.wrist[3:])
@@ -197,6 +214,14 @@ def newton_step(
     at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
     acc = Acc(jnp.concatenate([first, second]), fingers, at_centre)
     return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
+
+
+def _of_links(skin: dict, rows: slice | int) -> dict:
+    """The hull's contacts as those of the links before its rows."""
+    return {
+        n.replace("hull", "finger"): (inertia[:6, :6, rows], wrench[:6, rows])
+        for n, (inertia, wrench) in skin.items()
+    }
 
 
 def _nothing(like: jax.Array) -> el.Quadratic:
@@ -264,7 +289,7 @@ def _push(stages: Stages, name: str, c: Contacts, jar: jax.Array) -> tuple[jax.A
 
     def summed(c: Contacts, hessian: jax.Array, force: jax.Array):
         matrix, wrench = contact_inertia(c, hessian), contact_wrench(c, force)
-        if name.startswith("finger"):
+        if on_links(name):
             return sum_axis(matrix, 3), sum_axis(wrench, 2)
         return sum_fingers(matrix), sum_fingers(wrench)
 
@@ -402,7 +427,7 @@ def _decrement(slope: jax.Array, pushes: dict, step: Spatial) -> jax.Array:
     pushed = -slope
     for name, (_, wrench) in pushes.items():
         product = dot(
-            relative(name, step)[:, :, 0] if name.startswith("finger") else relative(name, step),
+            relative(name, step)[:, :, 0] if on_links(name) else relative(name, step),
             wrench,
         )
         pushed = pushed + sum_items(product)

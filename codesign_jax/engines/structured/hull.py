@@ -1,0 +1,100 @@
+"""Contacts of the skinned hull: points that follow a link and its parent in parts.
+
+A vertex with weight w on the link of joint i (frame T_i, joint at p) and 1 - w on the link before
+has the images x1 = T_i(v) and x0 = T_{i-1}(v) and lies at x = (1 - w) x0 + w x1.  Velocities of
+rigid bodies are affine in the point, so that the blend of the two images' velocities is exactly
+  dx = V_{i-1}(x) + w dtheta x (x1 - p),
+the parent's velocity at the vertex itself and a share of the joint's own rotation dtheta = S_i dq_i
+about the image on the link: no common point has to be assumed.  A contact adds its arm from the
+vertex to the contact point to both.  With the relative motion m = (angular, linear, joint's
+rotation) of nine components a contact is the matrix X'KX, X = [-[r], 1, -[lever]] with lever =
+w (x1 + arm - p); the sums over a joint's vertices enter the elimination of that joint.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax import hull
+from codesign_jax.engines.structured.contact import Contacts
+from codesign_jax.engines.structured.elimination import JointTerms
+from codesign_jax.engines.structured.hand import HandLanes, apply_columns
+from codesign_jax.engines.structured.kinematics import Kinematics
+from codesign_jax.engines.structured.lanes import contract
+from codesign_jax.scene import Scene
+
+
+class Vertices(NamedTuple):
+    """Contact points of the hull; rows are the joints and the tip, see `codesign_jax.hull.Slots`.
+
+    Attributes:
+      point: In the palm's frame, shape (3, row, k, finger, world).
+      image: Images on the rows' links, from their joints, same shape.
+      weight: Weights of those links, shape (row, k, 1, 1).
+      share: Contact stiffness relative to the scene's, shape (row, k, finger, world).
+    """
+
+    point: jax.Array
+    image: jax.Array
+    weight: jax.Array
+    share: jax.Array
+
+
+def vertices(scene: Scene, hand: HandLanes, kin: Kinematics) -> Vertices:
+    """Places the hull's contact points."""
+    s, width, dtype = hull.slots(scene), scene.hand.section.width, kin.origin.dtype
+    along, across, up, weight, *area = (
+        jnp.asarray(v[..., None, None], dtype) for v in (s.along, s.across, s.up, s.weight, *s.area)
+    )
+    # The first joint stands half a segment from the base; centres lie at half the height.
+    segment, height = 2.0 * hand.offset[0], 2.0 * hand.centre[2, 0]
+    local = jnp.stack([along * segment, across * width + 0.0 * segment + 0.0 * along, up * height])
+    base = jnp.stack([apply_columns(kin.palm, hand.mount[k]) for k in range(3)])
+    before = jnp.concatenate([base[:, :, None], kin.link], 2)[:, :, :, None]
+    after = jnp.concatenate([kin.link, kin.link[:, :, -1:]], 2)[:, :, :, None]
+    joint = jnp.concatenate([kin.origin, kin.origin[:, -1:]], 1)[:, :, None]
+    image = apply_columns(after, local)
+    blend = (1.0 - weight) * apply_columns(before, local) + weight * image
+    surface = area[0] * segment * width + area[1] * segment * height + area[2] * width * height
+    return Vertices(joint + blend, image, weight, surface / width**2)
+
+
+def attach(contacts: Contacts, skin: Vertices) -> Contacts:
+    """Makes contacts of the vertices, as of spheres without a radius, follow their two links."""
+    lever = skin.weight * (skin.image + contacts.point - skin.point)
+    cone = contacts.cone
+    cone = cone._replace(normal=cone.normal * skin.share, tangent=cone.tangent * skin.share)
+    return contacts._replace(cone=cone, lever=lever)
+
+
+def across_joints(palm: jax.Array, links: jax.Array) -> jax.Array:
+    """Motion of each row's first link and of the joint after it, shape (9, row, finger, world)."""
+    first = palm[:, None] + jnp.zeros_like(links[:, :1])
+    before = jnp.concatenate([first, links], 1)
+    turning = jnp.concatenate([links[:3] - before[:3, :-1], jnp.zeros_like(first[:3])], 1)
+    return jnp.concatenate([before, turning])
+
+
+def joint_terms(
+    axes: jax.Array,
+    terms: dict[str, tuple[jax.Array, jax.Array]],
+) -> JointTerms:
+    """What the contacts of the rows add to the elimination of their joints.
+
+    Args:
+      axes: Motion subspaces, shape (link, axis, 6, finger, world).
+      terms: Contact inertia, (9, 9, row, finger, world), and wrench by pair of bodies.
+    """
+    turn = jnp.moveaxis(axes[:, :, :3], 0, 2)  # (axis, 3, link, finger, world)
+    result = None
+    for name, (inertia, wrench) in terms.items():
+        mixed = contract(turn[:, :, None], inertia[None, 6:, :, :-1], 1)  # (axis, 9, link, ...)
+        parent = mixed[:, :6]
+        own = contract(turn[:, None], mixed[None, :, 6:], 2)
+        force = contract(turn, wrench[None, 6:, :-1], 1)
+        obj = parent if name.endswith("object") else jnp.zeros_like(parent)
+        new = JointTerms(own, parent, obj, force)
+        result = new if result is None else jax.tree.map(jnp.add, result, new)
+    assert result is not None
+    return result

@@ -35,6 +35,21 @@ class Engine(Protocol):
         ...
 
 
+def refuse_hull(scene: Scene, engine: str) -> None:
+    """Says that an engine that collides by MuJoCo's own geoms cannot simulate the skinned hull.
+
+    Raises:
+      SceneError: if the scene's contact surface is the hull.
+    """
+    if scene.effects.surface == "hull":
+        raise SceneError(
+            [
+                f"not supported by engine {engine}: effects.surface = 'hull'; use engine structured "
+                "or surface 'spheres'"
+            ]
+        )
+
+
 def refuse_meshes(scene: Scene, engine: str) -> None:
     """Says which objects an engine that collides by MuJoCo's own geoms cannot simulate.
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from codesign_jax.engines.base import refuse_meshes
+from codesign_jax.engines.base import refuse_hull, refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
@@ -28,6 +28,7 @@ class MjxEngine:
 
     def __init__(self, scene: Scene):
         """Puts the scene's template on the device; the float type is jax's at this moment."""
+        refuse_hull(scene, self.name)
         refuse_meshes(scene, self.name)
         self.scene = scene
         self.template = mjx.put_model(compile_template(scene))

@@ -7,7 +7,7 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from codesign_jax.engines.base import refuse_meshes
+from codesign_jax.engines.base import refuse_hull, refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
@@ -34,6 +34,7 @@ class MujocoEngine:
           scene: The scene.
           num_threads: Threads to use; 0 for all cores.
         """
+        refuse_hull(scene, self.name)
         refuse_meshes(scene, self.name)
         self.scene = scene
         self.template = compile_template(scene)

@@ -17,11 +17,16 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax import hull
-from codesign_jax.engines.structured.contact import Contacts
+from codesign_jax.engines.structured.contact import (
+    Contacts,
+    contact_inertia,
+    contact_wrench,
+    respond,
+)
 from codesign_jax.engines.structured.elimination import JointTerms
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics
-from codesign_jax.engines.structured.lanes import contract
+from codesign_jax.engines.structured.lanes import Stages, contract, scan_links
 from codesign_jax.scene import Scene
 
 
@@ -74,6 +79,38 @@ def across_joints(palm: jax.Array, links: jax.Array) -> jax.Array:
     before = jnp.concatenate([first, links], 1)
     turning = jnp.concatenate([links[:3] - before[:3, :-1], jnp.zeros_like(first[:3])], 1)
     return jnp.concatenate([before, turning])
+
+
+def push(run: Stages, c: Contacts, jar: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Contact inertia (9, 9, row, finger, world) and wrench (9, row, finger, world) of the rows.
+
+    One vertex of every row after the other: the whole set's matrices would not fit a CPU's cache,
+    and most vertices, such as those on a finger's back, touch nothing.
+    """
+    each = (c.point, c.normal, c.distance, c.lever, c.cone.normal, c.cone.tangent, jar)
+
+    def evaluate(each: tuple) -> tuple[jax.Array, jax.Array]:
+        point, normal, distance, lever, stiff, tangent, jar = each
+        cone = c.cone._replace(normal=stiff, tangent=tangent)
+        vertex = Contacts(point, normal, distance, cone, lever)
+        response = respond(vertex, jar)
+        matrix = contact_inertia(vertex, response.hessian)
+        wrench = contact_wrench(vertex, response.force)
+        return jnp.stack([matrix[i, j] for i, j in _UPPER]), wrench
+
+    def add(sums: tuple, vertex: tuple) -> tuple[tuple, tuple]:
+        values = run.only_if((vertex[1][2] < 0).any())(evaluate, vertex[1])
+        return tuple(s + v for s, v in zip(sums, values, strict=True)), ()
+
+    like = jar[0, :, 0]
+    zero = [jnp.zeros((n, *like.shape), like.dtype) for n in (len(_UPPER), 9)]
+    (upper, wrench), _ = scan_links(add, tuple(zero), (jnp.arange(jar.shape[2]),), each)
+    place = {ij: n for n, ij in enumerate(_UPPER)}
+    rows = [jnp.stack([upper[place[min(i, j), max(i, j)]] for j in range(9)]) for i in range(9)]
+    return jnp.stack(rows), wrench
+
+
+_UPPER = [(i, j) for i in range(9) for j in range(i, 9)]
 
 
 def joint_terms(

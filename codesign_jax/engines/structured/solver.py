@@ -293,6 +293,8 @@ def _push(stages: Stages, name: str, c: Contacts, jar: jax.Array) -> tuple[jax.A
             return sum_axis(matrix, 3), sum_axis(wrench, 2)
         return sum_fingers(matrix), sum_fingers(wrench)
 
+    if c.lever is not None:
+        return hull.push(stages, c, jar)
     response = stages(respond, c, jar)
     return stages(summed, c, response.hessian, response.force)
 

@@ -24,6 +24,7 @@ class Effects:
     disturb: bool = True
     ungrasp: bool = True
     surface: str = choice("spheres", "hull", default="spheres")
+    finger_finger: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +67,7 @@ class Contact:
     impedance: float = quantity("", 0.01, 0.9999)
     friction_ratio: float = quantity("", 0.01, 1000)
     finger_table_friction: float = quantity("", 0, 5)
+    finger_finger_friction: float = quantity("", 0, 5, default=0.8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,6 +232,10 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
         problems.append(
             f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
             f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
+        )
+    if scene.effects.finger_finger and scene.effects.surface == "hull":
+        problems.append(
+            f"{where}.effects.finger_finger is between spheres and does not go with surface = 'hull'"
         )
     if scene.discretization.hull_points % 4:
         problems.append(

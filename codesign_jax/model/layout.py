@@ -67,7 +67,7 @@ def layout(scene: Scene) -> Layout:
     bodies = stubs[:, None] + 1 + np.arange(links)
     dofs = 6 + np.arange(n * links * len(axes)).reshape(n, links, len(axes))
     e = scene.effects
-    touching = e.surface == "spheres" and (e.finger_object or e.finger_table)
+    touching = e.surface == "spheres" and (e.finger_object or e.finger_table or e.finger_finger)
     k = scene.discretization.spheres_per_link if touching else 0
     first = 1 + (len(palm_points(scene)) if scene.effects.palm_contact else 0)
     spheres = first + np.arange(n * links * k).reshape(n, links, k)

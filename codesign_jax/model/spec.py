@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 
 import jax
 import mujoco
@@ -259,3 +260,7 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
             add(name, f"object_{i}", shape.friction)
     for name in [*(fingers if e.finger_table else []), *palm]:
         add("table", name, c.finger_table_friction)
+    if e.finger_finger:
+        for first, second in itertools.combinations(fingers, 2):
+            if first.split("_")[1] != second.split("_")[1]:
+                add(first, second, c.finger_finger_friction)

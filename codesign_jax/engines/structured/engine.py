@@ -7,7 +7,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, hull, implicit, mesh, solver
+from codesign_jax.engines.structured import (
+    collision,
+    finger_pairs,
+    hull,
+    implicit,
+    mesh,
+    solver,
+)
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
@@ -146,6 +153,10 @@ class StructuredEngine:
                 found["finger_object"] = on_object(run, spheres, hand.radius)
             if e.finger_table:
                 found["finger_table"] = on_table(spheres, hand.radius)
+            if e.finger_finger and self.scene.num_fingers > 1:
+                found["finger_finger"] = run(
+                    lambda s, r: finger_pairs.contacts(scene, s, r), spheres, hand.radius
+                )
         if e.surface == "hull" and (e.finger_object or e.finger_table):
             skin = run(lambda h, k: hull.vertices(scene, h, k), hand, kin)
             if e.finger_object:
@@ -202,7 +213,8 @@ class StructuredEngine:
         """Whether the scene has what neither the kernel nor the stream knows."""
         # The stream moves worlds between lanes; a mesh's grid belongs to no world.
         meshes = any(o.type == "mesh" for o in self.scene.objects.object)
-        return meshes or self.scene.effects.surface == "hull"
+        e = self.scene.effects
+        return meshes or e.surface == "hull" or e.finger_finger
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array) -> Trace:
         from codesign_jax.engines.structured.fused import Limits, Program

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured import hull
+from codesign_jax.engines.structured import finger_pairs, hull
 from codesign_jax.engines.structured.contact import (
     Contacts,
     contact_inertia,
@@ -115,6 +115,8 @@ def on_links(name: str) -> bool:
 def relative(name: str, motion: Spatial) -> jax.Array:
     """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
     obj = motion.object
+    if name == "finger_finger":
+        return finger_pairs.relative(motion.link)
     if name.startswith("hull"):
         moved = hull.across_joints(motion.palm, motion.link)
         if name == "hull_object":
@@ -214,6 +216,50 @@ def newton_step(
     at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
     acc = Acc(jnp.concatenate([first, second]), fingers, at_centre)
     return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
+
+
+def respond_all(
+    runs: dict[str, Stages], contacts: dict[str, Contacts], jar: dict[str, jax.Array]
+) -> tuple[dict[str, tuple[jax.Array, jax.Array]], finger_pairs.Coupling | None]:
+    """What the contacts add to the Newton system: to its elimination, and between the fingers."""
+    name = "finger_finger"
+    pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items() if n != name}
+    if name not in contacts:
+        return pushes, None
+    return pushes, finger_pairs.coupling(runs[name], contacts[name], jar[name])
+
+
+def linear_solve(
+    run: Stages,
+    problem: Problem,
+    force: Forces,
+    pushes: dict[str, tuple[jax.Array, jax.Array]],
+    pairs: finger_pairs.Coupling | None,
+    tolerance: float = 1e-6,
+) -> tuple[Acc, Spatial]:
+    """`newton_step` with the contacts between fingers, if the scene has them.
+
+    Args:
+      run: Runs the stages.
+      problem: The problem.
+      force: Smooth forces minus inertial forces.
+      pushes: As in `newton_step`.
+      pairs: The contacts between fingers.
+      tolerance: Squared relative error of the step.
+    """
+    if pairs is None:
+        return newton_step(run, problem, force, pushes)
+    force = force._replace(link=force.link + pairs.push)
+    step, motion = newton_step(run, problem, force, pushes)
+    descent = _decrement(-work(run, force, step, motion), pushes, motion, None)
+    none, still = jax.tree.map(jnp.zeros_like, (force, pushes))
+    still = {n: (inertia, still[n][1]) for n, (inertia, _) in pushes.items()}
+
+    def precondition(links: jax.Array) -> tuple[Acc, Spatial]:
+        return newton_step(run, problem, none._replace(link=links), still)
+
+    active = run.only_if(pairs.contacts.active.any())
+    return finger_pairs.correct(active, pairs, (step, motion), descent, precondition, tolerance)
 
 
 def _of_links(skin: dict, rows: slice | int) -> dict:
@@ -394,8 +440,8 @@ def solve(
         acc, motion, jar, before, count = carry
         inertial = inertial_forces(run, problem, acc, motion)
         force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))
-        pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items()}
-        step, step_motion = newton_step(run, problem, force, pushes)
+        pushes, pairs = respond_all(runs, contacts, jar)
+        step, step_motion = linear_solve(run, problem, force, pushes, pairs)
         slope = -work(run, force, step, step_motion)
         curvature = work(run, inertial_forces(run, problem, step, step_motion), step, step_motion)
         jar_step = {
@@ -406,7 +452,7 @@ def solve(
         # A world that is done stays as it is, so that its result does not depend on the others.
         done = before <= tolerance
         alpha = jnp.where(done, 0.0, alpha)
-        residual = _decrement(slope, pushes, step_motion) / _scale(problem, motion)
+        residual = _decrement(slope, pushes, step_motion, pairs) / _scale(problem, motion)
 
         def advance(old, new):
             return jax.tree.map(lambda a, p: a + alpha * p, old, new)
@@ -424,7 +470,9 @@ def solve(
     return Solution(acc, residual, count)
 
 
-def _decrement(slope: jax.Array, pushes: dict, step: Spatial) -> jax.Array:
+def _decrement(
+    slope: jax.Array, pushes: dict, step: Spatial, pairs: finger_pairs.Coupling | None
+) -> jax.Array:
     """Newton decrement -p'gradient, shape (1, world): twice the decrease that the step predicts."""
     pushed = -slope
     for name, (_, wrench) in pushes.items():
@@ -433,6 +481,8 @@ def _decrement(slope: jax.Array, pushes: dict, step: Spatial) -> jax.Array:
             wrench,
         )
         pushed = pushed + sum_items(product)
+    if pairs is not None:
+        pushed = pushed + finger_pairs.product(pairs.push, step.link)
     return jnp.maximum(pushed, 0.0)
 
 

@@ -142,7 +142,10 @@ def _faces(rings: int, points: int) -> np.ndarray:
     a, a_next = first + i, first + after
     b, b_next = a + points, a_next + points
     sides = np.concatenate(
-        [np.stack([a, b_next, b], -1).reshape(-1, 3), np.stack([a, a_next, b_next], -1).reshape(-1, 3)]
+        [
+            np.stack([a, b_next, b], -1).reshape(-1, 3),
+            np.stack([a, a_next, b_next], -1).reshape(-1, 3),
+        ]
     )
     end = 1 + points * (rings - 1)
     base = np.stack([0 * i, 1 + after, 1 + i], -1)
@@ -163,7 +166,7 @@ def rest(scene: Scene, length: float, height: float) -> np.ndarray:
 
 
 def link_origins(scene: Scene, length: float) -> np.ndarray:
-    """Frames of a straight finger's links along it [m], from the half segment on, shape (N + 1,)."""
+    """Frames of a straight finger's links along it [m], the half segment first, shape (N + 1,)."""
     segment = length / scene.discretization.links
     return np.concatenate([[0.0], segment * (np.arange(scene.discretization.links) + 0.5)])
 

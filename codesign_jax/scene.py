@@ -235,7 +235,7 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
         )
     if scene.effects.finger_finger and scene.effects.surface == "hull":
         problems.append(
-            f"{where}.effects.finger_finger is between spheres and does not go with surface = 'hull'"
+            f"{where}.effects.finger_finger is between spheres: it needs surface = 'spheres'"
         )
     if scene.discretization.hull_points % 4:
         problems.append(

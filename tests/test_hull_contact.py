@@ -1,4 +1,4 @@
-"""Contacts of the skinned hull: against MuJoCo C where it is rigid, against a dense solve elsewhere."""
+"""Contacts of the skinned hull: MuJoCo C where it is rigid, a dense solve elsewhere."""
 
 import jax
 import jax.numpy as jnp
@@ -55,13 +55,16 @@ def with_points(scene, hand, trial):
     """MuJoCo's model with a tiny sphere at each vertex of a hull whose rings are rigid.
 
     A vertex's compliance is the scene's times its share of a width squared: with MuJoCo's
-    R = (1 - d)/d invweight that is another impedance d, and a direct reference (stiffness, damping).
+    R = (1 - d)/d invweight that is another impedance d, and a reference given directly as
+    (stiffness, damping).
     """
     spec = model.build_spec(scene, hand, trial)
     slots, c, width = hull.slots(scene), scene.contact, scene.hand.section.width
     for f in range(scene.num_fingers):
         segment, height = float(hand.length[f]) / scene.discretization.links, float(hand.height[f])
-        area = np.array([segment * width, segment * height, width * height]) @ slots.area.reshape(3, -1)
+        area = np.array([segment * width, segment * height, width * height]) @ slots.area.reshape(
+            3, -1
+        )
         share = area.reshape(slots.along.shape) / width**2
         for row, k in np.ndindex(slots.along.shape):
             link = min(row + 1, scene.discretization.links)
@@ -92,7 +95,10 @@ def with_points(scene, hand, trial):
     return compiled
 
 
-@pytest.mark.parametrize("shape", small.SHAPES)
+SLOW = pytest.mark.slow  # half a minute of compiling each
+
+
+@pytest.mark.parametrize("shape", ["cylinder", pytest.param("box", marks=SLOW)])
 def test_rigid_rings_equal_mujoco(shape):
     """One ring a link has weights of zero and one: points on rigid links, as MuJoCo knows them."""
     with jax.enable_x64(True):
@@ -158,7 +164,9 @@ class Dense:
         for row, k in np.ndindex(s.along.shape):
             joint = bodies[min(row + 1, lay.links)]
             before = bodies[row]
-            v = np.array([s.along[row, k] * segment, s.across[row, k] * width, s.up[row, k] * height])
+            v = np.array(
+                [s.along[row, k] * segment, s.across[row, k] * width, s.up[row, k] * height]
+            )
             # The joint is the origin of the link's frame and half or one segment along its parent.
             step = 0 if row == lay.links else segment / 2 if row == 0 else segment
             w = s.weight[row, k]
@@ -182,7 +190,9 @@ class Dense:
     @staticmethod
     def _jac(oracle, data, points, bodies, weight):
         total = 0.0
-        for point, body, w in zip(points, bodies, (1 - weight, weight)[-len(points) :], strict=True):
+        for point, body, w in zip(
+            points, bodies, (1 - weight, weight)[-len(points) :], strict=True
+        ):
             jac = np.zeros((3, oracle.nv))
             mujoco.mj_jac(oracle, data, jac, None, point, body)
             total = total + w * jac
@@ -250,7 +260,7 @@ def project(z, slope):
     return ray * size, np.outer(ray, ray) + across
 
 
-@pytest.mark.parametrize("shape", ["box", "sphere"])
+@pytest.mark.parametrize("shape", ["box", pytest.param("sphere", marks=SLOW)])
 def test_blended_rings_equal_a_dense_solve(shape):
     """Accelerations of a grasp with blended vertices against dense Jacobians and SciPy."""
     with jax.enable_x64(True):

@@ -44,8 +44,8 @@ def refuse_hull(scene: Scene, engine: str) -> None:
     if scene.effects.surface == "hull":
         raise SceneError(
             [
-                f"not supported by engine {engine}: effects.surface = 'hull'; use engine structured "
-                "or surface 'spheres'"
+                f"not supported by engine {engine}: effects.surface = 'hull'; "
+                "use engine structured, or surface = 'spheres'"
             ]
         )
 

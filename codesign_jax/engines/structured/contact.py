@@ -58,7 +58,7 @@ class Contacts(NamedTuple):
         return self.distance < 0
 
     def relative(self, motion: jax.Array) -> jax.Array:
-        """Point motion, (3, ...), of a relative spatial motion, (6, ...), or (9, ...) with a lever."""
+        """Point motion, (3, ...), of a relative spatial motion, (6, ...); (9, ...) with a lever."""
         moved = motion[3:6] + cross(motion[:3], self.point)
         return moved if self.lever is None else moved + cross(motion[6:], self.lever)
 
@@ -195,5 +195,5 @@ def _crossed(r: jax.Array, k: list[jax.Array]) -> list[jax.Array]:
 
 def contact_wrench(contacts: Contacts, force: jax.Array) -> jax.Array:
     """Spatial force (moment about the origin, force), (6, ...); with a lever its moment as well."""
-    parts = [cross(contacts.point, force), force]
-    return jnp.concatenate(parts + ([cross(contacts.lever, force)] if contacts.lever is not None else []))
+    lever = [] if contacts.lever is None else [cross(contacts.lever, force)]
+    return jnp.concatenate([cross(contacts.point, force), force, *lever])

@@ -160,9 +160,9 @@ class StructuredEngine:
         if e.surface == "hull" and (e.finger_object or e.finger_table):
             skin = run(lambda h, k: hull.vertices(scene, h, k), hand, kin)
             if e.finger_object:
-                found["hull_object"] = hull.attach(on_object(run, skin.point, 0.0), skin)
+                found["hull_object"] = hull.attach(run, on_object(run, skin.point, 0.0), skin)
             if e.finger_table:
-                found["hull_table"] = hull.attach(on_table(skin.point, 0.0), skin)
+                found["hull_table"] = hull.attach(run, on_table(skin.point, 0.0), skin)
         if e.palm_contact:
             palm, radius = collision.palm_spheres(scene, kin), scene.hand.palm.contact_radius
             found["palm_object"] = on_object(run, palm, radius)

@@ -11,6 +11,7 @@ rotation) of nine components a contact is the matrix X'KX, X = [-[r], 1, -[lever
 w (x1 + arm - p); the sums over a joint's vertices enter the elimination of that joint.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -19,14 +20,16 @@ import jax.numpy as jnp
 from codesign_jax import hull
 from codesign_jax.engines.structured.contact import (
     Contacts,
+    Line,
     contact_inertia,
     contact_wrench,
     respond,
+    slopes,
 )
 from codesign_jax.engines.structured.elimination import JointTerms
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics
-from codesign_jax.engines.structured.lanes import Stages, contract, scan_links
+from codesign_jax.engines.structured.lanes import Stages, contract, sum_items
 from codesign_jax.scene import Scene
 
 
@@ -65,12 +68,27 @@ def vertices(scene: Scene, hand: HandLanes, kin: Kinematics) -> Vertices:
     return Vertices(joint + blend, image, weight, surface / width**2)
 
 
-def attach(contacts: Contacts, skin: Vertices) -> Contacts:
-    """Makes contacts of the vertices, as of spheres without a radius, follow their two links."""
-    lever = skin.weight * (skin.image + contacts.point - skin.point)
+def attach(run: Stages, contacts: Contacts, skin: Vertices) -> Contacts:
+    """Makes contacts of the vertices, as of spheres without a radius, follow their two links.
+
+    The vertices that touch come first in every row and lane: sums end after the last of them.
+    """
+
+    def ordered(c: Contacts, skin: Vertices) -> tuple[jax.Array, ...]:
+        lever = skin.weight * (skin.image + c.point - skin.point)
+        order = jnp.argsort(~c.active, axis=1, stable=True)
+        each = (c.point, c.normal, c.distance, lever, skin.share)
+        return tuple(
+            jnp.take_along_axis(x, order if x.ndim == order.ndim else order[None], axis=x.ndim - 3)
+            for x in each
+        )
+
+    # Where no vertex touches all become zero, which is no contact either.
+    touching = run.only_if(contacts.active.any())
+    point, normal, distance, lever, share = touching(ordered, contacts, skin)
     cone = contacts.cone
-    cone = cone._replace(normal=cone.normal * skin.share, tangent=cone.tangent * skin.share)
-    return contacts._replace(cone=cone, lever=lever)
+    cone = cone._replace(normal=cone.normal * share, tangent=cone.tangent * share)
+    return Contacts(point, normal, distance, cone, lever)
 
 
 def across_joints(palm: jax.Array, links: jax.Array) -> jax.Array:
@@ -82,15 +100,9 @@ def across_joints(palm: jax.Array, links: jax.Array) -> jax.Array:
 
 
 def push(run: Stages, c: Contacts, jar: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Contact inertia (9, 9, row, finger, world) and wrench (9, row, finger, world) of the rows.
+    """Contact inertia (9, 9, row, finger, world) and wrench (9, row, finger, world) of the rows."""
 
-    One vertex of every row after the other: the whole set's matrices would not fit a CPU's cache,
-    and most vertices, such as those on a finger's back, touch nothing.
-    """
-    each = (c.point, c.normal, c.distance, c.lever, c.cone.normal, c.cone.tangent, jar)
-
-    def evaluate(each: tuple) -> tuple[jax.Array, jax.Array]:
-        point, normal, distance, lever, stiff, tangent, jar = each
+    def evaluate(point, normal, distance, lever, stiff, tangent, jar) -> tuple:
         cone = c.cone._replace(normal=stiff, tangent=tangent)
         vertex = Contacts(point, normal, distance, cone, lever)
         response = respond(vertex, jar)
@@ -98,16 +110,54 @@ def push(run: Stages, c: Contacts, jar: jax.Array) -> tuple[jax.Array, jax.Array
         wrench = contact_wrench(vertex, response.force)
         return jnp.stack([matrix[i, j] for i, j in _UPPER]), wrench
 
-    def add(sums: tuple, vertex: tuple) -> tuple[tuple, tuple]:
-        values = run.only_if((vertex[1][2] < 0).any())(evaluate, vertex[1])
-        return tuple(s + v for s, v in zip(sums, values, strict=True)), ()
-
-    like = jar[0, :, 0]
-    zero = [jnp.zeros((n, *like.shape), like.dtype) for n in (len(_UPPER), 9)]
-    (upper, wrench), _ = scan_links(add, tuple(zero), (jnp.arange(jar.shape[2]),), each)
+    each = (c.point, c.normal, c.distance, c.lever, c.cone.normal, c.cone.tangent, jar)
+    upper, wrench = _sum_vertices(run, c, evaluate, each, (len(_UPPER), 9))
     place = {ij: n for n, ij in enumerate(_UPPER)}
     rows = [jnp.stack([upper[place[min(i, j), max(i, j)]] for j in range(9)]) for i in range(9)]
     return jnp.stack(rows), wrench
+
+
+def line_slopes(run: Stages, c: Contacts, ray: Line, alpha: jax.Array) -> tuple:
+    """First and second derivative of the cost of all vertices along the line, shape (1, world)."""
+
+    def evaluate(distance, stiff, tangent, *ray) -> tuple:
+        cone = c.cone._replace(normal=stiff, tangent=tangent)
+        vertex = Contacts(distance, distance, distance, cone)
+        return tuple(v[None] for v in slopes(vertex, Line(*ray), alpha))
+
+    each = (c.distance, c.cone.normal, c.cone.tangent, *ray)
+    return tuple(sum_items(v[0]) for v in _sum_vertices(run, c, evaluate, each, (1, 1)))
+
+
+def _sum_vertices(
+    run: Stages, c: Contacts, function: Callable, each: tuple, sizes: tuple[int, ...]
+) -> tuple:
+    """Sums over the vertices of each row that touch in any lane, one vertex after the other.
+
+    All vertices' matrices would not fit a CPU's cache, and most vertices, such as those on a
+    finger's back, touch nothing; those that do come first, see `attach`.
+
+    Args:
+      run: Runs the stages.
+      c: The contacts.
+      function: From the arrays of one vertex of each row, shape (..., row, finger, world), to
+        arrays of shape (size, row, finger, world).
+      each: Arrays of shape (..., row, k, finger, world).
+      sizes: The sizes.
+    """
+    rows, k, *lanes = c.distance.shape
+    # Rows and planes to the compiler, as in `scan_links`.
+    planes = [x.reshape(-1, k, lanes[0] * lanes[1]) for x in each]
+
+    def add(i: jax.Array, sums: tuple) -> tuple:
+        vertex = [
+            jax.lax.dynamic_index_in_dim(p, i, 1, keepdims=False).reshape(*x.shape[:-3], *lanes)
+            for p, x in zip(planes, each, strict=True)
+        ]
+        return tuple(s + v for s, v in zip(sums, run(function, *vertex), strict=True))
+
+    zero = tuple(jnp.zeros((n, rows, *lanes), c.distance.dtype) for n in sizes)
+    return jax.lax.fori_loop(0, c.active.sum(1).max(), add, zero)
 
 
 _UPPER = [(i, j) for i in range(9) for j in range(i, 9)]

@@ -392,7 +392,10 @@ def line_search(
         alpha, low, high = carry
         first, second = slope + alpha * curvature, curvature
         for n, c in contacts.items():
-            f, s = run[n](summed, c, rays[n], alpha)
+            if c.lever is None:
+                f, s = run[n](summed, c, rays[n], alpha)
+            else:
+                f, s = hull.line_slopes(run[n], c, rays[n], alpha)
             first, second = first + f, second + s
         return refine(alpha, low, high, first, second)
 

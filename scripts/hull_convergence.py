@@ -1,7 +1,6 @@
 """Contact force of the skinned hull against its mesh density, and its cost against spheres.
 
-  python scripts/hull_convergence.py --out docs/data/hull_convergence.json \\
-      --figure docs/hull_convergence.png
+  python scripts/hull_convergence.py --out FILE.json --figure FILE.png
 
 A hand with long fingers closes on each object of the paper and is at rest just before the lift.
 Two forces of the fingers on the object are measured at every density: with the hand where the

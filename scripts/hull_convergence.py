@@ -1,4 +1,4 @@
-"""Contact force of the skinned hull against its mesh density, and its cost against spheres.
+"""Contact force of the skinned hull against its mesh density.
 
   python scripts/hull_convergence.py --out FILE.json --figure FILE.png
 
@@ -10,7 +10,6 @@ float64.
 
 import dataclasses
 import json
-import time
 from pathlib import Path
 
 import jax
@@ -54,21 +53,16 @@ class Case:
         self.engine = StructuredEngine(self.scene, tolerance=1e-10, iterations=60, evaluations=12)
         self.hand, self.state = hand_lanes(self.scene, fields), self.engine.reset(fields)
 
-    def settle(self) -> float:
-        """Steps to just before the lift; returns microseconds a world and step."""
+    def settle(self) -> None:
+        """Steps to just before the lift."""
         steps = round(self.scene.phases.inflate / self.scene.discretization.timestep) - 5
 
         @jax.jit
         def run(hand, state, ctrl):
-            return jax.lax.scan(lambda s, u: (self.engine.step(hand, s, u)[0], None), state, ctrl)[
-                0
-            ]
+            step = self.engine.step
+            return jax.lax.scan(lambda s, u: (step(hand, s, u)[0], None), state, ctrl)[0]
 
-        ctrl = jnp.moveaxis(self.ctrl[:, :steps], 0, -1)
-        compiled = run.lower(self.hand, self.state, ctrl).compile()
-        start = time.process_time()
-        self.state = jax.block_until_ready(compiled(self.hand, self.state, ctrl))
-        return 1e6 * (time.process_time() - start) / steps / ctrl.shape[-1]
+        self.state = run(self.hand, self.state, jnp.moveaxis(self.ctrl[:, :steps], 0, -1))
 
     def force(self, state) -> np.ndarray:
         """Sum of the normal forces that the penetrations cause [N], shape (world,)."""
@@ -89,12 +83,12 @@ def main(options: Options) -> None:
     cases = {d: Case(*d) for d in DENSITIES}
     rows, own = [], {}
     for d, case in cases.items():
-        cost = case.settle()
-        own[d] = case.force(case.state), cost
+        case.settle()
+        own[d] = case.force(case.state)
         print(d, own[d], flush=True)
     finest = cases[DENSITIES[-1]].state
     for (rings, points), case in cases.items():
-        (rest, touching), cost = own[rings, points]
+        rest, touching = own[rings, points]
         rows.append(
             {
                 "hull_rings": rings,
@@ -102,7 +96,6 @@ def main(options: Options) -> None:
                 "force_same_place": case.force(finest)[0].tolist(),
                 "force_at_rest": rest.tolist(),
                 "points_in_contact": touching.tolist(),
-                "cpu_us_per_world_step": cost,
             }
         )
         print(rows[-1], flush=True)
@@ -115,7 +108,7 @@ def main(options: Options) -> None:
 
 
 def draw(record: dict, path: Path) -> None:
-    """Relative deviation from the finest mesh against points a finger's length of one segment."""
+    """Relative deviation from the finest mesh against the vertices of a link."""
     import matplotlib.figure
 
     figure = matplotlib.figure.Figure(figsize=(9, 3.6), layout="constrained")
@@ -127,6 +120,8 @@ def draw(record: dict, path: Path) -> None:
             force = np.array([r[key][k] for r in rows])
             axes.plot(x[:-1], np.abs(force[:-1] / force[-1] - 1), "o-", label=shape)
         axes.set(xscale="log", yscale="log", xlabel="hull points a link", ylim=(1e-3, 1))
+        axes.set_xticks(x[:-1], [str(n) for n in x[:-1]])
+        axes.minorticks_off()
         axes.set_title(("hand in the same place", "each at its own rest")[i])
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("normal force, deviation from the finest mesh")

@@ -134,6 +134,7 @@ def correct(
     pairs: Coupling,
     start: tuple,
     descent: jax.Array,
+    idle: jax.Array,
     precondition: Callable[[jax.Array], tuple],
     tolerance: float,
 ) -> tuple:
@@ -144,6 +145,7 @@ def correct(
       pairs: F.
       start: z = P^-1 g as accelerations and spatial motion.
       descent: g'z, shape (1, world).
+      idle: Worlds for which nothing is done, shape (1, world).
       precondition: P^-1 J'L of forces L on the links, as accelerations and spatial motion.
       tolerance: Squared error of x, relative to its squared size, both as measured by H.
 
@@ -181,5 +183,5 @@ def correct(
         x, gx, *_ = jax.lax.while_loop(going, body, first)
         return jax.tree.map(lambda a, b: jnp.where(gx > 0, a, b), x, start)
 
-    r = -apply(start[1])
+    r = jnp.where(idle, 0.0, -apply(start[1]))
     return jax.lax.cond(pairs.contacts.active.any(), iterate, lambda _: start, r)

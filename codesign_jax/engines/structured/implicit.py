@@ -108,7 +108,7 @@ def adjoint(run: Stages, problem: Problem, velocity: Spatial, acc: Acc, cotangen
     )
     # As far as rounding allows: the derivative has no further Newton step to mend it.
     tolerance = float(jnp.finfo(motion.link.dtype).eps) ** 1.5
-    return solver.linear_solve(run, problem, force, pushes, pairs, tolerance)[0]
+    return solver.linear_solve(run, problem, force, pushes, pairs, tolerance=tolerance)[0]
 
 
 def residual_power(

@@ -235,6 +235,7 @@ def linear_solve(
     force: Forces,
     pushes: dict[str, tuple[jax.Array, jax.Array]],
     pairs: finger_pairs.Coupling | None,
+    idle: jax.Array | None = None,
     tolerance: float = 1e-6,
 ) -> tuple[Acc, Spatial]:
     """`newton_step` with the contacts between fingers, if the scene has them.
@@ -245,6 +246,7 @@ def linear_solve(
       force: Smooth forces minus inertial forces.
       pushes: As in `newton_step`.
       pairs: The contacts between fingers.
+      idle: Worlds whose step is of no use, shape (1, world).
       tolerance: Squared relative error of the step.
     """
     if pairs is None:
@@ -259,7 +261,9 @@ def linear_solve(
         return newton_step(run, problem, none._replace(link=links), still)
 
     active = run.only_if(pairs.contacts.active.any())
-    return finger_pairs.correct(active, pairs, (step, motion), descent, precondition, tolerance)
+    start = step, motion
+    idle = jnp.zeros_like(descent, bool) if idle is None else idle
+    return finger_pairs.correct(active, pairs, start, descent, idle, precondition, tolerance)
 
 
 def _of_links(skin: dict, rows: slice | int) -> dict:
@@ -444,7 +448,8 @@ def solve(
         inertial = inertial_forces(run, problem, acc, motion)
         force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))
         pushes, pairs = respond_all(runs, contacts, jar)
-        step, step_motion = linear_solve(run, problem, force, pushes, pairs)
+        idle = None if pairs is None else before <= tolerance
+        step, step_motion = linear_solve(run, problem, force, pushes, pairs, idle)
         slope = -work(run, force, step, step_motion)
         curvature = work(run, inertial_forces(run, problem, step, step_motion), step, step_motion)
         jar_step = {

@@ -9,13 +9,15 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
-.PHONY: demo test test-slow notebooks benchmark lint format types clean help
+.PHONY: demo test test-slow notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
+	@echo "make effects     what each effect costs and decides: docs/effects.md"
+	@echo "make accuracy    what accuracy costs in time: ACCURACY=docs/data/accuracy_cpu.json, SIZE=full"
 	@echo "make format      ruff format          make clean       remove what make built"
 
 demo: $(STAMP)
@@ -34,6 +36,16 @@ notebooks: $(STAMP)
 BENCHMARK ?= runs/benchmark.json
 benchmark: $(STAMP)
 	$(BIN)/python scripts/benchmark.py --json $(BENCHMARK) $(ARGS)
+
+# About 15 minutes on two idle cores.
+effects: $(STAMP)
+	$(BIN)/python scripts/effects_cost.py $(ARGS)
+
+# Minutes at the quick size, hours of CPU at the full one; goes on where it stopped.
+ACCURACY ?= runs/accuracy_cpu.json
+SIZE ?= quick
+accuracy: $(STAMP)
+	$(BIN)/python scripts/accuracy_vs_time.py --json $(ACCURACY) --size $(SIZE) $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(CHECKED)

@@ -39,6 +39,8 @@ class Optimize:
     """Object set: a built-in name or a .toml file; default: the scene's."""
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
+    accuracy: Text = None
+    """Discretization and solver instead of the scene's: fast, standard, reference, or a .toml."""
     overrides: Overrides = ()
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control."""
@@ -90,6 +92,8 @@ class Evaluate:
     """Object set: a built-in name or a .toml file; default: the scene's."""
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
+    accuracy: Text = None
+    """Discretization and solver instead of the scene's: fast, standard, reference, or a .toml."""
     overrides: Overrides = ()
     engine: Text = None
     """Engine that simulates; default: the run's, or structured."""
@@ -107,6 +111,40 @@ class Evaluate:
         return evaluate.main(self)
 
 
+@dataclasses.dataclass
+class Scenes:
+    """List scenes and their effects: on, off, or unsupported by an engine."""
+
+    name: Annotated[
+        str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help_behavior_hint="")
+    ] = None
+    """Scene: a built-in name or a .toml file; default: all built-in ones."""
+    engine: Text = None
+    """Show this engine only."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import scenes
+
+        return scenes.main(self)
+
+
+@dataclasses.dataclass
+class Replay:
+    """Replay a failed world of a run: simulate it again, and its last good state in MuJoCo C."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A file of the run folder's failures/, or the run folder, whose failed worlds are listed."""
+    engine: Text = None
+    """Engine that simulates; default: the run's."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import replay
+
+        return replay.main(self)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Parses the command line, runs the command and returns the exit status.
 
@@ -117,7 +155,7 @@ def main(arguments: list[str] | None = None) -> int:
       arguments: Arguments without the program's name; default: those of the process.
     """
     command = tyro.cli(
-        Optimize | Evaluate,  # type: ignore[arg-type]
+        Optimize | Evaluate | Scenes | Replay,  # type: ignore[arg-type]
         args=arguments,
         prog="codesign",
         description="Co-design of soft hand morphology and control.",

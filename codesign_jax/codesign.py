@@ -17,7 +17,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.optimize import Info, ParticleFilter, Space, State, rejection_sample
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome
+from codesign_jax.types import Outcome, Trial
 
 # Four ASCII letters each, as the optimiser's streams, so that no two streams of a seed meet.
 STREAM_TRIAL = 0x7472696C
@@ -45,11 +45,14 @@ class EpisodeInfo(NamedTuple):
       population: Particles as simulated [SI units], shape (particle, parameter).
       trials: Cost, status, time of loss and first bad step, each of shape (particle, trial).
       selection: Particle costs, weights and ancestors of the resampling; see `optimize.Info`.
+      last: States at which the worlds ended, failed ones frozen at their last good one, shape
+        (particle, trial, nq + nv), or None if the engine does not tell.
     """
 
     population: jax.Array
     trials: Outcome
     selection: Info
+    last: jax.Array | None = None
 
 
 class FinalTest(NamedTuple):
@@ -120,16 +123,24 @@ def make_episode(
       optimizer: Particle filter over the same space.
       num_trials: Trials of each particle in an episode.
     """
-    evaluate = make_evaluate(scene, engine, space, num_trials)
 
     @jax.jit
     def episode(state: State, mask: jax.typing.ArrayLike) -> tuple[State, EpisodeInfo]:
         population = optimizer.ask(state, mask)
-        trials = evaluate(population, stream_key(state.key, STREAM_TRIAL, state.episode))
+        noise = episode_trials(scene, state.key, state.episode, num_trials)
+        hands = jax.vmap(space.params)(population)
+        trials, last = rollout.evaluate_to_end(scene, engine, hands, noise)
         new, selection = optimizer.tell(state, population, particle_cost(scene, trials))
-        return new, EpisodeInfo(population, trials, selection)
+        return new, EpisodeInfo(population, trials, selection, last)
 
     return episode
+
+
+def episode_trials(
+    scene: Scene, key: jax.Array, episode: jax.typing.ArrayLike, num_trials: int
+) -> Trial:
+    """Trials of an episode of the run with this root key, leading axis (trial,)."""
+    return rollout.sample_trials(scene, stream_key(key, STREAM_TRIAL, episode), num_trials)
 
 
 def evaluate_by(episode: EpisodeFunction, num_parameters: int) -> EvaluateFunction:

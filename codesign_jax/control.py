@@ -41,7 +41,30 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
         pitch - arm[4] + trial.arm_tilt[1],
     ]
     pressure = params.pressure[:, None] * _inflation(scene, time)
+    if scene.effects.pressure_dynamics:
+        pressure = supplied(scene, pressure)
     return jnp.concatenate([jnp.stack(pose), pressure]).T
+
+
+def supplied(scene: Scene, wanted: jax.Array) -> jax.Array:
+    """Chamber pressures that the air supply reaches, from the wanted ones, both (finger, time).
+
+    tau dp/dt = min(wanted, maximum) - p with |dp/dt| <= rate, from the first wanted pressure on.
+    `wanted` is held over each time step, over which the lag is solved exactly.  The chamber's
+    volume does not enter, so pressures are known beforehand and cost a step nothing.
+
+    Args:
+      scene: The scene; its `pneumatics` have the constants.
+      wanted: Wanted pressures [Pa].
+    """
+    p, h = scene.pneumatics, scene.discretization.timestep
+    gain = -np.expm1(-h / p.lag) if p.lag > 0 else 1.0
+    target = jnp.minimum(wanted, p.maximum)
+
+    def step(now: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return now + jnp.clip(gain * (goal - now), -p.rate * h, p.rate * h), now
+
+    return jax.lax.scan(step, target[:, 0], target.T)[1].T
 
 
 def _inflation(scene: Scene, time: np.ndarray) -> np.ndarray:

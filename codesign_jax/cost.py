@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Status, Trace
+from codesign_jax.types import WARNINGS, Outcome, Status, Trace, failed
 
 
-def outcome(scene: Scene, trace: Trace) -> Outcome:
+def outcome(scene: Scene, trace: Trace, initial: jax.Array | int = 0) -> Outcome:
     """Returns cost and status of one trial from its trace.
 
     c = c_max (t_end - t_lost) / (t_end - t_0), where t_lost is the first time in [t_0, t_end) at
@@ -19,6 +19,7 @@ def outcome(scene: Scene, trace: Trace) -> Outcome:
     Args:
       scene: The scene.
       trace: Trace of one world, arrays of shape (time,).
+      initial: Bits of `Status` that the world starts with, shape () int32.
     """
     steps = trace.distance.shape[0]
     time = np.arange(steps) * scene.discretization.timestep
@@ -28,15 +29,17 @@ def outcome(scene: Scene, trace: Trace) -> Outcome:
     window = (time >= start - slack) & (time < end - slack)
     lost_step = _first(window & (trace.distance >= scene.cost.lost_distance))
     bits = _failures(scene, trace)
+    bits = bits.at[0].set(bits[0] | jnp.asarray(initial, jnp.int32))
     bad_step = _first(bits != 0)
-    failed = bad_step < lost_step
-    lost = (lost_step < steps) & ~failed
+    bad = bad_step < lost_step
+    lost = (lost_step < steps) & ~bad
     lost_time = jnp.where(lost, lost_step * scene.discretization.timestep, jnp.inf).astype(dtype)
     cost = scene.cost.maximum * (end - jnp.where(lost, lost_time, end)) / (end - start)
-    status = jnp.where(failed, bits[jnp.minimum(bad_step, steps - 1)], 0)
-    status = jnp.where(_stuck(scene, trace) & ~lost & ~failed, int(Status.STUCK), status)
-    cost = jnp.where(status == 0, cost, scene.cost.maximum)
-    return Outcome(cost.astype(dtype), status, lost_time, jnp.where(failed, bad_step, -1))
+    stuck = _bit(_stuck(scene, trace) & ~lost & ~bad, Status.STUCK)
+    status = bad * bits[jnp.minimum(bad_step, steps - 1)] | stuck
+    status |= _warnings(trace, jnp.minimum(bad_step, lost_step))
+    cost = jnp.where(failed(status), scene.cost.maximum, cost)
+    return Outcome(cost.astype(dtype), status, lost_time, jnp.where(bad, bad_step, -1))
 
 
 def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
@@ -52,7 +55,7 @@ def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
     Returns:
       Costs without the trial axis.
     """
-    good = trials.status == 0
+    good = ~failed(trials.status)
     if scene.cost.failure == "worst":
         return jnp.where(good, trials.cost, scene.cost.maximum).mean(-1)
     count = good.sum(-1)
@@ -69,10 +72,29 @@ def _first(condition: jax.Array) -> jax.Array:
 def _failures(scene: Scene, trace: Trace) -> jax.Array:
     """Status bits of every step, shape (time,) int32."""
     finite = jnp.isfinite(trace.speed) & jnp.isfinite(trace.distance)
-    bits = jnp.where(finite, 0, int(Status.NONFINITE))
-    bits |= jnp.where(trace.speed > scene.limits.speed, int(Status.SPEED), 0)
     below = trace.height < -scene.limits.penetration
-    return (bits | jnp.where(below, int(Status.PENETRATION), 0)).astype(jnp.int32)
+    bits = _bit(~finite, Status.NONFINITE)
+    bits |= _bit(trace.speed > scene.limits.speed, Status.SPEED) | _bit(below, Status.PENETRATION)
+    if trace.status is not None:
+        told = jnp.asarray(trace.status, jnp.int32)
+        bits |= jnp.where(failed(told), told, jnp.zeros_like(told))
+    return bits
+
+
+def _bit(condition: jax.Array, bit: Status) -> jax.Array:
+    """The bit where the condition holds, int32 in every mode of JAX."""
+    return condition.astype(jnp.int32) * np.int32(bit)
+
+
+def _warnings(trace: Trace, decided: jax.Array) -> jax.Array:
+    """Warnings of the steps before the one at which the trial was decided, shape () int32."""
+    if trace.status is None:
+        return jnp.zeros((), jnp.int32)
+    # The last entry's step leads to a state that nothing reads.
+    steps = trace.status.shape[0]
+    counts = np.arange(steps) < jnp.minimum(decided, steps - 1)
+    warned = counts & ((trace.status & int(WARNINGS)) != 0)
+    return _bit(warned.any(), WARNINGS)
 
 
 def _stuck(scene: Scene, trace: Trace) -> jax.Array:

@@ -12,11 +12,12 @@ _FOLDERS = {
     "hands": (_PACKAGE / "hands", _PACKAGE.parent / "hands"),
     "objects": (_PACKAGE / "objects", _PACKAGE.parent / "objects"),
     "scenes": (_PACKAGE / "scenes",),
+    "accuracy": (_PACKAGE / "scenes" / "accuracy",),
 }
 
 
 def available(kind: str) -> dict[str, Path]:
-    """Returns the built-in files of a kind ("hands", "objects" or "scenes") by name."""
+    """Returns the built-in files of a kind ("hands", "objects", "scenes", "accuracy") by name."""
     found: dict[str, Path] = {}
     for folder in _FOLDERS[kind]:
         if folder.is_dir():

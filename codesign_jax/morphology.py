@@ -81,6 +81,38 @@ def finger_beams(hand: Hand, params: Params) -> Beam:
     )
 
 
+def softening(
+    curvature: jax.Array, height: jax.Array, wall: jax.Array, *, width: float
+) -> jax.Array:
+    """Share of the linear bending moment that a neo-Hookean section lacks at large curvature.
+
+    With the stretch lambda = 1 + kappa y of a fibre at height y above the inextensible layer, held
+    in plane strain by the threads, a neo-Hookean wall carries the moment
+      M(kappa) = G int (lambda - lambda^-3) y dA = E I kappa (1 - s(kappa)).
+    The integral over a block of width b from 0 to y is, with e = kappa y,
+      b y^3 kappa (4/3 - r(e)),  r(e) = e (3 + 2 e) / (2 (1 + e)^2),
+    so that s is [w h^3 r(kappa h) - w_c ((h-d)^3 r(kappa (h-d)) - d^3 r(kappa d))] / (4 I_0): 0 at
+    small strain, at most 3/4, and free of G.  Bent backwards (kappa < 0) thin walls wrinkle before
+    the rubber stiffens; there the linear law stays [ours].
+
+    Args:
+      curvature: Curvature kappa [1/m], any shape.
+      height: Outer height h [m], broadcasting to it.
+      wall: Wall thickness d [m], likewise.
+      width: Outer width w [m].
+    """
+    kappa, inner = curvature * (curvature > 0), height - wall
+    chamber = width - 2 * wall
+
+    def missing(y: jax.Array) -> jax.Array:
+        e = kappa * y
+        return y**3 * e * (3 + 2 * e) / (2 * (1 + e) ** 2)
+
+    second_moment = (width * height**3 - chamber * (inner**3 - wall**3)) / 3
+    lacking = width * missing(height) - chamber * (missing(inner) - missing(wall))
+    return lacking / (4 * second_moment)
+
+
 def block_inertia(
     mass: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array
 ) -> tuple[jax.Array, ...]:

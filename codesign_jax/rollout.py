@@ -7,6 +7,7 @@ import numpy as np
 from codesign_jax import control, cost, model
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Scene
+from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Trace, Trial
 
 
@@ -66,7 +67,8 @@ def simulate(
     fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
     ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)
     trace = engine.rollout(fields, ctrl, trajectory=trajectory)
-    return jax.vmap(lambda t: cost.outcome(scene, t))(trace), trace
+    initial = invalid_start(scene, fields)
+    return jax.vmap(lambda t, i: cost.outcome(scene, t, i))(trace, initial), trace
 
 
 def evaluate(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Outcome:
@@ -82,8 +84,18 @@ def evaluate(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Out
     Returns:
       Outcomes, every array of shape (particle, trial).
     """
+    return evaluate_to_end(scene, engine, params, trials)[0]
+
+
+def evaluate_to_end(
+    scene: Scene, engine: Engine, params: Params, trials: Trial
+) -> tuple[Outcome, jax.Array | None]:
+    """As `evaluate`, with the states at the end, shape (particle, trial, nq + nv).
+
+    They are None if the engine does not tell them.
+    """
     particles, count = params.length.shape[0], trials.yaw.shape[0]
     worlds_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
     worlds_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
-    result, _ = simulate(scene, engine, worlds_p, worlds_t)
-    return jax.tree.map(lambda v: v.reshape(particles, count), result)
+    result, trace = simulate(scene, engine, worlds_p, worlds_t)
+    return jax.tree.map(lambda v: v.reshape(particles, count, *v.shape[1:]), (result, trace.last))

@@ -14,17 +14,27 @@ from codesign_jax.schema import choice, quantity
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """What is simulated; an effect that is off has no joint, contact or branch in the program."""
+    """What is simulated; an effect that is off has no joint, contact or branch in the program.
+
+    `codesign_jax.effects` says what each means and which engines have it.
+    """
 
     lateral_bending: bool = True
     twist: bool = True
+    wrist: bool = True
     finger_object: bool = True
+    palm_object: bool = True
     finger_table: bool = True
-    palm_contact: bool = True
+    palm_table: bool = True
+    object_table: bool = True
+    finger_finger: bool = False
+    surface: str = choice("spheres", "hull", default="spheres")
+    friction: str = choice("none", "coulomb", "full", default="coulomb")
     disturb: bool = True
     ungrasp: bool = True
-    surface: str = choice("spheres", "hull", default="spheres")
-    finger_finger: bool = False
+    neo_hookean: bool = False
+    pressure_dynamics: bool = False
+    gravity: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,14 +70,29 @@ class Cost:
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """MuJoCo's soft contact as the rubber skin's own numbers; see `model.contact_invweight`."""
+    """MuJoCo's soft contact as the rubber skin's own numbers; see `model.contact_invweight`.
+
+    A contact of normal force N resists spin with `torsional_friction` N and rolling with
+    `rolling_friction` N, both lengths as in MuJoCo, if the effect `friction` is "full".
+    """
 
     normal_stiffness: float = quantity("N/m", 10, 1e6)
     time_constant: float = quantity("s", 1e-4, 1)
     impedance: float = quantity("", 0.01, 0.9999)
     friction_ratio: float = quantity("", 0.01, 1000)
     finger_table_friction: float = quantity("", 0, 5)
+    torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
+    rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
     finger_finger_friction: float = quantity("", 0, 5, default=0.8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pneumatics:
+    """Dynamics of the chambers' pressure, used with the effect `pressure_dynamics`."""
+
+    lag: float = quantity("s", 0, 10, default=0.1)
+    rate: float = quantity("Pa/s", 1e3, 1e9, default=400e3)
+    maximum: float = quantity("Pa", 1e3, 1e6, default=200e3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +123,15 @@ class Solver:
 
 
 @dataclasses.dataclass(frozen=True)
+class Accuracy:
+    """Values of a preset of accuracy; docs/accuracy.md has its measured errors and cost."""
+
+    description: str
+    discretization: dict
+    solver: dict
+
+
+@dataclasses.dataclass(frozen=True)
 class Limits:
     """Bounds beyond which a world has failed although its numbers are finite."""
 
@@ -122,6 +156,12 @@ class Scene:
     discretization: Discretization
     solver: Solver
     limits: Limits
+    pneumatics: Pneumatics = Pneumatics()
+
+    @property
+    def gravity_on(self) -> float:
+        """Gravity as simulated: 0 if the effect is off [m/s^2]."""
+        return self.gravity if self.effects.gravity else 0.0
 
     @property
     def num_fingers(self) -> int:
@@ -165,7 +205,8 @@ class _SceneFile:
     discretization: Discretization
     solver: Solver
     limits: Limits
-    gravity: float = quantity("m/s^2", 0, 100)
+    pneumatics: Pneumatics = Pneumatics()
+    gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
 
 
 def load(
@@ -173,6 +214,7 @@ def load(
     *,
     hand_name: str | Path | None = None,
     object_set: str | Path | None = None,
+    accuracy: str | Path | None = None,
     overrides: dict[str, dict[str, Any]] | None = None,
 ) -> Scene:
     """Reads a scene with its hand and objects.
@@ -181,20 +223,23 @@ def load(
       name: Name of a built-in scene, or a path ending in .toml.
       hand_name: Hand to use instead of the scene's.
       object_set: Object set to use instead of the scene's.
-      overrides: Values by table and key that replace the file's, e.g. {"discretization": {"links":
-        5}}.
+      accuracy: Preset of discretization and solver to use instead of the scene's: "fast",
+        "standard", "reference", or a path ending in .toml; see `load_accuracy`.
+      overrides: Values by table and key that replace the file's and the preset's, e.g.
+        {"discretization": {"links": 5}}.
 
     Raises:
       SceneError: with every problem of the scene, the hand and the objects.
     """
     path = files.find("scenes", name)
     table = files.read(path)
-    for group, values in (overrides or {}).items():
+    problems: list[str] = []
+    changes = [_preset(accuracy, problems), overrides or {}]
+    for group, values in (item for change in changes for item in change.items()):
         if isinstance(values, dict):
             table[group] = {**table.get(group, {}), **values}
         else:
             table[group] = values
-    problems: list[str] = []
     parsed = schema.parse(_SceneFile, table, path.name, problems)
     parts = {}
     for key, loader, chosen in (
@@ -216,6 +261,35 @@ def load(
     return Scene(**parts, **{n: getattr(parsed, n) for n in names})
 
 
+def load_accuracy(name: str | Path) -> Accuracy:
+    """Reads a preset of discretization and solver; its values are checked with the scene's.
+
+    Args:
+      name: Name of a built-in preset, or a path ending in .toml.
+
+    Raises:
+      SceneError: with every problem of the file.
+    """
+    path = files.find("accuracy", name)
+    problems: list[str] = []
+    preset = schema.parse(Accuracy, files.read(path), path.name, problems)
+    if problems or preset is None:
+        raise schema.SceneError(problems)
+    return preset
+
+
+def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str, Any]]:
+    """Overrides of a preset of accuracy; none without a name or with problems."""
+    if name is None:
+        return {}
+    try:
+        preset = load_accuracy(name)
+    except schema.SceneError as error:
+        problems += error.problems
+        return {}
+    return {"discretization": preset.discretization, "solver": preset.solver}
+
+
 def _beside(path: Path, name: str) -> str | Path:
     """Paths inside a scene file are relative to that file, whatever the working directory holds."""
     return path.parent / name if name.endswith(".toml") else name
@@ -233,10 +307,17 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
             f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
             f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
         )
-    if scene.effects.finger_finger and scene.effects.surface == "hull":
+    e = scene.effects
+    if e.finger_finger and e.surface == "hull":
         problems.append(
             f"{where}.effects.finger_finger is between spheres: it needs surface = 'spheres'"
         )
+    for name, on in (("surface", e.surface == "hull"), ("finger_finger", e.finger_finger)):
+        if on and e.friction != "coulomb":
+            problems.append(
+                f"{where}.effects.{name} = {getattr(e, name)!r} needs friction = 'coulomb', "
+                f"not {e.friction!r}"
+            )
     if scene.discretization.hull_points % 4:
         problems.append(
             f"{where}.discretization.hull_points = {scene.discretization.hull_points} "

@@ -5,13 +5,28 @@ inside jit.
 """
 
 import enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
 
 class Status(enum.IntFlag):
-    """Why a world failed, as bits; OK is zero."""
+    """What went wrong in a world, as bits; OK is zero.
+
+    Every bit but those of `WARNINGS` makes the trial a failed one, which says nothing about the
+    grasp; see `failed`.
+
+    Attributes:
+      NONFINITE: A number of the state was not finite.
+      SPEED: A velocity beyond the scene's limit.
+      PENETRATION: The object fell through the table.
+      SOLVER_CAP: The solver stopped at its cap of iterations in a step before the verdict. A
+        warning: each iteration lowers the convex objective, so the step taken is the best found,
+        and to exclude such trials would favour hands that touch little.
+      CONTACT_OVERFLOW: The engine had no room for a contact. Only MuJoCo C allocates contacts.
+      INVALID_START: Bad model fields, or bodies deep inside one another before the first step.
+      STUCK: The released object neither left the hand nor rests on the table.
+    """
 
     OK = 0
     NONFINITE = 1
@@ -21,6 +36,18 @@ class Status(enum.IntFlag):
     CONTACT_OVERFLOW = 16
     INVALID_START = 32
     STUCK = 64
+
+
+WARNINGS = Status.SOLVER_CAP
+"""Bits that do not make a trial a failed one."""
+
+
+_FAILURES = sum(bit for bit in Status if bit not in WARNINGS)
+
+
+def failed(status: Any) -> Any:
+    """Whether trials failed, bool; status: int or integer array of any shape."""
+    return (status & _FAILURES) != 0
 
 
 class Params(NamedTuple):
@@ -73,12 +100,18 @@ class Trace(NamedTuple):
         state is not.
       qpos: Generalized positions if trajectories were asked for, shape (time, nq), else shape
         (time, 0).
+      status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP,
+        CONTACT_OVERFLOW), shape (time,) int32, or None if it does not tell.
+      last: Generalized positions and velocities at the end, a failed world's last good state, shape
+        (nq + nv,), or None.
     """
 
     distance: jax.Array
     height: jax.Array
     speed: jax.Array
     qpos: jax.Array
+    status: jax.Array | None = None
+    last: jax.Array | None = None
 
 
 class Outcome(NamedTuple):
@@ -86,7 +119,7 @@ class Outcome(NamedTuple):
 
     Attributes:
       cost: Cost of the trial in [0, maximum], shape ().
-      status: Bits of `Status`, shape () int32; 0 if the trial counts.
+      status: Bits of `Status`, shape () int32; the trial counts unless it `failed`.
       lost_time: First time at which the object was lost [s], infinite if never, shape ().
       bad_step: First time step of a failed world, or -1, shape () int32.
     """

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.figure
+import matplotlib.ticker
 
 from codesign_jax.benchmark import report
 
@@ -76,6 +77,9 @@ def _rates(axis: Any, records: list[dict[str, Any]], title: str) -> None:
         style = {"color": COLORS[engine], "ls": STYLES[number % len(STYLES)]}
         axis.loglog(x, y, marker="o", ms=4, label=f"{engine}, {setting}", **style)
     axis.set(title=title, xlabel="worlds", ylabel="world-steps/s")
+    sizes = sorted({r["worlds"] for r in records})
+    axis.set_xticks(sizes, [f"{n:,}" for n in sizes])
+    axis.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
     if lines:
         axis.legend(frameon=False, fontsize=7)
 
@@ -136,6 +140,24 @@ def compared(found: dict[str, Any]) -> str:
     return "\n\n".join(["## Costs against MuJoCo C", note, report.markdown(rows), machine(found)])
 
 
+READ = {
+    "h200": """
+Read from these tables:
+
+* MuJoCo Warp, which MJX's documentation recommends on NVIDIA GPUs, does 0.30 and 0.46 million
+  world-steps/s at 1,728 and 16,384 worlds of whole grasps; the structured engine 15 and 23 times
+  as many, at an error of the accelerations 20 times smaller in the 99 % quantile. Warp agrees with
+  MuJoCo C in 99.7 % of the verdicts: it solves the same problem.
+* Cost grows faster than the number of links: exponent 1.41 from 10 to 40 links at 16,384 worlds,
+  where 1.1 was wanted. Newton iterations grow by a third (contacts of more spheres are harder);
+  an iteration grows with exponent 1.2. The elimination itself is linear; a block's numbers
+  (18 kB a link) outgrow the caches, and a block waits for the slowest of its eight worlds.
+* Growth against fingers and spheres was measured at 4,096 worlds, against links at 16,384. Fingers
+  fill a warp in powers of two: six cost as much memory as eight.
+""".strip()
+}
+
+
 def page(folder: Path, figures: Path) -> str:
     """The page's text; draws the figures on the way."""
     parts = [HEAD.strip()]
@@ -147,7 +169,7 @@ def page(folder: Path, figures: Path) -> str:
         draw(results, picture)
         parts += [f"## {results['runs'][-1]['device'] if name != 'cpu' else 'CPU'}"]
         parts += [machine(results["runs"][-1]), f"![Rates and growth]({picture.name})"]
-        parts += [report.tables(results), omissions(results)]
+        parts += [report.tables(results), omissions(results), READ.get(name, "")]
     if (folder / "compare_engines.json").exists():
         parts.append(compared(json.loads((folder / "compare_engines.json").read_text())))
     return "\n\n".join(part for part in parts if part) + "\n"

@@ -23,7 +23,7 @@ from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.fused import Limits, Program
 from codesign_jax.engines.structured.hand import hand_lanes
-from codesign_jax.types import Trace
+from codesign_jax.types import Trace, failed
 
 SCENE = scene.load("paper")
 SPACE = parameters.design_space(SCENE.hand, "2d")
@@ -79,7 +79,7 @@ def row(name: str, trace: Any, reference: np.ndarray, **notes: float) -> dict:
         "same_verdict": float(((costs < 0.01) == (reference < 0.01)).mean()),
         "rank_correlation": float(spearmanr(mine, theirs).statistic),
         "mean_difference": float((costs - reference).mean()),
-        "failed": int((status != 0).sum()),
+        "failed": int(failed(status).sum()),
         **notes,
     }
     print(json.dumps(found), flush=True)

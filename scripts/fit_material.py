@@ -18,7 +18,7 @@ from codesign_jax import fit, model, parameters, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
 
-OFF = ("finger_object", "finger_table", "palm_contact", "disturb", "ungrasp")
+OFF = ("finger_object", "finger_table", "palm_object", "palm_table", "disturb", "ungrasp")
 
 
 def finger_scene(links: int, timestep: float) -> scene.Scene:

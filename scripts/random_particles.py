@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import parameters, rollout, scene
+from codesign_jax import parameters, rollout, scene, types
 from codesign_jax.benchmark import measure
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.types import Status
@@ -55,8 +55,10 @@ def main() -> None:
         seconds.append(time.perf_counter() - start)
         status.append(np.asarray(result.status))
         cost.append(np.asarray(result.cost))
-        print(f"chunk {c + 1}/{chunks}: {seconds[-1]:.1f} s, failed {(status[-1] != 0).sum()}")
-        for world in np.flatnonzero(status[-1])[:100]:
+        print(
+            f"chunk {c + 1}/{chunks}: {seconds[-1]:.1f} s, failed {types.failed(status[-1]).sum()}"
+        )
+        for world in np.flatnonzero(types.failed(status[-1]))[:100]:
             bits = Status(int(status[-1][world]))
             bad = int(result.bad_step[world])
             failures.append({"chunk": c, "world": int(world), "status": bits.name, "step": bad})

@@ -19,7 +19,7 @@ from codesign_jax import scene
 from codesign_jax.experiments import record, winners
 from codesign_jax.experiments.winners import VARIANTS, Variant
 from codesign_jax.experiments.worlds import LIMIT
-from codesign_jax.runs.provenance import environment, git_state
+from codesign_jax.provenance import environment, git_state
 from codesign_jax.schema import SceneError
 
 # Runs, particles of a run, blocks of trials, trials of a block (all shapes of a set equally often).
@@ -90,6 +90,7 @@ def main() -> int:
     todo.sort(key=lambda task: task.block)
     settings = {
         "size": args.size,
+        "particles": "the best of each run first",
         "scene_sha256": record.scene_hash(scene.load("paper")),
         "set": list(args.set),
     }
@@ -98,7 +99,7 @@ def main() -> int:
     )
     notes = {
         "command": " ".join(["python", *sys.argv]),
-        **({"commit": args.commit} if args.commit else git_state()),
+        **git_state(args.commit),
         **environment(),
         "settings": settings,
     }

@@ -30,7 +30,8 @@ def finger_scene(links, *, bending_only=True, gravity=0.0, timestep=0.01, shear_
         effects__twist=not bending_only,
         effects__finger_object=False,
         effects__finger_table=False,
-        effects__palm_contact=False,
+        effects__palm_object=False,
+        effects__palm_table=False,
     )
     one = dataclasses.replace(
         the_scene.hand,

@@ -25,7 +25,9 @@ EFFECTS = {
 def test_step_against_central_differences(effect):
     """A weighted sum of the new velocities along a random direction of the state."""
     with jax.enable_x64(True):
-        scene = small.pinch("sphere", effects__palm_contact=False, **EFFECTS[effect])
+        scene = small.pinch(
+            "sphere", effects__palm_object=False, effects__palm_table=False, **EFFECTS[effect]
+        )
         hand, trial = small.hand_world(scene, length=0.1)
         fields = model.model_fields(scene, jax.tree.map(jnp.asarray, hand), trial)
         fields = jax.tree.map(lambda x: x[None], fields)

@@ -122,7 +122,8 @@ def test_free_running_before_contact(steps):
 HURRIED = {
     "links": 2,
     "effects__twist": False,
-    "effects__palm_contact": False,
+    "effects__palm_object": False,
+    "effects__palm_table": False,
     "effects__finger_table": False,
     "phases__approach": 0.5,
     "phases__inflate": 0.8,

@@ -59,7 +59,8 @@ def short_grasp():
         phases__lift=0.5,
         effects__disturb=False,
         effects__ungrasp=False,
-        effects__palm_contact=False,
+        effects__palm_object=False,
+        effects__palm_table=False,
         arm__start_height=0.15,
     )
 

@@ -64,7 +64,7 @@ def test_skinning_equals_mujoco(tmp_path):
     the_scene = hull_scene()
     compiled, data = bent(the_scene)
     view = mujoco.MjvScene(compiled, maxgeom=100)
-    mujoco.mjv_updateSkin(compiled, data, view)
+    mujoco.mjv_updateActiveSkin(compiled, data, view, mujoco.MjvOption())
     lay, mesh, fingers = model.layout(the_scene), hull.hull(the_scene), []
     for f in range(the_scene.num_fingers):
         links = [lay.stubs[f], *lay.bodies[f]]
@@ -114,11 +114,15 @@ def test_velocities_are_derivatives_of_positions():
 
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
 def test_other_engines_refuse_the_hull(engine):
-    with pytest.raises(SceneError, match=f"engine {engine}: effects.surface = 'hull'"):
+    with pytest.raises(
+        SceneError, match=f'engine {engine}: effects.surface = "hull".*use engine structured'
+    ):
         make_engine(engine, hull_scene())
 
 
-def test_bad_density_is_refused():
+def test_bad_settings_are_refused():
+    with pytest.raises(SceneError, match="'hull' needs friction = 'coulomb', not 'full'"):
+        small.pinch("box", effects__surface="hull", effects__friction="full")
     with pytest.raises(SceneError, match="hull_points = 6 must be a multiple of 4"):
         hull_scene(points=6)
     with pytest.raises(SceneError, match="did you mean 'hull'"):

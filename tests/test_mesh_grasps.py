@@ -144,7 +144,13 @@ def test_pictures_show_the_mesh_where_it_is():
 # A grasp in 1.3 s with few links and contacts: what is compared is the object's side of them.
 HURRIED = {
     "discretization": {"links": 2},
-    "effects": {"twist": False, "palm_contact": False, "finger_table": False, "disturb": False}
+    "effects": {
+        "twist": False,
+        "palm_object": False,
+        "palm_table": False,
+        "finger_table": False,
+        "disturb": False,
+    }
     | {"ungrasp": False},
     "phases": {"approach": 0.5, "inflate": 0.8, "lift": 1.3},
 }

@@ -278,7 +278,9 @@ def test_effects_that_are_off_are_not_in_the_model():
         ("twist", "nv"),
         ("finger_object", "npair"),
         ("finger_table", "npair"),
-        ("palm_contact", "ngeom"),
+        ("palm_object", "npair"),
+        ("palm_table", "npair"),
+        ("object_table", "npair"),
     ):
         reduced = model.compile_template(
             scene.load("paper", overrides={"effects": {effect: False}})

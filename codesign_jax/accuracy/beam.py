@@ -49,7 +49,8 @@ def arc(turn: float) -> tuple[float, float]:
 def finger_scene(links: int) -> Scene:
     """One horizontal finger on a stiff wrist that bends only, without gravity or contact."""
     off = dict.fromkeys(
-        ("lateral_bending", "twist", "finger_object", "finger_table", "palm_contact"), False
+        ("lateral_bending", "twist", "finger_object", "finger_table", "palm_object", "palm_table"),
+        False,
     )
     # The dead load's own stiffness is explicit: a short step keeps it stable.
     sizes = {"discretization": {"links": links, "timestep": 0.002}}

@@ -116,6 +116,12 @@ def merge(*tables: Overrides) -> Overrides:
 
 
 STANDARD = Setting()
+PRESETS = {
+    "fast": Setting(links=5, spheres=2),
+    "standard": STANDARD,
+    "reference": Setting(timestep=1.0, links=20),
+}
+"""The presets' discretizations in the structured engine, whose solver is its own."""
 TIMESTEPS = (1.0, 2.0, 5.0, 10.0, 20.0)
 LINKS = (3, 5, 10, 20, 40)
 SPHERES = (1, 2, 4)

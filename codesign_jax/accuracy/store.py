@@ -60,9 +60,8 @@ class Store:
             self.data = json.loads(path.read_text())
         if self.data["size"] != size:
             raise ValueError(f"{path} holds the size {self.data['size']!r}, not {size!r}")
-        run = measure.provenance() | {"command": " ".join(["python", *sys.argv])}
-        if commit:
-            run["commit"] = commit
+        command = " ".join(["python", *sys.argv])
+        run = measure.provenance(command=command, commit=commit)
         self.data["runs"].append(run)
 
     def done(self, case: Case) -> bool:

@@ -14,7 +14,8 @@ IN_THE_AIR = {
     "effects": {
         "finger_object": False,
         "finger_table": False,
-        "palm_contact": False,
+        "palm_object": False,
+        "palm_table": False,
         "ungrasp": False,
     },
     "phases": {"approach": 0.3, "inflate": 0.6, "lift": 0.9, "disturb": 2.4, "ungrasp": 3.0},

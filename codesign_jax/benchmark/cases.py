@@ -15,7 +15,7 @@ from codesign_jax import cost, rollout
 from codesign_jax.benchmark import measure, peers, work
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Trace
+from codesign_jax.types import Outcome, Trace, failed
 
 # Steps between states at which accelerations are compared.
 _STRIDE = 3
@@ -152,11 +152,11 @@ def rates(scene: Scene, worlds: int, steps: int, seconds: float, simulated: np.n
 def verdicts(outcome: Outcome, simulated: np.ndarray, count: int) -> dict:
     """Costs of the first worlds, failures, and whether decided worlds were simulated on."""
     costs, status = np.asarray(outcome.cost), np.asarray(outcome.status)
-    lost = np.isfinite(np.asarray(outcome.lost_time)) & (status == 0)
+    lost = np.isfinite(np.asarray(outcome.lost_time)) & ~failed(status)
     # A world that is lost long before the end and still changes in the last steps is simulated on.
     early = lost & (costs > 0.5)
     return {
-        "failed": int((status != 0).sum()),
+        "failed": int(failed(status).sum()),
         "kept": float((costs == 0).mean()),
         "stops_early": bool(simulated[early].mean() < 0.95 * simulated.max())
         if early.any()

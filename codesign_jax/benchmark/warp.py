@@ -90,7 +90,7 @@ class WarpProgram:
         # Warp never resets a world and refuses the flag that asks for that.
         template.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         begin = time.perf_counter()
-        names = [n for n in ModelFields._fields if n not in _ABSENT]
+        names = [n for n in fields.of_model if n not in _ABSENT]
         self.model = mjw.put_model(template, dict.fromkeys(names, self.worlds))
         for name in names:
             self._assign(name, np.asarray(getattr(fields, name), np.float32))

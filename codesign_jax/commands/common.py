@@ -11,10 +11,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from codesign_jax import schema
+from codesign_jax import preflight, schema
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
+from codesign_jax.types import Params
 
 
 def use_all_cores(engine: str | None) -> None:
@@ -112,6 +113,18 @@ def mesh_notes(scene: Scene) -> list[str]:
                 f"below {error:.2g} mm (99 %), {worst:.2g} mm at worst"
             )
     return notes
+
+
+def preflight_notes(scene: Scene, designs: Params, names: list[str]) -> list[str]:
+    """Warnings and notes about designs that are about to be simulated.
+
+    Raises:
+      SceneError: If a design must not be simulated.
+    """
+    report = preflight.check(scene, designs, names)
+    if report.refusals:
+        raise SceneError(report.refusals)
+    return [f"warning: {text}" for text in report.warnings] + report.notes
 
 
 def _number(text: str) -> float | None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, rollout, runs, schema
+from codesign_jax import codesign, engines, rollout, runs, schema, types
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common
 from codesign_jax.cost import particle_cost
@@ -38,10 +38,12 @@ def main(options: "Evaluate") -> int:
     common.use_all_cores(options.engine)
     case = _from_run(options) if options.run_folder else _from_flags(options)
     _check(options, case.engine)
+    designs = jax.vmap(case.space.params)(jnp.asarray(case.design)[None])
+    notes = common.preflight_notes(case.scene, designs, ["the design"])
     engine = make_engine(case.engine, case.scene)
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
-    for note in common.mesh_notes(case.scene):
+    for note in [*notes, *common.mesh_notes(case.scene)]:
         console.print(note, markup=False)
     _evaluate(case, engine, options, console)
     if options.render:
@@ -73,6 +75,7 @@ def _from_flags(options: "Evaluate") -> _Case:
         options.scene,
         hand_name=options.hand,
         object_set=options.objects,
+        accuracy=options.accuracy,
         overrides=common.parse_overrides(options.overrides),
     )
     space = design_space(scene.hand, options.preset)
@@ -82,7 +85,7 @@ def _from_flags(options: "Evaluate") -> _Case:
 
 def _from_run(options: "Evaluate") -> _Case:
     """The final particle of a run that tested best, or the last episode's best without a test."""
-    if options.design or options.hand or options.objects or options.overrides:
+    if any((options.design, options.hand, options.objects, options.accuracy, options.overrides)):
         raise SceneError(["--run brings its own design and scene; leave out the flags for them"])
     folder: Path = options.run_folder  # type: ignore[assignment]
     scene, settings = runs.read_run(folder)
@@ -110,10 +113,10 @@ def _evaluate(case: _Case, engine: engines.Engine, options: "Evaluate", console:
         if not cost.size:
             continue
         lost = np.isfinite(outcomes.lost_time[0, k :: len(names)]).sum()
-        failed = ", ".join(sorted({runs.status_names(s) for s in status if s}))
+        counts = runs.status_counts(status)
         console.print(
             f"{name:>12}: mean cost {cost.mean():.3f} over {cost.size} trials, {lost} lost, "
-            f"{(status != 0).sum()} failed" + (f" ({failed})" if failed else "")
+            f"{types.failed(status).sum()} failed" + (f" ({counts})" if counts else "")
         )
     total = float(particle_cost(case.scene, outcomes)[0])
     verdict = "success" if total < codesign.SUCCESS_COST else "no success"

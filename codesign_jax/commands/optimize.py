@@ -36,10 +36,12 @@ def main(options: "Optimize") -> int:
     common.use_all_cores(options.engine)
     scene, settings = resolve(options)
     if options.dry_run:
+        print("".join(f"{note}\n" for note in _preflight(scene, settings)), end="")
         _dry_run(scene, settings)
         return 0
+    notes = _preflight(scene, settings)
     plan = runs.prepare(scene, settings)
-    print("".join(f"{note}\n" for note in common.mesh_notes(scene)), end="")
+    print("".join(f"{note}\n" for note in [*notes, *common.mesh_notes(scene)]), end="")
     folder = options.out or _default_folder(scene, settings)
     try:
         result = runs.optimize(plan, folder, sys.argv, fresh=options.fresh)
@@ -64,6 +66,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
             options.scene,
             hand_name=options.hand,
             object_set=options.objects,
+            accuracy=options.accuracy,
             overrides=common.parse_overrides(options.overrides),
         )
     except SceneError as error:
@@ -88,6 +91,21 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
 def _default_folder(scene: Scene, settings: Settings) -> Path:
     name = f"{scene.hand.name}-{settings.preset}-{settings.schedule}-{settings.seed}"
     return Path("runs") / name
+
+
+def _preflight(scene: Scene, settings: Settings) -> list[str]:
+    """Checks the ends of the design space, as every particle lies between them.
+
+    Only the ends themselves are refused or warned about: what a particle is later, its status says.
+
+    Raises:
+      SceneError: If an end must not be simulated.
+    """
+    space = design_space(scene.hand, settings.preset)
+    ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}
+    designs = jnp.stack([jnp.asarray(v, jnp.float32) for v in ends.values()])
+    params = jax.vmap(lambda d: space.params(space.project(d)))(designs)
+    return common.preflight_notes(scene, params, [f"design of the space's {n}" for n in ends])
 
 
 def _dry_run(scene: Scene, settings: Settings) -> None:

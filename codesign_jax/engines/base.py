@@ -29,25 +29,10 @@ class Engine(Protocol):
 
         Returns:
           The trace of every world, every array with a leading world axis.  A world that fails is
-          frozen at its last good state; its trace shows the failure at the failing step and stays
-          there.
+          frozen at its last good state, which the trace returns; its trace shows the failure at
+          the failing step and stays there.
         """
         ...
-
-
-def refuse_hull(scene: Scene, engine: str) -> None:
-    """Says that an engine that collides by MuJoCo's own geoms cannot simulate the skinned hull.
-
-    Raises:
-      SceneError: if the scene's contact surface is the hull.
-    """
-    if scene.effects.surface == "hull":
-        raise SceneError(
-            [
-                f"not supported by engine {engine}: effects.surface = 'hull'; "
-                "use engine structured, or surface = 'spheres'"
-            ]
-        )
 
 
 def refuse_meshes(scene: Scene, engine: str) -> None:

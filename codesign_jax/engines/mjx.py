@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from codesign_jax.engines.base import refuse_hull, refuse_meshes
-from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax import effects
+from codesign_jax.engines.base import refuse_meshes
+from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
 
@@ -28,16 +29,15 @@ class MjxEngine:
 
     def __init__(self, scene: Scene):
         """Puts the scene's template on the device; the float type is jax's at this moment."""
-        refuse_hull(scene, self.name)
         refuse_meshes(scene, self.name)
+        effects.refuse(scene.effects, self.name)
         self.scene = scene
         self.template = mjx.put_model(compile_template(scene))
         self.data = mjx.make_data(self.template)
 
     def model(self, fields: ModelFields) -> mjx.Model:
         """Returns the template with the fields of one world."""
-        changed = {k: v for k, v in fields._asdict().items() if k != "start"}
-        return self.template.tree_replace(changed)  # type: ignore[arg-type]
+        return self.template.tree_replace(fields.of_model)  # type: ignore[arg-type]
 
     def reset(self, fields: ModelFields) -> mjx.Data:
         """Returns the start state of one world."""
@@ -45,6 +45,10 @@ class MjxEngine:
 
     def step(self, fields: ModelFields, data: mjx.Data, ctrl: jax.Array) -> mjx.Data:
         """Advances one world by one time step under controls of shape (nu,)."""
+        if self.scene.effects.neo_hookean:
+            bend = layout(self.scene).dofs[..., 0]
+            moments = softening_moments(self.scene, fields, data.qpos[bend])
+            data = data.replace(qfrc_applied=data.qfrc_applied.at[bend].set(moments))
         return mjx.step(self.model(fields), data.replace(ctrl=ctrl))
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
@@ -79,4 +83,5 @@ class MjxEngine:
 
         zero = jnp.zeros(self.template.nv, ctrl.dtype)
         start = _Carry(fields.start, zero, zero, jnp.zeros((), ctrl.dtype))
-        return jax.lax.scan(body, start, ctrl)[1]
+        end, trace = jax.lax.scan(body, start, ctrl)
+        return trace._replace(last=jnp.concatenate([end.qpos, end.qvel]))

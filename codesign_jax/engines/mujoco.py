@@ -7,15 +7,17 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from codesign_jax.engines.base import refuse_hull, refuse_meshes
-from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax import effects
+from codesign_jax.engines.base import refuse_meshes
+from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
 from codesign_jax.scene import Scene
-from codesign_jax.types import Trace
+from codesign_jax.types import Status, Trace
 
 # Steps between looking at the worlds: a lost object or a failed world stops being simulated at this
 # grain.
 _CHUNK = 25
 _TIME = int(mujoco.mjtState.mjSTATE_TIME)
+_FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
 class MujocoEngine:
@@ -34,8 +36,8 @@ class MujocoEngine:
           scene: The scene.
           num_threads: Threads to use; 0 for all cores.
         """
-        refuse_hull(scene, self.name)
         refuse_meshes(scene, self.name)
+        effects.refuse(scene.effects, self.name)
         self.scene = scene
         self.template = compile_template(scene)
         self.num_threads = num_threads
@@ -47,17 +49,26 @@ class MujocoEngine:
         worlds, steps = ctrl.shape[:2]
         like = jax.ShapeDtypeStruct((worlds, steps), ctrl.dtype)
         nq = self.template.nq if trajectory else 0
-        shapes = Trace(like, like, like, jax.ShapeDtypeStruct((worlds, steps, nq), ctrl.dtype))
+        shapes = Trace(
+            like,
+            like,
+            like,
+            jax.ShapeDtypeStruct((worlds, steps, nq), ctrl.dtype),
+            jax.ShapeDtypeStruct((worlds, steps), np.int32),
+            jax.ShapeDtypeStruct((worlds, self.template.nq + self.template.nv), ctrl.dtype),
+        )
         return jax.pure_callback(
             lambda f, c: self._run(f, c, trajectory), shapes, fields, ctrl, vmap_method="sequential"
         )
 
     def _run(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
         dtype = np.asarray(ctrl).dtype
-        fields = ModelFields(*(np.asarray(v, np.float64) for v in fields))
+        fields = jax.tree.map(lambda v: np.asarray(v, np.float64), fields)
         with self._lock:
             trace = self._simulate(fields, np.asarray(ctrl, np.float64), trajectory)
-        return Trace(*(v.astype(dtype) for v in trace))
+        return Trace(
+            *(v if v.dtype == np.int32 else v.astype(dtype) for v in trace)  # type: ignore[union-attr]
+        )
 
     def _batch(self, num_worlds: int) -> mujoco.batch.Batch:
         if num_worlds not in self._batches:
@@ -71,51 +82,62 @@ class MujocoEngine:
         batch = self._batch(worlds)
         write_fields(batch, fields)
         distance, height, speed = np.zeros((3, worlds, steps))
-        trace = Trace(distance, height, speed, np.zeros((worlds, steps, nq * trajectory)))
+        status, qpos = (
+            np.zeros((worlds, steps), np.int32),
+            np.zeros((worlds, steps, nq * trajectory)),
+        )
+        series = (distance, height, speed, qpos, status)
+        last = np.concatenate([fields.start, np.zeros((worlds, self.template.nv))], 1)
         start, end = (round(t / scene.discretization.timestep) for t in scene.window)
         going = np.arange(worlds)
-        for first in range(0, steps, _CHUNK):
-            part = slice(first, min(first + _CHUNK, steps))
-            new, taken = self._advance(batch, going, ctrl[going, part], trajectory)
-            for array, values in zip(trace, new, strict=True):
-                array[going, part] = values
+        chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
+        for first in range(0, steps, chunk):
+            part = slice(first, min(first + chunk, steps))
+            if scene.effects.neo_hookean:
+                _apply_softening(scene, batch, fields, going)
+            new, taken, states = self._advance(batch, going, ctrl[going, part], trajectory)
+            for array, values in zip(series, new[:-1], strict=True):
+                array[going, part] = values  # type: ignore[call-overload]
             # The cost window's end counts as lost only strictly inside it, as in `cost.outcome`.
             time = np.arange(part.start, part.stop)
             lost = (new.distance >= scene.cost.lost_distance) & (time >= start) & (time < end)
             failed = ~np.isfinite(new.speed) | (new.speed > scene.limits.speed)
             # MuJoCo warned (a bad control, state or inertia, a full contact list) and stopped.
-            stopped = batch.warning[going, :, 0].any(1)
-            done = lost.any(1) | failed.any(1) | (new.height < -scene.limits.penetration).any(1)
-            done |= stopped
-            for array in trace:
+            stopped = batch.warning[going, :, 0].any(1) | (taken == 0)
+            failed |= new.height < -scene.limits.penetration
+            done = lost.any(1) | failed.any(1) | stopped
+            # The entry before the first bad one, which may be the last chunk's, or the last taken.
+            good = np.where(failed.any(1), failed.argmax(1) - 1, taken - 1)
+            here = good >= 0
+            last[going[here]] = states[here, good[here]]
+            for array in series:
                 array[going[done], part.stop :] = array[going[done], part.stop - 1][:, None]
             for world, count in zip(going[stopped], taken[stopped], strict=True):
-                trace.speed[world, first + count :] = np.nan
+                speed[world, first + count :] = np.nan
+            full = batch.warning[:, _FULL, 0].any(1)[going]
+            for world, count in zip(going[full], taken[full], strict=True):
+                status[world, first + count - 1] |= int(Status.CONTACT_OVERFLOW)
             going = going[~done]
             if not going.size:
                 break
-        return trace
+        return Trace(*series, last)
 
     def _advance(
         self, batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool
-    ) -> tuple[Trace, np.ndarray]:
+    ) -> tuple[Trace, np.ndarray, np.ndarray]:
         """Steps the given worlds through a chunk.
 
         Returns:
-          The chunk's trace, whose entry k describes the state before step k, and the steps taken by
-          each world: fewer than asked for where MuJoCo stopped.
+          The chunk's trace, whose entry k describes the state before step k; the steps taken by
+          each world, fewer than asked for where MuJoCo stopped; and qpos and qvel of the states
+          that the entries describe.
         """
         lay = layout(self.scene)
         before = batch.bind("qvel")[ids][:, None], batch.bind("qpos")[ids][:, None]
-        record = batch.rollout(
-            ctrl.shape[1],
-            ctrl,
-            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
-            record=("xipos", "qvel", _TIME, *(("qpos",) if trajectory else ())),
-            ids=ids,
-        )
+        record, raised = _rollout(batch, ids, ctrl)
         # Where a world stopped, its records repeat, and so does their time.
         taken = 1 + np.count_nonzero(np.diff(record[_TIME][..., 0], axis=1), axis=1)
+        taken[raised] = 0
         xipos = record["xipos"]
         centre = np.tensordot(xipos, lay.centre_weights, axes=(2, 0))
         middle = xipos[:, :, lay.object]
@@ -123,23 +145,66 @@ class MujocoEngine:
         qvel = np.concatenate([before[0], record["qvel"][:, :-1]], 1)
         with np.errstate(invalid="ignore"):
             speed = np.abs(qvel).max(-1)
-        qpos = (
-            np.concatenate([before[1], record["qpos"][:, :-1]], 1)
-            if trajectory
-            else xipos[:, :, 0, :0]
-        )
+        qpos = np.concatenate([before[1], record["qpos"][:, :-1]], 1)
         distance = np.linalg.norm(middle - centre, axis=-1)
-        return Trace(distance, middle[..., 2], speed, qpos), taken
+        capped = record["solver_niter"].max(-1) >= self.scene.solver.iterations
+        status = np.where(capped, int(Status.SOLVER_CAP), 0)
+        status[raised, 0] |= int(Status.CONTACT_OVERFLOW)
+        kept = qpos if trajectory else qpos[..., :0]
+        states = np.concatenate([qpos, qvel], -1)
+        return Trace(distance, middle[..., 2], speed, kept, status), taken, states
+
+
+def _rollout(
+    batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray
+) -> tuple[dict, np.ndarray]:
+    """Records of a chunk, and which worlds MuJoCo gave up for want of memory, shape (world,) bool.
+
+    Contacts, constraints and solver share one arena.  Where it is full MuJoCo leaves out contacts
+    and warns, or raises; records of the latter worlds are not numbers.
+
+    Raises:
+      SimulationError: For any other error.
+    """
+    m, shape = batch.model, (len(ids), ctrl.shape[1])
+    names = {"xipos": (m.nbody, 3), "qvel": (m.nv,), "qpos": (m.nq,), _TIME: (1,)}
+    record = {name: np.full((*shape, *size), np.nan) for name, size in names.items()}
+    record["solver_niter"] = np.zeros((*shape, mujoco.mjNISLAND), np.int32)
+    raised = np.zeros(len(ids), bool)
+    try:
+        batch.rollout(
+            ctrl.shape[1],
+            ctrl,
+            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+            record=tuple(record),
+            ids=ids,
+            out=record,
+        )
+    except mujoco.batch.SimulationError as error:
+        raised = np.isin(ids, error.ids)
+        if not all("out of memory" in str(batch.error(int(i))) for i in error.ids):
+            raise
+        for values in (v for v in record.values() if v.dtype != np.int32):
+            values[raised] = np.nan
+    return record, raised
+
+
+def _apply_softening(
+    scene: Scene, batch: mujoco.batch.Batch, fields: ModelFields, ids: np.ndarray
+) -> None:
+    """Applies the moments of the neo-Hookean law at the worlds' present angles."""
+    bend = layout(scene).dofs[..., 0]
+    angles = batch.bind("qpos")[ids][:, bend]
+    mine = jax.tree.map(lambda v: v[ids], fields)
+    batch.bind("qfrc_applied")[ids[:, None, None], bend] = softening_moments(scene, mine, angles)
 
 
 def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:
     """Gives every simulation of a batch its model fields and start state."""
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
-    for name in ModelFields._fields:
-        if name == "start":
-            batch.bind("qpos")[:] = fields.start
-        else:
-            batch.expand(name)[:] = getattr(fields, name)
+    batch.bind("qpos")[:] = fields.start
+    for name, value in fields.of_model.items():
+        batch.expand(name)[:] = value
     batch.bind("qacc_warmstart")[:] = 0.0
 
 
@@ -148,7 +213,6 @@ def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:
     import copy
 
     model = copy.deepcopy(compile_template(scene))
-    for name in ModelFields._fields:
-        if name != "start":
-            getattr(model, name)[:] = np.asarray(getattr(fields, name), np.float64)
+    for name, value in fields.of_model.items():
+        getattr(model, name)[:] = np.asarray(value, np.float64)
     return model

@@ -19,7 +19,7 @@ from codesign_jax.experiments.record import Arrays, pack
 from codesign_jax.experiments.worlds import Worlds
 from codesign_jax.optimize import ParticleFilter, State, candidates
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Trial
+from codesign_jax.types import Outcome, Trial, failed
 
 MAX_SCREENS = 100
 """Batches of seed candidates after which the search is given up."""
@@ -123,9 +123,9 @@ class Batch:
         if e == self.plan.episodes - 1:
             self._keep_last(record, outcome, ancestors)
         means = zip(self.plan.strategies, cost.mean((1, 2)), strict=True)
-        failed = int((outcome.status != 0).sum())
+        count = int(failed(outcome.status).sum())
         text = "  ".join(f"{name} {mean:.3f}" for name, mean in means)
-        return f"mean cost: {text}  failed {failed}"
+        return f"mean cost: {text}  failed {count}"
 
     def _keep_last(self, record: Arrays, outcome: Outcome, ancestors: np.ndarray) -> None:
         """The last episode's outcomes of the final particles count in their test."""

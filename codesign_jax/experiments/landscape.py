@@ -10,6 +10,7 @@ from codesign_jax.experiments.record import Arrays, pack
 from codesign_jax.experiments.worlds import Worlds
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
+from codesign_jax.types import failed
 
 STREAM_GRID = 0x67726964
 """Stream of the noise of the grid's trials ("grid")."""
@@ -70,7 +71,7 @@ class Grid:
         record["status"][..., part] = status.reshape(shape)
         record["trial_cost"][..., part] = outcome.cost.reshape(shape)
         record["step"] = record["step"] + 1
-        return f"mean cost {outcome.cost.mean():.3f}  failed {(outcome.status != 0).sum()}"
+        return f"mean cost {outcome.cost.mean():.3f}  failed {failed(outcome.status).sum()}"
 
     def grasps(self, step: int) -> int:
         """Grasps of one step."""

@@ -42,17 +42,23 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     return text
 
 
-def fill(page: Path, text: str) -> None:
+def fill(page: Path, text: str, mark: str = "results") -> None:
     """Replaces what stands between the marks of a page.
+
+    Args:
+      page: Markdown page.
+      text: The new text.
+      mark: Name of the marks.
 
     Raises:
       ValueError: If the page does not hold both marks.
     """
+    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
     old = page.read_text()
-    if BEGIN not in old or END not in old:
-        raise ValueError(f"{page} holds no {BEGIN} and {END}")
-    head, tail = old.split(BEGIN)[0], old.split(END)[1]
-    page.write_text(f"{head}{BEGIN}\n\n{text}\n\n{END}{tail}")
+    if begin not in old or end not in old:
+        raise ValueError(f"{page} holds no {begin} and {end}")
+    head, tail = old.split(begin)[0], old.split(end)[1]
+    page.write_text(f"{head}{begin}\n\n{text}\n\n{end}{tail}")
 
 
 def comparison(studies: dict[str, Study | None], grid) -> str:

@@ -12,7 +12,7 @@ from codesign_jax.experiments.landscape import Grid
 from codesign_jax.experiments.record import KEPT, Arrays
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.scene import Scene
-from codesign_jax.types import Status
+from codesign_jax.types import Status, failed
 
 BITS = tuple(s for s in Status if s)
 """Status bits in the order of the `failed` arrays' last axis."""
@@ -23,12 +23,12 @@ def costs(scene: Scene, lost_step: np.ndarray, status: np.ndarray) -> np.ndarray
     start, end = scene.window
     lost = np.where(lost_step == KEPT, end, lost_step * scene.discretization.timestep)
     cost = scene.cost.maximum * (end - lost) / (end - start)
-    return np.where(status == 0, cost, scene.cost.maximum).astype(np.float32)
+    return np.where(failed(status), scene.cost.maximum, cost).astype(np.float32)
 
 
 def both_means(scene: Scene, cost: np.ndarray, status: np.ndarray) -> dict[str, np.ndarray]:
     """Mean cost over the last axis by either rule for failed trials; see `cost.particle_cost`."""
-    good = status == 0
+    good = ~failed(status)
     total = np.where(good, cost, 0).sum(-1, dtype=np.float64)
     count = good.sum(-1)
     exclude = np.where(count > 0, total / np.maximum(count, 1), scene.cost.maximum)
@@ -90,7 +90,7 @@ def _grid(grid: Grid, record: Arrays) -> Arrays:
         "second_axis": space.in_units(record["designs"])[0, :, 1],
         "exclude": means["exclude"],
         "worst": means["worst"],
-        "success_ratio": ((record["trial_cost"][..., :done] == 0) & (status == 0)).mean(-1),
+        "success_ratio": ((record["trial_cost"][..., :done] == 0) & ~failed(status)).mean(-1),
         "failed": failures(status, (2,)).astype(np.int16),
     }
 

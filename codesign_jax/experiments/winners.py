@@ -99,8 +99,8 @@ class Finals:
     Attributes:
       name: Name of the experiment.
       preset: Design space.
-      particles: Shape (run, particle, parameter), float32.
-      cost: Their test costs in the experiment, shape (run, particle).
+      particles: Shape (run, particle, parameter), float32, the best of each run first.
+      cost: Their test costs in the experiment, shape (run, particle), ascending.
     """
 
     name: str
@@ -109,27 +109,29 @@ class Finals:
     cost: np.ndarray
 
     @property
-    def best(self) -> np.ndarray:
-        """Index of the best particle of each run, shape (run,)."""
-        return self.cost.argmin(1)
-
-    @property
     def successful(self) -> np.ndarray:
         """Whether each run found a particle that solves the task, bool, shape (run,)."""
         return self.cost.min(1) < SUCCESS_COST
 
     def chosen(self, best: bool) -> np.ndarray:
         """Particles, all or the best of each run, shape (run, particle, parameter)."""
-        if not best:
-            return self.particles
-        return np.take_along_axis(self.particles, self.best[:, None, None], 1)
+        return self.particles[:, :1] if best else self.particles
 
 
 def finals(data: Path, name: str, runs: int | None = None, particles: int | None = None) -> Finals:
-    """Reads an experiment's final particles, or the first of them."""
+    """Reads the final particles of an experiment's last strategy.
+
+    Args:
+      data: Folder with NAME.npz.
+      name: Name of the experiment.
+      runs: Number of runs, the first ones; None for all.
+      particles: Number of particles of a run, the best ones; None for all.
+    """
     with np.load(data / f"{name}.npz", allow_pickle=False) as file:
-        part = np.s_[-1, :runs, :particles]
-        return Finals(name, name, file["final_particles"][part], file["test_exclude"][part])
+        every, cost = file["final_particles"][-1, :runs], file["test_exclude"][-1, :runs]
+    order = np.argsort(cost, axis=1, kind="stable")[:, :particles]
+    chosen = np.take_along_axis(every, order[..., None], 1)
+    return Finals(name, name, chosen, np.take_along_axis(cost, order, 1))
 
 
 @dataclasses.dataclass(frozen=True)

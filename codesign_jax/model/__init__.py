@@ -13,7 +13,12 @@ integrator Euler with eulerdamp disabled.  MuJoCo then solves (M + h D + h^2 K) 
 h K) v.
 """
 
-from codesign_jax.model.fields import ModelFields, joint_springs, model_fields
+from codesign_jax.model.fields import (
+    ModelFields,
+    joint_springs,
+    model_fields,
+    softening_moments,
+)
 from codesign_jax.model.layout import Layout, contact_invweight, joint_axes, layout
 from codesign_jax.model.spec import build_spec, compile_model, compile_template
 
@@ -28,4 +33,5 @@ __all__ = [
     "joint_springs",
     "layout",
     "model_fields",
+    "softening_moments",
 ]

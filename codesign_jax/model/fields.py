@@ -1,6 +1,6 @@
 """Parameters to batched model fields, as a pure function: one topology, no recompile."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from codesign_jax.model.layout import (
     mounts,
     object_quat,
     object_size,
+    wrist_springs,
 )
 from codesign_jax.model.spec import compile_template
 from codesign_jax.scene import Scene
@@ -23,7 +24,9 @@ from codesign_jax.types import Params, Trial
 class ModelFields(NamedTuple):
     """The fields of mjModel that depend on parameters and trial, and the start state.
 
-    Every array has MuJoCo's name and shape for one world; `start` is the initial qpos, shape (nq,).
+    Every array has MuJoCo's name and shape for one world, but for two: `start` is the initial qpos,
+    shape (nq,), and `section` has height, wall and segment length of the fingers [m], shape
+    (finger, 3), with the effect `neo_hookean`; None without it.
     """
 
     body_pos: jax.Array
@@ -42,6 +45,12 @@ class ModelFields(NamedTuple):
     dof_M0: jax.Array
     actuator_gainprm: jax.Array
     start: jax.Array
+    section: jax.Array | None = None
+
+    @property
+    def of_model(self) -> dict[str, jax.Array]:
+        """The fields of mjModel, by name."""
+        return {k: v for k, v in self._asdict().items() if k not in ("start", "section")}
 
 
 def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
@@ -56,9 +65,7 @@ def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     by_axis = {"bend": beam.bending, "lateral": beam.lateral, "twist": beam.torsion}
     finger = jnp.stack([by_axis[name] / segment for name in lay.axes], -1)
     finger = jnp.broadcast_to(finger[:, None, :], lay.dofs.shape).reshape(-1)
-    w = hand.wrist
-    wrist = jnp.array([w.linear_stiffness] * 3 + [w.angular_stiffness] * 3, finger.dtype)
-    wrist_damping = jnp.array([w.linear_damping] * 3 + [w.angular_damping] * 3, finger.dtype)
+    wrist, wrist_damping = (jnp.array(v, finger.dtype) for v in wrist_springs(scene))
     free = jnp.zeros(6, finger.dtype)
     stiffness = jnp.concatenate([wrist, finger, free])
     return stiffness, jnp.concatenate([wrist_damping, hand.material.damping_time * finger, free])
@@ -114,7 +121,36 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         dof_M0=base("dof_M0").at[-6:-3].set(object_mass).at[-3:].set(object_inertia),
         actuator_gainprm=base("actuator_gainprm").at[6:, 0].set(beam.moment_per_pressure),
         start=_start(scene, params, trial, rest),
+        section=_section(scene, params),
     )
+
+
+def _section(scene: Scene, params: Params) -> jax.Array | None:
+    if not scene.effects.neo_hookean:
+        return None
+    return jnp.stack([params.height, params.wall, params.length / layout(scene).links], -1)
+
+
+def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
+    """Moments that take the linear springs of the bend joints to the neo-Hookean law [N m].
+
+    MuJoCo's springs stay as they are, and with them the implicit step, which is stable as the law's
+    tangent is at most the spring's; what the law lacks is applied as a force known from the step's
+    start.
+
+    Args:
+      scene: The scene.
+      fields: Fields with `section`; leading axes as `angles`.
+      angles: Bend angles [rad], shape (..., finger, link); NumPy or JAX arrays.
+
+    Returns:
+      Moments, shaped as `angles`.
+    """
+    assert fields.section is not None
+    height, wall, segment = (fields.section[..., i : i + 1] for i in range(3))
+    stiffness = fields.jnt_stiffness[..., layout(scene).dofs[..., 0]]
+    width = scene.hand.section.width
+    return stiffness * angles * morphology.softening(angles / segment, height, wall, width=width)
 
 
 def _extents(segment: jax.Array, lay: Layout) -> jax.Array:

@@ -69,13 +69,32 @@ def layout(scene: Scene) -> Layout:
     e = scene.effects
     touching = e.surface == "spheres" and (e.finger_object or e.finger_table or e.finger_finger)
     k = scene.discretization.spheres_per_link if touching else 0
-    first = 1 + (len(palm_points(scene)) if scene.effects.palm_contact else 0)
+    first = 1 + (len(palm_points(scene)) if palm_touches(scene) else 0)
     spheres = first + np.arange(n * links * k).reshape(n, links, k)
     shapes = first + n * links * k + np.arange(len(scene.objects.object))
     weights = np.zeros(3 + n * (links + 1))
     weights[bodies] = 1.0 / (n * links)
     weights[[*stubs, *bodies[:, -1]]] = 0.5 / (n * links)
     return Layout(links, axes, stubs, bodies, len(weights) - 1, dofs, spheres, shapes, weights)
+
+
+# Implicit inertia of a wrist joint without compliance [kg, kg m^2]: forces of the hand, of at most
+# 100 N, move a joint that heavy by 1e-11 m in a step.  At 1e11 rounding of its rows reaches the
+# solver's decisions: 1 of 144 grasps went unstable.
+RIGID = 1e9
+
+
+def wrist_springs(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness [N/m, N m/rad] and damping [N s/m, N m s/rad] of the wrist's joints, each (6,).
+
+    Without the effect `wrist` they are the limit in which the implicit spring ends every step where
+    the arm frame is: (M + h^2 K) a = K (u - q - h v) gives q + h (v + h a) = u as K grows.
+    """
+    w = scene.hand.wrist
+    if not scene.effects.wrist:
+        return np.full(6, RIGID / scene.discretization.timestep**2), np.zeros(6)
+    stiffness = [w.linear_stiffness] * 3 + [w.angular_stiffness] * 3
+    return np.array(stiffness), np.array([w.linear_damping] * 3 + [w.angular_damping] * 3)
 
 
 def contact_invweight(scene: Scene) -> float:
@@ -89,6 +108,11 @@ def contact_invweight(scene: Scene) -> float:
     """
     c = scene.contact
     return 1.0 / ((1.0 - c.impedance) * c.time_constant**2 * 2.0 * c.normal_stiffness)
+
+
+def palm_touches(scene: Scene) -> bool:
+    """Whether an effect calls for the palm's contact spheres."""
+    return scene.effects.palm_object or scene.effects.palm_table
 
 
 def palm_points(scene: Scene) -> np.ndarray:

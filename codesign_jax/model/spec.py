@@ -11,6 +11,7 @@ import numpy as np
 from codesign_jax import hull, morphology, parameters
 from codesign_jax.model.layout import (
     AXES,
+    RIGID,
     WRIST,
     contact_invweight,
     layout,
@@ -18,6 +19,8 @@ from codesign_jax.model.layout import (
     object_quat,
     object_size,
     palm_points,
+    palm_touches,
+    wrist_springs,
 )
 from codesign_jax.morphology import Beam
 from codesign_jax.scene import Scene
@@ -64,6 +67,10 @@ def compile_model(
     model = build_spec(scene, params, trial, visual=visual).compile()
     # Declared, not derived; see contact_invweight.  The world keeps zero.
     model.body_invweight0[1:] = contact_invweight(scene)
+    if not scene.effects.wrist:
+        # The solver's tolerance is relative to this scale, which is the moving masses'.
+        moving = model.dof_M0 - RIGID * (np.arange(model.nv) < 6)
+        model.stat.meaninertia = moving.mean()
     return model
 
 
@@ -96,7 +103,7 @@ _COLORS = {
 
 def _options(scene: Scene, spec: mujoco.MjSpec) -> None:
     o = spec.option
-    o.timestep, o.gravity = scene.discretization.timestep, [0, 0, -scene.gravity]
+    o.timestep, o.gravity = scene.discretization.timestep, [0, 0, -scene.gravity_on]
     o.integrator, o.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_ELLIPTIC
     o.solver = mujoco.mjtSolver.mjSOL_NEWTON
     o.iterations, o.ls_iterations = scene.solver.iterations, scene.solver.ls_iterations
@@ -117,17 +124,15 @@ def _hinge(
 
 
 def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
-    p, w, h = scene.hand.palm, scene.hand.wrist, scene.discretization.timestep
+    p, h = scene.hand.palm, scene.discretization.timestep
     body = spec.worldbody.add_body(name="palm")
     body.explicitinertial, body.mass, body.ipos = True, p.mass, [0, 0, p.thickness / 2]
     across = p.mass * (p.radius**2 / 4 + p.thickness**2 / 12)
     body.inertia = [across, across, p.mass * p.radius**2 / 2]
     axes = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
     axes |= {"roll": axes["x"], "yaw": axes["z"], "pitch": axes["y"]}
-    for name in WRIST:
+    for name, stiffness, damping in zip(WRIST, *wrist_springs(scene), strict=True):
         linear = len(name) == 1
-        stiffness = w.linear_stiffness if linear else w.angular_stiffness
-        damping = w.linear_damping if linear else w.angular_damping
         kind = mujoco.mjtJoint.mjJNT_SLIDE if linear else mujoco.mjtJoint.mjJNT_HINGE
         implicit = damping + h * stiffness
         _hinge(body, f"wrist_{name}", axes[name], kind, damping=implicit, armature=h * implicit)
@@ -136,7 +141,7 @@ def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
         )
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         actuator.gainprm[0], actuator.biasprm[1] = stiffness, -stiffness
-    if scene.effects.palm_contact:
+    if palm_touches(scene):
         for i, point in enumerate(palm_points(scene)):
             _sphere(body, f"palm_{i}", point, p.contact_radius)
     if visual:
@@ -246,19 +251,22 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
     """Explicit contact pairs: the contact list is the scene's, not a filter's."""
     e, c, lay = scene.effects, scene.contact, layout(scene)
     fingers = [f"finger_{f}_sphere_{i + 1}_{j}" for f, i, j in np.ndindex(lay.spheres.shape)]
-    palm = [f"palm_{i}" for i in range(len(palm_points(scene)))] if e.palm_contact else []
+    palm = [f"palm_{i}" for i in range(len(palm_points(scene)))]
+    condim = {"none": 1, "coulomb": 3, "full": 6}[e.friction]
 
     def add(first: str, second: str, friction: float) -> None:
-        pair = spec.add_pair(geomname1=first, geomname2=second, condim=3)
-        pair.friction = [friction, friction, 0.005, 0.0001, 0.0001]
+        pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim)
+        spin, roll = c.torsional_friction, c.rolling_friction
+        pair.friction = [friction, friction, spin, roll, roll]
         pair.solref = [c.time_constant, 1.0]
         pair.solimp = [c.impedance, c.impedance, 0.001, 0.5, 2.0]
 
     for i, shape in enumerate(scene.objects.object):
-        add("table", f"object_{i}", scene.objects.table.friction)
-        for name in [*(fingers if e.finger_object else []), *palm]:
+        if e.object_table:
+            add("table", f"object_{i}", scene.objects.table.friction)
+        for name in (fingers if e.finger_object else []) + (palm if e.palm_object else []):
             add(name, f"object_{i}", shape.friction)
-    for name in [*(fingers if e.finger_table else []), *palm]:
+    for name in (fingers if e.finger_table else []) + (palm if e.palm_table else []):
         add("table", name, c.finger_table_friction)
     if e.finger_finger:
         for first, second in itertools.combinations(fingers, 2):

@@ -7,7 +7,7 @@ from codesign_jax.runs.directory import read_run
 from codesign_jax.runs.loop import AllFailed, Plan, RunResult, load_record, optimize, prepare
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, check, make_settings
-from codesign_jax.runs.tables import describe, status_names
+from codesign_jax.runs.tables import describe, status_counts, status_names
 
 __all__ = [
     "AllFailed",
@@ -23,5 +23,6 @@ __all__ = [
     "optimize",
     "prepare",
     "read_run",
+    "status_counts",
     "status_names",
 ]

@@ -31,7 +31,7 @@ _LOCK = ".lock"
 _PROVENANCE = "provenance.json"
 _TABLES = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
 _OURS = {*scene_files.NAMES, scene_files.MESHES, _PROVENANCE, *_TABLES, _LOCK}
-_OURS |= {"checkpoints", "events.log", "figures"}
+_OURS |= {"checkpoints", "events.log", "failures", "figures"}
 
 
 class RunDirectory:

@@ -6,20 +6,21 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import codesign
+from codesign_jax import codesign, types
 from codesign_jax.checkpoint import Checkpoints
-from codesign_jax.codesign import EpisodeFunction, FinalTest
+from codesign_jax.codesign import EpisodeFunction, EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.optimize import ParticleFilter, schedule
 from codesign_jax.parameters import DesignSpace, design_space
+from codesign_jax.runs import failures, tables
 from codesign_jax.runs import record as records
-from codesign_jax.runs import tables
 from codesign_jax.runs.directory import RunDirectory, open_run
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Progress
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings
 from codesign_jax.scene import Scene
+from codesign_jax.types import Status
 
 
 class AllFailed(RuntimeError):
@@ -164,13 +165,24 @@ class _Loop:
 
     def _episodes(self, record: Record, episode: EpisodeFunction) -> None:
         for e in range(record.done, self.plan.settings.episodes):
+            key = record.state.key
             with self.progress.busy("simulating") as watch:
                 record.state, info = self.interrupts.call(episode, record.state, self.plan.mask[e])
             records.report(record.history, e, info)
+            self._save_failures(key, e, info)
             self._save(e + 1, record)
             self._write_tables(record, e)
             self._report(record.history, e, watch.seconds)
-            _check_failures(record.history.trials.status[e])
+            _check_failures(record.history.trials.status[e], self.run_directory.path)
+
+    def _save_failures(self, key: jax.Array, e: int, info: EpisodeInfo) -> None:
+        """Saves failed worlds with their last good states, for `codesign replay`."""
+        if not types.failed(np.asarray(info.trials.status)).any():
+            return
+        plan = self.plan
+        trials = codesign.episode_trials(plan.scene, key, e, plan.settings.trials)
+        for path in failures.save(self.run_directory.path, e, info, trials):
+            self.run_directory.log(f"failed world: codesign replay {path}")
 
     def _compile(self) -> EpisodeFunction:
         """Compiles the episode apart, so that its time is not an episode's."""
@@ -211,7 +223,8 @@ class _Loop:
             e + 1,
             mean=float(history.cost[e].mean()),
             best=float(history.cost[e].min()),
-            failed=int((status != 0).sum()),
+            failed=int(types.failed(status).sum()),
+            causes=tables.status_counts(status),
             grasps=status.size,
             seconds=seconds,
         )
@@ -245,12 +258,24 @@ def _final_test(plan: Plan, record: Record) -> FinalTest | None:
     return None if record.test is None else codesign.summarize_test(plan.scene, record.test)
 
 
-def _check_failures(status: np.ndarray) -> None:
-    if (status == 0).any():
+def _check_failures(status: np.ndarray, folder: Path) -> None:
+    if not types.failed(status).all():
         return
-    names, counts = np.unique([tables.status_names(s) for s in status.flat], return_counts=True)
-    causes = ", ".join(f"{name} {count}" for name, count in zip(names, counts, strict=True))
+    advice = [text for bit, text in _ADVICE.items() if (status & bit).any()]
     raise AllFailed(
-        f"every one of {status.size} trials failed ({causes}); see trials.csv. "
-        "A smaller discretization.timestep or more solver.iterations may help."
+        f"every one of {status.size} trials failed ({tables.status_counts(status)}); see "
+        f"trials.csv and codesign replay {folder}. " + " ".join(advice)
     )
+
+
+_UNSTABLE = "A smaller discretization.timestep or more solver.iterations may help."
+_ADVICE = {
+    Status.NONFINITE | Status.SPEED: _UNSTABLE,
+    Status.PENETRATION: "The object falls through the table: contact.normal_stiffness is too low "
+    "for its mass, or discretization.timestep too large.",
+    Status.CONTACT_OVERFLOW: "MuJoCo has no memory for this many contacts: fewer "
+    "discretization.spheres_per_link, or another engine.",
+    Status.INVALID_START: "The hand starts inside the table or the object: raise arm.start_height.",
+    Status.STUCK: "The hand does not let go in time: more time between phases.disturb and "
+    "phases.ungrasp, or a shorter phases.deflate_time.",
+}

@@ -50,7 +50,15 @@ class Progress:
         return Stopwatch()
 
     def episode(
-        self, done: int, *, mean: float, best: float, failed: int, grasps: int, seconds: float
+        self,
+        done: int,
+        *,
+        mean: float,
+        best: float,
+        failed: int,
+        grasps: int,
+        seconds: float,
+        causes: str = "",
     ) -> str:
         """Reports a finished episode and returns the line.
 
@@ -61,14 +69,16 @@ class Progress:
           failed: Failed worlds among the episode's grasps.
           grasps: Grasps of the episode.
           seconds: Wall time of the episode.
+          causes: Counts of the status bits, such as "SPEED 1, SOLVER_CAP 3".
         """
         self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
         rate = self._grasps / max(self._seconds, 1e-9)
         left = duration((self.total - done) * grasps / rate)
+        reasons = f" ({causes})" if causes else ""
         count = f"{done:>{len(str(self.total))}}/{self.total}"
         line = (
-            f"episode {count}  mean {mean:.3f}  best {best:.3f}  failed {failed}/{grasps}  "
-            f"{rate:.1f} grasps/s  ETA {left}"
+            f"episode {count}  mean {mean:.3f}  best {best:.3f}  failed {failed}/{grasps}"
+            f"{reasons}  {rate:.1f} grasps/s  ETA {left}"
         )
         self._bar.update(self._task, completed=done, description=f"{rate:.1f} grasps/s  ETA {left}")
         self.message(line)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from codesign_jax import types
 from codesign_jax.codesign import FinalTest
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.runs.record import History
@@ -44,6 +45,7 @@ def write_episodes(
     head = ["episode", "particle", "cost", "weight", "next_copies_particle", *designs]
     _write(folder / "particles.csv", head, _particles(history, space, span), start)
     head = ["episode", "particle", "trial", "object", "cost", "lost_time_s", "status"]
+    head.append("first_bad_step")
     _write(folder / "trials.csv", head, _trials(history, scene, span), start)
 
 
@@ -57,7 +59,7 @@ def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: F
       test: Their test.
     """
     head = ["particle", "test_cost", "trials", "failed_trials", "success", *design_columns(space)]
-    failed = np.asarray(test.trials.status) != 0
+    failed = types.failed(np.asarray(test.trials.status))
     rows = (
         [i, _number(test.cost[i]), failed.shape[1], failed[i].sum(), int(test.success[i]), *design]
         for i, design in enumerate(_designs(space, particles))
@@ -76,6 +78,12 @@ def status_names(status: int) -> str:
     return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
 
 
+def status_counts(status: np.ndarray) -> str:
+    """How often each status bit is set, e.g. "SPEED 1, SOLVER_CAP 3"; empty if none is."""
+    counts = {bit.name: int(((status & bit) != 0).sum()) for bit in Status if bit}
+    return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+
+
 def _best(designs: list[str]) -> list[str]:
     return [f"best_{name}" for name in designs]
 
@@ -83,7 +91,7 @@ def _best(designs: list[str]) -> list[str]:
 def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[list]:
     for e in span:
         best = int(np.argmin(history.cost[e]))
-        failed = int((history.trials.status[e] != 0).sum())
+        failed = int(types.failed(history.trials.status[e]).sum())
         size = 1 / (history.weight[e] ** 2).sum()
         costs = [_number(history.cost[e].mean()), _number(history.cost[e, best])]
         yield [e, *costs, failed, _number(size), *_designs(space, history.population[e])[best]]
@@ -101,7 +109,10 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
     for e in span:
         for i, t in np.ndindex(*history.trials.cost.shape[1:]):
             numbers = [_number(trials.cost[e, i, t]), _number(trials.lost_time[e, i, t])]
-            yield [e, i, t, names[t % len(names)], *numbers, status_names(trials.status[e, i, t])]
+            status = status_names(trials.status[e, i, t])
+            bad_step = int(trials.bad_step[e, i, t])
+            row = [e, i, t, names[t % len(names)], *numbers, status]
+            yield [*row, bad_step if bad_step >= 0 else ""]
 
 
 def _designs(space: DesignSpace, population: np.ndarray) -> list[list[str]]:

@@ -28,10 +28,22 @@ def make_cone(scene: Scene, friction: jax.Array | float, *, bodies: int) -> Cone
     """
     c = scene.contact
     regularizer = (1.0 - c.impedance) / c.impedance * contact_invweight(scene) * bodies
+    if scene.effects.friction == "none":
+        return Cone(1.0 / regularizer, None, None, None, *_reference(scene))
     ratio = friction / np.sqrt(c.friction_ratio)
+    tangent = c.friction_ratio / regularizer
+    cone = Cone(1.0 / regularizer, tangent, friction, ratio, *_reference(scene))
+    if scene.effects.friction != "full":
+        return cone
+    least = jnp.maximum(friction, 1e-5)  # MuJoCo's mjMINMU
+    return cone._replace(spin=c.torsional_friction / least, roll=c.rolling_friction / least)
+
+
+def _reference(scene: Scene) -> tuple[float, float]:
+    """Spring and damper coefficients of aref."""
+    c = scene.contact
     spring = 1.0 / (c.impedance * c.time_constant) ** 2 * c.impedance
-    damper = 2.0 / (c.impedance * c.time_constant)
-    return Cone(1.0 / regularizer, c.friction_ratio / regularizer, friction, ratio, spring, damper)
+    return spring, 2.0 / (c.impedance * c.time_constant)
 
 
 def object_friction(scene: Scene, shape: jax.Array) -> jax.Array:

@@ -2,8 +2,9 @@
 
 A contact's relative velocity and acceleration are those of the hand's (or, on the table, the
 object's) point minus the other body's, with the normal pointing the same way; jar = J a - aref as
-in MuJoCo.  Within a set of contacts every array has the item axes (link, k, finger), (sphere, 1) or
-(slot, 1) before the world's.
+in MuJoCo.  With full friction jar has three more components, see `Contacts.turning`; without
+friction its tangential part is ignored.  Within a set of contacts every array has the item axes
+(link, k, finger), (sphere, 1) or (slot, 1) before the world's.
 """
 
 from typing import NamedTuple
@@ -17,6 +18,8 @@ from codesign_jax.engines.structured.lanes import cross, dot
 class Cone(NamedTuple):
     """MuJoCo's contact parameters, as numbers of the scene or arrays broadcasting to the contacts.
 
+    What a friction model does not need is None: it has no place in the program.
+
     Attributes:
       normal: D = 1/R of the normal row [kg].
       tangent: D of the tangential rows, impratio times as much [kg].
@@ -24,6 +27,8 @@ class Cone(NamedTuple):
       ratio: mu / sqrt(impratio), MuJoCo's regularized cone.
       spring: Coefficient of the penetration in aref [1/s^2].
       damper: Coefficient of the velocity in aref [1/s].
+      spin: Torsional friction over Coulomb friction [m].
+      roll: Rolling friction over Coulomb friction [m].
     """
 
     normal: jax.Array | float
@@ -32,6 +37,8 @@ class Cone(NamedTuple):
     ratio: jax.Array | float
     spring: float
     damper: float
+    spin: jax.Array | float | None = None
+    roll: jax.Array | float | None = None
 
 
 class Contacts(NamedTuple):
@@ -57,22 +64,50 @@ class Contacts(NamedTuple):
         """Which contacts exist, shape (...)."""
         return self.distance < 0
 
+    @property
+    def direction(self) -> jax.Array:
+        """The normal as a direction of jar, shape (3, ...) or (6, ...)."""
+        if self.cone.spin is None:
+            return self.normal
+        return jnp.concatenate([self.normal, jnp.zeros_like(self.normal)])
+
     def relative(self, motion: jax.Array) -> jax.Array:
-        """Point motion, (3, ...), of a relative spatial motion, (6, ...); (9, ...) with a lever."""
-        moved = motion[3:6] + cross(motion[:3], self.point)
-        return moved if self.lever is None else moved + cross(motion[6:], self.lever)
+        """Point motion, (3, ...), of a relative spatial motion, (6, ...); see `turning`.
+
+        With a lever of a motion of nine components.
+        """
+        moving = motion[3:6] + cross(motion[:3], self.point)
+        if self.lever is not None:
+            moving = moving + cross(motion[6:], self.lever)
+        if self.cone.spin is None:
+            return moving
+        turning = self.turning(motion[:3])
+        return jnp.concatenate([moving, jnp.broadcast_to(turning, moving.shape)])
+
+    def turning(self, omega: jax.Array) -> jax.Array:
+        """Relative turning as lengths that slide alike: S omega, with full friction.
+
+        MuJoCo's cone of six dimensions limits the norm of (f_t / mu, m_spin / mu_spin, m_roll /
+        mu_roll) and regularises each row by R_i = R_t mu^2 / mu_i^2.  In the scaled turning S omega
+        with S = (mu_roll (1 - n n') + mu_spin n n') / mu both are isotropic: torsion and rolling
+        are further tangential components of the cone of three dimensions.  S is symmetric.
+        """
+        cone, n = self.cone, self.normal
+        assert cone.spin is not None and cone.roll is not None
+        return cone.roll * omega + (cone.spin - cone.roll) * dot(n, omega) * n
 
     def reference(self, velocity: jax.Array) -> jax.Array:
-        """Reference acceleration aref from the relative point velocity, shape (3, ...)."""
-        return -self.cone.damper * velocity - self.cone.spring * self.distance * self.normal
+        """Reference acceleration aref from the relative point velocity, shaped as that."""
+        return -self.cone.damper * velocity - self.cone.spring * self.distance * self.direction
 
 
 class Response(NamedTuple):
     """Cone force and Hessian at jar.
 
     Attributes:
-      force: -ds/d(jar), shape (3, ...).
-      hessian: Upper triangle xx, xy, xz, yy, yz, zz, shape (6, ...).
+      force: -ds/d(jar), shape (3, ...); with full friction (6, ...).
+      hessian: Upper triangle xx, xy, xz, yy, yz, zz, shape (6, ...); with full friction of the
+        6 x 6 matrix, row by row, shape (21, ...).
       cost: s(jar), shape (...).
     """
 
@@ -88,7 +123,9 @@ def respond(contacts: Contacts, jar: jax.Array) -> Response:
     the middle zone 1/2 D_m (w_n - mu |w_t|)^2 with D_m = D_n / (1 + mu^2 / impratio), the top zone
     zero.
     """
-    cone, n = contacts.cone, contacts.normal
+    cone, n = contacts.cone, contacts.direction
+    if cone.friction is None:
+        return _respond_frictionless(contacts, jar)
     normal = dot(n, jar)
     tangent = jar - normal * n
     length = jnp.sqrt(dot(tangent, tangent) + 1e-30)
@@ -102,7 +139,8 @@ def respond(contacts: Contacts, jar: jax.Array) -> Response:
     nn = jnp.where(bottom, cone.normal, stiff) - kappa
     ne = -stiff * cone.friction
     ee = jnp.where(bottom, 0.0, stiff * cone.friction**2 - kappa)
-    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    size = n.shape[0]
+    pairs = [(i, j) for i in range(size) for j in range(i, size)]
     hessian = jnp.stack(
         [
             nn * n[i] * n[j]
@@ -117,6 +155,16 @@ def respond(contacts: Contacts, jar: jax.Array) -> Response:
     return Response(force, hessian, cost)
 
 
+def _respond_frictionless(contacts: Contacts, jar: jax.Array) -> Response:
+    """One row a contact: quadratic in the normal part where that is negative."""
+    n = contacts.normal
+    normal = dot(n, jar)
+    stiff = jnp.where(contacts.active & (normal < 0), contacts.cone.normal, 0.0)
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
+    hessian = jnp.stack([stiff * n[i] * n[j] for i, j in pairs])
+    return Response(-stiff * normal * n, hessian, 0.5 * stiff * normal**2)
+
+
 def _zones(contacts: Contacts, normal: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:
     cone = contacts.cone
     bottom = contacts.active & (cone.ratio**2 * normal + cone.friction * length <= 0)
@@ -126,6 +174,8 @@ def _zones(contacts: Contacts, normal: jax.Array, length: jax.Array) -> tuple[ja
 
 class Line(NamedTuple):
     """A contact's cost along jar + alpha * step: all that the line search needs.
+
+    Without friction the tangential parts are None.
 
     Attributes:
       n0: Normal part of jar.
@@ -145,7 +195,9 @@ class Line(NamedTuple):
 def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> Line:
     """Prepares the line search along a step of jar."""
     n0, n1 = dot(contacts.normal, jar), dot(contacts.normal, step)
-    u, v = jar - n0 * contacts.normal, step - n1 * contacts.normal
+    if contacts.cone.friction is None:
+        return Line(n0, n1, None, None, None)
+    u, v = jar - n0 * contacts.direction, step - n1 * contacts.direction
     return Line(n0, n1, dot(u, u), dot(u, v), dot(v, v))
 
 
@@ -153,6 +205,9 @@ def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, 
     """First and second derivative of the cost along the line, shape (...)."""
     cone = contacts.cone
     normal = ray.n0 + alpha * ray.n1
+    if cone.friction is None:
+        stiff = jnp.where(contacts.active & (normal < 0), cone.normal, 0.0)
+        return stiff * normal * ray.n1, stiff * ray.n1**2
     square = jnp.maximum(ray.uu + alpha * (2 * ray.uv + alpha * ray.vv), 0.0)
     length = jnp.sqrt(square + 1e-30)
     half = ray.uv + alpha * ray.vv
@@ -172,8 +227,11 @@ def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, 
 def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
     """X'KX with X = [-[r], 1]: a contact's Hessian in spatial accelerations, rows (6, 6, ...).
 
-    With a lever X = [-[r], 1, -[lever]], rows (9, 9, ...).
+    With full friction X = [-[r], 1; S, 0], see `Contacts.turning`; with a lever
+    X = [-[r], 1, -[lever]], rows (9, 9, ...).
     """
+    if contacts.cone.spin is not None:
+        return _full_inertia(contacts, hessian)
     xx, xy, xz, yy, yz, zz = hessian
     k = [jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])]
     r = contacts.point
@@ -195,5 +253,33 @@ def _crossed(r: jax.Array, k: list[jax.Array]) -> list[jax.Array]:
 
 def contact_wrench(contacts: Contacts, force: jax.Array) -> jax.Array:
     """Spatial force (moment about the origin, force), (6, ...); with a lever its moment as well."""
-    lever = [] if contacts.lever is None else [cross(contacts.lever, force)]
-    return jnp.concatenate([cross(contacts.point, force), force, *lever])
+    if contacts.cone.spin is None:
+        lever = [] if contacts.lever is None else [cross(contacts.lever, force)]
+        return jnp.concatenate([cross(contacts.point, force), force, *lever])
+    moment = cross(contacts.point, force[:3]) + contacts.turning(force[3:])
+    return jnp.concatenate([moment, force[:3]])
+
+
+def _full_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
+    """As `contact_inertia`, for K = [A B; B' C]: the part of A, and what turning adds.
+
+    With E = B S the added blocks are [r] E + ([r] E)' + S C S in the corner of turning, and E
+    beside it.
+    """
+    place = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(6) for j in range(i, 6))}
+
+    def row(i: int, columns: range) -> jax.Array:
+        return jnp.stack([hessian[place[min(i, j), max(i, j)]] for j in columns])
+
+    top = hessian[jnp.array([place[i, j] for i in range(3) for j in range(i, 3)])]
+    coulomb = contacts._replace(cone=contacts.cone._replace(spin=None, roll=None))
+    matrix, r = contact_inertia(coulomb, top), contacts.point
+    e = [contacts.turning(row(i, range(3, 6))) for i in range(3)]
+    c = jnp.stack([contacts.turning(row(3 + i, range(3, 6))) for i in range(3)])  # C S
+    turned = [contacts.turning(jnp.stack([c[i][j] for i in range(3)])) for j in range(3)]
+    arm = [r[1] * e[2] - r[2] * e[1], r[2] * e[0] - r[0] * e[2], r[0] * e[1] - r[1] * e[0]]
+    corner = [[arm[i][j] + arm[j][i] + turned[j][i] for j in range(3)] for i in range(3)]
+    none = jnp.zeros_like(matrix[0, 0])
+    upper = [jnp.stack([*corner[i], *(e[j][i] for j in range(3))]) for i in range(3)]
+    lower = [jnp.stack([*e[i], none, none, none]) for i in range(3)]
+    return matrix + jnp.stack(upper + lower)

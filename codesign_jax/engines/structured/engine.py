@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from codesign_jax import effects
 from codesign_jax.engines.structured import (
     collision,
     finger_pairs,
@@ -23,8 +24,9 @@ from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, k
 from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
-from codesign_jax.scene import Scene
-from codesign_jax.types import Trace
+from codesign_jax.model.layout import palm_touches
+from codesign_jax.scene import Effects, Scene
+from codesign_jax.types import Status, Trace
 
 LANES = 60
 """Worlds in flight on a core: their arrays fit its L2 cache."""
@@ -75,8 +77,8 @@ class StructuredEngine:
             a tighter tolerance, as the derivative is that of the solution.
           checkpoint: Whether the derivative of a rollout stores only states and accelerations and
             repeats the rest of each step; costs nothing without a derivative.
-          fused: Whether one GPU kernel runs a rollout (float32, primitive shapes, no trajectory).
-            By default on a GPU.
+          fused: Whether one GPU kernel runs a rollout (float32, primitive shapes, no trajectory,
+            effects of `in_kernel`). By default on a GPU.
           lanes: Worlds in flight at once, see `stream`; 0 steps all worlds in unison. By default
             `LANES` on a CPU and 0 elsewhere.
           burst: Newton iterations of a round of the stream.
@@ -84,6 +86,7 @@ class StructuredEngine:
         Raises:
           SceneError: If a mesh's distance cannot be put on a grid.
         """
+        effects.refuse(scene.effects, self.name)
         mesh.tables(scene)
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
@@ -136,11 +139,17 @@ class StructuredEngine:
         body = bodies(run, hand, kin)
         smooth = smooth_forces(run, hand, kin, body, state, ctrl, self.scene)
         matrix = solver.Matrices(*(run(lambda b: b.matrix(), b) for b in body))
-        contacts = self._contacts(run, hand, kin, state.wrist[2])
+        contacts = self.contacts(run, hand, kin, state.wrist[2])
         velocity = solver.Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-        return solver.Problem(hand, kin, body, matrix, smooth, contacts), velocity
+        arm = None if self.scene.effects.wrist else self._arm(state, ctrl)
+        return solver.Problem(hand, kin, body, matrix, smooth, contacts, arm), velocity
 
-    def _contacts(
+    def _arm(self, state: State, ctrl: jax.Array) -> jax.Array:
+        """Acceleration of the palm's coordinates that ends the step at the arm frame."""
+        h = self.scene.discretization.timestep
+        return ((ctrl[:6, None] - state.wrist) / h - state.wrist_vel) / h
+
+    def contacts(
         self, run: Stages, hand: HandLanes, kin: Kinematics, height: jax.Array
     ) -> dict[str, Contacts]:
         """Contacts that the scene's effects call for, by pair of bodies."""
@@ -163,11 +172,14 @@ class StructuredEngine:
                 found["hull_object"] = hull.attach(run, on_object(run, skin.point, 0.0), skin)
             if e.finger_table:
                 found["hull_table"] = hull.attach(run, on_table(skin.point, 0.0), skin)
-        if e.palm_contact:
+        if palm_touches(scene):
             palm, radius = collision.palm_spheres(scene, kin), scene.hand.palm.contact_radius
-            found["palm_object"] = on_object(run, palm, radius)
-            found["palm_table"] = on_table(palm, radius)
-        found["object_table"] = collision.object_on_table(run, scene, hand, kin, height)
+            if e.palm_object:
+                found["palm_object"] = on_object(run, palm, radius)
+            if e.palm_table:
+                found["palm_table"] = on_table(palm, radius)
+        if e.object_table:
+            found["object_table"] = collision.object_on_table(run, scene, hand, kin, height)
         return found
 
     def step(
@@ -187,6 +199,8 @@ class StructuredEngine:
             tolerance=self.tolerance,
         )
         h = self.scene.discretization.timestep
+        if problem.arm is not None:
+            solution = solution._replace(acc=solution.acc._replace(wrist=problem.arm))
         new = run(lambda s, k, a: integrate(s, k, a, h), state, problem.kin, solution.acc)
         centre = self._centre(hand, problem.kin, problem.body) + state.wrist[:3]
         return new, StepInfo(solution.acc, solution.residual, solution.iterations, centre)
@@ -202,7 +216,8 @@ class StructuredEngine:
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`; on a GPU in float32 one kernel runs it all, see `fused`."""
         batched = self._needs_batch()
-        if self.fused and not batched and not trajectory and ctrl.dtype == jnp.float32:
+        fits = self.fused and not batched and in_kernel(self.scene.effects)
+        if fits and not trajectory and ctrl.dtype == jnp.float32:
             return self._one_kernel(fields, ctrl)
         with jax.default_matmul_precision("highest"):
             if self.lanes and not batched:
@@ -221,11 +236,14 @@ class StructuredEngine:
 
         # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
         limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
-        found = Program(self.scene, limits).run(
+        found, end = Program(self.scene, limits).simulate(
             hand_lanes(self.scene, fields), self.reset(fields), ctrl
         )
         qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
-        return Trace(found["distance"], found["height"], found["speed"], qpos)
+        status = self._status(found["residual"])
+        return Trace(
+            found["distance"], found["height"], found["speed"], qpos, status, self._flat(end)
+        )
 
     def _stream(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
         def advance(hand: HandLanes, state: State, u: jax.Array):
@@ -242,6 +260,7 @@ class StructuredEngine:
             advance,
             self._speed,
             self.qpos,
+            self._flat,
             lanes=self.lanes,
             max_rounds=-(-self.iterations // self.burst),
             trajectory=trajectory,
@@ -260,6 +279,7 @@ class StructuredEngine:
                 state.position[2, 0],
                 speed,
                 self.qpos(state) if trajectory else jnp.zeros((u.shape[1], 0), u.dtype),
+                self._status(info.residual[0]),
             )
             new_speed = self._speed(new)
             was_good = speed <= limits.speed
@@ -269,8 +289,9 @@ class StructuredEngine:
             return (state, jnp.where(was_good, new_speed, speed)), entry
 
         start = (self.reset(fields), jnp.zeros(ctrl.shape[0], ctrl.dtype))
-        _, trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 0, -1))
-        return Trace(*(jnp.moveaxis(v, 0, 1) for v in trace))
+        (end, _), trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 0, -1))
+        trace = jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), trace)
+        return trace._replace(last=self._flat(end))
 
     def _checkpointed(self):
         """The step with a derivative that stores little; see `implicit.checkpointed`."""
@@ -279,10 +300,23 @@ class StructuredEngine:
         limit = self.scene.limits.speed
         return implicit.checkpointed(self.step, solved.step, lambda s: self._speed(s) <= limit)
 
+    def _status(self, residual: jax.Array) -> jax.Array:
+        """SOLVER_CAP where a step ended above the tolerance, int32 of the residual's shape."""
+        return jnp.where(residual > self.tolerance, int(Status.SOLVER_CAP), 0).astype(jnp.int32)
+
+    def _flat(self, state: State) -> jax.Array:
+        """Generalized positions and velocities, shape (world, nq + nv)."""
+        return jnp.concatenate([self.qpos(state), self.qvel(state)], 1)
+
     def _speed(self, state: State) -> jax.Array:
         """Largest absolute generalized velocity; not finite if any velocity or position is not."""
         qvel, qpos = self.qvel(state), self.qpos(state)
         return jnp.abs(qvel).max(1) + 0.0 * qpos.sum(1)
+
+
+def in_kernel(e: Effects) -> bool:
+    """Whether the fused kernel simulates a scene's effects; the batch form simulates all."""
+    return e.wrist and e.object_table and e.friction == "coulomb" and not e.neo_hookean
 
 
 def integrate(state: State, kin: Kinematics, acc: Acc, h: float) -> State:

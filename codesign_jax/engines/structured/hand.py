@@ -41,6 +41,8 @@ class HandLanes(NamedTuple):
       object_size: Sizes of the object's shape, shape (3, 1, world).
       shape: Index of the object's shape, shape (1, world).
       mesh: Meshes of the worlds; None if the scene has none.
+      section: Height, wall and segment length of the fingers, shape (3, finger, world); None
+        without the effect `neo_hookean`.
     """
 
     mount: jax.Array
@@ -66,6 +68,7 @@ class HandLanes(NamedTuple):
     object_size: jax.Array
     shape: jax.Array
     mesh: MeshLanes | None
+    section: jax.Array | None = None
 
 
 def rotation_columns(quat: jax.Array) -> jax.Array:
@@ -134,6 +137,7 @@ def hand_lanes(scene: Scene, fields: ModelFields) -> HandLanes:
         object_size=object_size,
         shape=shape[None],
         mesh=mesh_lanes(scene, shape[None], object_size),
+        section=None if fields.section is None else fields.section.transpose(2, 1, 0),
     )
 
 

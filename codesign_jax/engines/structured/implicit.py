@@ -115,6 +115,8 @@ def residual_power(
     run: Stages, problem: Problem, velocity: Spatial, acc: Acc, virtual: Acc
 ) -> jax.Array:
     """Power lambda' F of the unbalanced forces at acc along virtual, shape (1, world)."""
+    if problem.arm is not None:  # data of the step, not a solution
+        acc = acc._replace(wrist=problem.arm)
     motion = solver.propagate(run, problem.kin, acc)
     along = solver.propagate(run, problem.kin, virtual)
     inertial = solver.inertial_forces(run, problem, acc, motion)

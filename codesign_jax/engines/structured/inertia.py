@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics, State
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
+from codesign_jax.morphology import softening
 
 
 class Body(NamedTuple):
@@ -62,7 +63,8 @@ class Body(NamedTuple):
         omega, alpha = vel[:3], bias[:3]
         point_vel = vel[3:] + cross(omega, self.centre)
         acc = bias[3:] + cross(alpha, self.centre) + cross(omega, point_vel)
-        force = -self.mass * jnp.stack([acc[0], acc[1], acc[2] + gravity])
+        # A sum with no gravity would still be in the program.
+        force = -self.mass * (jnp.stack([acc[0], acc[1], acc[2] + gravity]) if gravity else acc)
         spin = apply_columns(self.tensor, omega)
         moment = -apply_columns(self.tensor, alpha) - cross(omega, spin)
         return spatial(moment + cross(self.centre, force), force)
@@ -140,6 +142,13 @@ def bodies(run: Stages, hand: HandLanes, kin: Kinematics) -> Bodies:
     )
 
 
+def _softening(hand: HandLanes, angle: jax.Array, width: float) -> jax.Array:
+    """As `model.softening_moments`, for angles of shape (link, 1, finger, world)."""
+    assert hand.section is not None
+    height, wall, segment = hand.section
+    return hand.stiffness[:, :1] * angle * softening(angle / segment, height, wall, width=width)
+
+
 def smooth_forces(
     run: Stages,
     hand: HandLanes,
@@ -160,12 +169,19 @@ def smooth_forces(
       ctrl: Controls: arm pose and pressures, shape (nu, world).
       scene: The scene.
     """
-    w, g = scene.hand.wrist, scene.gravity
+    w, g = scene.hand.wrist, scene.gravity_on
     arm, pressure = ctrl[:6, None], ctrl[6:]
-    stiffness = jnp.array([w.linear_stiffness] * 3 + [w.angular_stiffness] * 3, ctrl.dtype)
-    wrist = stiffness[:, None, None] * (arm - state.wrist) - hand.wrist_damping * state.wrist_vel
+    if not scene.effects.wrist:
+        wrist = jnp.zeros_like(state.wrist)
+    else:
+        stiffness = jnp.array([w.linear_stiffness] * 3 + [w.angular_stiffness] * 3, ctrl.dtype)
+        wrist = stiffness[:, None, None] * (arm - state.wrist)
+        wrist = wrist - hand.wrist_damping * state.wrist_vel
     finger = -hand.stiffness * state.finger - hand.damping * state.finger_vel
-    finger = jnp.concatenate([finger[:, :1] + hand.gain * pressure, finger[:, 1:]], 1)
+    bend = finger[:, :1] + hand.gain * pressure
+    if hand.section is not None:
+        bend = bend + _softening(hand, state.finger[:, :1], scene.hand.section.width)
+    finger = jnp.concatenate([bend, finger[:, 1:]], 1)
     links = run(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
     return Smooth(
         palm=body.palm.smooth_force(kin.palm_vel, kin.palm_bias, g),

@@ -135,6 +135,20 @@ def kinematics(
     )
 
 
+def straight(hand: HandLanes, state: State) -> Kinematics:
+    """Places of all bodies with straight fingers, nothing moving: no loop along the links."""
+    palm, wrist_axes, *_ = _wrist(state.wrist, jnp.zeros_like(state.wrist_vel))
+    frame, base = _mount(palm, hand.mount, hand.base)
+    along = jnp.cumsum(hand.offset, axis=0)
+    origin = jnp.stack([base[i] + frame[0][i] * along for i in range(3)])
+    link = jnp.broadcast_to(frame[:, :, None], (3, *origin.shape))
+    columns, position, _ = _object(state)
+    none = jnp.zeros(())
+    return Kinematics(
+        palm, wrist_axes, none, none, link, origin, none, none, none, columns, position, none
+    )
+
+
 def _wrist(wrist: jax.Array, wrist_vel: jax.Array):
     one, zero = jnp.ones_like(wrist[0]), jnp.zeros_like(wrist[0])
     frame = [jnp.stack([one if i == k else zero for i in range(3)]) for k in range(3)]

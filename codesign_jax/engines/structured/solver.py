@@ -53,7 +53,18 @@ class Matrices(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """One step's problem: everything that does not change from iteration to iteration."""
+    """One step's problem: everything that does not change from iteration to iteration.
+
+    Attributes:
+      hand: The hand.
+      kin: Kinematics.
+      body: Inertia of the bodies.
+      matrix: The same as matrices.
+      smooth: Smooth forces.
+      contacts: Contacts by pair of bodies.
+      arm: Prescribed accelerations of the palm's coordinates, shape (6, 1, world); None with a
+        compliant wrist, whose accelerations are unknowns.
+    """
 
     hand: HandLanes
     kin: Kinematics
@@ -61,6 +72,7 @@ class Problem(NamedTuple):
     matrix: Matrices
     smooth: Smooth
     contacts: dict[str, Contacts]
+    arm: jax.Array | None = None
 
 
 class Solution(NamedTuple):
@@ -149,7 +161,7 @@ def inertial_forces(run: Stages, problem: Problem, acc: Acc, motion: Spatial) ->
         body.palm.times(motion.palm),
         run(lambda b, m: b.times(m), body.link, motion.link),
         body.object.times(motion.object),
-        hand.wrist_armature * acc.wrist,
+        jnp.zeros_like(acc.wrist) if problem.arm is not None else hand.wrist_armature * acc.wrist,
         hand.armature * acc.finger,
     )
 
@@ -199,13 +211,7 @@ def newton_step(
         zero = jnp.zeros_like(node.p), jnp.zeros_like(node.r)
         node = run(lambda n, s: _add_link(n, _own(*zero, _of_links(s, 0))), node, skin)
     node = run(_add_palm, node, problem.matrix, force, pushes)
-    arm = hand.wrist_armature
-    node, hinges = el.eliminate(run, node, kin.wrist_axes, arm[3:], force.wrist[3:])
-    slide_axes = _slides(arm)
-    node, slides = el.eliminate(run, node, slide_axes, arm[:3], force.wrist[:3])
-    obj = el.solve_object(run, node.q, node.r_object)
-    first, palm = run(el.substitute, slide_axes, slides, jnp.zeros_like(obj), obj)
-    second, palm = run(el.substitute, kin.wrist_axes, hinges, palm, obj)
+    joints, palm, obj = _palm_step(run, problem, force, node)
 
     def next_link(parent: jax.Array, link: tuple):
         a, motion = run(el.substitute, *link[0], parent, obj)
@@ -214,8 +220,25 @@ def newton_step(
     first_link = palm + jnp.zeros_like(force.link[:, 0])
     _, (fingers, motions) = scan_links(next_link, first_link, (kin.axes, factors))
     at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
-    acc = Acc(jnp.concatenate([first, second]), fingers, at_centre)
+    acc = Acc(jnp.concatenate(joints), fingers, at_centre)
     return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
+
+
+def _palm_step(
+    run: Stages, problem: Problem, force: Forces, node: el.Quadratic
+) -> tuple[list[jax.Array], jax.Array, jax.Array]:
+    """Steps of the wrist's joints, and spatial steps of palm and object."""
+    if problem.arm is not None:  # known: no step
+        obj = el.solve_object(run, node.q, node.r_object)
+        return [jnp.zeros_like(problem.arm)], jnp.zeros_like(obj), obj
+    arm, axes = problem.hand.wrist_armature, problem.kin.wrist_axes
+    node, hinges = el.eliminate(run, node, axes, arm[3:], force.wrist[3:])
+    slide_axes = _slides(arm)
+    node, slides = el.eliminate(run, node, slide_axes, arm[:3], force.wrist[:3])
+    obj = el.solve_object(run, node.q, node.r_object)
+    first, palm = run(el.substitute, slide_axes, slides, jnp.zeros_like(obj), obj)
+    second, palm = run(el.substitute, axes, hinges, palm, obj)
+    return [first, second], palm, obj
 
 
 def respond_all(
@@ -316,8 +339,9 @@ def _add_palm(node: el.Quadratic, matrix: Matrices, force: Forces, pushes: dict)
     p, c, q, r, ro = (sum_fingers(v) for v in node)
     p, r = p + matrix.palm, r + force.palm
     q, ro = q + matrix.object, ro + force.object
-    inertia, wrench = pushes["object_table"]
-    q, ro = q + inertia, ro + wrench
+    if "object_table" in pushes:
+        inertia, wrench = pushes["object_table"]
+        q, ro = q + inertia, ro + wrench
     if "palm_table" in pushes:
         inertia, wrench = pushes["palm_table"]
         p, r = p + inertia, r + wrench
@@ -429,6 +453,10 @@ def solve(
       tolerance: Newton decrement, relative to the objective's scale, below which a world is done.
     """
     contacts = problem.contacts
+    if problem.arm is not None:
+        start = start._replace(wrist=problem.arm)
+    if not contacts:
+        return _solve_free(run, problem, start)
     # A set without a contact in any world of the batch costs nothing: its stages return zeros.
     runs = {n: run.only_if(c.active.any()) for n, c in contacts.items()}
 
@@ -476,6 +504,16 @@ def solve(
         going, body, (start, motion, jar, infinite, jnp.zeros((), jnp.int32))
     )
     return Solution(acc, residual, count)
+
+
+def _solve_free(run: Stages, problem: Problem, start: Acc) -> Solution:
+    """Without contacts the objective is quadratic: one elimination solves it."""
+    motion = propagate(run, problem.kin, start)
+    inertial = inertial_forces(run, problem, start, motion)
+    force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))
+    step, _ = newton_step(run, problem, force, {})
+    acc = jax.tree.map(jnp.add, start, step)
+    return Solution(acc, jnp.zeros_like(start.wrist[0]), jnp.ones((), jnp.int32))
 
 
 def _decrement(

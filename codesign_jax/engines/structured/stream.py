@@ -16,9 +16,11 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.hand import HandLanes
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.scene import Scene
-from codesign_jax.types import Trace
+from codesign_jax.types import Status, Trace
 
 Advance = Callable[[HandLanes, State, jax.Array], tuple[State, State, jax.Array, jax.Array]]
+ROW = 4
+"""Distance, height, speed and status of a step."""
 
 
 class Queue(NamedTuple):
@@ -58,10 +60,17 @@ class Lanes(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Trace rows as they come, and the last step of every world, shape (world,) int32."""
+    """What the worlds leave.
+
+    Attributes:
+      values: Trace rows as they come, shape (world, time, `ROW` and qpos).
+      last: The last step of every world, shape (world,) int32.
+      state: The state before it, shape (world, nq + nv).
+    """
 
     values: jax.Array
     last: jax.Array
+    state: jax.Array
 
 
 def stream(
@@ -70,6 +79,7 @@ def stream(
     advance: Advance,
     speed_of: Callable[[State], jax.Array],
     qpos_of: Callable[[State], jax.Array],
+    flat_of: Callable[[State], jax.Array],
     *,
     lanes: int,
     max_rounds: int,
@@ -85,6 +95,7 @@ def stream(
         centre, shape (3, 1, lane).
       speed_of: Largest velocity of states, shape (lane,).
       qpos_of: MuJoCo's qpos of states, shape (lane, nq).
+      flat_of: MuJoCo's qpos and qvel of states, shape (lane, nq + nv).
       lanes: Number of lanes; fewer if there are fewer worlds.
       max_rounds: Rounds after which a step is taken as it is.
       trajectory: Whether to record qpos.
@@ -94,7 +105,7 @@ def stream(
     """
     worlds, steps, dtype = *queue.ctrl.shape[:2], queue.ctrl.dtype
     lanes = min(lanes, worlds)
-    width = 3 + (qpos_of(queue.start).shape[1] if trajectory else 0)
+    width = ROW + (qpos_of(queue.start).shape[1] if trajectory else 0)
 
     def one_round(carry: tuple[Lanes, Record]) -> tuple[Lanes, Record]:
         now, record = carry
@@ -102,13 +113,15 @@ def stream(
         step = jnp.minimum(now.time, steps - 1)
         ctrl = queue.ctrl[jnp.minimum(now.world, worlds - 1), step].T
         new, resumed, solved, centre = advance(now.hand, now.state, ctrl)
-        row = _row(now.state, now.speed, centre)
+        capped = ~solved & (now.rounds + 1 >= max_rounds)
+        row = _row(now.state, now.speed, centre, capped)
         if trajectory:
             row = jnp.concatenate([row, qpos_of(now.state)], 1)
         values = record.values.at[now.world, now.time].set(row, mode="drop")
         decided = _decided(scene, row, now.time) | (now.time >= steps - 1)
         last = record.last.at[now.world].set(now.time, mode="drop")
-        solved |= now.rounds + 1 >= max_rounds
+        end = record.state.at[now.world].set(flat_of(now.state), mode="drop")
+        solved |= capped
         speed = speed_of(new)
         good = solved & (speed <= scene.limits.speed)
         state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, resumed)
@@ -118,16 +131,19 @@ def stream(
             speed=jnp.where(solved, speed, now.speed),
             state=state,
         )
-        return _refill(queue, moved, decided & (now.world < worlds)), Record(values, last)
+        return _refill(queue, moved, decided & (now.world < worlds)), Record(values, last, end)
 
-    record = Record(jnp.zeros((worlds, steps, width), dtype), jnp.zeros(worlds, jnp.int32))
+    values, none = jnp.zeros((worlds, steps, width), dtype), jnp.zeros(worlds, jnp.int32)
+    record = Record(values, none, flat_of(queue.start))
     first = _first(queue, lanes)
     _, record = jax.lax.while_loop(
         lambda carry: jnp.any(carry[0].world < worlds), one_round, (first, record)
     )
     held = jnp.minimum(jnp.arange(steps)[None], record.last[:, None])
     values = jnp.take_along_axis(record.values, held[:, :, None], axis=1)
-    return Trace(values[..., 0], values[..., 1], values[..., 2], values[..., 3:])
+    distance, height, speed, status = (values[..., k] for k in range(ROW))
+    bits = status.astype(jnp.int32)
+    return Trace(distance, height, speed, values[..., ROW:], bits, record.state)
 
 
 def _first(queue: Queue, lanes: int) -> Lanes:
@@ -138,11 +154,12 @@ def _first(queue: Queue, lanes: int) -> Lanes:
     return Lanes(jnp.arange(lanes), zero, zero, speed, state, hand, jnp.int32(lanes))
 
 
-def _row(state: State, speed: jax.Array, centre: jax.Array) -> jax.Array:
-    """Distance, height and speed of every lane, shape (lane, 3)."""
+def _row(state: State, speed: jax.Array, centre: jax.Array, capped: jax.Array) -> jax.Array:
+    """Distance, height, speed and status of every lane, shape (lane, `ROW`)."""
     away = state.position - centre
     distance = jnp.sqrt(away[0, 0] ** 2 + away[1, 0] ** 2 + away[2, 0] ** 2)
-    return jnp.stack([distance, state.position[2, 0], speed], 1)
+    status = jnp.where(capped, float(Status.SOLVER_CAP), 0.0).astype(speed.dtype)
+    return jnp.stack([distance, state.position[2, 0], speed, status], 1)
 
 
 def _decided(scene: Scene, row: jax.Array, time: jax.Array) -> jax.Array:

@@ -18,10 +18,10 @@ from codesign_jax.engines.structured.fused.ptx import LANES
 from codesign_jax.engines.structured.fused.step import Step
 from codesign_jax.engines.structured.fused.tables import Block, Table, anywhere
 from codesign_jax.engines.structured.hand import HandLanes
-from codesign_jax.engines.structured.kinematics import State
+from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanewise import lanes
 from codesign_jax.model import layout
-from codesign_jax.model.layout import palm_points
+from codesign_jax.model.layout import palm_points, palm_touches
 from codesign_jax.scene import Scene
 
 TRACE = ("distance", "height", "speed", "residual", "iterations")
@@ -70,15 +70,15 @@ class Program:
             sets.append(make("finger_object", self.links, k))
         if k and e.finger_table:
             sets.append(make("finger_table", self.links, k))
-        if e.palm_contact:
-            sets += [make(n, self.palm_groups, 1) for n in ("palm_object", "palm_table")]
+        on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
+        sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
         return [*sets, make("object_table", -(-4 // self.fingers), 1)]
 
     def _tables(self) -> None:
         n, a = self.links, self.axes
         one: tuple[int, ...] = ()
         spheres = {"sphere": (n, (3, self.k)), "radius": (n, (self.k,))} if self.k else {}
-        if self.scene.effects.palm_contact:
+        if palm_touches(self.scene):
             spheres |= {
                 "palm_point": (self.palm_groups, (3, 1)),
                 "palm_radius": (self.palm_groups, (1,)),
@@ -148,7 +148,7 @@ class Program:
         # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
         share = jnp.ones((self.links + 1, *lane), dtype)
         arrays["share"] = share.at[jnp.array([0, self.links])].set(0.5)
-        if self.scene.effects.palm_contact:
+        if palm_touches(self.scene):
             arrays |= self._palm_slots(worlds, dtype)
         extra = self.fingers - n
         if extra:
@@ -210,6 +210,12 @@ class Program:
         self, hand: HandLanes, state: State, ctrl: jax.Array, *, interpret: bool = False
     ) -> dict[str, jax.Array]:
         """Runs a rollout; returns `TRACE` by name, shape (world, time)."""
+        return self.simulate(hand, state, ctrl, interpret=interpret)[0]
+
+    def simulate(
+        self, hand: HandLanes, state: State, ctrl: jax.Array, *, interpret: bool = False
+    ) -> tuple[dict[str, jax.Array], State]:
+        """Runs a rollout; returns `TRACE` by name, shape (world, time), and the last states."""
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         blocks, steps, dtype = inputs[0].shape[0], ctrl.shape[1], ctrl.dtype
         shapes = [
@@ -235,7 +241,15 @@ class Program:
         out = call(*inputs) if interpret else launch(call, inputs, outputs)
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(TRACE))[: ctrl.shape[0]]
-        return {name: trace[..., k] for k, name in enumerate(TRACE)}
+        found = {name: trace[..., k] for k, name in enumerate(TRACE)}
+        return found, self.unpack_state(out[0], out[1], ctrl.shape[0])
+
+    def unpack_state(self, fine: jax.Array, rest: jax.Array, worlds: int) -> State:
+        """Inverse of `pack_state`."""
+        wide = self.fine.unpack(fine, self.fingers, self.num_fingers, worlds)
+        narrow = self.rest.unpack(rest, 1, 1, worlds)
+        acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
+        return State(**wide, **narrow, acc=acc)
 
     def _kernel(self, steps: int, interpret: bool, *refs: Any) -> None:
         hand, world, fine0, rest0, arm, pressure, fine, rest, scratch, trace = refs

@@ -91,7 +91,7 @@ class Step:
 
     def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
         """Kinematics, inertia and smooth forces of palm, wrist and object."""
-        w, g = self.p.scene.hand.wrist, self.p.scene.gravity
+        w, g = self.p.scene.hand.wrist, self.p.scene.gravity_on
         names = ("palm_mass", "palm_centre", "palm_inertia", "wrist_damping", "wrist_armature")
         constants = self.constants(*names, "object_mass", "object_inertia")
 
@@ -211,10 +211,11 @@ class Step:
             )
             m.contacts[name].create(i, geometry, *moves)
 
-        for i in range(p.palm_groups if "palm_object" in m.contacts else 0):
+        palm = [name for name in ("palm_object", "palm_table") if name in m.contacts]
+        for i in range(p.palm_groups if palm else 0):
             point, radius = (p.hand.read(self.hand, n, i) for n in ("palm_point", "palm_radius"))
             centre = lanewise(lambda f, s: apply_columns(f[:, :, None], s), at["frame"], point)
-            for name in ("palm_object", "palm_table"):
+            for name in palm:
                 create(name, i, self._geometry(name, centre, radius, at, shape))
         slots = self._table_points(state, at, shape)
         for i in range(m.contacts["object_table"].set.count):
@@ -316,7 +317,7 @@ def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, 
         "body_centre": body.centre,
         "tensor": triangle(body.tensor),
         "motion": motion,
-        "smooth": body.smooth_force(vel, bias, scene.gravity),
+        "smooth": body.smooth_force(vel, bias, scene.gravity_on),
         "tau": tau,
     }
     return (origin, frame, vel, bias, motion), stored

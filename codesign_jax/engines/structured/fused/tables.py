@@ -47,6 +47,29 @@ class Table:
         blocks = stacked.reshape(*stacked.shape[:2], -1, block)
         return jnp.moveaxis(blocks, 2, 0).reshape(blocks.shape[2], self.rows, -1)
 
+    def unpack(
+        self, packed: jax.Array, fingers: int, kept: int, worlds: int
+    ) -> dict[str, jax.Array]:
+        """Inverse of `pack`: arrays (item, component, ..., finger or 1, world) by name.
+
+        An item's axis is left out where there is one item only.
+
+        Args:
+          packed: The table.
+          fingers: Fingers it was packed for, 1 for a table of worlds.
+          kept: The first of them, without those that fill up.
+          worlds: Worlds without those that fill the last block.
+        """
+        blocks = packed.reshape(packed.shape[0], self.rows, fingers, -1)
+        flat = jnp.moveaxis(blocks, 0, 2).reshape(self.rows, fingers, -1)[:, :kept, :worlds]
+        arrays = {}
+        for name, (count, shape) in self.groups.items():
+            size = count * int(np.prod(shape))
+            first = self.offset[name]
+            items = (count, *shape) if self.wide else shape
+            arrays[name] = flat[first : first + size].reshape(*items, kept, worlds)
+        return arrays
+
     def _row(self, name: str, item: Any) -> tuple[Any, tuple[int, ...]]:
         _, shape = self.groups[name]
         return self.offset[name] + item * int(np.prod(shape)), shape

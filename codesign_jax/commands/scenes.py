@@ -1,0 +1,41 @@
+"""`codesign scenes`."""
+
+from typing import TYPE_CHECKING
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from codesign_jax import effects, files, schema
+from codesign_jax import scene as scenes
+from codesign_jax.schema import SceneError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Scenes
+
+
+def main(options: "Scenes") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      SceneError: If a scene or the engine is unknown, or a scene has problems.
+    """
+    if options.engine is not None and options.engine not in effects.ENGINES:
+        hint = schema.nearest(options.engine, effects.ENGINES)
+        raise SceneError([f"--engine {options.engine!r} is not valid; {hint}"])
+    engines = effects.ENGINES if options.engine is None else (options.engine,)
+    names = files.available("scenes") if options.name is None else [options.name]
+    console = Console(highlight=False)
+    for scene in [scenes.load(name) for name in names]:
+        console.print(f"{scene.name}: {scene.description}", markup=False)
+        console.print(_table(scene, engines))
+    return 0
+
+
+def _table(scene: scenes.Scene, engines: tuple[str, ...]) -> Table:
+    """Effects of a scene, a row each, with a column for each engine."""
+    table = Table("effect", *engines, "meaning", box=box.SIMPLE)
+    for name, effect in effects.EFFECTS.items():
+        states = [effects.state(scene.effects, name, engine) for engine in engines]
+        table.add_row(name, *states, effect.meaning)
+    return table

@@ -1,0 +1,108 @@
+"""What each effect of a scene means, and which engines simulate it.
+
+Effects are static: one that is off has no joint, contact or branch in the compiled program.  An
+engine that cannot do what a scene asks for refuses the scene when it is built.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from codesign_jax.schema import SceneError
+
+ENGINES = ("mjx", "mujoco", "structured")
+
+
+class Effect(NamedTuple):
+    """An effect's description.
+
+    Attributes:
+      meaning: What is simulated, in a line.
+      refused: Why an engine cannot do a value of the effect, by engine and value.
+    """
+
+    meaning: str
+    refused: Mapping[str, Mapping[Any, str]] = {}
+
+
+_PRESCRIBED = (
+    "MuJoCo's bodies that move as prescribed stand still to contacts, and the heavy wrist that "
+    "replaces one needs float64"
+)
+
+_SKIN = "its geoms are rigid parts of single bodies"
+
+EFFECTS: Mapping[str, Effect] = {
+    "lateral_bending": Effect("fingers bend sideways"),
+    "twist": Effect("fingers twist about their length"),
+    "wrist": Effect(
+        "compliant wrist; without it the palm is where the arm frame is",
+        {"mjx": {False: _PRESCRIBED}},
+    ),
+    "finger_object": Effect("fingers touch the object"),
+    "palm_object": Effect("the palm touches the object"),
+    "finger_table": Effect("fingers touch the table"),
+    "palm_table": Effect("the palm touches the table"),
+    "object_table": Effect("the object rests on the table"),
+    "finger_finger": Effect("spheres of different fingers touch"),
+    "surface": Effect(
+        "the fingers' contact points: spheres, or the vertices of the skinned hull",
+        {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},
+    ),
+    "friction": Effect(
+        "of all contacts: none, coulomb, or full with torsion and rolling",
+        {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},
+    ),
+    "disturb": Effect("the arm is shaken after the lift"),
+    "ungrasp": Effect("the fingers let go at the end"),
+    "neo_hookean": Effect("rubber at large strain: fingers soften as they bend"),
+    "pressure_dynamics": Effect("chambers fill with a lag and under the supply's limits"),
+    "gravity": Effect("everything has weight"),
+}
+
+
+def refusals(effects: Any, engine: str) -> dict[str, str]:
+    """Returns why an engine cannot do a scene's effects, by effect; empty if it can.
+
+    Args:
+      effects: The scene's `Effects`.
+      engine: Name of the engine.
+    """
+    values = dataclasses.asdict(effects)
+    found = {name: EFFECTS[name].refused.get(engine, {}).get(v) for name, v in values.items()}
+    return {name: reason for name, reason in found.items() if reason}
+
+
+def refuse(effects: Any, engine: str) -> None:
+    """Checks that an engine can do what a scene asks for.
+
+    Args:
+      effects: The scene's `Effects`.
+      engine: Name of the engine.
+
+    Raises:
+      SceneError: With a line for each effect that it cannot do.
+    """
+    problems = []
+    for name, reason in refusals(effects, engine).items():
+        able = [e for e in ENGINES if name not in refusals(effects, e)]
+        problems.append(
+            f"not supported by engine {engine}: effects.{name} = {setting(effects, name)} "
+            f"({reason}); use engine {' or '.join(able)}"
+        )
+    if problems:
+        raise SceneError(problems)
+
+
+def setting(effects: Any, name: str) -> str:
+    """An effect's value as in a scene file."""
+    value = getattr(effects, name)
+    return str(value).lower() if isinstance(value, bool) else repr(value).replace("'", '"')
+
+
+def state(effects: Any, name: str, engine: str) -> str:
+    """An effect in a scene and an engine: on, off, the model chosen, or unsupported."""
+    if name in refusals(effects, engine):
+        return f"unsupported ({setting(effects, name)})"
+    value = getattr(effects, name)
+    return {True: "on", False: "off"}.get(value, str(value))

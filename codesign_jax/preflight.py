@@ -1,0 +1,236 @@
+"""Limits of step, stiffness, pressure and reach, checked before anything is simulated.
+
+The scene's own checks look at one number at a time; these look at what a design makes of them.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import linalg
+
+from codesign_jax import model, morphology, rollout
+from codesign_jax.scene import Scene
+from codesign_jax.start import depth
+from codesign_jax.types import Params
+
+SHAKE_STEPS = 20
+"""Fewest time steps in a period of the shaking: the sampled sine then misses 1.2 % of its peak."""
+SINK = 1e-3
+"""Depth at rest [m] above which a contact is called soft: the paper's objects are 60 mm wide."""
+
+
+class Limits(NamedTuple):
+    """Numbers of one finger of one design.
+
+    Attributes:
+      slowest: Lowest natural frequency in bending [Hz].
+      fastest: Highest natural frequency of the chain in any direction [Hz].
+      undamped_step: Largest stable step of explicit springs without damping [s].
+      damped_step: The same with the material's damping, itself implicit [s]. Both for information,
+        as springs and damping are implicit in every engine.
+    """
+
+    slowest: float
+    fastest: float
+    undamped_step: float
+    damped_step: float
+
+
+class Report(NamedTuple):
+    """What was found; each entry names the design, the value, its limit and the reason.
+
+    Attributes:
+      refusals: What must not be simulated.
+      warnings: What may be, but may not mean what it seems to.
+      notes: For information.
+    """
+
+    refusals: list[str]
+    warnings: list[str]
+    notes: list[str]
+
+
+def finger_limits(scene: Scene, params: Params, finger: int) -> Limits:
+    """Natural frequencies of a straight finger on a fixed palm, by its chain's mass matrix.
+
+    A mode of frequency omega and Kelvin-Voigt damping beta is stable with explicit springs if
+    h^2 k < 4 m + 2 h c, that is h < beta + sqrt(beta^2 + 4 / omega^2).
+
+    Args:
+      scene: The scene.
+      params: One design, NumPy arrays.
+      finger: Which finger.
+    """
+    beam = morphology.finger_beams(scene.hand, params)
+    n, length = scene.discretization.links, float(params.length[finger])
+    segment = length / n
+    density = float(beam.line_density[finger])
+    # Joints at the segments' midpoints; the last link is a half segment, the others whole ones.
+    joint = (np.arange(n) + 0.5) * segment
+    end = np.append(joint[1:], length)
+    mass, centre = density * (end - joint), 0.5 * (joint + end)
+    arm = np.maximum(centre[:, None] - joint[None], 0.0)
+    swing = arm.T @ (mass[:, None] * arm)
+    # Links are solid blocks whose centres lie half the height above the layer that carries joints.
+    height, width = float(params.height[finger]), scene.hand.section.width
+    along, up = (end - joint) ** 2 / 12, height**2 / 12
+    bend = swing + _blocks(mass * (along + up + height**2 / 4))
+    side = swing + _blocks(mass * (along + width**2 / 12))
+    twist = _blocks(mass * (up + width**2 / 12 + height**2 / 4))
+    squares = [float(beam.bending[finger]) / segment / _ends(bend)]
+    if scene.effects.lateral_bending:
+        squares.append(float(beam.lateral[finger]) / segment / _ends(side))
+    if scene.effects.twist:
+        squares.append(float(beam.torsion[finger]) / segment / _ends(twist))
+    omega = np.sqrt(np.array(squares))
+    beta, top = scene.hand.material.damping_time, omega.max()
+    step = beta + np.sqrt(beta**2 + 4 / top**2)
+    slowest, fastest = omega[0].min() / (2 * np.pi), top / (2 * np.pi)
+    return Limits(float(slowest), float(fastest), float(2 / top), float(step))
+
+
+def _blocks(inertia: np.ndarray) -> np.ndarray:
+    """Mass matrix of joints that each turn all links behind them with these inertias."""
+    behind = np.cumsum(inertia[::-1])[::-1]
+    index = np.arange(len(inertia))
+    return behind[np.maximum(index[:, None], index[None])]
+
+
+def _ends(matrix: np.ndarray) -> np.ndarray:
+    """Largest and smallest eigenvalue: the lowest and the highest frequency."""
+    values = linalg.eigvalsh(matrix)
+    return np.array([values[-1], values[0]])
+
+
+def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Report:
+    """Checks designs against the scene's limits; costs milliseconds and simulates nothing.
+
+    Args:
+      scene: The scene.
+      designs: Parameters with leading axis (design,).
+      names: What to call the designs; by default "design 0" and so on.
+    """
+    designs = Params(*(np.asarray(v, float) for v in designs))
+    count = designs.length.shape[0]
+    names = names or [f"design {i}" for i in range(count)]
+    report = Report([], _scene_warnings(scene), [])
+    sound = []
+    for i, name in enumerate(names):
+        one = Params(*(v[i] for v in designs))
+        problems = _sections(scene, one, name)
+        report.refusals.extend(problems)
+        sound.append(not problems)
+        if not problems:
+            report.warnings.extend(_reach(scene, one, name))
+    if any(sound):
+        keep = np.array(sound)
+        kept = Params(*(v[keep] for v in designs))
+        report.refusals.extend(
+            _overlaps(scene, kept, [n for n, s in zip(names, sound, strict=True) if s])
+        )
+        report.notes.append(_step_note(scene, kept))
+    return report
+
+
+def _scene_warnings(scene: Scene) -> list[str]:
+    h, found = scene.discretization.timestep, []
+    if scene.contact.time_constant < 2 * h:
+        found.append(
+            f"contact.time_constant = {scene.contact.time_constant:g} s is below two time steps "
+            f"({2 * h:g} s): MuJoCo raises it (refsafe), the contact is softer than asked for"
+        )
+    rate = scene.arm.shake_frequency
+    if scene.effects.disturb and rate * h * SHAKE_STEPS > 1:
+        found.append(
+            f"arm.shake_frequency = {rate:g} Hz has {1 / (rate * h):.1f} time steps of {h:g} s in "
+            f"a period: below {SHAKE_STEPS} the shaking is not the sine asked for"
+        )
+    for shape in scene.objects.object:
+        stiffness = scene.contact.normal_stiffness
+        sunk = shape.mass * scene.gravity / (2 * stiffness)
+        if sunk > SINK:
+            found.append(
+                f"object {shape.name!r} of {shape.mass:g} kg sinks {1e3 * sunk:.1f} mm into the "
+                f"table on one contact: contact.normal_stiffness = {stiffness:g} N/m is soft for "
+                "its weight"
+            )
+    return found
+
+
+def _sections(scene: Scene, one: Params, name: str) -> list[str]:
+    """Why a design's numbers are no hand."""
+    if not all(np.isfinite(v).all() for v in one):
+        return [f"{name}: a parameter is not a finite number"]
+    found, limit = [], scene.hand.pressure_limit.per_wall
+    for f in range(scene.num_fingers):
+        where = f"{name}: finger {f}"
+        length, height, wall = (float(v[f]) for v in (one.length, one.height, one.wall))
+        if length <= 0 or wall <= 0:
+            found.append(f"{where}: length {length:g} m and wall {wall:g} m must be positive")
+        if 2 * wall >= min(height, scene.hand.section.width):
+            found.append(
+                f"{where}: walls of {wall:g} m leave no air chamber in a section of {height:g} m "
+                f"by {scene.hand.section.width:g} m"
+            )
+        if one.pressure[f] > limit * wall * (1 + 1e-6):
+            found.append(
+                f"{where}: pressure {one.pressure[f]:.4g} Pa is above the limit of "
+                f"{limit * wall:.4g} Pa for a wall of {wall:g} m"
+            )
+    return found
+
+
+def _reach(scene: Scene, one: Params, name: str) -> list[str]:
+    """Warns if no finger can come down to the object's top, even straight."""
+    if not scene.effects.finger_object:
+        return []
+    palm = scene.arm.zero_height + float(one.arm[2])
+    tilt = np.deg2rad([f.tilt for f in scene.hand.finger])
+    lowest = float((palm - one.length * np.sin(tilt)).min())
+    # An arm that is turned may bring a finger lower, by no more than its whole length.
+    turned = float(palm - one.length.max() - max(f.radius for f in scene.hand.finger))
+    top = max(2 * shape.radius for shape in scene.objects.object)
+    if turned > top:
+        return [
+            f"{name}: the fingers end {1e3 * (lowest - top):.0f} mm above the tallest object "
+            f"(palm at {1e3 * palm:.0f} mm): nothing can be touched"
+        ]
+    return []
+
+
+def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
+    """Refuses designs that start deep inside the table or an object, without noise."""
+    found, limit = [], scene.limits.penetration
+    for k, shape in enumerate(scene.objects.object):
+        trial = rollout.nominal_trial(scene, k)
+        fields = jax.vmap(lambda p, t=trial: model.model_fields(scene, p, t))(
+            jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), designs)
+        )
+        for name, deep in zip(names, np.asarray(depth(scene, fields)), strict=True):
+            if not deep <= limit:
+                found.append(
+                    f"{name}: starts {1e3 * deep:.0f} mm inside the table or object {shape.name!r} "
+                    f"(limits.penetration = {1e3 * limit:g} mm); raise arm.start_height = "
+                    f"{scene.arm.start_height:g} m"
+                )
+    return found
+
+
+def _step_note(scene: Scene, designs: Params) -> str:
+    """Frequencies and what an explicit integrator would need, over all fingers of all designs."""
+    limits = [
+        finger_limits(scene, Params(*(v[i] for v in designs)), f)
+        for i in range(designs.length.shape[0])
+        for f in range(scene.num_fingers)
+    ]
+    h, beta = scene.discretization.timestep, scene.hand.material.damping_time
+    low, high = min(v.slowest for v in limits), max(v.fastest for v in limits)
+    bare, damped = min(v.undamped_step for v in limits), min(v.damped_step for v in limits)
+    return (
+        f"finger frequencies {low:.3g} to {high:.3g} Hz; explicit springs would need steps below "
+        f"{1e3 * bare:.2g} ms ({1e3 * damped:.2g} ms with the material's damping), implicit ones "
+        f"are stable at {1e3 * h:g} ms and act there as a damping time of {1e3 * (beta + h):g} ms "
+        f"instead of {1e3 * beta:g} ms"
+    )

@@ -1,0 +1,84 @@
+"""Failed worlds on disk: what they were and the last good state they were frozen at."""
+
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from codesign_jax import types
+from codesign_jax.codesign import EpisodeInfo
+from codesign_jax.schema import SceneError
+from codesign_jax.types import Trial
+
+FOLDER = "failures"
+MOST = 10
+"""Failed worlds saved of an episode; all are in trials.csv."""
+
+
+class Failure(NamedTuple):
+    """One failed world.
+
+    Attributes:
+      design: Design as simulated [SI units], shape (parameter,).
+      trial: Its trial.
+      state: Generalized positions and velocities at which it was frozen, shape (nq + nv,); empty
+        if the engine does not tell.
+      status: Bits of `Status`.
+      bad_step: First bad time step, or -1 (STUCK).
+      place: Episode, particle and trial.
+    """
+
+    design: np.ndarray
+    trial: Trial
+    state: np.ndarray
+    status: int
+    bad_step: int
+    place: tuple[int, int, int]
+
+
+def save(folder: Path, episode: int, info: EpisodeInfo, trials: Trial) -> list[Path]:
+    """Saves an episode's first failed worlds, a file each; returns the files.
+
+    Args:
+      folder: The run folder.
+      episode: Number of the episode.
+      info: Its report.
+      trials: Its trials, leading axis (trial,).
+    """
+    status = np.asarray(info.trials.status)
+    files = []
+    for p, t in np.argwhere(types.failed(status))[:MOST]:
+        trial = jax.tree.map(lambda v, t=t: np.asarray(v)[t], trials)
+        state = np.zeros(0) if info.last is None else np.asarray(info.last[p, t])
+        path = folder / FOLDER / f"episode-{episode}-particle-{p}-trial-{t}.npz"
+        path.parent.mkdir(exist_ok=True)
+        np.savez(
+            path,
+            design=np.asarray(info.population[p]),
+            state=state,
+            status=status[p, t],
+            bad_step=np.asarray(info.trials.bad_step)[p, t],
+            place=np.array([episode, p, t]),
+            **{f"trial_{k}": v for k, v in trial._asdict().items()},
+        )
+        files.append(path)
+    return files
+
+
+def load(path: Path) -> Failure:
+    """Reads a failed world.
+
+    Raises:
+      SceneError: If the file is not one.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            values = {k: stored[k] for k in stored.files}
+        trial = Trial(**{k: values[f"trial_{k}"] for k in Trial._fields})
+        place = tuple(int(v) for v in values["place"])
+        status, bad_step = int(values["status"]), int(values["bad_step"])
+        return Failure(values["design"], trial, values["state"], status, bad_step, place)  # type: ignore[arg-type]
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise SceneError([f"{path} is not a failed world of a run: {error}"]) from error

@@ -1,0 +1,276 @@
+"""Hard cases 1 to 5 and 8: one finger against closed forms of beams, and its energy."""
+
+import functools
+
+import mujoco
+import numpy as np
+from scipy import linalg
+
+from codesign_jax import model, morphology
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.types import Params
+from tests import small
+from tests.stability.bench import bench
+from tests.stability.table import Found, case
+from tests.test_beam_oracles import Finger, finger_scene
+
+HEIGHT, WALL = 0.020, 0.005
+
+
+class Rod:
+    """The one-finger scene on a bench, with its beam properties and MuJoCo C to read states."""
+
+    def __init__(self, engine, step, precision, *, links=10, length=0.1, damped=True):
+        base = finger_scene(links)
+        if not damped:
+            base = undamped(links)
+        self.bench = bench(base, engine, step, precision)
+        self.links, self.length, self.h = links, length, self.bench.h
+        one = np.ones(1)
+        params = Params(length * one, HEIGHT * one, WALL * one, np.zeros(()), np.zeros(6), 0 * one)
+        self.fields = self.bench.fields([params], [small.still()])
+        self.model = world_model(self.bench.scene, small.nth(self.fields, 0))
+        self.data, self.lay = mujoco.MjData(self.model), model.layout(self.bench.scene)
+        material = self.bench.scene.hand.material
+        self.beam = morphology.beam(
+            HEIGHT,
+            WALL,
+            width=self.bench.scene.hand.section.width,
+            shear_modulus=material.shear_modulus,
+            density=material.density,
+        )
+        self.joints = 6 + np.arange(links)
+
+    def run(self, pressure, start=None):
+        """History under pressures (time,) from finger angles (links,) at rest."""
+        qpos = self.fields.start.copy()
+        if start is not None:
+            qpos[0, self.joints] = start
+        ctrl = np.zeros((1, len(pressure), self.model.nu))
+        ctrl[0, :, :6], ctrl[0, :, 6] = qpos[0, :6], pressure
+        return self.bench.run(self.fields, ctrl, qpos)
+
+    def tip(self, qpos):
+        """Tip of the bottom layer in the frame of the finger's root."""
+        m, d, last = self.model, self.data, self.lay.bodies[0, -1]
+        d.qpos[:] = qpos
+        mujoco.mj_kinematics(m, d)
+        end = d.xpos[last] + d.xmat[last].reshape(3, 3) @ [self.length / self.links / 2, 0, 0]
+        return d.xmat[1].reshape(3, 3).T @ (end - d.xpos[1])
+
+    def mass(self, qpos):
+        """Mass matrix of the finger's joints without what the implicit springs add."""
+        m, d = self.model, self.data
+        d.qpos[:] = qpos
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_comPos(m, d)
+        mujoco.mj_crb(m, d)
+        full = np.zeros((m.nv, m.nv))
+        mujoco.mj_fullM(m, d, full)
+        return (full - np.diag(m.dof_armature))[np.ix_(self.joints, self.joints)]
+
+    def mode(self):
+        """First angular frequency and mode shape, largest angle 1."""
+        stiffness = np.diag(self.model.jnt_stiffness[self.joints])
+        values, vectors = linalg.eigh(stiffness, self.mass(self.fields.start[0]))
+        shape = vectors[:, 0]
+        return np.sqrt(values[0]), shape / shape[np.abs(shape).argmax()]
+
+    def energy(self, history):
+        """Kinetic and spring energy after every step [J]."""
+        k, out = self.model.jnt_stiffness[self.joints], []
+        for qpos, qvel in zip(history.qpos[0], history.qvel[0], strict=True):
+            q, v = qpos[self.joints].astype(float), qvel[self.joints].astype(float)
+            out.append(0.5 * v @ self.mass(qpos) @ v + 0.5 * (k * q) @ q)
+        return np.array(out)
+
+
+@functools.cache
+def undamped(links):
+    """The one-finger scene without the material's damping; the scheme's own remains."""
+    import dataclasses
+
+    base = finger_scene(links)
+    material = dataclasses.replace(base.hand.material, damping_time=0.0)
+    return dataclasses.replace(base, hand=dataclasses.replace(base.hand, material=material))
+
+
+@case(
+    1,
+    "cantilever, small load",
+    "order of the tip's error over N = 5, 10, 20, 40",
+    engine="mujoco",
+    lower=True,
+    quick=((1.0, "float64"),),
+)
+def cantilever_order(engine, step, precision):
+    """The load is small enough (alpha = 1e-4) for the linear closed form P L^3 / 3 E I."""
+    counts, errors = np.array([5, 10, 20, 40]), []
+    for links in counts:
+        finger = Finger(int(links), timestep=0.01 * step)
+        load = 1e-4 * finger.beam.bending / finger.length**2
+        position, _ = finger.settle(force=(0, 0, -load), steps=20000)
+        errors.append(1 + position[2] * 3 * finger.beam.bending / (load * finger.length**3))
+    # The protocol's bound; the chain's error is exactly 1 / (4 N^2).
+    return Found(-np.polyfit(np.log(counts), np.log(errors), 1)[0], 1.8)
+
+
+def roll_up(engine, step, precision):
+    """M = 2 pi E I / L closes the midpoint chain exactly; pressure grows for 2 s, rests for 3."""
+    rod = Rod(engine, step, precision)
+    full = 2 * np.pi * rod.beam.bending / rod.length / rod.beam.moment_per_pressure
+    time = np.arange(round(5 / rod.h)) * rod.h
+    history = rod.run(full * np.clip(time / 2, 0, 1))
+    gap = np.linalg.norm(rod.tip(history.qpos[0, -1])) / rod.length
+    # Ten angles of 0.6 rad; float32 has 6e-8 of each, and of the torques that make them.
+    return Found(gap, {"float64": 1e-7, "float32": 1e-5}[precision])
+
+
+case(
+    2,
+    "roll-up to a full circle",
+    "tip to root over length",
+    quick=((1.0, "float32"),),
+)(roll_up)
+case(2, "roll-up to a full circle", "tip to root over length", engine="mujoco")(roll_up)
+
+
+@case(
+    3,
+    "elastica, alpha = 1, 2, 10",
+    "largest error of w/L, u/L, relative",
+    engine="mujoco",
+    steps=(0.2, 0.1, 0.05),
+)
+def elastica_error(engine, step, precision):
+    """Bisshopp and Drucker (1945), at ten links; the dead load is explicit, so from 2 ms on."""
+    from tests.test_beam_oracles import elastica
+
+    worst = 0.0
+    for alpha in (1, 2, 10):
+        finger = Finger(10, timestep=0.01 * step)
+        load = alpha * finger.beam.bending / finger.length**2
+        position, _ = finger.settle(force=(0, 0, -load), steps=40000)
+        tip = np.array([-position[2], finger.length - position[0]]) / finger.length
+        worst = max(worst, np.abs(tip / elastica(alpha) - 1).max())
+    return Found(worst, 5e-3, "base step 2 ms")
+
+
+@case(
+    3,
+    "45 degree bend, P = 300 and 600",
+    "largest error of a tip component, relative",
+    engine="mujoco",
+    steps=(0.2, 0.1, 0.05),
+)
+def bend_45(engine, step, precision):
+    """Bathe and Bolourchi (1979), tips of Simo and Vu-Quoc (1986): R = 100, E I = G J = 8.333e5.
+
+    In our units the radius is 1 m and the load P R^2 / E I; a curved chain is a straight one whose
+    lateral springs rest at pi / 4 N.
+    """
+    worst = 0.0
+    for load, expected in ((300, (58.84, 22.33, 40.08)), (600, (47.23, 15.79, 53.37))):
+        finger = Finger(60, length=np.pi / 4, bending_only=False, timestep=0.01 * step)
+        m, dofs = finger.model, finger.layout.dofs[0]
+        beam = finger.beam.bending
+        spacing, h = finger.length / finger.links, m.opt.timestep
+        k = beam / spacing
+        m.jnt_stiffness[dofs] = k
+        beta = 1.0  # near critical for the first mode of 0.2 Hz, to be at rest soon
+        m.dof_damping[dofs] = beta * k + h * k
+        m.dof_armature[dofs] = h * (beta * k + h * k)
+        m.qpos_spring[dofs[:, 1]] = np.pi / 4 / finger.links
+        finger.data.qpos[dofs[:, 1]] = np.pi / 4 / finger.links
+        force = load * 100.0**2 / 8.333e5 * beam
+        position, _ = finger.settle(force=(0, 0, force), steps=60000)
+        # Theirs: the root's tangent is their y, the centre of curvature on their x, load along z.
+        worst = max(worst, np.abs(100 * position / np.array(expected) - 1).max())
+    return Found(worst, 0.015, "60 links, base step 2 ms")
+
+
+def free_vibration(engine, step, precision):
+    """First mode, 0.1 rad, without material damping; energy over 100 periods of about 0.9 s."""
+    rod = Rod(engine, step, precision, links=5, length=0.3, damped=False)
+    omega, shape = rod.mode()
+    steps = round(100 * 2 * np.pi / omega / rod.h)
+    history = rod.run(np.zeros(steps), 0.1 * shape)
+    energy = rod.energy(history)
+    k = rod.model.jnt_stiffness[rod.joints]
+    first = 0.5 * (k * (0.1 * shape) ** 2).sum()
+    # Nothing may be gained; of float32 a rounding of 1e-6 a step is allowed.
+    return Found(energy.max() / first, {"float64": 1 + 1e-9, "float32": 1 + 1e-5}[precision])
+
+
+vibration = (4, "free vibration, 100 periods", "largest energy over the first")
+case(*vibration)(free_vibration)
+case(*vibration, engine="mujoco", quick=((1.0, "float64"),))(free_vibration)
+
+
+def vibration_frequency(engine, step, precision):
+    """Zero crossings of the first five periods against E I and rho A of ten links."""
+    rod = Rod(engine, step, precision, links=5, length=0.3, damped=False)
+    omega, shape = rod.mode()
+    history = rod.run(np.zeros(round(6 * 2 * np.pi / omega / rod.h)), 0.01 * shape)
+    angle = history.qpos[0, :, 6].astype(float)
+    turn = np.flatnonzero(np.diff(np.sign(angle)) != 0)
+    # Where the straight line between two steps crosses zero.
+    time = (turn + angle[turn] / (angle[turn] - angle[turn + 1])) * rod.h
+    found = np.pi * (len(time) - 1) / (time[-1] - time[0])
+    # The scheme acts as zeta = h omega / 2: the frequency falls by zeta^2 / 2 and no more.
+    zeta = rod.h * omega / 2
+    return Found(abs(found / omega - 1), 1.5 * zeta**2, f"zeta = h omega / 2 = {zeta:.3f}")
+
+
+frequency = (4, "free vibration", "error of the first frequency, relative")
+case(*frequency)(vibration_frequency)
+case(*frequency, engine="mujoco", quick=((1.0, "float64"),))(vibration_frequency)
+
+
+def damped_release(engine, step, precision):
+    """Let go from half a circle of the paper's finger, with its damping."""
+    rod = Rod(engine, step, precision)
+    history = rod.run(np.zeros(round(2 / rod.h)), np.full(10, np.pi / 10))
+    k = rod.model.jnt_stiffness[rod.joints]
+    energy = np.r_[0.5 * (k * (np.pi / 10) ** 2).sum(), rod.energy(history)]
+    rise = max(np.diff(energy).max(), 0.0)
+    return Found(rise / energy[0], {"float64": 1e-12, "float32": 1e-6}[precision])
+
+
+release = (5, "damped release", "largest rise of energy in a step over the first")
+case(*release, quick=((1.0, "float32"),))(damped_release)
+case(*release, engine="mujoco")(damped_release)
+
+
+def pressure_step(engine, step, precision):
+    """120 kPa in one time step; settles at the free curvature M / E I in every joint."""
+    rod = Rod(engine, step, precision)
+    pressure = 120e3
+    history = rod.run(np.full(round(3 / rod.h), pressure))
+    angle = pressure * rod.beam.moment_per_pressure * rod.length / rod.links / rod.beam.bending
+    error = np.abs(history.qpos[0, -1, rod.joints] / angle - 1).max()
+    return Found(error, {"float64": 1e-9, "float32": 1e-5}[precision])
+
+
+def pressure_speed(engine, step, precision):
+    """Before springs and damping act, a free tip link cannot be faster than the work allows.
+
+    The pressure's work on the way to twice the static angle, all of it as the tip link's motion in
+    the first mode: v^2 = 2 W / m with the first mode's mass at the tip joint.
+    """
+    rod = Rod(engine, step, precision)
+    pressure = 120e3
+    history = rod.run(np.full(round(1 / rod.h), pressure))
+    moment = pressure * rod.beam.moment_per_pressure
+    work = moment**2 * rod.length / rod.beam.bending
+    kinetic = rod.energy(history) - 0.5 * (
+        rod.model.jnt_stiffness[rod.joints] * history.qpos[0][:, rod.joints].astype(float) ** 2
+    ).sum(1)
+    return Found(kinetic.max() / work, 0.5, "work = M^2 L / E I, on the way to the static angle")
+
+
+jump = (8, "pressure step of 120 kPa in one time step", "error of the angles at rest, relative")
+case(*jump, quick=((1.0, "float32"),))(pressure_step)
+case(*jump, engine="mujoco")(pressure_step)
+jump = (8, "pressure step of 120 kPa in one time step", "largest kinetic energy over M^2 L / E I")
+case(*jump, quick=((1.0, "float32"),))(pressure_speed)

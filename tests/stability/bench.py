@@ -1,0 +1,192 @@
+"""Runs worlds in MuJoCo C or the structured engine behind one interface, for the hard cases."""
+
+import contextlib
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from codesign_jax import control, model, scene
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.kinematics import Acc
+from codesign_jax.scene import Scene
+from tests import small
+
+CHUNK = 50
+"""Steps that a compiled program of the structured engine takes."""
+
+
+class History(NamedTuple):
+    """States after every step: qpos (world, time, nq) and qvel (world, time, nv)."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+
+    @property
+    def object(self) -> np.ndarray:
+        """Position of the object, (world, time, 3)."""
+        return self.qpos[..., -7:-4]
+
+    @property
+    def object_velocity(self) -> np.ndarray:
+        """Linear velocity of the object, (world, time, 3)."""
+        return self.qvel[..., -6:-3]
+
+    @property
+    def speed(self) -> np.ndarray:
+        """Largest absolute velocity of each step, (world, time)."""
+        return np.abs(self.qvel).max(-1)
+
+
+def refined(base: Scene, step: float) -> Scene:
+    """The scene with its time step times a factor."""
+    h = base.discretization.timestep * step
+    return dataclasses.replace(
+        base, discretization=dataclasses.replace(base.discretization, timestep=h)
+    )
+
+
+@functools.cache
+def pinch(**settings) -> Scene:
+    """Two opposed fingers of three links and the paper's three objects."""
+    overrides: dict = {"discretization": {"links": 3}}
+    for key, value in settings.items():
+        table, name = key.split("__")
+        overrides.setdefault(table, {})[name] = value
+    return scene.load("paper", hand_name=small.DATA / "pinch.toml", overrides=overrides)
+
+
+@functools.cache
+def bench(
+    base: Scene, engine: str, step: float, precision: str, tolerance: float = 1e-6
+) -> "Bench":
+    """One bench for each scene, engine, time step and precision: it is compiled once."""
+    return Bench(refined(base, step), engine, precision, tolerance)
+
+
+@contextlib.contextmanager
+def floats(wide: bool):
+    """Float64 or float32 by default.
+
+    JAX keeps what it made of a long-lived NumPy array of indices, in the width of that time: the
+    layout's are made anew.
+    """
+    model.layout.cache_clear()
+    with jax.enable_x64(wide), jax.default_matmul_precision("highest"):
+        yield
+    model.layout.cache_clear()
+
+
+class Bench:
+    """A scene in one engine and precision."""
+
+    def __init__(self, the_scene: Scene, engine: str, precision: str, tolerance: float = 1e-6):
+        """Tolerance: the structured engine's; MuJoCo's is the scene's."""
+        self.tolerance = tolerance
+        self.scene, self.engine, self.wide = the_scene, engine, precision == "float64"
+        assert self.wide or engine == "structured"  # MuJoCo C is built for float64
+        self.h = the_scene.discretization.timestep
+        self._programs: dict = {}
+
+    def fields(self, params, trials):
+        """Model fields of worlds, float64 NumPy arrays with a leading world axis."""
+        with floats(True):
+            worlds = zip(*(jax.tree.map(jnp.asarray, v) for v in (params, trials)), strict=True)
+            found = [model.model_fields(self.scene, p, t) for p, t in worlds]
+            return jax.tree.map(lambda *v: np.stack(v), *found)
+
+    def commands(self, params, trials) -> np.ndarray:
+        """The grasp's controls, (world, time, nu)."""
+        with floats(True):
+            worlds = zip(*(jax.tree.map(jnp.asarray, v) for v in (params, trials)), strict=True)
+            return np.stack([control.commands(self.scene, p, t) for p, t in worlds])
+
+    def hold(self, seconds: float, *rows) -> np.ndarray:
+        """Constant controls, a row for each world, (world, time, nu)."""
+        return np.repeat(np.stack(rows)[:, None], round(seconds / self.h), 1)
+
+    def run(self, fields, ctrl, qpos=None, qvel=None) -> History:
+        """Steps worlds from a state, the fields' start at rest if none is given.
+
+        Args:
+          fields: See `fields`.
+          ctrl: Controls, (world, time, nu).
+          qpos: Start positions (world, nq).
+          qvel: Start velocities (world, nv).
+        """
+        worlds = len(ctrl)
+        qpos = fields.start if qpos is None else np.asarray(qpos)
+        qvel = np.zeros((worlds, qpos.shape[1] - 1)) if qvel is None else np.asarray(qvel)
+        if self.engine == "mujoco":
+            return self._mujoco(fields, ctrl, qpos, qvel)
+        with floats(self.wide):
+            return self._structured(fields._replace(start=qpos), ctrl, qvel)
+
+    def _mujoco(self, fields, ctrl, qpos, qvel) -> History:
+        out = []
+        for w in range(len(ctrl)):
+            compiled = world_model(self.scene, small.nth(fields, w))
+            data, rows = mujoco.MjData(compiled), []
+            data.qpos[:], data.qvel[:] = qpos[w], qvel[w]
+            for u in ctrl[w]:
+                data.ctrl[:] = u
+                mujoco.mj_step(compiled, data)
+                rows.append((data.qpos.copy(), data.qvel.copy()))
+            out.append([np.stack(v) for v in zip(*rows, strict=True)])
+        return History(*(np.stack(v) for v in zip(*out, strict=True)))
+
+    def _structured(self, fields, ctrl, qvel) -> History:
+        dtype = jnp.float64 if self.wide else jnp.float32
+        fields = jax.tree.map(lambda v: jnp.asarray(v, dtype), fields)
+        worlds, steps = ctrl.shape[:2]
+        start, advance = self._program(worlds)
+        hand, state = start(fields, jnp.asarray(qvel, dtype))
+        ctrl = np.concatenate([ctrl, np.repeat(ctrl[:, -1:], -steps % CHUNK, 1)], 1)
+        rows = []
+        for first in range(0, steps, CHUNK):
+            u = jnp.asarray(np.moveaxis(ctrl[:, first : first + CHUNK], 0, -1), dtype)
+            state, row = advance(hand, state, u)
+            rows.append(jax.tree.map(np.asarray, row))
+        return History(
+            *(np.moveaxis(np.concatenate(v), 1, 0)[:, :steps] for v in zip(*rows, strict=True))
+        )
+
+    def _program(self, worlds: int):
+        """Compiled start and chunk of steps for a number of worlds."""
+        if worlds not in self._programs:
+            engine = StructuredEngine(self.scene, tolerance=self.tolerance)
+
+            def start(fields, qvel):
+                state = engine.reset(fields)
+                return hand_lanes(self.scene, fields), moving(engine, state, qvel)
+
+            def advance(hand, state, ctrl):
+                def one(state, u):
+                    state, _ = engine.step(hand, state, u)
+                    return state, (engine.qpos(state), engine.qvel(state))
+
+                return jax.lax.scan(one, state, ctrl)
+
+            self._programs[worlds] = jax.jit(start), jax.jit(advance)
+        return self._programs[worlds]
+
+
+def moving(engine: StructuredEngine, state, qvel):
+    """The state with velocities (world, nv) and a cold warm start."""
+    lay = model.layout(engine.scene)
+    v, end = qvel.T[:, None], 6 + lay.dofs.size
+    finger = jnp.moveaxis(v[6:end, 0].reshape(*lay.dofs.shape, -1), 0, 2)
+    zero = jnp.zeros_like
+    return state._replace(
+        wrist_vel=v[:6],
+        finger_vel=finger,
+        linear_vel=v[end : end + 3],
+        angular_vel=v[end + 3 :],
+        acc=Acc(zero(v[:6]), zero(finger), zero(v[:6])),
+    )

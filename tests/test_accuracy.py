@@ -1,0 +1,330 @@
+"""The study of accuracy: its oracles, its statistics, its file, and a run of a tiny size."""
+
+import dataclasses
+import json
+import runpy
+import sys
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import scipy.stats
+from small import pinch, still
+
+from codesign_jax import cli, model, parameters, scene, schema
+from codesign_jax.accuracy import (
+    beam,
+    decision,
+    oracle,
+    report,
+    statistics,
+    steps,
+    study,
+    tip,
+    worlds,
+)
+from codesign_jax.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
+from codesign_jax.accuracy.store import Case, Store
+from codesign_jax.accuracy.timing import name
+from codesign_jax.commands import optimize
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.hand import hand_lanes
+
+ROOT = Path(__file__).parents[1]
+
+
+# --- presets -------------------------------------------------------------------------------------
+
+
+def test_the_standard_preset_is_the_scene_and_the_study_s_default():
+    assert scene.load("paper", accuracy="standard") == scene.load("paper")
+    assert STANDARD.scene() == scene.load("paper")
+
+
+def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
+    fine = scene.load("paper", accuracy="reference")
+    assert fine.discretization == scene.Discretization(0.001, 20, 1)
+    for preset_name, setting in PRESETS.items():
+        preset = scene.load("paper", accuracy=preset_name).discretization
+        assert preset == setting.scene().discretization
+        assert setting in one_at_a_time("structured")
+    fast = scene.load("paper", accuracy="fast", overrides={"discretization": {"links": 7}})
+    assert (fast.discretization.links, fast.discretization.spheres_per_link) == (7, 2)
+
+
+def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
+    wrong = {"discretization": {"timestep": 18.0}}
+    with pytest.raises(schema.SceneError) as error:
+        scene.load("paper", accuracy="fats", overrides=wrong)
+    assert "did you mean 'fast'" in str(error.value)
+    assert "0.018" in str(error.value)
+    mistaken = tmp_path / "mine.toml"
+    mistaken.write_text('description = "x"\n[discretization]\nlink = 3\n[solver]\n')
+    with pytest.raises(schema.SceneError, match="links"):
+        scene.load("paper", accuracy=mistaken)
+
+
+def test_the_command_line_takes_a_preset(capsys):
+    found, _ = optimize.resolve(cli.Optimize(accuracy="fast", overrides=("solver.iterations=7",)))
+    assert found.discretization == scene.Discretization(0.01, 5, 2)
+    assert found.solver.iterations == 7
+    assert cli.main(["evaluate", "--accuracy", "finest"]) == 2
+    assert "'finest' unknown; did you mean 'fast'" in capsys.readouterr().err
+
+
+# --- settings ------------------------------------------------------------------------------------
+
+
+def test_settings_change_what_they_say_and_no_two_have_the_same_name():
+    every = one_at_a_time("structured")
+    assert len({s.label for s in every}) == len(every)
+    changed = Setting(timestep=2.0, links=5, axes=2, spheres=2).scene()
+    assert changed.discretization == scene.Discretization(0.002, 5, 2)
+    assert changed.effects.lateral_bending and not changed.effects.twist
+
+
+def test_a_long_step_needs_a_longer_contact_time_constant():
+    """The scene refuses 20 ms as it is; with a longer constant the stiffness stays the same."""
+    with pytest.raises(schema.SceneError, match="time_constant"):
+        Setting(timestep=20.0, keep_contact=True).scene()
+    stiffness = []
+    for setting in (STANDARD, Setting(timestep=20.0)):
+        c = setting.scene().contact
+        # k_n of model.contact_invweight's docstring, from what MuJoCo is given.
+        k = c.impedance / (c.impedance * c.time_constant) ** 2
+        w = 2 * model.contact_invweight(setting.scene())
+        stiffness.append(k * c.impedance / ((1 - c.impedance) * w))
+    assert stiffness[0] == pytest.approx(stiffness[1], rel=1e-12)
+    assert stiffness[0] == pytest.approx(2000.0, rel=1e-12)
+
+
+# --- oracles -------------------------------------------------------------------------------------
+
+
+def test_closed_forms():
+    """The elastica against Mattiasson's table (1981), the arc against the circle's coordinates."""
+    table = {1.0: (0.301720770, 0.056433236), 10.0: (0.810609020, 0.554995600)}
+    for load, expected in table.items():
+        np.testing.assert_allclose(beam.elastica(load), expected, atol=5e-9)
+    assert beam.arc(np.pi) == pytest.approx((2 / np.pi, 1.0))
+
+
+def test_the_chain_s_error_falls_with_the_square_of_the_links():
+    errors = [beam.errors(n, (1.0,), (90.0,)) for n in (5, 10)]
+    for load in errors[0]:
+        # Second order up to terms of the fourth: 1 / 4 N^2 at five links is 1 %.
+        assert errors[0][load] / errors[1][load] == pytest.approx(4.0, rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def grasp():
+    """A pinch of two fingers in float64: scene, fields and controls of one world."""
+    small = pinch("box", links=2)
+    with worlds.floats(True) as dtype:
+        space = parameters.design_space(small.hand)
+        params = jax.tree.map(lambda x: np.asarray(x)[None], space.params(space.default()))
+        trial = jax.tree.map(lambda x: np.asarray(x)[None], still())
+        fields, ctrl = worlds.inputs(small, worlds.Worlds(params, trial), dtype)
+    return small, fields, ctrl
+
+
+def test_tips_lie_a_segment_behind_the_last_joint(grasp):
+    """A straight finger's tip is its length away from its root."""
+    small, fields, _ = grasp
+    m = oracle.model_of(small, fields, 0)
+    data = mujoco.MjData(m)
+    data.qpos[:] = fields.start[0]
+    mujoco.mj_kinematics(m, data)
+    roots = data.xpos[model.layout(small).stubs]
+    away = np.linalg.norm(oracle.tips(small, m, data) - roots, axis=1)
+    space = parameters.design_space(small.hand)
+    # The default lengths are float32 of the table's millimetres.
+    np.testing.assert_allclose(away, space.params(space.default()).length, rtol=1e-6)
+
+
+def test_grip_is_the_force_that_the_object_feels(grasp):
+    """With the object held up by the hand alone, the contacts' wrench balances its momentum."""
+    small, fields, ctrl = grasp
+    m = oracle.model_of(small, fields, 0)
+    found = []
+
+    def visit(m, d, k):
+        expected = 0.0
+        for i in range(d.ncon):
+            names = [m.geom(g).name for g in d.contact[i].geom]
+            force = np.zeros(6)
+            mujoco.mj_contactForce(m, d, i, force)
+            if "table" not in names and any(n.startswith("object") for n in names):
+                expected += force[0]
+        found.append((oracle.grip(small, m, d), expected))
+
+    oracle.advance(m, fields.start[0], ctrl[0], range(0, 400, 10), visit)
+    got, expected = np.array(found).T
+    assert expected.max() > 0.1, "never touched"
+    np.testing.assert_allclose(got, expected, atol=1e-12)
+
+
+def test_states_and_accelerations_translate_between_the_engines(grasp):
+    """The structured step on sampled states gives MuJoCo C's accelerations back."""
+    small, fields, ctrl = grasp
+    exact = dataclasses.replace(small, solver=scene.Solver(300, 100, 1e-15))
+    found = steps.sample(exact, fields, ctrl, range(250, 400, 30))
+    with worlds.floats(True):
+        engine = StructuredEngine(small, iterations=100, evaluations=20, tolerance=1e-18)
+        batch = jax.tree.map(lambda x: jax.numpy.asarray(x[found.world]), fields)
+        state = steps.to_state(engine, small, batch, found)
+        np.testing.assert_array_equal(np.asarray(engine.qpos(state)), found.qpos)
+        np.testing.assert_array_equal(np.asarray(engine.qvel(state)), found.qvel)
+        run = jax.jit(lambda b, s, u: engine.step(hand_lanes(small, b), s, u)[1].acc)
+        got = steps.from_acc(small, run(batch, state, found.ctrl.T), found.qpos)
+    scale = np.maximum(np.linalg.norm(found.qacc, axis=1), steps.FLOOR)
+    # As in test_structured: both solvers stop at rounding of their own.
+    assert (np.linalg.norm(got - found.qacc, axis=1) / scale).max() < 1e-8
+
+
+def test_tips_of_a_shorter_step_come_closer_to_the_reference():
+    """The error of the implicit Euler step falls at first order."""
+    reference = tip.motion(Setting("mujoco", timestep=0.5, links=2, iterations=0), 1, 0.4)
+    errors = []
+    for step in (5.0, 10.0):
+        found = tip.motion(Setting("mujoco", timestep=step, links=2), 1, 0.4)
+        errors.append(tip.compare(found, reference)["tip_rms_mm"])
+    # The reference's own step is a tenth of the smaller one: the ratio is 9.5 / 4.5 at first order.
+    assert errors[1] / errors[0] == pytest.approx(9.5 / 4.5, rel=0.2)
+
+
+# --- statistics ----------------------------------------------------------------------------------
+
+
+def test_rank_correlation_and_its_interval_are_scipy_s():
+    rng = np.random.default_rng(3)
+    a = rng.integers(0, 6, 40) / 2.0  # with ties, as mean costs have
+    b = a + rng.normal(size=40)
+    expected = scipy.stats.spearmanr(a, b).statistic
+    assert statistics.spearman(a, b) == pytest.approx(expected, rel=1e-12)
+    found = statistics.resampled(lambda i: statistics.spearman(a[i], b[i]), 40)
+    interval = scipy.stats.bootstrap(
+        (a, b),
+        lambda x, y: scipy.stats.spearmanr(x, y).statistic,
+        paired=True,
+        vectorized=False,
+        n_resamples=1000,
+        method="percentile",
+        rng=np.random.default_rng(1),
+    ).confidence_interval
+    # Ends of an interval from a thousand resamples scatter by some hundredths.
+    np.testing.assert_allclose([found.low, found.high], interval, atol=0.05)
+
+
+def test_comparing_a_setting_with_itself_and_with_its_opposite():
+    cost = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0], [1.0, 0.0], [2.0, 2.0], [0.5, 0.0]])
+    same = statistics.compare(cost, cost)
+    assert same["same_verdict"].value == same["rank"].value == 1.0
+    assert same["offspring_moved"] == 0.0 and same["failed"] == 0
+    other = statistics.compare(3.0 - cost, cost)
+    assert other["rank"].value == pytest.approx(-1.0)
+    failed = cost.copy()
+    failed[0, 0] = np.nan
+    lost = statistics.compare(failed, cost)
+    assert lost["failed"] == 1
+    assert lost["same_verdict"].value == pytest.approx(11 / 12)  # a failed trial is not kept
+
+
+def test_fronts_and_orders():
+    assert statistics.front([(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (0.5, 9.0)]) == [3, 0, 2]
+    assert statistics.order([(h, 3.0 * h**2) for h in (1, 2, 4)]) == pytest.approx(2.0)
+    assert statistics.order([(1.0, 1.0)]) is None
+
+
+def test_populations_are_final_particles_of_every_quality():
+    data = ROOT / "docs" / "data" / "reproduction"
+    found = decision.populations(data, 12)
+    with np.load(data / "23d.npz") as file:
+        every, cost = file["final_particles"].reshape(-1, 23), file["test_exclude"].ravel()
+    index = [int(np.flatnonzero((every == p).all(1))[0]) for p in found["spread"]]
+    assert cost[index].max() > 2.0 and cost[index].min() < 0.05
+    assert all((every == p).all(1).any() for p in found["late"])
+
+
+# --- the file ------------------------------------------------------------------------------------
+
+
+def test_a_study_goes_on_where_it_stopped_and_keeps_failures(tmp_path):
+    path, calls = tmp_path / "a.json", []
+
+    def case(label, run):
+        return Case("tip", Setting(extra=(label,)), (), run)
+
+    good = case("cost.maximum=1", lambda: calls.append(1) or {"value": 2})
+    broken = case("cost.maximum=2", lambda: 1 / 0)
+    store = Store(path, size="tiny")
+    store.measure(good)
+    assert "ZeroDivisionError" in store.measure(broken)["failed"]
+    again = Store(path, size="tiny")
+    assert again.done(good) and again.done(broken) and calls == [1]
+    with pytest.raises(ValueError, match="tiny"):
+        Store(path, size="full")
+
+
+def test_a_case_that_kills_its_process_counts_as_failed_after_two_attempts(tmp_path):
+    class Killed(BaseException):
+        pass
+
+    def die():
+        raise Killed
+
+    path, case = tmp_path / "a.json", Case("tip", Setting(), (), die)
+    for _ in range(2):
+        store = Store(path, size="tiny")
+        assert not store.done(case)
+        with pytest.raises(Killed):
+            store.measure(case)
+    store = Store(path, size="tiny")
+    assert store.done(case)
+    assert "two runs" in json.loads(path.read_text())["records"][case.key]["failed"]
+
+
+def test_cases_have_names_of_their_own():
+    data = ROOT / "docs" / "data" / "reproduction"
+    for size in study.SIZES.values():
+        every = study.cases(size, study.PARTS, study.ENGINES, data, gpu=True)
+        assert len({c.key for c in every}) == len(every)
+        assert {c.part for c in every} == {*study.PARTS, "beam"}
+
+
+def test_names_of_timed_engines():
+    assert name(Setting("mujoco")) == "mujoco"
+    assert name(Setting(precision="float64")) == "structured float64"
+
+
+def test_a_tiny_study_runs_resumes_and_is_drawn(tmp_path, monkeypatch, capsys):
+    """The script with MuJoCo C alone: every part, a refused setting, the budget, page and CSV."""
+    data = tmp_path / "docs" / "data"
+    data.mkdir(parents=True)
+    page = tmp_path / "docs" / "accuracy.md"
+    page.write_text("<!-- results:begin -->\n<!-- results:end -->\n")
+    monkeypatch.chdir(ROOT)
+
+    def run(*more):
+        arguments = ["--size", "tiny", "--json", str(data / "accuracy_cpu.json")]
+        script = str(ROOT / "scripts" / "accuracy_vs_time.py")
+        monkeypatch.setattr(sys, "argv", [script, *arguments, "--engines", "mujoco", *more])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(script, run_name="__main__")
+        return end.value.code
+
+    assert run("--budget", "0") == 3
+    assert run("--commit", "abc") == 0
+    records = json.loads((data / "accuracy_cpu.json").read_text())["records"]
+    # 20 ms with the scene's own contact constant, in the parts tip and impulse.
+    assert sum("refused" in r for r in records.values()) == 2
+    assert not [k for k, r in records.items() if "failed" in r]
+    capsys.readouterr()
+    assert run() == 0
+    assert ", 0 to do" in capsys.readouterr().out
+    text = report.make(tmp_path / "docs")
+    assert "refused" in text and "abc" in text
+    assert (tmp_path / "docs" / "figures" / "accuracy_cpu.png").stat().st_size > 10_000
+    assert "impulse_error" in (data / "accuracy_cpu.csv").read_text().splitlines()[0]

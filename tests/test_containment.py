@@ -1,0 +1,302 @@
+"""Status bits, frozen worlds and their neighbours, saved failures and their replay."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from small import hand_world, nth, pinch, random_worlds, stack, still
+
+from codesign_jax import cli, control, cost, model, rollout, runs, start
+from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.types import Status, Trace, failed
+
+HURRIED = {
+    "links": 2,
+    "phases__approach": 0.3,
+    "phases__inflate": 0.5,
+    "phases__lift": 0.7,
+    "phases__disturb": 0.9,
+    "phases__ungrasp": 1.5,
+}
+GOOD, SUDDEN, NEIGHBOUR = range(3)
+
+
+def both(the_scene, params, trials):
+    """Fields and controls of a batch."""
+    make = jax.jit(
+        jax.vmap(
+            lambda p, t: (model.model_fields(the_scene, p, t), control.commands(the_scene, p, t))
+        )
+    )
+    return make(params, trials)
+
+
+@pytest.fixture(scope="module")
+def batches():
+    """Three worlds, and the same with a finger of the middle one blown up from step 20 on."""
+    the_scene = pinch("box", **HURRIED)
+    fields, ctrl = both(the_scene, *random_worlds(the_scene, 3, 3))
+    return the_scene, (fields, ctrl), (fields, ctrl.at[SUDDEN, 20:, 6].set(1e12))
+
+
+@pytest.fixture(scope="module")
+def traces(batches):
+    """Of both batches by the structured engine in two lanes, with trajectories."""
+    the_scene, *both = batches
+    engine = StructuredEngine(the_scene, lanes=2)
+    run = jax.jit(lambda f, c: engine.rollout(f, c, trajectory=True))
+    return [jax.tree.map(np.asarray, run(*batch)) for batch in both]
+
+
+# --- structured engine -----------------------------------------------------------------------
+
+
+def test_neighbours_of_a_failing_world_are_bitwise_unaffected(traces):
+    good, bad = traces
+    for index in (GOOD, NEIGHBOUR):
+        for a, b in zip(good, bad, strict=True):
+            np.testing.assert_array_equal(a[index], b[index])
+    assert not np.array_equal(good.speed[SUDDEN], bad.speed[SUDDEN])
+
+
+def test_a_failed_world_returns_its_last_good_state(batches, traces):
+    """First bad step, frozen from then on, and the state before it, at most one step old."""
+    the_scene, *_ = batches
+    bad = traces[1]
+    result = jax.vmap(lambda t: cost.outcome(the_scene, t))(bad)
+    assert not failed(np.asarray(result.status))[[GOOD, NEIGHBOUR]].any()
+    assert int(result.status[SUDDEN]) & (Status.SPEED | Status.NONFINITE)
+    step = int(result.bad_step[SUDDEN])
+    assert 20 < step < 25
+    nq = bad.qpos.shape[2]
+    last = bad.last[SUDDEN]
+    assert np.isfinite(last).all() and np.abs(last[nq:]).max() <= the_scene.limits.speed
+    np.testing.assert_array_equal(last[:nq], bad.qpos[SUDDEN, step])
+    np.testing.assert_array_equal(last[:nq], bad.qpos[SUDDEN, -1])
+
+
+def test_the_cap_is_flagged_step_by_step():
+    """Bits of a step come from its residual; exactly the tolerance is solved."""
+    engine = StructuredEngine(pinch("box"), tolerance=1e-6)
+    residual = jnp.array([0.0, 1e-6, 2e-6, jnp.nan])
+    np.testing.assert_array_equal(engine._status(residual), [0, 0, Status.SOLVER_CAP, 0])
+
+
+# --- the cap's meaning -----------------------------------------------------------------------
+
+
+def with_status(the_scene, bits, **changes):
+    """A grasp that keeps the object, with bits at steps."""
+    steps = the_scene.num_steps
+    arrays = {"distance": np.full(steps, 0.03), "height": np.full(steps, 0.03)}
+    arrays |= {"speed": np.zeros(steps), "status": np.zeros(steps, np.int32)}
+    for step, value in bits.items():
+        arrays["status"][step] = value
+    for name, (step, value) in changes.items():
+        arrays[name][step] = value
+    d, h, s = (jnp.asarray(arrays[n], jnp.float32) for n in ("distance", "height", "speed"))
+    return Trace(d, h, s, jnp.zeros((steps, 0)), jnp.asarray(arrays["status"]))
+
+
+def test_a_capped_step_warns_and_the_trial_counts():
+    the_scene = pinch("box")
+    result = cost.outcome(the_scene, with_status(the_scene, {100: Status.SOLVER_CAP}))
+    assert result.status == Status.SOLVER_CAP and result.cost == 0 and result.bad_step == -1
+    assert not failed(int(result.status))
+    batch = jax.tree.map(lambda v: v[None], result)
+    assert cost.particle_cost(the_scene, batch) == 0
+
+
+def test_steps_after_the_verdict_do_not_warn():
+    the_scene = pinch("box")
+    lost = {"distance": (400, 1.0)}
+    for step, status in ((399, Status.SOLVER_CAP), (400, Status.OK), (500, Status.OK)):
+        result = cost.outcome(the_scene, with_status(the_scene, {step: Status.SOLVER_CAP}, **lost))
+        assert result.status == status and result.cost > 0
+    # The step taken from the last entry leads to a state that nothing reads.
+    last = with_status(the_scene, {the_scene.num_steps - 1: Status.SOLVER_CAP})
+    assert cost.outcome(the_scene, last).status == Status.OK
+
+
+def test_an_overflow_fails_the_trial_at_its_step():
+    the_scene = pinch("box")
+    trace = with_status(the_scene, {100: Status.CONTACT_OVERFLOW, 50: Status.SOLVER_CAP})
+    result = cost.outcome(the_scene, trace)
+    assert result.status == Status.CONTACT_OVERFLOW | Status.SOLVER_CAP
+    assert result.bad_step == 100 and result.cost == the_scene.cost.maximum
+
+
+def test_an_invalid_start_fails_the_trial_at_once():
+    the_scene = pinch("box")
+    trace = with_status(the_scene, {}, distance=(400, 1.0))
+    result = cost.outcome(the_scene, trace, Status.INVALID_START)
+    assert result.status == Status.INVALID_START and result.bad_step == 0
+    assert result.cost == the_scene.cost.maximum
+
+
+def test_failed_reads_every_integer_type():
+    for dtype in (np.uint8, np.int32, np.int64):
+        values = np.array([0, Status.SOLVER_CAP, Status.STUCK, Status.SPEED | 8], dtype)
+        np.testing.assert_array_equal(failed(values), [False, False, True, True])
+
+
+# --- MuJoCo C --------------------------------------------------------------------------------
+
+
+def one_world(the_scene):
+    params, trial = hand_world(the_scene)
+    return both(the_scene, *(stack(v) for v in (params, trial)))
+
+
+def test_mujoco_tells_when_its_solver_stops_at_the_cap():
+    """The resting box needs more than one iteration in its first step."""
+    for iterations, capped in ((1, True), (30, False)):
+        the_scene = pinch("box", solver__iterations=iterations, **HURRIED)
+        trace = MujocoEngine(the_scene).rollout(*one_world(the_scene))
+        assert bool((np.asarray(trace.status) == Status.SOLVER_CAP).any()) == capped
+
+
+def test_mujoco_tells_when_its_contacts_do_not_fit(monkeypatch, tmp_path, capfd):
+    """With an arena of 20 kB the box's contacts with the table have no room.
+
+    MuJoCo leaves them out or gives up, by how much is missing; the batch goes on either way.
+    """
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
+    the_scene = pinch("box", **HURRIED)
+    engine = MujocoEngine(the_scene)
+    params, trial = hand_world(the_scene)
+    spec = model.build_spec(the_scene, params, trial)
+    spec.memory = 20_000
+    engine.template = spec.compile()
+    trace = engine.rollout(*one_world(the_scene))
+    result = cost.outcome(the_scene, nth(trace, 0))
+    assert result.status & Status.CONTACT_OVERFLOW and 0 <= result.bad_step <= 25
+    assert result.cost == the_scene.cost.maximum
+    capfd.readouterr()
+
+
+# --- start -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def starting():
+    """INVALID_START of worlds that start with the palm at 150 mm."""
+    the_scene = pinch("box", arm__start_height=0.15)
+
+    def invalid(*params):
+        fields, _ = both(the_scene, stack(*params), stack(*[still()] * len(params)))
+        return np.asarray(start.invalid_start(the_scene, fields)) != 0
+
+    return the_scene, invalid
+
+
+def test_bad_starts_are_flagged(starting):
+    the_scene, invalid = starting
+    base, _ = hand_world(the_scene, length=0.08)
+
+    def changed(**values):
+        return base._replace(**{k: 0 * getattr(base, k) + v for k, v in values.items()})
+
+    found = invalid(
+        base,
+        changed(length=0.18),  # straight fingers, 75 degrees down: 24 mm into the table
+        changed(length=np.nan),
+        changed(wall=0.0),  # neither mass nor stiffness
+        changed(length=-0.05),
+        changed(wall=0.02),  # walls thicker than the section
+    )
+    np.testing.assert_array_equal(found, [False, True, True, True, True, True])
+
+
+def test_the_depth_is_mujocos(starting):
+    """Deepest contact of the straight hand by MuJoCo C's own collision detection."""
+    the_scene, _ = starting
+    params = [hand_world(the_scene, length=x)[0] for x in (0.16, 0.17, 0.18)]
+    fields, _ = both(the_scene, stack(*params), stack(*[still()] * 3))
+    ours = np.asarray(start.depth(the_scene, fields))
+    for p, deep in zip(params, ours, strict=True):
+        compiled = model.compile_model(the_scene, p, still())
+        data = mujoco.MjData(compiled)
+        data.qpos[:] = model.model_fields(the_scene, *map(jnp_tree, (p, still()))).start
+        mujoco.mj_fwdPosition(compiled, data)
+        # float32 positions of 0.2 m.
+        assert deep == pytest.approx(-data.contact.dist.min(), abs=1e-6)
+
+
+def jnp_tree(tree):
+    return jax.tree.map(jnp.asarray, tree)
+
+
+def test_an_invalid_start_is_in_the_outcome(starting):
+    the_scene, _ = starting
+    params = stack(*(hand_world(the_scene, length=x)[0] for x in (0.08, 0.18)))
+    engine = MujocoEngine(the_scene)
+    result, _ = rollout.simulate(the_scene, engine, params, stack(still(), still()))
+    assert [bool(s & Status.INVALID_START) for s in result.status] == [False, True]
+
+
+# --- runs ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def failing_run(tmp_path_factory):
+    """A tiny optimisation in MuJoCo C in which some trials are too fast."""
+    from toy import TINY
+
+    folder = tmp_path_factory.mktemp("failing") / "run"
+    sizes = ["--particles", "3", "--trials", "2", "--episodes", "1", "--test-trials", "0"]
+    code = cli.main(
+        ["optimize", "--scene", str(TINY), "--out", str(folder), *sizes, "--set", "limits.speed=12"]
+    )
+    return folder, code
+
+
+def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
+    """The saved state is the last good one, and the replay fails alike, at the same step."""
+    folder, _ = failing_run
+    scene, _ = runs.read_run(folder)
+    files = sorted((folder / "failures").glob("*.npz"))
+    assert files
+    saved = runs.failures.load(files[0])
+    nq = len(saved.state) // 2 + 1
+    assert saved.status & Status.SPEED and saved.bad_step > 0
+    assert np.abs(saved.state[nq:]).max() <= scene.limits.speed
+    assert cli.main(["replay", str(files[0])]) == 0
+    text = capsys.readouterr().out
+    recorded, again = (line for line in text.splitlines() if "first bad step" in line)
+    assert recorded.split(": ")[1] == again.split(": ")[1]
+    # From the last good state MuJoCo C itself takes the step beyond the limit.
+    speed = float(text.rsplit("to a speed of ", 1)[1])
+    assert speed > scene.limits.speed
+    assert cli.main(["replay", str(folder)]) == 0
+    assert files[0].name in capsys.readouterr().out
+
+
+def test_what_is_no_failed_world_is_refused(failing_run, tmp_path, capsys):
+    folder, _ = failing_run
+    other = folder / "failures" / "no.npz"
+    for content in (b"nothing", b""):
+        other.write_bytes(content)
+        assert cli.main(["replay", str(other)]) == 2
+        assert "not a failed world" in capsys.readouterr().err
+    other.unlink()
+    assert cli.main(["replay", str(tmp_path / "missing.npz")]) == 2
+
+
+def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
+    from toy import TINY
+
+    folder = tmp_path / "run"
+    sizes = ["--particles", "2", "--trials", "2", "--episodes", "2", "--test-trials", "0"]
+    arguments = ["optimize", "--scene", str(TINY), "--out", str(folder), *sizes]
+    assert cli.main([*arguments, "--set", "limits.speed=1"]) == 1
+    message = capsys.readouterr().err
+    assert "every one of 4 trials failed (SPEED 4)" in message
+    assert "discretization.timestep" in message and "codesign replay" in message
+
+
+def test_the_progress_line_counts_by_cause():
+    status = np.array([[0, Status.SPEED, 8], [Status.SPEED | 8, Status.STUCK, 0]])
+    assert runs.status_counts(status) == "SPEED 2, SOLVER_CAP 2, STUCK 1"

@@ -1,0 +1,429 @@
+"""Effects of a scene: as in MuJoCo C, inert without a stimulus, not in the program if off."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from codesign_jax import control, effects, model, schema
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.fused import Limits, Program
+from codesign_jax.engines.structured.hand import hand_lanes
+from tests import small
+from tests.test_structured import lanes_state
+
+# Compiling takes longer than all that is done with a program here.
+QUICK = {"xla_backend_optimization_level": 0}
+CONTACTS = ("finger_object", "finger_table", "palm_object", "palm_table", "object_table")
+slow = pytest.mark.slow
+# Away from the paper's scene: some together, for speed, then one at a time.
+SETTINGS = {
+    "new models": {"friction": "full", "wrist": False, "neo_hookean": True},
+    "little": {"friction": "none", "twist": False, "palm_table": False, "gravity": False},
+    "no contact": dict.fromkeys(CONTACTS, False),
+    "frictionless": {"friction": "none"},
+    "full friction": {"friction": "full"},
+    "rigid arm": {"wrist": False},
+    "neo-Hookean": {"neo_hookean": True},
+    "weightless": {"gravity": False},
+    "fingers do not touch": {"finger_object": False, "finger_table": False},
+    "fingers do not touch the table": {"finger_table": False},
+    "palm does not touch the object": {"palm_object": False, "twist": False},
+    "palm does not touch the table": {"palm_table": False, "lateral_bending": False},
+    "no table": {"finger_table": False, "palm_table": False, "object_table": False},
+}
+TOGETHER = ("new models", "little", "no contact")
+
+
+@jax.enable_x64(True)
+def setting(effects, shape="box", **changes):
+    """Scene, MuJoCo C's model, fields and controls of a pinch grasp, in float64."""
+    scene = small.pinch(shape, **{f"effects__{k}": v for k, v in effects.items()})
+    world, trial = small.hand_world(scene, **changes)
+    world = jax.tree.map(jnp.asarray, world)
+    trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
+    fields = model.model_fields(scene, world, trial)
+    ctrl = np.asarray(control.commands(scene, world, trial))
+    oracle = world_model(scene, fields)
+    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
+    return scene, oracle, fields, ctrl
+
+
+def apply_softening(scene, fields, data):
+    """What the engine `mujoco` applies before a step."""
+    if scene.effects.neo_hookean:
+        bend = model.layout(scene).dofs[..., 0]
+        data.qfrc_applied[bend] = model.softening_moments(scene, fields, data.qpos[bend])
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in TOGETHER else pytest.param(n, marks=slow) for n in SETTINGS]
+)
+def test_steps_equal_mujocos(name):
+    """Accelerations on states along a grasp, from MuJoCo C's own path, contacts included."""
+    with jax.enable_x64(True):
+        scene, oracle, fields, ctrl = setting(SETTINGS[name])
+        engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
+        hand = hand_lanes(scene, jax.tree.map(lambda x: jnp.asarray(x)[None], fields))
+        step, data, most = jax.jit(engine.step, compiler_options=QUICK), mujoco.MjData(oracle), 0
+        data.qpos[:] = fields.start
+        for k in range(420):
+            data.ctrl[:] = ctrl[k]
+            apply_softening(scene, fields, data)
+            if k % 35 == 20:
+                qpos, qvel = data.qpos.copy(), data.qvel.copy()
+                mujoco.mj_forward(oracle, data)
+                batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
+                state = lanes_state(engine, scene, batch, qpos, qvel)
+                new, _ = step(hand, state, jnp.asarray(ctrl[k])[:, None])
+                acc = (np.asarray(engine.qvel(new))[0] - qvel) / scene.discretization.timestep
+                scale = max(np.linalg.norm(data.qacc), 100.0)
+                error = np.linalg.norm(acc - data.qacc) / scale
+                # As in test_structured; MuJoCo's rigid arm gives way by the hand's forces over
+                # 1e9 kg, which stiff fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
+                bound = 1e-8 if scene.effects.wrist else 1e-7
+                assert error < bound, (k, data.ncon, error)
+                most = max(most, data.ncon)
+            mujoco.mj_step(oracle, data)
+    if scene.effects.finger_object and scene.effects.object_table:
+        assert most > 4  # more than the box on the table
+
+
+@slow
+def test_mjx_steps_equal_mujocos():
+    """Stock MJX with the models that it has, on a sphere (its other contacts differ a little)."""
+    with jax.enable_x64(True):
+        scene, oracle, fields, ctrl = setting({"friction": "full", "neo_hookean": True}, "sphere")
+        solver = dataclasses.replace(
+            scene.solver, tolerance=1e-14, iterations=100, ls_iterations=50
+        )
+        scene = dataclasses.replace(scene, solver=solver)
+        engine = make_engine("mjx", scene)
+        step = jax.jit(engine.step, compiler_options=QUICK)
+        data, ours = mujoco.MjData(oracle), engine.reset(fields)
+        data.qpos[:] = fields.start
+        for k in range(420):
+            data.ctrl[:] = ctrl[k]
+            apply_softening(scene, fields, data)
+            if k % 70 == 20:
+                ours = ours.replace(qpos=data.qpos.copy(), qvel=data.qvel.copy())
+                found = step(fields, ours, ctrl[k])
+                mujoco.mj_forward(oracle, data)
+                scale = max(np.linalg.norm(data.qacc), 100.0)
+                # MJX keeps its warm start where it is good enough: 4e-9 at rest (test_engines).
+                assert np.linalg.norm(found.qacc - data.qacc) / scale < 1e-7, k
+            mujoco.mj_step(oracle, data)
+
+
+@slow
+def test_streamed_worlds_of_the_new_models():
+    """The stream of a CPU moves all that these effects added along with their worlds."""
+    with jax.enable_x64(True):
+        scene = small.pinch(
+            "cylinder", links=2, **{f"effects__{k}": v for k, v in SETTINGS["new models"].items()}
+        )
+        world, trial = small.hand_world(scene)
+        lengths = np.linspace(0.07, 0.13, 6)
+        params = small.stack(*[world._replace(length=0 * world.length + x) for x in lengths])
+        trials = small.stack(*[trial] * len(lengths))
+        fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
+        ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :230]
+        found = [
+            jax.jit(StructuredEngine(scene, tolerance=1e-16, lanes=n).rollout)(fields, ctrl)
+            for n in (0, 2)
+        ]
+    # As in test_structured: rounding, on the way to the object and in touch with the table.
+    np.testing.assert_allclose(found[1].distance, found[0].distance, atol=1e-10)
+    assert np.ptp(found[0].distance[:, -1]) > 1e-3
+
+
+@slow
+@pytest.mark.parametrize("name", ["new models", "no contact"])
+def test_gradients_of_a_step(name):
+    """The implicit derivative with respect to controls and stiffness against differences."""
+    with jax.enable_x64(True):
+        scene, _, fields, ctrl = setting(SETTINGS[name])
+        engine = StructuredEngine(
+            scene, iterations=100, evaluations=16, tolerance=1e-24, differentiable=True
+        )
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
+        # Fingers bent against the table.
+        qpos = np.array(fields.start)
+        qpos[2] = 0.06
+        qpos[6 : 6 + model.layout(scene).dofs.size] = 0.1
+        state = lanes_state(engine, scene, batch, qpos, np.zeros(len(qpos) - 1))
+        base = jnp.asarray(ctrl[200]).at[2].set(0.0601)
+
+        def end(change):
+            u = base.at[2].add(change[0]).at[6].add(1e5 * change[1])
+            stiffer = batch._replace(jnt_stiffness=batch.jnt_stiffness * (1 + change[2]))
+            new, _ = engine.step(hand_lanes(scene, stiffer), state, u[:, None])
+            return (engine.qvel(new) ** 2).sum()
+
+        end = jax.jit(end, compiler_options=QUICK)
+        found, e = jax.grad(end)(jnp.zeros(3)), 1e-6 * jnp.eye(3)
+        expected = [(end(d) - end(-d)) / 2e-6 for d in e]
+        assert np.abs(expected).min() > 0
+        # Central differences of 1e-6 lose ten of 16 digits and add their square.
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+# --- without a stimulus --------------------------------------------------------------------------
+
+
+def still_rollout(effects_on, steps=60, **changes):
+    """Final qpos of `steps` steps of MuJoCo C from the start under its first controls."""
+    with jax.enable_x64(True):
+        scene, _, fields, ctrl = setting(effects_on, **changes)
+        fields = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
+        held = jnp.broadcast_to(ctrl[:1], (1, steps, ctrl.shape[1]))
+        trace = make_engine("mujoco", scene).rollout(fields, held, trajectory=True)
+        return scene, ctrl, np.asarray(trace.qpos)[0]
+
+
+@pytest.mark.parametrize(
+    "effect", [{"friction": "full"}, {"friction": "none"}, {"pressure_dynamics": True}]
+)
+def test_inert_without_stimulus(effect):
+    """A box at rest, straight fingers and a still arm: nothing slides, and no pressure changes."""
+    (_, _, plain), (_, _, changed) = still_rollout({}), still_rollout(effect)
+    # The contact problem gets other rows, its solution only their rounding.
+    np.testing.assert_allclose(changed, plain, rtol=0, atol=1e-12)
+
+
+def test_neo_hookean_is_inert_at_small_strain():
+    """Its share of the moment falls with the strain; at 1e-6 the angles differ by as much."""
+    weightless = {"gravity": False, "wrist": False}
+    angles = []
+    for law in (False, True):
+        scene, _, fields, ctrl = setting(weightless | {"neo_hookean": law}, pressure=2.0)
+        angles.append(inflated(scene, fields, ctrl, 2.0))
+    assert 0 < angles[0].max() < 1e-5
+    np.testing.assert_allclose(angles[1], angles[0], rtol=1e-5)
+
+
+def inflated(scene, fields, ctrl, pressure, steps=400):
+    """Bend angles (finger, link) of fingers at rest under a pressure, by the engine `mujoco`."""
+    with jax.enable_x64(True):
+        held = np.broadcast_to(ctrl[:1], (1, steps, ctrl.shape[1])).copy()
+        held[..., 6:] = pressure
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
+        trace = make_engine("mujoco", scene).rollout(batch, jnp.asarray(held), trajectory=True)
+    return np.asarray(trace.qpos)[0, -1][model.layout(scene).dofs[..., 0]]
+
+
+# --- off is absent -------------------------------------------------------------------------------
+
+# Constants that only these effects read.
+CONSTANTS = {
+    "wrist": ("hand.wrist", "linear_stiffness", 777.0),
+    "finger_table": ("contact", "finger_table_friction", 0.31),
+    "object_table": ("objects.table", "friction", 0.29),
+    "friction": ("contact", "torsional_friction", 0.017),
+    "disturb": ("arm", "shake_amplitude", 13.0),
+    "pressure_dynamics": ("pneumatics", "lag", 0.3),
+    "gravity": ("", "gravity", 1.6),
+}
+OFF = {
+    "wrist": False,
+    "finger_table": False,
+    "palm_table": False,
+    "object_table": False,
+    "friction": "coulomb",
+    "disturb": False,
+    "pressure_dynamics": False,
+    "gravity": False,
+}
+
+
+def changed(value, path, field, new):
+    """A scene with one number changed."""
+    if not path:
+        return dataclasses.replace(value, **{field: new})
+    head, _, rest = path.partition(".")
+    inner = changed(getattr(value, head), rest, field, new)
+    return dataclasses.replace(value, **{head: inner})
+
+
+def program(scene):
+    """Text of everything a grasp computes: fields, controls and a step."""
+    world, trial = small.hand_world(scene)
+    world = jax.tree.map(jnp.asarray, small.stack(world))
+    trial = small.stack(trial)
+    engine = StructuredEngine(scene)
+
+    def run(p, t):
+        fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(p, t)
+        ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(p, t)
+        return engine.step(hand_lanes(scene, fields), engine.reset(fields), ctrl[:, 0].T)
+
+    return jax.jit(run).lower(world, trial).as_text()
+
+
+def effects_scene(values, **settings):
+    return small.pinch(links=2, **{f"effects__{k}": v for k, v in values.items()}, **settings)
+
+
+@pytest.fixture(scope="module")
+def bare():
+    """A scene without the effects of OFF, and its program."""
+    scene = effects_scene(OFF)
+    return scene, program(scene)
+
+
+def test_an_effect_that_is_off_is_not_in_the_program(bare):
+    """With every constant of these effects changed, the program is the same text."""
+    scene, text = bare
+    for name in CONSTANTS:
+        scene = changed(scene, *CONSTANTS[name])
+    assert scene != bare[0]
+    assert program(scene) == text
+
+
+@pytest.mark.parametrize(
+    "name", [n if n == "wrist" else pytest.param(n, marks=slow) for n in CONSTANTS]
+)
+def test_an_effect_that_is_on_is_in_the_program(name):
+    """The same comparison fails for every effect that is on."""
+    scene = effects_scene(OFF | {name: "full" if name == "friction" else True})
+    assert program(changed(scene, *CONSTANTS[name])) != program(scene)
+
+
+def primitives(jaxpr, found):
+    """Counts the primitives of a jaxpr and all its parts."""
+    for equation in jaxpr.eqns:
+        found[equation.primitive.name] = found.get(equation.primitive.name, 0) + 1
+        for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "eqns")):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                primitives(inner, found)
+    return found
+
+
+def step_primitives(scene):
+    fields = jax.eval_shape(
+        jax.vmap(lambda p, t: model.model_fields(scene, p, t)),
+        *(small.stack(v) for v in small.hand_world(scene)),
+    )
+    engine = StructuredEngine(scene)
+    hand = jax.eval_shape(lambda f: hand_lanes(scene, f), fields)
+    state = jax.eval_shape(engine.reset, fields)
+    ctrl = jax.ShapeDtypeStruct((6 + scene.num_fingers, 1), fields.start.dtype)
+    return primitives(jax.make_jaxpr(engine.step)(hand, state, ctrl).jaxpr, {})
+
+
+def test_without_contacts_the_step_is_one_elimination():
+    """No Newton loop, no line search, no cone: a beam simulation and a falling body."""
+    free = step_primitives(effects_scene(dict.fromkeys(CONTACTS, False)))
+    touching = step_primitives(effects_scene({}))
+    assert "while" in touching and "while" not in free
+    # One elimination has a scan to the palm and one back; kinematics and the start's motion one
+    # each.
+    assert free["scan"] == 4
+    assert sum(free.values()) < 0.6 * sum(touching.values())
+
+
+def test_the_kernel_does_not_run_what_it_lacks(monkeypatch):
+    """The GPU kernel knows the paper's effects; other scenes take the batch form."""
+
+    def taken(way):
+        def run(self, fields, ctrl, *_):
+            raise RuntimeError(way)
+
+        return run
+
+    monkeypatch.setattr(StructuredEngine, "_one_kernel", taken("kernel"))
+    monkeypatch.setattr(StructuredEngine, "_rollout", taken("batch"))
+    ctrl = jnp.zeros((1, 2, 8), jnp.float32)
+    for values, way in (
+        ({}, "kernel"),
+        ({"gravity": False, "palm_table": False, "pressure_dynamics": True}, "kernel"),
+        ({"friction": "full"}, "batch"),
+        ({"friction": "none"}, "batch"),
+        ({"wrist": False}, "batch"),
+        ({"neo_hookean": True}, "batch"),
+        ({"object_table": False}, "batch"),
+    ):
+        engine = StructuredEngine(effects_scene(values), fused=True, lanes=0)
+        with pytest.raises(RuntimeError, match=way):
+            engine.rollout(None, ctrl)
+
+
+def test_kernel_without_palm_on_table():
+    """The kernel's contact sets are the scene's."""
+    for off in ("palm_object", "palm_table"):
+        sets = [s.name for s in Program(effects_scene({off: False}), Limits(4, 4, 1e-6)).sets]
+        assert off not in sets and len(sets) == 4
+
+
+# --- support -------------------------------------------------------------------------------------
+
+
+def test_every_effect_is_in_the_table():
+    names = [f.name for f in dataclasses.fields(small.pinch().effects)]
+    assert list(effects.EFFECTS) == names
+    for effect in effects.EFFECTS.values():
+        assert set(effect.refused) <= set(effects.ENGINES)
+
+
+def test_unsupported_effect_names_itself_and_the_engine():
+    scene = effects_scene({"wrist": False})
+    with pytest.raises(schema.SceneError, match="engine mjx: effects.wrist = false .*float64"):
+        make_engine("mjx", scene)
+    assert effects.state(scene.effects, "wrist", "mjx") == "unsupported (false)"
+    assert effects.state(scene.effects, "wrist", "mujoco") == "off"
+    assert effects.state(scene.effects, "friction", "mujoco") == "coulomb"
+
+
+def values_of(field):
+    return st.sampled_from(field.metadata.get("options", (True, False)))
+
+
+COMBINATIONS = st.fixed_dictionaries(
+    {f.name: values_of(f) for f in dataclasses.fields(small.pinch().effects)}
+)
+
+
+def check_combination(values, shape):
+    """Every engine takes a step that is finite, or traces one, or says what it cannot do."""
+    scene = small.pinch(shape, links=1, **{f"effects__{k}": v for k, v in values.items()})
+    for name in effects.ENGINES:
+        refused = effects.refusals(scene.effects, name)
+        if refused:
+            with pytest.raises(schema.SceneError) as caught:
+                make_engine(name, scene)
+            assert len(caught.value.problems) == len(refused)
+            assert all(f"engine {name}: effects." in p for p in caught.value.problems)
+            continue
+        engine = make_engine(name, scene)
+        if name == "mujoco":
+            world, trial = (small.stack(v) for v in small.hand_world(scene))
+            fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(world, trial)
+            ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(world, trial)
+            trace = engine.rollout(fields, ctrl[:, :2])
+            assert np.isfinite(trace.speed).all() and np.isfinite(trace.distance).all()
+        elif name == "structured":
+            assert "scan" in step_primitives(scene)
+
+
+OPTIONS = {"deadline": None, "derandomize": True, "phases": [Phase.generate]}
+
+
+@settings(max_examples=5, **OPTIONS)
+@given(values=COMBINATIONS, shape=st.sampled_from(small.SHAPES))
+def test_a_combination_builds_or_is_refused(values, shape):
+    check_combination(values, shape)
+
+
+@slow
+@settings(max_examples=60, **OPTIONS)
+@given(values=COMBINATIONS, shape=st.sampled_from(small.SHAPES))
+def test_any_combination_builds_or_is_refused(values, shape):
+    check_combination(values, shape)

@@ -9,11 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
-<<<<<<< HEAD
-.PHONY: demo test test-slow notebooks benchmark effects accuracy lint format types clean help
-=======
-.PHONY: demo test test-slow stability notebooks benchmark lint format types clean help
->>>>>>> stability
+.PHONY: demo test test-slow stability notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"

@@ -30,6 +30,8 @@ _PRESCRIBED = (
     "replaces one needs float64"
 )
 
+_SKIN = "its geoms are rigid parts of single bodies"
+
 EFFECTS: Mapping[str, Effect] = {
     "lateral_bending": Effect("fingers bend sideways"),
     "twist": Effect("fingers twist about their length"),
@@ -42,6 +44,11 @@ EFFECTS: Mapping[str, Effect] = {
     "finger_table": Effect("fingers touch the table"),
     "palm_table": Effect("the palm touches the table"),
     "object_table": Effect("the object rests on the table"),
+    "finger_finger": Effect("spheres of different fingers touch"),
+    "surface": Effect(
+        "the fingers' contact points: spheres, or the vertices of the skinned hull",
+        {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},
+    ),
     "friction": Effect(
         "of all contacts: none, coulomb, or full with torsion and rolling",
         {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},

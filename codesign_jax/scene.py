@@ -27,6 +27,8 @@ class Effects:
     finger_table: bool = True
     palm_table: bool = True
     object_table: bool = True
+    finger_finger: bool = False
+    surface: str = choice("spheres", "hull", default="spheres")
     friction: str = choice("none", "coulomb", "full", default="coulomb")
     disturb: bool = True
     ungrasp: bool = True
@@ -81,6 +83,7 @@ class Contact:
     finger_table_friction: float = quantity("", 0, 5)
     torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
     rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
+    finger_finger_friction: float = quantity("", 0, 5, default=0.8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,11 +97,17 @@ class Pneumatics:
 
 @dataclasses.dataclass(frozen=True)
 class Discretization:
-    """Time step, segments a finger (the paper's ten links) and contact spheres on each link."""
+    """Time step, segments a finger (the paper's ten links) and density of the contact points.
+
+    Each link has `spheres_per_link` spheres or, with the surface "hull", `hull_rings` rings of
+    `hull_points` vertices, a multiple of four.
+    """
 
     timestep: float = quantity("s", 1e-5, 0.05)
     links: int = quantity("", 1, 200)
     spheres_per_link: int = quantity("", 1, 20)
+    hull_rings: int = quantity("", 1, 20, default=2)
+    hull_points: int = quantity("", 4, 80, default=8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,6 +306,22 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
         problems.append(
             f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
             f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
+        )
+    e = scene.effects
+    if e.finger_finger and e.surface == "hull":
+        problems.append(
+            f"{where}.effects.finger_finger is between spheres: it needs surface = 'spheres'"
+        )
+    for name, on in (("surface", e.surface == "hull"), ("finger_finger", e.finger_finger)):
+        if on and e.friction != "coulomb":
+            problems.append(
+                f"{where}.effects.{name} = {getattr(e, name)!r} needs friction = 'coulomb', "
+                f"not {e.friction!r}"
+            )
+    if scene.discretization.hull_points % 4:
+        problems.append(
+            f"{where}.discretization.hull_points = {scene.discretization.hull_points} "
+            "must be a multiple of 4: every side of the section has as many"
         )
     if scene.contact.time_constant < 2 * h:
         problems.append(

@@ -1,14 +1,12 @@
 """Whether a world may start: sound model fields, and no bodies deep inside one another."""
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.hand import hand_lanes
 from codesign_jax.engines.structured.kinematics import straight
+from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status
@@ -45,11 +43,6 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     """
     engine = StructuredEngine(scene)
     state, hand = engine.reset(fields), hand_lanes(scene, fields)
-    contacts = engine.contacts(_direct, hand, straight(hand, state), state.wrist[2])
+    contacts = engine.contacts(Stages(None), hand, straight(hand, state), state.wrist[2])
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in contacts.values()]
     return jnp.stack(found).max(0)
-
-
-def _direct(function: Callable, *args: Any) -> Any:
-    """A stage that is none."""
-    return jax.lax.optimization_barrier(function(*args))

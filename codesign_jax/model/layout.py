@@ -66,7 +66,8 @@ def layout(scene: Scene) -> Layout:
     stubs = 2 + np.arange(n) * (links + 1)
     bodies = stubs[:, None] + 1 + np.arange(links)
     dofs = 6 + np.arange(n * links * len(axes)).reshape(n, links, len(axes))
-    touching = scene.effects.finger_object or scene.effects.finger_table
+    e = scene.effects
+    touching = e.surface == "spheres" and (e.finger_object or e.finger_table or e.finger_finger)
     k = scene.discretization.spheres_per_link if touching else 0
     first = 1 + (len(palm_points(scene)) if palm_touches(scene) else 0)
     spheres = first + np.arange(n * links * k).reshape(n, links, k)

@@ -2,12 +2,13 @@
 
 import contextlib
 import functools
+import itertools
 
 import jax
 import mujoco
 import numpy as np
 
-from codesign_jax import morphology, parameters
+from codesign_jax import hull, morphology, parameters
 from codesign_jax.model.layout import (
     AXES,
     RIGID,
@@ -176,7 +177,7 @@ def _add_finger(
         body.explicitinertial, body.mass = True, beam.line_density * extent
         body.ipos = [extent / 2, 0, height / 2]
         body.inertia = np.array(morphology.block_inertia(body.mass, extent, width, height))
-        if visual:
+        if visual and scene.effects.surface == "spheres":
             kind, half = mujoco.mjtGeom.mjGEOM_BOX, [extent / 2, width / 2, height / 2]
             name = f"finger_{f}_block_{i}"
             body.add_geom(
@@ -206,6 +207,22 @@ def _add_finger(
     # Pressure [Pa] in, bending moment [N m] at every joint out: a constant torque, not a moving
     # rest angle.
     actuator.gainprm[0] = beam.moment_per_pressure
+    if visual and scene.effects.surface == "hull":
+        _add_skin(scene, spec, f, length, height)
+
+
+def _add_skin(scene: Scene, spec: mujoco.MjSpec, f: int, length: float, height: float) -> None:
+    """The finger's hull as MuJoCo's skin, which is for looking at only."""
+    mesh, origins = hull.hull(scene), hull.link_origins(scene, length)
+    skin = spec.add_skin(name=f"finger_{f}_hull", rgba=_COLORS["finger"])
+    skin.vert = hull.rest(scene, length, height).ravel()
+    skin.face = mesh.face.ravel()
+    followed = [np.nonzero((mesh.link == i) & (mesh.weight > 0)) for i in range(len(origins))]
+    skin.bodyname = [f"finger_{f}_link_{i}" for i in range(len(origins))]
+    skin.vertid = [vertex.tolist() for vertex, _ in followed]
+    skin.vertweight = [mesh.weight[where].tolist() for where in followed]
+    skin.bindpos = np.column_stack([origins, 0 * origins, 0 * origins]).ravel()
+    skin.bindquat = np.tile([1.0, 0, 0, 0], len(origins))
 
 
 def _add_object(scene: Scene, spec: mujoco.MjSpec, trial: Trial, visual: bool) -> None:
@@ -251,3 +268,7 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
             add(name, f"object_{i}", shape.friction)
     for name in (fingers if e.finger_table else []) + (palm if e.palm_table else []):
         add("table", name, c.finger_table_friction)
+    if e.finger_finger:
+        for first, second in itertools.combinations(fingers, 2):
+            if first.split("_")[1] != second.split("_")[1]:
+                add(first, second, c.finger_finger_friction)

@@ -49,12 +49,15 @@ class Contacts(NamedTuple):
       normal: Unit normals, shape (3, ...).
       distance: Signed distance [m], negative in contact, shape (...).
       cone: Their parameters.
+      lever: Of points that follow a joint's rotation in part, see `hull`, the arm at which they do,
+        shape (3, ...).
     """
 
     point: jax.Array
     normal: jax.Array
     distance: jax.Array
     cone: Cone
+    lever: jax.Array | None = None
 
     @property
     def active(self) -> jax.Array:
@@ -69,8 +72,13 @@ class Contacts(NamedTuple):
         return jnp.concatenate([self.normal, jnp.zeros_like(self.normal)])
 
     def relative(self, motion: jax.Array) -> jax.Array:
-        """Point motion, (3, ...), of a relative spatial motion, (6, ...); see `turning`."""
-        moving = motion[3:] + cross(motion[:3], self.point)
+        """Point motion, (3, ...), of a relative spatial motion, (6, ...); see `turning`.
+
+        With a lever of a motion of nine components.
+        """
+        moving = motion[3:6] + cross(motion[:3], self.point)
+        if self.lever is not None:
+            moving = moving + cross(motion[6:], self.lever)
         if self.cone.spin is None:
             return moving
         turning = self.turning(motion[:3])
@@ -219,24 +227,35 @@ def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, 
 def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
     """X'KX with X = [-[r], 1]: a contact's Hessian in spatial accelerations, rows (6, 6, ...).
 
-    With full friction X = [-[r], 1; S, 0], see `Contacts.turning`.
+    With full friction X = [-[r], 1; S, 0], see `Contacts.turning`; with a lever
+    X = [-[r], 1, -[lever]], rows (9, 9, ...).
     """
     if contacts.cone.spin is not None:
         return _full_inertia(contacts, hessian)
     xx, xy, xz, yy, yz, zz = hessian
     k = [jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])]
     r = contacts.point
+    if contacts.lever is not None:
+        arm = contacts.lever
+        rows = [*_crossed(r, k), *k, *_crossed(arm, k)]
+        return jnp.stack([jnp.concatenate([cross(r, w), w, cross(arm, w)]) for w in rows])
     # Rows of [r]K, then of -[r]K[r]: cross products, never the skew matrix's zeros.
-    y = [r[1] * k[2] - r[2] * k[1], r[2] * k[0] - r[0] * k[2], r[0] * k[1] - r[1] * k[0]]
+    y = _crossed(r, k)
     upper = [jnp.concatenate([cross(r, row), row]) for row in y]
     lower = [jnp.concatenate([jnp.stack([y[j][i] for j in range(3)]), k[i]]) for i in range(3)]
     return jnp.stack(upper + lower)
 
 
+def _crossed(r: jax.Array, k: list[jax.Array]) -> list[jax.Array]:
+    """Rows of [r]K from those of K."""
+    return [r[1] * k[2] - r[2] * k[1], r[2] * k[0] - r[0] * k[2], r[0] * k[1] - r[1] * k[0]]
+
+
 def contact_wrench(contacts: Contacts, force: jax.Array) -> jax.Array:
-    """Spatial force (moment about the origin, force), shape (6, ...)."""
+    """Spatial force (moment about the origin, force), (6, ...); with a lever its moment as well."""
     if contacts.cone.spin is None:
-        return jnp.concatenate([cross(contacts.point, force), force])
+        lever = [] if contacts.lever is None else [cross(contacts.lever, force)]
+        return jnp.concatenate([cross(contacts.point, force), force, *lever])
     moment = cross(contacts.point, force[:3]) + contacts.turning(force[3:])
     return jnp.concatenate([moment, force[:3]])
 

@@ -48,8 +48,31 @@ class Factors(NamedTuple):
     z: jax.Array
 
 
+class JointTerms(NamedTuple):
+    """A quadratic in a joint's accelerations a, its parent's v and the object's v_o.
+
+    1/2 a'd a + a'u v - a'h v_o - a'y: contacts of points that follow the joint in part.
+
+    Attributes:
+      d: Shape (axis, axis, finger, world).
+      u: Shape (axis, 6, finger, world).
+      h: Same shape.
+      y: Shape (axis, finger, world).
+    """
+
+    d: jax.Array
+    u: jax.Array
+    h: jax.Array
+    y: jax.Array
+
+
 def eliminate(
-    run: Stages, node: Quadratic, axes: jax.Array, arm: jax.Array, tau: jax.Array
+    run: Stages,
+    node: Quadratic,
+    axes: jax.Array,
+    arm: jax.Array,
+    tau: jax.Array,
+    terms: JointTerms | None = None,
 ) -> tuple[Quadratic, Factors]:
     """Minimises over the accelerations of a joint.
 
@@ -59,12 +82,17 @@ def eliminate(
       axes: Motion subspace S, shape (axis, 6, finger, world).
       arm: Diagonal joint inertia (armature with implicit terms), shape (axis, finger, world).
       tau: Joint force, same shape.
+      terms: More of the objective that the joint's accelerations are in.
 
     Returns:
       The objective in the parent's acceleration and the factors for `substitute`.
     """
     u, h, y = run(_project, node.p, node.c, node.r, axes, tau)
-    inverse = run(_joint_inverse, axes, u, arm)
+    if terms is None:
+        inverse = run(_joint_inverse, axes, u, arm)
+    else:
+        inverse = run(_joint_inverse, axes, u, arm, terms.d)
+        u, h, y = u + terms.u, h + terms.h, y + terms.y
     factors = Factors(*run(_factor, inverse, u, h, y))
     return Quadratic(*run(_reduce, node, u, h, factors)), factors
 
@@ -75,11 +103,14 @@ def _project(p: jax.Array, c: jax.Array, r: jax.Array, axes: jax.Array, tau: jax
     return u, contract(axes[:, :, None], c[None], 1), contract(axes, r[None], 1) + tau
 
 
-def _joint_inverse(axes: jax.Array, u: jax.Array, arm: jax.Array) -> jax.Array:
-    """D^-1 with D = S'P S + arm."""
+def _joint_inverse(
+    axes: jax.Array, u: jax.Array, arm: jax.Array, more: jax.Array | None = None
+) -> jax.Array:
+    """D^-1 with D = S'P S + arm, and more if there is more."""
     n = axes.shape[0]
     eye = jnp.eye(n, dtype=axes.dtype)[:, :, None, None]
-    return inverse_spd(contract(axes[:, None], u[None], 2) + eye * arm[:, None])
+    own = contract(axes[:, None], u[None], 2) + eye * arm[:, None]
+    return inverse_spd(own if more is None else own + more)
 
 
 def _factor(inverse: jax.Array, u: jax.Array, h: jax.Array, y: jax.Array):

@@ -8,7 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax import effects
-from codesign_jax.engines.structured import collision, implicit, mesh, solver
+from codesign_jax.engines.structured import (
+    collision,
+    finger_pairs,
+    hull,
+    implicit,
+    mesh,
+    solver,
+)
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
@@ -155,6 +162,16 @@ class StructuredEngine:
                 found["finger_object"] = on_object(run, spheres, hand.radius)
             if e.finger_table:
                 found["finger_table"] = on_table(spheres, hand.radius)
+            if e.finger_finger and self.scene.num_fingers > 1:
+                found["finger_finger"] = run(
+                    lambda s, r: finger_pairs.contacts(scene, s, r), spheres, hand.radius
+                )
+        if e.surface == "hull" and (e.finger_object or e.finger_table):
+            skin = run(lambda h, k: hull.vertices(scene, h, k), hand, kin)
+            if e.finger_object:
+                found["hull_object"] = hull.attach(run, on_object(run, skin.point, 0.0), skin)
+            if e.finger_table:
+                found["hull_table"] = hull.attach(run, on_table(skin.point, 0.0), skin)
         if palm_touches(scene):
             palm, radius = collision.palm_spheres(scene, kin), scene.hand.palm.contact_radius
             if e.palm_object:
@@ -198,15 +215,21 @@ class StructuredEngine:
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`; on a GPU in float32 one kernel runs it all, see `fused`."""
-        primitive = all(o.type != "mesh" for o in self.scene.objects.object)
-        fits = self.fused and primitive and in_kernel(self.scene.effects)
+        batched = self._needs_batch()
+        fits = self.fused and not batched and in_kernel(self.scene.effects)
         if fits and not trajectory and ctrl.dtype == jnp.float32:
             return self._one_kernel(fields, ctrl)
         with jax.default_matmul_precision("highest"):
-            # The stream moves worlds between lanes; a mesh's grid belongs to no world.
-            if self.lanes and primitive:
+            if self.lanes and not batched:
                 return on_all_cores(partial(self._stream, trajectory=trajectory), fields, ctrl)
             return self._rollout(fields, ctrl, trajectory)
+
+    def _needs_batch(self) -> bool:
+        """Whether the scene has what neither the kernel nor the stream knows."""
+        # The stream moves worlds between lanes; a mesh's grid belongs to no world.
+        meshes = any(o.type == "mesh" for o in self.scene.objects.object)
+        e = self.scene.effects
+        return meshes or e.surface == "hull" or e.finger_finger
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array) -> Trace:
         from codesign_jax.engines.structured.fused import Limits, Program

@@ -88,12 +88,15 @@ def solve(
 def adjoint(run: Stages, problem: Problem, velocity: Spatial, acc: Acc, cotangent: Acc) -> Acc:
     """Solves H lambda = cotangent by the elimination of a Newton step at the solution acc."""
     motion = solver.propagate(run, problem.kin, acc)
-    pushes = {}
-    for name, c in problem.contacts.items():
-        active = run.only_if(c.active.any())
-        jar = active(lambda *v, name=name: _jar(name, *v), c, motion, velocity)
-        inertia, wrench = solver._push(active, name, c, jar)
-        pushes[name] = inertia, jnp.zeros_like(wrench)
+    runs = {n: run.only_if(c.active.any()) for n, c in problem.contacts.items()}
+    jar = {
+        n: runs[n](lambda *v, n=n: _jar(n, *v), c, motion, velocity)
+        for n, c in problem.contacts.items()
+    }
+    pushes, pairs = solver.respond_all(runs, problem.contacts, jar)
+    pushes = {n: (inertia, jnp.zeros_like(wrench)) for n, (inertia, wrench) in pushes.items()}
+    if pairs is not None:
+        pairs = pairs._replace(push=jnp.zeros_like(pairs.push))
     turning, moving = cotangent.object[:3], cotangent.object[3:]
     # The object's accelerations are at its centre, its spatial force at the origin.
     force = Forces(
@@ -103,7 +106,9 @@ def adjoint(run: Stages, problem: Problem, velocity: Spatial, acc: Acc, cotangen
         wrist=cotangent.wrist,
         finger=cotangent.finger,
     )
-    return solver.newton_step(run, problem, force, pushes)[0]
+    # As far as rounding allows: the derivative has no further Newton step to mend it.
+    tolerance = float(jnp.finfo(motion.link.dtype).eps) ** 1.5
+    return solver.linear_solve(run, problem, force, pushes, pairs, tolerance=tolerance)[0]
 
 
 def residual_power(

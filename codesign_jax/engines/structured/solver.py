@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
+from codesign_jax.engines.structured import finger_pairs, hull
 from codesign_jax.engines.structured.contact import (
     Contacts,
     contact_inertia,
@@ -118,9 +119,21 @@ def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
     return Spatial(palm, jnp.moveaxis(links, 0, 1), obj)
 
 
+def on_links(name: str) -> bool:
+    """Whether the items of a set of contacts are of links or joints, several of each."""
+    return name.startswith(("finger", "hull"))
+
+
 def relative(name: str, motion: Spatial) -> jax.Array:
     """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
     obj = motion.object
+    if name == "finger_finger":
+        return finger_pairs.relative(motion.link)
+    if name.startswith("hull"):
+        moved = hull.across_joints(motion.palm, motion.link)
+        if name == "hull_object":
+            moved = jnp.concatenate([moved[:6] - obj[:, None], moved[6:]])
+        return moved[:, :, None]
     if name == "finger_object":
         return jnp.stack([motion.link[i] - obj[i] for i in range(6)])[:, :, None]
     return {
@@ -183,14 +196,20 @@ def newton_step(
     kin, hand = problem.kin, problem.hand
 
     def next_joint(node: el.Quadratic, link: tuple):
-        (axes, arm, tau), own = link
-        return el.eliminate(run, run(_add_link, node, own), axes, arm, tau)
+        (axes, arm, tau), (own, joint) = link
+        return el.eliminate(run, run(_add_link, node, own), axes, arm, tau, joint)
 
     # Sums over all links at once: the recursion then slices fewer arrays.
     terms = {n: v for n, v in pushes.items() if n.startswith("finger")}
-    own = run(_own, problem.matrix.link, force.link, terms)
+    skin = {n: v for n, v in pushes.items() if n.startswith("hull")}
+    joints = run(hull.joint_terms, kin.axes, skin) if skin else None
+    terms |= _of_links(skin, slice(1, None))
+    own = run(_own, problem.matrix.link, force.link, terms), joints
     links = (kin.axes, hand.armature, force.finger)
     node, factors = scan_links(next_joint, _nothing(force.link[:, 0]), links, own, reverse=True)
+    if skin:  # what the first joints' rows add to the palm
+        zero = jnp.zeros_like(node.p), jnp.zeros_like(node.r)
+        node = run(lambda n, s: _add_link(n, _own(*zero, _of_links(s, 0))), node, skin)
     node = run(_add_palm, node, problem.matrix, force, pushes)
     joints, palm, obj = _palm_step(run, problem, force, node)
 
@@ -220,6 +239,62 @@ def _palm_step(
     first, palm = run(el.substitute, slide_axes, slides, jnp.zeros_like(obj), obj)
     second, palm = run(el.substitute, axes, hinges, palm, obj)
     return [first, second], palm, obj
+
+
+def respond_all(
+    runs: dict[str, Stages], contacts: dict[str, Contacts], jar: dict[str, jax.Array]
+) -> tuple[dict[str, tuple[jax.Array, jax.Array]], finger_pairs.Coupling | None]:
+    """What the contacts add to the Newton system: to its elimination, and between the fingers."""
+    name = "finger_finger"
+    pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items() if n != name}
+    if name not in contacts:
+        return pushes, None
+    return pushes, finger_pairs.coupling(runs[name], contacts[name], jar[name])
+
+
+def linear_solve(
+    run: Stages,
+    problem: Problem,
+    force: Forces,
+    pushes: dict[str, tuple[jax.Array, jax.Array]],
+    pairs: finger_pairs.Coupling | None,
+    idle: jax.Array | None = None,
+    tolerance: float = 1e-6,
+) -> tuple[Acc, Spatial]:
+    """`newton_step` with the contacts between fingers, if the scene has them.
+
+    Args:
+      run: Runs the stages.
+      problem: The problem.
+      force: Smooth forces minus inertial forces.
+      pushes: As in `newton_step`.
+      pairs: The contacts between fingers.
+      idle: Worlds whose step is of no use, shape (1, world).
+      tolerance: Squared relative error of the step.
+    """
+    if pairs is None:
+        return newton_step(run, problem, force, pushes)
+    force = force._replace(link=force.link + pairs.push)
+    step, motion = newton_step(run, problem, force, pushes)
+    descent = _decrement(-work(run, force, step, motion), pushes, motion, None)
+    none, still = jax.tree.map(jnp.zeros_like, (force, pushes))
+    still = {n: (inertia, still[n][1]) for n, (inertia, _) in pushes.items()}
+
+    def precondition(links: jax.Array) -> tuple[Acc, Spatial]:
+        return newton_step(run, problem, none._replace(link=links), still)
+
+    active = run.only_if(pairs.contacts.active.any())
+    start = step, motion
+    idle = jnp.zeros_like(descent, bool) if idle is None else idle
+    return finger_pairs.correct(active, pairs, start, descent, idle, precondition, tolerance)
+
+
+def _of_links(skin: dict, rows: slice | int) -> dict:
+    """The hull's contacts as those of the links before its rows."""
+    return {
+        n.replace("hull", "finger"): (inertia[:6, :6, rows], wrench[:6, rows])
+        for n, (inertia, wrench) in skin.items()
+    }
 
 
 def _nothing(like: jax.Array) -> el.Quadratic:
@@ -288,10 +363,12 @@ def _push(stages: Stages, name: str, c: Contacts, jar: jax.Array) -> tuple[jax.A
 
     def summed(c: Contacts, hessian: jax.Array, force: jax.Array):
         matrix, wrench = contact_inertia(c, hessian), contact_wrench(c, force)
-        if name.startswith("finger"):
+        if on_links(name):
             return sum_axis(matrix, 3), sum_axis(wrench, 2)
         return sum_fingers(matrix), sum_fingers(wrench)
 
+    if c.lever is not None:
+        return hull.push(stages, c, jar)
     response = stages(respond, c, jar)
     return stages(summed, c, response.hessian, response.force)
 
@@ -343,7 +420,10 @@ def line_search(
         alpha, low, high = carry
         first, second = slope + alpha * curvature, curvature
         for n, c in contacts.items():
-            f, s = run[n](summed, c, rays[n], alpha)
+            if c.lever is None:
+                f, s = run[n](summed, c, rays[n], alpha)
+            else:
+                f, s = hull.line_slopes(run[n], c, rays[n], alpha)
             first, second = first + f, second + s
         return refine(alpha, low, high, first, second)
 
@@ -395,8 +475,9 @@ def solve(
         acc, motion, jar, before, count = carry
         inertial = inertial_forces(run, problem, acc, motion)
         force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))
-        pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items()}
-        step, step_motion = newton_step(run, problem, force, pushes)
+        pushes, pairs = respond_all(runs, contacts, jar)
+        idle = None if pairs is None else before <= tolerance
+        step, step_motion = linear_solve(run, problem, force, pushes, pairs, idle)
         slope = -work(run, force, step, step_motion)
         curvature = work(run, inertial_forces(run, problem, step, step_motion), step, step_motion)
         jar_step = {
@@ -407,7 +488,7 @@ def solve(
         # A world that is done stays as it is, so that its result does not depend on the others.
         done = before <= tolerance
         alpha = jnp.where(done, 0.0, alpha)
-        residual = _decrement(slope, pushes, step_motion) / _scale(problem, motion)
+        residual = _decrement(slope, pushes, step_motion, pairs) / _scale(problem, motion)
 
         def advance(old, new):
             return jax.tree.map(lambda a, p: a + alpha * p, old, new)
@@ -435,15 +516,19 @@ def _solve_free(run: Stages, problem: Problem, start: Acc) -> Solution:
     return Solution(acc, jnp.zeros_like(start.wrist[0]), jnp.ones((), jnp.int32))
 
 
-def _decrement(slope: jax.Array, pushes: dict, step: Spatial) -> jax.Array:
+def _decrement(
+    slope: jax.Array, pushes: dict, step: Spatial, pairs: finger_pairs.Coupling | None
+) -> jax.Array:
     """Newton decrement -p'gradient, shape (1, world): twice the decrease that the step predicts."""
     pushed = -slope
     for name, (_, wrench) in pushes.items():
         product = dot(
-            relative(name, step)[:, :, 0] if name.startswith("finger") else relative(name, step),
+            relative(name, step)[:, :, 0] if on_links(name) else relative(name, step),
             wrench,
         )
         pushed = pushed + sum_items(product)
+    if pairs is not None:
+        pushed = pushed + finger_pairs.product(pairs.push, step.link)
     return jnp.maximum(pushed, 0.0)
 
 

@@ -1,0 +1,187 @@
+"""Contacts of the skinned hull: points that follow a link and its parent in parts.
+
+A vertex with weight w on the link of joint i (frame T_i, joint at p) and 1 - w on the link before
+has the images x1 = T_i(v) and x0 = T_{i-1}(v) and lies at x = (1 - w) x0 + w x1.  Velocities of
+rigid bodies are affine in the point, so that the blend of the two images' velocities is exactly
+  dx = V_{i-1}(x) + w dtheta x (x1 - p),
+the parent's velocity at the vertex itself and a share of the joint's own rotation dtheta = S_i dq_i
+about the image on the link: no common point has to be assumed.  A contact adds its arm from the
+vertex to the contact point to both.  With the relative motion m = (angular, linear, joint's
+rotation) of nine components a contact is the matrix X'KX, X = [-[r], 1, -[lever]] with lever =
+w (x1 + arm - p); the sums over a joint's vertices enter the elimination of that joint.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax import hull
+from codesign_jax.engines.structured.contact import (
+    Contacts,
+    Line,
+    contact_inertia,
+    contact_wrench,
+    respond,
+    slopes,
+)
+from codesign_jax.engines.structured.elimination import JointTerms
+from codesign_jax.engines.structured.hand import HandLanes, apply_columns
+from codesign_jax.engines.structured.kinematics import Kinematics
+from codesign_jax.engines.structured.lanes import Stages, contract, sum_items
+from codesign_jax.scene import Scene
+
+
+class Vertices(NamedTuple):
+    """Contact points of the hull; rows are the joints and the tip, see `codesign_jax.hull.Slots`.
+
+    Attributes:
+      point: In the palm's frame, shape (3, row, k, finger, world).
+      image: Images on the rows' links, from their joints, same shape.
+      weight: Weights of those links, shape (row, k, 1, 1).
+      share: Contact stiffness relative to the scene's, shape (row, k, finger, world).
+    """
+
+    point: jax.Array
+    image: jax.Array
+    weight: jax.Array
+    share: jax.Array
+
+
+def vertices(scene: Scene, hand: HandLanes, kin: Kinematics) -> Vertices:
+    """Places the hull's contact points."""
+    s, width, dtype = hull.slots(scene), scene.hand.section.width, kin.origin.dtype
+    along, across, up, weight, *area = (
+        jnp.asarray(v[..., None, None], dtype) for v in (s.along, s.across, s.up, s.weight, *s.area)
+    )
+    # The first joint stands half a segment from the base; centres lie at half the height.
+    segment, height = 2.0 * hand.offset[0], 2.0 * hand.centre[2, 0]
+    local = jnp.stack([along * segment, across * width + 0.0 * segment + 0.0 * along, up * height])
+    base = jnp.stack([apply_columns(kin.palm, hand.mount[k]) for k in range(3)])
+    before = jnp.concatenate([base[:, :, None], kin.link], 2)[:, :, :, None]
+    after = jnp.concatenate([kin.link, kin.link[:, :, -1:]], 2)[:, :, :, None]
+    joint = jnp.concatenate([kin.origin, kin.origin[:, -1:]], 1)[:, :, None]
+    image = apply_columns(after, local)
+    blend = (1.0 - weight) * apply_columns(before, local) + weight * image
+    surface = area[0] * segment * width + area[1] * segment * height + area[2] * width * height
+    return Vertices(joint + blend, image, weight, surface / width**2)
+
+
+def attach(run: Stages, contacts: Contacts, skin: Vertices) -> Contacts:
+    """Makes contacts of the vertices, as of spheres without a radius, follow their two links.
+
+    The vertices that touch come first in every row and lane: sums end after the last of them.
+    """
+
+    def ordered(c: Contacts, skin: Vertices) -> tuple[jax.Array, ...]:
+        lever = skin.weight * (skin.image + c.point - skin.point)
+        order = jnp.argsort(~c.active, axis=1, stable=True)
+        each = (c.point, c.normal, c.distance, lever, skin.share)
+        return tuple(
+            jnp.take_along_axis(x, order if x.ndim == order.ndim else order[None], axis=x.ndim - 3)
+            for x in each
+        )
+
+    # Where no vertex touches all become zero, which is no contact either.
+    touching = run.only_if(contacts.active.any())
+    point, normal, distance, lever, share = touching(ordered, contacts, skin)
+    cone = contacts.cone
+    cone = cone._replace(normal=cone.normal * share, tangent=cone.tangent * share)
+    return Contacts(point, normal, distance, cone, lever)
+
+
+def across_joints(palm: jax.Array, links: jax.Array) -> jax.Array:
+    """Motion of each row's first link and of the joint after it, shape (9, row, finger, world)."""
+    first = palm[:, None] + jnp.zeros_like(links[:, :1])
+    before = jnp.concatenate([first, links], 1)
+    turning = jnp.concatenate([links[:3] - before[:3, :-1], jnp.zeros_like(first[:3])], 1)
+    return jnp.concatenate([before, turning])
+
+
+def push(run: Stages, c: Contacts, jar: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Contact inertia (9, 9, row, finger, world) and wrench (9, row, finger, world) of the rows."""
+
+    def evaluate(point, normal, distance, lever, stiff, tangent, jar) -> tuple:
+        cone = c.cone._replace(normal=stiff, tangent=tangent)
+        vertex = Contacts(point, normal, distance, cone, lever)
+        response = respond(vertex, jar)
+        matrix = contact_inertia(vertex, response.hessian)
+        wrench = contact_wrench(vertex, response.force)
+        return jnp.stack([matrix[i, j] for i, j in _UPPER]), wrench
+
+    each = (c.point, c.normal, c.distance, c.lever, c.cone.normal, c.cone.tangent, jar)
+    upper, wrench = _sum_vertices(run, c, evaluate, each, (len(_UPPER), 9))
+    place = {ij: n for n, ij in enumerate(_UPPER)}
+    rows = [jnp.stack([upper[place[min(i, j), max(i, j)]] for j in range(9)]) for i in range(9)]
+    return jnp.stack(rows), wrench
+
+
+def line_slopes(run: Stages, c: Contacts, ray: Line, alpha: jax.Array) -> tuple:
+    """First and second derivative of the cost of all vertices along the line, shape (1, world)."""
+
+    def evaluate(distance, stiff, tangent, *ray) -> tuple:
+        cone = c.cone._replace(normal=stiff, tangent=tangent)
+        vertex = Contacts(distance, distance, distance, cone)
+        return tuple(v[None] for v in slopes(vertex, Line(*ray), alpha))
+
+    each = (c.distance, c.cone.normal, c.cone.tangent, *ray)
+    return tuple(sum_items(v[0]) for v in _sum_vertices(run, c, evaluate, each, (1, 1)))
+
+
+def _sum_vertices(
+    run: Stages, c: Contacts, function: Callable, each: tuple, sizes: tuple[int, ...]
+) -> tuple:
+    """Sums over the vertices of each row that touch in any lane, one vertex after the other.
+
+    All vertices' matrices would not fit a CPU's cache, and most vertices, such as those on a
+    finger's back, touch nothing; those that do come first, see `attach`.
+
+    Args:
+      run: Runs the stages.
+      c: The contacts.
+      function: From the arrays of one vertex of each row, shape (..., row, finger, world), to
+        arrays of shape (size, row, finger, world).
+      each: Arrays of shape (..., row, k, finger, world).
+      sizes: The sizes.
+    """
+    rows, k, *lanes = c.distance.shape
+    # Rows and planes to the compiler, as in `scan_links`.
+    planes = [x.reshape(-1, k, lanes[0] * lanes[1]) for x in each]
+
+    def add(i: jax.Array, sums: tuple) -> tuple:
+        vertex = [
+            jax.lax.dynamic_index_in_dim(p, i, 1, keepdims=False).reshape(*x.shape[:-3], *lanes)
+            for p, x in zip(planes, each, strict=True)
+        ]
+        return tuple(s + v for s, v in zip(sums, run(function, *vertex), strict=True))
+
+    zero = tuple(jnp.zeros((n, rows, *lanes), c.distance.dtype) for n in sizes)
+    return jax.lax.fori_loop(0, c.active.sum(1).max(), add, zero)
+
+
+_UPPER = [(i, j) for i in range(9) for j in range(i, 9)]
+
+
+def joint_terms(
+    axes: jax.Array,
+    terms: dict[str, tuple[jax.Array, jax.Array]],
+) -> JointTerms:
+    """What the contacts of the rows add to the elimination of their joints.
+
+    Args:
+      axes: Motion subspaces, shape (link, axis, 6, finger, world).
+      terms: Contact inertia, (9, 9, row, finger, world), and wrench by pair of bodies.
+    """
+    turn = jnp.moveaxis(axes[:, :, :3], 0, 2)  # (axis, 3, link, finger, world)
+    result = None
+    for name, (inertia, wrench) in terms.items():
+        mixed = contract(turn[:, :, None], inertia[None, 6:, :, :-1], 1)  # (axis, 9, link, ...)
+        parent = mixed[:, :6]
+        own = contract(turn[:, None], mixed[None, :, 6:], 2)
+        force = contract(turn, wrench[None, 6:, :-1], 1)
+        obj = parent if name.endswith("object") else jnp.zeros_like(parent)
+        new = JointTerms(own, parent, obj, force)
+        result = new if result is None else jax.tree.map(jnp.add, result, new)
+    assert result is not None
+    return result

@@ -1,0 +1,61 @@
+"""Derivatives of a step through the hull and through contacts between fingers, in float64."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from codesign_jax import model
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.lanes import Stages
+from tests import small
+from tests.test_structured import lanes_state
+
+# The derivative of a step compiles in one to two minutes.
+pytestmark = pytest.mark.slow
+
+EFFECTS = {
+    "hull": {"effects__surface": "hull"},
+    "finger_finger": {"effects__finger_finger": True, "discretization__spheres_per_link": 2},
+}
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_step_against_central_differences(effect):
+    """A weighted sum of the new velocities along a random direction of the state."""
+    with jax.enable_x64(True):
+        scene = small.pinch(
+            "sphere", effects__palm_object=False, effects__palm_table=False, **EFFECTS[effect]
+        )
+        hand, trial = small.hand_world(scene, length=0.1)
+        fields = model.model_fields(scene, jax.tree.map(jnp.asarray, hand), trial)
+        fields = jax.tree.map(lambda x: x[None], fields)
+        engine = StructuredEngine(
+            scene, iterations=200, evaluations=20, tolerance=1e-26, differentiable=True
+        )
+        random, lay = np.random.default_rng(0), model.layout(scene)
+        qpos = np.array(fields.start[0])
+        qpos[2] = 0.07
+        angles = 0.1 * random.normal(size=lay.dofs.shape)
+        angles[..., 0] += 0.8
+        qpos[6 : 6 + lay.dofs.size] = angles.ravel()
+        qvel = 0.3 * random.normal(size=len(qpos) - 1)
+        along_q, along_v = random.normal(size=len(qpos)), random.normal(size=len(qvel))
+        along_q[-4:] = 0.0  # the quaternion stays one
+        weights, lanes = random.normal(size=len(qvel)), hand_lanes(scene, fields)
+        ctrl = jnp.asarray([*qpos[:6], 6e4, 6e4])[:, None]
+        contacts = jax.jit(lambda s: engine.problem(Stages(None), lanes, s, ctrl)[0].contacts)
+        name = {"hull": "hull_object"}.get(effect, effect)
+
+        def value(t):
+            state = lanes_state(engine, scene, fields, qpos + t * along_q, qvel + t * along_v)
+            return (engine.qvel(engine.step(lanes, state, ctrl)[0])[0] * weights).sum()
+
+        at = contacts(lanes_state(engine, scene, fields, qpos, qvel))
+        assert int((at[name].distance < 0).sum()) > 5
+        run, h = jax.jit(value), 1e-7
+        derivative = float(jax.jit(jax.grad(value))(0.0))
+        difference = float(run(h) - run(-h)) / (2 * h)
+        # The solver's error of 1e-13 over h, and h^2 times a third derivative of stiff contacts.
+        np.testing.assert_allclose(derivative, difference, rtol=1e-5)

@@ -1,0 +1,132 @@
+"""Contacts between fingers: the structured engine against MuJoCo C, pairs of spheres and all."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from codesign_jax import model, scene
+from codesign_jax.engines.mjx import MjxEngine
+from codesign_jax.engines.structured import StructuredEngine, finger_pairs
+from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.schema import SceneError
+from tests import small
+from tests.test_structured import lanes_state
+
+SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 2}
+
+
+def curled(the_scene, seed, bend, height):
+    """Model, data and lanes of a hand with random joint angles about a bend, object between."""
+    hand, trial = small.hand_world(the_scene, length=0.1)
+    fields = model.model_fields(the_scene, jax.tree.map(jnp.asarray, hand), trial)
+    oracle = model.compile_model(the_scene, hand, trial)
+    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
+    data, random = mujoco.MjData(oracle), np.random.default_rng(seed)
+    lay, qpos = model.layout(the_scene), np.array(fields.start)
+    qpos[2] = height
+    angles = 0.1 * random.normal(size=lay.dofs.shape)
+    angles[..., 0] += bend
+    qpos[6 : 6 + lay.dofs.size] = angles.ravel()
+    data.qpos[:], data.qvel[:] = qpos, 0.3 * random.normal(size=oracle.nv)
+    data.ctrl[:6] = qpos[:6]
+    data.ctrl[6:] = 60e3
+    return oracle, data, jax.tree.map(lambda x: x[None], fields)
+
+
+def kinds(oracle, data):
+    """Numbers of contacts between two fingers and of a finger with the object."""
+    names = [
+        [mujoco.mj_id2name(oracle, mujoco.mjtObj.mjOBJ_GEOM, int(g)) for g in pair]
+        for pair in data.contact.geom
+    ]
+    fingers = [sum(n.startswith("finger") for n in pair) for pair in names]
+    held = sum("finger" in a + b and "object" in a + b for a, b in names)
+    return fingers.count(2), held
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """The scene and one compiled step to convergence, for every state of this module."""
+    with jax.enable_x64(True):
+        the_scene = small.pinch("sphere", **SETTINGS)
+        engine = StructuredEngine(the_scene, iterations=200, evaluations=20, tolerance=1e-26)
+        return the_scene, engine, jax.jit(engine.step)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_accelerations_equal_mujoco_on_curled_hands(driven, seed):
+    """Fingers touch one another and the object, sliding at up to a metre a second."""
+    the_scene, engine, step = driven
+    with jax.enable_x64(True):
+        oracle, data, fields = curled(the_scene, seed, bend=0.75 + 0.05 * seed, height=0.07)
+        mujoco.mj_forward(oracle, data)
+        state = lanes_state(engine, the_scene, fields, data.qpos, data.qvel)
+        new, _ = step(hand_lanes(the_scene, fields), state, jnp.asarray(data.ctrl)[:, None])
+        acc = (np.asarray(engine.qvel(new))[0] - data.qvel) / the_scene.discretization.timestep
+        error = np.linalg.norm(acc - data.qacc) / np.linalg.norm(data.qacc)
+        between, held = kinds(oracle, data)
+        assert between > 5 and held > 5
+        # As without these contacts: a difference of velocities, and MuJoCo's own rounding.
+        assert error < 1e-8, (between, held, error)
+
+
+def test_without_a_touch_nothing_changes(driven):
+    """Fingers apart: the accelerations of MuJoCo's model that has no such pairs."""
+    the_scene, engine, step = driven
+    with jax.enable_x64(True):
+        bare = small.pinch("sphere", discretization__spheres_per_link=2)
+        oracle, data, _ = curled(bare, 0, bend=0.1, height=0.12)
+        _, _, fields = curled(the_scene, 0, bend=0.1, height=0.12)
+        mujoco.mj_forward(oracle, data)
+        state = lanes_state(engine, the_scene, fields, data.qpos, data.qvel)
+        new, _ = step(hand_lanes(the_scene, fields), state, jnp.asarray(data.ctrl)[:, None])
+        acc = (np.asarray(engine.qvel(new))[0] - data.qvel) / the_scene.discretization.timestep
+        assert np.linalg.norm(acc - data.qacc) < 1e-8 * np.linalg.norm(data.qacc)
+
+
+def test_candidates_are_all_pairs_of_different_fingers():
+    """MuJoCo's explicit pairs and the engine's slots: 6 pairs of fingers, all their spheres."""
+    the_scene = scene.load("paper", overrides={"effects": {"finger_finger": True}})
+    off = scene.load("paper")
+    pairs = [model.compile_template(s).npair for s in (the_scene, off)]
+    assert pairs[0] - pairs[1] == 6 * 10 * 10 == len(finger_pairs.finger_pairs(4)) * 100
+
+
+def test_concentric_spheres_have_a_normal():
+    """Fingers that start inside one another push along MuJoCo's fallback axis, finitely."""
+    the_scene = small.pinch("sphere", **SETTINGS)
+    centre = jnp.zeros((3, 1, 1, 2, 1))
+    found = finger_pairs.contacts(the_scene, centre, jnp.full((1, 1, 2, 1), 0.01))
+    np.testing.assert_allclose(found.distance, -0.02, rtol=1e-6)
+    oracle = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><freejoint/><geom size=".01"/></body>
+        <body><freejoint/><geom size=".01"/></body></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(oracle)
+    mujoco.mj_forward(oracle, data)
+    # MuJoCo's normal points from the first to the second, ours the other way.
+    np.testing.assert_allclose(found.normal.ravel(), -data.contact.frame[0, :3])
+    np.testing.assert_allclose(data.contact.dist[0], -0.02)
+
+
+def test_not_with_the_hull():
+    with pytest.raises(SceneError, match="finger_finger is between spheres"):
+        small.pinch("sphere", effects__surface="hull", **SETTINGS)
+
+
+@pytest.mark.slow  # a minute of compiling
+def test_mjx_equals_mujoco():
+    """The same pairs in stock MJX; its Newton stops at the scene's tolerance of 1e-8."""
+    with jax.enable_x64(True):
+        the_scene = small.pinch("sphere", **SETTINGS)
+        oracle, data, fields = curled(the_scene, 0, bend=0.8, height=0.07)
+        mujoco.mj_forward(oracle, data)
+        engine = MjxEngine(the_scene)
+        one = jax.tree.map(lambda x: x[0], fields)
+        start = engine.reset(one).replace(qpos=jnp.asarray(data.qpos), qvel=jnp.asarray(data.qvel))
+        new = jax.jit(engine.step)(one, start, jnp.asarray(data.ctrl))
+        assert kinds(oracle, data)[0] > 5
+        error = np.linalg.norm(new.qacc - data.qacc) / np.linalg.norm(data.qacc)
+        assert error < 1e-4

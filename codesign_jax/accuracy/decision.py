@@ -12,6 +12,7 @@ from codesign_jax import parameters, rollout
 from codesign_jax.accuracy import worlds
 from codesign_jax.accuracy.settings import Setting
 from codesign_jax.scene import Scene
+from codesign_jax.types import failed
 
 KEPT, FAILED = -1, -2
 """Marks in place of the time of loss: kept to the end, and failed."""
@@ -71,7 +72,7 @@ def simulate(
         found = jax.tree.map(np.asarray, run(jnp.asarray(designs, dtype), drawn))
         seconds = time.perf_counter() - start
     lost = np.where(np.isfinite(found.lost_time), 1e3 * found.lost_time, KEPT)
-    lost = np.where(found.status == 0, np.round(lost), FAILED).astype(int)
+    lost = np.where(failed(found.status), FAILED, np.round(lost)).astype(int)
     status = found.status[found.status != 0]
     return {
         "particles": len(designs),

@@ -22,7 +22,7 @@ from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.experiments.statistics import wilson
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
-from codesign_jax.types import Params
+from codesign_jax.types import Params, failed
 
 CONTACTS = ("finger_object", "palm_object", "finger_table", "palm_table", "object_table")
 STEPS = 20
@@ -117,7 +117,7 @@ def _velocity(scene: Scene, before: np.ndarray, after: np.ndarray) -> np.ndarray
 
 def compare(found: Decision, reference: Decision, trials: int) -> dict[str, Any]:
     """Success rate with its 95 % interval and agreement with the scene as it is."""
-    success = (found.cost < SUCCESS_COST) & (found.status == 0)
+    success = (found.cost < SUCCESS_COST) & ~failed(found.status)
     rate = wilson(int(success.sum()), success.size)
     same = agreement(found.cost, reference.cost, trials)
     return {
@@ -127,7 +127,7 @@ def compare(found: Decision, reference: Decision, trials: int) -> dict[str, Any]
         "success_high": float(rate.high),
         "same_verdict": same["same_verdict"],
         "rank_correlation": same["spearman"],
-        "failed": int((found.status != 0).sum()),
+        "failed": int(failed(found.status).sum()),
         "grasp_seconds": found.seconds,
     }
 

@@ -13,6 +13,7 @@ from codesign_jax.experiments.record import Arrays
 from codesign_jax.experiments.report import fill
 from codesign_jax.experiments.statistics import Interval
 from codesign_jax.experiments.winners import STANDARD, VARIANTS, Finals
+from codesign_jax.types import failed
 
 MARK = "winners"
 """Name of the marks in the page."""
@@ -91,7 +92,7 @@ def rows(results: Arrays, finals: Finals) -> list[Row]:
 
 def solved(cost: np.ndarray, status: np.ndarray) -> np.ndarray:
     """Whether particles solve the task: mean cost of the trials that did not fail below 0.01."""
-    good = status == 0
+    good = ~failed(status)
     mean = np.where(good, cost, 0).sum(-1) / np.maximum(good.sum(-1), 1)
     return good.any(-1) & (mean < SUCCESS_COST)
 
@@ -107,7 +108,7 @@ def _row(
     top = cost[:, 0], status[:, 0]  # the best particle of each run is its first
     won = finals.successful
     good = solved(*top)
-    kept = (top[0] < SUCCESS_COST) & (top[1] == 0)
+    kept = (top[0] < SUCCESS_COST) & ~failed(top[1])
     p = same = None
     shared = None if standard is None else standard[0].shape[-1]
     # Other objects have trials of their own.
@@ -117,7 +118,7 @@ def _row(
         other = [v[:, 0, :n] for v in standard]
         mine = [v[:, :n] for v in top]
         p = statistics.mcnemar(solved(*mine)[won], solved(*other)[won])
-        theirs = (other[0] < SUCCESS_COST) & (other[1] == 0)
+        theirs = (other[0] < SUCCESS_COST) & ~failed(other[1])
         same = float((kept[:, :n] == theirs)[won].mean())
     by_run = solved(cost, status).mean(1)
     return Row(
@@ -129,7 +130,7 @@ def _row(
         statistics.bootstrap(by_run, lambda v: v.mean(-1)) if particles > 1 else None,
         statistics.bootstrap(kept[won].mean(1), lambda v: v.mean(-1)) if won.any() else NOTHING,
         same,
-        float((status != 0).mean()),
+        float(failed(status).mean()),
     )
 
 

@@ -9,11 +9,12 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
-.PHONY: demo test test-slow notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo test test-slow stability notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
+	@echo "make stability   the hard cases and their margins, docs/stability.md"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
 	@echo "make effects     what each effect costs and decides: docs/effects.md"
@@ -24,10 +25,14 @@ demo: $(STAMP)
 	$(BIN)/python scripts/demo.py
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow
+
+# All hard cases; their margins go to docs/stability.md. About an hour on two cores.
+stability: $(STAMP)
+	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
 
 notebooks: $(STAMP)
 	$(BIN)/python scripts/run_notebooks.py

@@ -9,13 +9,14 @@ import trimesh
 
 from codesign_jax import hull, model, scene
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.structured import StructuredEngine, solver
+from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import hull as skin
 from codesign_jax.engines.structured.collision import make_cone
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.hand import hand_lanes
 from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.engines.structured.problem import Spatial, relative
 from codesign_jax.schema import SceneError
 from tests import small
 from tests.test_structured import lanes_state
@@ -100,8 +101,8 @@ def test_velocities_are_derivatives_of_positions():
 
         kin, points, _ = at(0.0)
         zero, cone = jnp.zeros_like(points.point), make_cone(the_scene, 0.5, bodies=1)
-        motion = solver.Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-        rel = solver.relative("hull_table", motion)
+        motion = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
+        rel = relative("hull_table", motion)
         contacts = Contacts(points.point, zero, zero[0], cone, points.weight * points.image)
         moved = contacts.relative(rel)
         h = 1e-5

@@ -97,7 +97,7 @@ class MujocoEngine:
                 _apply_softening(scene, batch, fields, going)
             new, taken, states = self._advance(batch, going, ctrl[going, part], trajectory)
             for array, values in zip(series, new[:-1], strict=True):
-                array[going, part] = values  # type: ignore[call-overload]
+                array[going, part] = np.asarray(values)
             # The cost window's end counts as lost only strictly inside it, as in `cost.outcome`.
             time = np.arange(part.start, part.stop)
             lost = (new.distance >= scene.cost.lost_distance) & (time >= start) & (time < end)

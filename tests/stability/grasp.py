@@ -202,7 +202,7 @@ case(*turned[:3], unit=turned[3], engine="mujoco", quick=((1.0, "float64"),))(mi
 
 
 def scaled_scene(base, s):
-    """The same scene s times as large under the same gravity: forces s^3, stresses s, times s^½."""
+    """The scene s times as large, gravity the same: forces s^3, stresses s, times s^(1/2)."""
     t = np.sqrt(s)
     h, o, c = base.hand, base.objects, base.contact
     fingers = tuple(dataclasses.replace(f, radius=s * f.radius) for f in h.finger)

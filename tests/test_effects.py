@@ -392,8 +392,18 @@ COMBINATIONS = st.fixed_dictionaries(
 
 
 def check_combination(values, shape):
-    """Every engine takes a step that is finite, or traces one, or says what it cannot do."""
-    scene = small.pinch(shape, links=1, **{f"effects__{k}": v for k, v in values.items()})
+    """Every engine takes a step that is finite, or traces one, or says what it cannot do.
+
+    The hull, contact between fingers and frictions other than Coulomb's exclude one another.
+    """
+    chosen = {f"effects__{k}": v for k, v in values.items()}
+    hull, between = values["surface"] == "hull", values["finger_finger"]
+    if (hull and between) or ((hull or between) and values["friction"] != "coulomb"):
+        with pytest.raises(schema.SceneError) as caught:
+            small.pinch(shape, links=1, **chosen)
+        assert all("effects.surface" in p or "finger_finger" in p for p in caught.value.problems)
+        return
+    scene = small.pinch(shape, links=1, **chosen)
     for name in effects.ENGINES:
         refused = effects.refusals(scene.effects, name)
         if refused:

@@ -9,12 +9,14 @@ import trimesh
 
 from codesign_jax import hull, model, scene
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.structured import StructuredEngine, solver
+from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import hull as skin
+from codesign_jax.engines.structured.collision import make_cone
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.hand import hand_lanes
 from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.engines.structured.problem import Spatial, relative
 from codesign_jax.schema import SceneError
 from tests import small
 from tests.test_structured import lanes_state
@@ -64,7 +66,9 @@ def test_skinning_equals_mujoco(tmp_path):
     the_scene = hull_scene()
     compiled, data = bent(the_scene)
     view = mujoco.MjvScene(compiled, maxgeom=100)
-    mujoco.mjv_updateActiveSkin(compiled, data, view, mujoco.MjvOption())
+    mujoco.mj_forward(compiled, data)
+    every, camera = int(mujoco.mjtCatBit.mjCAT_ALL), mujoco.MjvCamera()
+    mujoco.mjv_updateScene(compiled, data, mujoco.MjvOption(), None, camera, every, view)
     lay, mesh, fingers = model.layout(the_scene), hull.hull(the_scene), []
     for f in range(the_scene.num_fingers):
         links = [lay.stubs[f], *lay.bodies[f]]
@@ -96,10 +100,10 @@ def test_velocities_are_derivatives_of_positions():
             return kin, skin.vertices(the_scene, lanes, kin), state.wrist[:3, 0, 0]
 
         kin, points, _ = at(0.0)
-        zero = jnp.zeros_like(points.point)
-        motion = solver.Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-        rel = solver.relative("hull_table", motion)
-        contacts = Contacts(points.point, zero, zero[0], None, points.weight * points.image)
+        zero, cone = jnp.zeros_like(points.point), make_cone(the_scene, 0.5, bodies=1)
+        motion = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
+        rel = relative("hull_table", motion)
+        contacts = Contacts(points.point, zero, zero[0], cone, points.weight * points.image)
         moved = contacts.relative(rel)
         h = 1e-5
         ends = [v.point + palm[:, None, None, None, None] for _, v, palm in (at(h), at(-h))]

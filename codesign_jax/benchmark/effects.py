@@ -47,8 +47,8 @@ def variants(scene: Scene) -> dict[str, Scene]:
 def grasps(scene: Scene, designs: int, trials: int) -> Worlds:
     """Designs of the 2D space around those that hold, each in the same trials.
 
-    The box, lengths of 45 to 150 mm and arm heights of -60 to 60 mm, is where about a third of the
-    designs holds: leaving an effect out can change a verdict both ways.
+    The box, lengths of 45 to 150 mm and arm heights of -60 to 60 mm, is where about half of the
+    grasps hold: leaving an effect out can change a verdict both ways.
     """
     space = parameters.design_space(scene.hand, "2d")
     low, high = np.array([0.045, -0.06]), np.array([0.150, 0.06])

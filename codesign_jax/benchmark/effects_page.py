@@ -34,7 +34,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
     flops = np.array([rows[names[k]]["flops"] for k in place]) / rows[REFERENCE]["flops"]
     left.plot(flops, place, "x", color="tab:orange", ms=5, label="operations of one iteration")
     left.plot([], [], "o", color="tab:blue", label="time, median and quartiles")
-    left.legend(frameon=False, fontsize=8)
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, 1.08), ncols=2, frameon=False, fontsize=8)
     left.set_yticks(range(len(names)), names)
     left.set(xlabel="a step, relative to the scene as it is", xlim=(0, None))
     right.set(xlabel="success rate with 95 % interval")
@@ -62,11 +62,13 @@ def measured_table(results: dict[str, Any]) -> list[list[str]]:
     rows = results["effects"]
     for name, r in rows.items():
         same = " (same program)" if _same(rows, name) else ""
-        program = ["–"] * 6
-        if "ratio" in r:
+        sizes = ("flops", "xla_flops", "xla_bytes")
+        program = [str(r.get("equations", "–"))]
+        program += [f"{r[k] / 1e3:.1f}" if k in r else "–" for k in sizes]
+        if "ratio" not in r:
+            program += ["–"] * 2
+        else:
             low, high = r["ratio_quartiles"]
-            program = [str(r["equations"])]
-            program += [f"{r[k] / 1e3:.1f}" for k in ("flops", "xla_flops", "xla_bytes")]
             program += [
                 f"{r['step_seconds'] * 1e6:.1f}",
                 f"{r['ratio']:.2f} ({low:.2f}–{high:.2f})",

@@ -14,7 +14,6 @@ from codesign_jax.engines.structured import (
     hull,
     implicit,
     mesh,
-    solver,
 )
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
@@ -22,6 +21,7 @@ from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
 from codesign_jax.engines.structured.lanes import Stages, total
+from codesign_jax.engines.structured.problem import Matrices, Problem, Spatial
 from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.model.layout import palm_touches
@@ -133,16 +133,16 @@ class StructuredEngine:
 
     def problem(
         self, run: Stages, hand: HandLanes, state: State, ctrl: jax.Array
-    ) -> tuple[solver.Problem, solver.Spatial]:
+    ) -> tuple[Problem, Spatial]:
         """Assembles a step's problem and the bodies' velocities; ctrl has shape (nu, world)."""
         kin = kinematics(run, hand, layout(self.scene).axes, state)
         body = bodies(run, hand, kin)
         smooth = smooth_forces(run, hand, kin, body, state, ctrl, self.scene)
-        matrix = solver.Matrices(*(run(lambda b: b.matrix(), b) for b in body))
+        matrix = Matrices(*(run(lambda b: b.matrix(), b) for b in body))
         contacts = self.contacts(run, hand, kin, state.wrist[2])
-        velocity = solver.Spatial(kin.palm_vel, kin.vel, kin.object_vel)
+        velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
         arm = None if self.scene.effects.wrist else self._arm(state, ctrl)
-        return solver.Problem(hand, kin, body, matrix, smooth, contacts, arm), velocity
+        return Problem(hand, kin, body, matrix, smooth, contacts, arm), velocity
 
     def _arm(self, state: State, ctrl: jax.Array) -> jax.Array:
         """Acceleration of the palm's coordinates that ends the step at the arm frame."""

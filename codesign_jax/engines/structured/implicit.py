@@ -20,7 +20,17 @@ from codesign_jax.engines.structured.contact import Contacts, respond
 from codesign_jax.engines.structured.hand import HandLanes
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, sum_items
-from codesign_jax.engines.structured.solver import Forces, Problem, Solution, Spatial
+from codesign_jax.engines.structured.newton import linear_solve, respond_all
+from codesign_jax.engines.structured.problem import (
+    Forces,
+    Problem,
+    Spatial,
+    inertial_forces,
+    propagate,
+    relative,
+    work,
+)
+from codesign_jax.engines.structured.solver import Solution
 
 
 def solve(
@@ -87,13 +97,13 @@ def solve(
 
 def adjoint(run: Stages, problem: Problem, velocity: Spatial, acc: Acc, cotangent: Acc) -> Acc:
     """Solves H lambda = cotangent by the elimination of a Newton step at the solution acc."""
-    motion = solver.propagate(run, problem.kin, acc)
+    motion = propagate(run, problem.kin, acc)
     runs = {n: run.only_if(c.active.any()) for n, c in problem.contacts.items()}
     jar = {
         n: runs[n](lambda *v, n=n: _jar(n, *v), c, motion, velocity)
         for n, c in problem.contacts.items()
     }
-    pushes, pairs = solver.respond_all(runs, problem.contacts, jar)
+    pushes, pairs = respond_all(runs, problem.contacts, jar)
     pushes = {n: (inertia, jnp.zeros_like(wrench)) for n, (inertia, wrench) in pushes.items()}
     if pairs is not None:
         pairs = pairs._replace(push=jnp.zeros_like(pairs.push))
@@ -108,7 +118,7 @@ def adjoint(run: Stages, problem: Problem, velocity: Spatial, acc: Acc, cotangen
     )
     # As far as rounding allows: the derivative has no further Newton step to mend it.
     tolerance = float(jnp.finfo(motion.link.dtype).eps) ** 1.5
-    return solver.linear_solve(run, problem, force, pushes, pairs, tolerance=tolerance)[0]
+    return linear_solve(run, problem, force, pushes, pairs, tolerance=tolerance)[0]
 
 
 def residual_power(
@@ -117,16 +127,16 @@ def residual_power(
     """Power lambda' F of the unbalanced forces at acc along virtual, shape (1, world)."""
     if problem.arm is not None:  # data of the step, not a solution
         acc = acc._replace(wrist=problem.arm)
-    motion = solver.propagate(run, problem.kin, acc)
-    along = solver.propagate(run, problem.kin, virtual)
-    inertial = solver.inertial_forces(run, problem, acc, motion)
+    motion = propagate(run, problem.kin, acc)
+    along = propagate(run, problem.kin, virtual)
+    inertial = inertial_forces(run, problem, acc, motion)
     force = Forces(*(m - s for m, s in zip(inertial, problem.smooth, strict=True)))
-    power = solver.work(run, force, virtual, along)
+    power = work(run, force, virtual, along)
     for name, c in problem.contacts.items():
 
         def pushed(c: Contacts, motion: Spatial, velocity: Spatial, along: Spatial, name=name):
             force = respond(c, _jar(name, c, motion, velocity)).force
-            return sum_items(dot(force, c.relative(solver.relative(name, along))))
+            return sum_items(dot(force, c.relative(relative(name, along))))
 
         active = run.only_if(c.active.any())
         power = power - active(pushed, c, motion, velocity, along)
@@ -135,8 +145,8 @@ def residual_power(
 
 def _jar(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Array:
     """J a - aref of a set of contacts."""
-    speed = c.relative(solver.relative(name, velocity))
-    return c.relative(solver.relative(name, motion)) - c.reference(speed)
+    speed = c.relative(relative(name, velocity))
+    return c.relative(relative(name, motion)) - c.reference(speed)
 
 
 def checkpointed(step: Callable, resume: Callable, good: Callable[[State], jax.Array]) -> Callable:

@@ -40,7 +40,7 @@ class ContactSet:
 
         Args:
           scene: The scene.
-          name: Pair of bodies, as in `solver.relative`.
+          name: Pair of bodies, as in `problem.relative`.
           count: Number of items.
           k: Contacts of an item, on each lane.
           size: Lanes of a block.

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured import solver
+from codesign_jax.engines.structured import newton, solver
 from codesign_jax.engines.structured.fused.contacts import BoundContacts, direct, zeros
 from codesign_jax.engines.structured.fused.tables import (
     Block,
@@ -20,6 +20,7 @@ from codesign_jax.engines.structured.fused.tables import (
 from codesign_jax.engines.structured.inertia import Body
 from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.engines.structured.problem import Forces, Matrices
 
 
 class Palm(NamedTuple):
@@ -123,7 +124,7 @@ class Newton:
         def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes):
             link = make_body(*body)
             push = smooth - link.times(motion)
-            node = solver._add_link(node, solver._own(link.matrix(), push, pushes))
+            node = newton.add_link(node, newton.link_terms(link.matrix(), push, pushes))
             return el.eliminate(direct, node, axes, arm, tau - arm * acc)
 
         def step(i: Any, node: el.Quadratic) -> el.Quadratic:
@@ -162,18 +163,18 @@ class Newton:
         """Solves for wrist and object."""
 
         def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> Iterate:
-            force = solver.Forces(
+            force = Forces(
                 palm.smooth_palm - palm.palm.times(now.palm_motion),
                 None,  # type: ignore[arg-type]
                 palm.smooth_object - palm.object.times(now.object_motion),
                 palm.smooth_wrist - palm.armature * now.wrist,
                 None,  # type: ignore[arg-type]
             )
-            matrices = solver.Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
-            node = solver._add_palm(node, matrices, force, pushes)
+            matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
+            node = newton.add_palm(node, matrices, force, pushes)
             arm = palm.armature
             node, hinges = el.eliminate(direct, node, palm.axes, arm[3:], force.wrist[3:])
-            slide_axes = solver._slides(arm)
+            slide_axes = newton.wrist_slides(arm)
             node, slides = el.eliminate(direct, node, slide_axes, arm[:3], force.wrist[:3])
             obj = el.solve_object(direct, node.q, node.r_object)
             first, motion = el.substitute(slide_axes, slides, jnp.zeros_like(obj), obj)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, inertia, solver
+from codesign_jax.engines.structured import collision, inertia
 from codesign_jax.engines.structured import kinematics as kin
 from codesign_jax.engines.structured.engine import integrate
 from codesign_jax.engines.structured.fused.contacts import (
@@ -31,6 +31,7 @@ from codesign_jax.engines.structured.inertia import Body
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.problem import next_motion, object_motion, palm_motion
 from codesign_jax.scene import Scene
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class Step:
             error = arm - state["wrist"]
             spring = jnp.stack([stiffness[i] * error[i] for i in range(6)])
             acc = state["acc_wrist"], state["acc_object"]
-            motions = solver.palm_motion(acc[0], axes), solver.object_motion(acc[1], position)
+            motions = palm_motion(acc[0], axes), object_motion(acc[1], position)
             return {
                 "frame": frame,
                 "vel": vel,
@@ -304,7 +305,7 @@ def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, 
     cos, sin = jnp.cos(q), jnp.sin(q)
     origin, frame, axes = kin._turn_link(names, origin, frame, offset, cos, sin)
     vel, bias = kin._link_velocity(vel, bias, axes, rate)
-    motion = solver.next_motion(motion, axes, acc)
+    motion = next_motion(motion, axes, acc)
     body = Body(
         mass,
         origin + apply_columns(frame, centre),

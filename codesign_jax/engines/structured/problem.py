@@ -1,0 +1,152 @@
+"""A step's problem: bodies, forces and contacts, and how bodies move with the joints."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import finger_pairs, hull
+from codesign_jax.engines.structured.contact import (
+    Contacts,
+)
+from codesign_jax.engines.structured.hand import HandLanes
+from codesign_jax.engines.structured.inertia import Bodies, Smooth
+from codesign_jax.engines.structured.kinematics import Acc, Kinematics
+from codesign_jax.engines.structured.lanes import (
+    Stages,
+    cross,
+    dot,
+    scan_links,
+    spatial,
+    sum_axis,
+    sum_fingers,
+    total,
+)
+
+
+class Spatial(NamedTuple):
+    """Spatial motion: palm (6, 1, world), links (6, link, finger, world), object as palm."""
+
+    palm: jax.Array
+    link: jax.Array
+    object: jax.Array
+
+
+class Matrices(NamedTuple):
+    """Spatial inertia: palm (6, 6, 1, world), links (6, 6, link, finger, world), object."""
+
+    palm: jax.Array
+    link: jax.Array
+    object: jax.Array
+
+
+class Problem(NamedTuple):
+    """One step's problem: everything that does not change from iteration to iteration.
+
+    Attributes:
+      hand: The hand.
+      kin: Kinematics.
+      body: Inertia of the bodies.
+      matrix: The same as matrices.
+      smooth: Smooth forces.
+      contacts: Contacts by pair of bodies.
+      arm: Prescribed accelerations of the palm's coordinates, shape (6, 1, world); None with a
+        compliant wrist, whose accelerations are unknowns.
+    """
+
+    hand: HandLanes
+    kin: Kinematics
+    body: Bodies
+    matrix: Matrices
+    smooth: Smooth
+    contacts: dict[str, Contacts]
+    arm: jax.Array | None = None
+
+
+def palm_motion(wrist: jax.Array, axes: jax.Array) -> jax.Array:
+    """The palm's spatial acceleration of the wrist's slides and hinges."""
+    moving = spatial(jnp.zeros_like(wrist[:3]), wrist[:3])
+    return moving + total([axes[k] * wrist[3 + k] for k in range(3)])
+
+
+def next_motion(parent: jax.Array, axes: jax.Array, a: jax.Array) -> jax.Array:
+    """A link's spatial acceleration from its parent's and its joint's."""
+    return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
+
+
+def object_motion(acc: jax.Array, position: jax.Array) -> jax.Array:
+    """The object's spatial acceleration from that at its centre."""
+    return spatial(acc[:3], acc[3:] + cross(position, acc[:3]))
+
+
+def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
+    """Spatial accelerations J a of all bodies, without velocity terms."""
+    palm = run(palm_motion, acc.wrist, kin.wrist_axes)
+
+    def step(parent: jax.Array, link: tuple):
+        motion = run(next_motion, parent, *link[0])
+        return motion, motion
+
+    first = palm + jnp.zeros_like(kin.vel[:, 0])
+    _, links = scan_links(step, first, (kin.axes, acc.finger))
+    obj = object_motion(acc.object, kin.object_pos)
+    return Spatial(palm, jnp.moveaxis(links, 0, 1), obj)
+
+
+def on_links(name: str) -> bool:
+    """Whether the items of a set of contacts are of links or joints, several of each."""
+    return name.startswith(("finger", "hull"))
+
+
+def relative(name: str, motion: Spatial) -> jax.Array:
+    """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
+    obj = motion.object
+    if name == "finger_finger":
+        return finger_pairs.relative(motion.link)
+    if name.startswith("hull"):
+        moved = hull.across_joints(motion.palm, motion.link)
+        if name == "hull_object":
+            moved = jnp.concatenate([moved[:6] - obj[:, None], moved[6:]])
+        return moved[:, :, None]
+    if name == "finger_object":
+        return jnp.stack([motion.link[i] - obj[i] for i in range(6)])[:, :, None]
+    return {
+        "finger_table": motion.link[:, :, None],
+        "palm_object": motion.palm - obj,
+        "palm_table": motion.palm,
+        "object_table": obj,
+    }[name]
+
+
+class Forces(NamedTuple):
+    """Forces on the bodies, (6, ...), and on the joints, shaped as `Smooth`."""
+
+    palm: jax.Array
+    link: jax.Array
+    object: jax.Array
+    wrist: jax.Array
+    finger: jax.Array
+
+
+def inertial_forces(run: Stages, problem: Problem, acc: Acc, motion: Spatial) -> Forces:
+    """M a in factored form: spatial forces of the bodies and armature forces of the joints."""
+    body, hand = problem.body, problem.hand
+    return Forces(
+        body.palm.times(motion.palm),
+        run(lambda b, m: b.times(m), body.link, motion.link),
+        body.object.times(motion.object),
+        jnp.zeros_like(acc.wrist) if problem.arm is not None else hand.wrist_armature * acc.wrist,
+        hand.armature * acc.finger,
+    )
+
+
+def work(run: Stages, force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
+    """Product of forces and accelerations over all bodies and joints, shape (1, world)."""
+
+    def product(force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
+        links = sum_axis(dot(force.link, motion.link), 0)
+        joints = sum_axis(sum_axis(force.finger * acc.finger, 0), 0)
+        rest = dot(force.palm, motion.palm) + dot(force.object, motion.object)
+        return sum_fingers(links + joints) + rest + dot(force.wrist, acc.wrist)
+
+    return run(product, force, acc, motion)

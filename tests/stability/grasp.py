@@ -287,7 +287,7 @@ def unit_scaling(engine, step, precision):
         scale[:3], scale[-7:-4] = s, s
         found.append(q.astype(float) / scale)
     error = np.abs(found[0] - found[1]).max()
-    return Found(error, {"float32": 1e-4, "float64": 1e-9}[precision], "to 2.5 s, touching")
+    return Found(error, {"float32": 1e-4, "float64": 1e-9}[precision], "to 2.5 s")
 
 
 units = (22, "lengths times four, everything else to scale", "largest difference of places")

@@ -124,7 +124,8 @@ def test_vmap_is_one_at_a_time(worlds):
         one = jax.jit(lambda p, t: model.model_fields(the_scene, p, t))(
             nth(params, 4), nth(trials, 4)
         )
-    for a, b in zip(one, nth(fields, 4), strict=True):
+    leaves = jax.tree.leaves(one), jax.tree.leaves(nth(fields, 4))
+    for a, b in zip(*leaves, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-15, atol=1e-18)  # the batch may fuse otherwise
 
 

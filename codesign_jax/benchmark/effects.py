@@ -15,6 +15,7 @@ from codesign_jax.benchmark.program_cost import program_size
 from codesign_jax.benchmark.statistics import agreement
 from codesign_jax.benchmark.work import Worlds, inputs
 from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.effects import refusals
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.hand import hand_lanes
@@ -76,8 +77,8 @@ class Decision(NamedTuple):
 
 
 def decide(scene: Scene, worlds: Worlds) -> Decision:
-    """Simulates the grasps in MuJoCo C."""
-    engine = make_engine("mujoco", scene)
+    """Simulates the grasps in MuJoCo C, or in the structured engine what C refuses."""
+    engine = make_engine("structured" if refusals(scene.effects, "mujoco") else "mujoco", scene)
     begin = time.perf_counter()
     outcome, _ = rollout.simulate(scene, engine, *worlds)
     cost, status = np.asarray(outcome.cost), np.asarray(outcome.status)
@@ -93,7 +94,10 @@ class Moment(NamedTuple):
 
 
 def lifting(scene: Scene, worlds: Worlds) -> Moment:
-    """The grasps in the middle of the lift, by MuJoCo C."""
+    """The grasps in the middle of the lift, by MuJoCo C; of a hull those of its spheres."""
+    scene = dataclasses.replace(
+        scene, effects=dataclasses.replace(scene.effects, surface="spheres")
+    )
     fields, ctrl = inputs(scene, worlds)
     step = round((scene.phases.inflate + scene.phases.lift) / 2 / scene.discretization.timestep)
     engine = make_engine("mujoco", scene)

@@ -14,32 +14,12 @@ from codesign_jax import control, cost, model, rollout
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.hand import hand_lanes
-from codesign_jax.engines.structured.kinematics import Acc
 from tests import small
 
 
 def lanes_state(engine, scene, fields, qpos, qvel):
     """The engine's state, one world, from MuJoCo's coordinates, with a cold start."""
-    lay = model.layout(scene)
-    state = engine.reset(fields)
-    q, v = jnp.asarray(qpos)[:, None, None], jnp.asarray(qvel)[:, None, None]
-    end = 6 + lay.dofs.size
-
-    def finger(x):
-        return jnp.moveaxis(x[6:end].reshape(*lay.dofs.shape, 1), 0, 2)
-
-    acc = Acc(jnp.zeros_like(v[:6]), jnp.zeros_like(finger(v)), jnp.zeros_like(v[:6]))
-    return state._replace(
-        wrist=q[:6],
-        finger=finger(q),
-        position=q[end : end + 3],
-        quat=q[end + 3 :],
-        wrist_vel=v[:6],
-        finger_vel=finger(v),
-        linear_vel=v[end : end + 3],
-        angular_vel=v[end + 3 :],
-        acc=acc,
-    )
+    return engine.place(engine.reset(fields), jnp.asarray(qpos)[None], jnp.asarray(qvel)[None])
 
 
 def setting(shape, **params):

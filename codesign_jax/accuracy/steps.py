@@ -159,19 +159,9 @@ def to_state(
     engine: StructuredEngine, scene: Scene, fields: ModelFields, samples: Samples
 ) -> State:
     """The engine's state of a batch, from MuJoCo's coordinates and accelerations."""
-    end = 6 + model.layout(scene).dofs.size
-    q, v = (jnp.asarray(x.T)[:, None] for x in (samples.qpos, samples.qvel))
-    return engine.reset(fields)._replace(
-        wrist=q[:6],
-        finger=_by_finger(scene, q[6:end, 0]),
-        position=q[end : end + 3],
-        quat=q[end + 3 :],
-        wrist_vel=v[:6],
-        finger_vel=_by_finger(scene, v[6:end, 0]),
-        linear_vel=v[end : end + 3],
-        angular_vel=v[end + 3 :],
-        acc=_to_acc(scene, samples.warm, samples.qpos),
-    )
+    q, v = jnp.asarray(samples.qpos), jnp.asarray(samples.qvel)
+    state = engine.place(engine.reset(fields), q, v)
+    return state._replace(acc=_to_acc(scene, samples.warm, samples.qpos))
 
 
 def _by_finger(scene: Scene, flat: jax.Array) -> jax.Array:

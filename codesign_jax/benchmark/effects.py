@@ -21,7 +21,6 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.hand import hand_lanes
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.experiments.statistics import wilson
-from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params, failed
 
@@ -166,7 +165,8 @@ def compile_steps(
     engine = StructuredEngine(scene, lanes=0, fused=False)
     fields, ctrl = inputs(scene, worlds)
     hand = hand_lanes(scene, fields)
-    state = state_at(engine, fields, at)
+    q, v = (jnp.asarray(x, fields.start.dtype) for x in (at.qpos, at.qvel))
+    state = engine.place(engine.reset(fields), q, v)
     rows = jnp.moveaxis(ctrl[:, at.step : at.step + STEPS], 0, -1)
 
     def steps(hand: Any, state: State, rows: jax.Array) -> State:
@@ -185,27 +185,6 @@ def compile_steps(
         record["xla_flops"] = analysis["flops"] / each
         record["xla_bytes"] = analysis["bytes accessed"] / each
     return Program(program, (hand, state, rows), record)
-
-
-def state_at(engine: StructuredEngine, fields: ModelFields, at: Moment) -> State:
-    """The engine's state at positions and velocities of MuJoCo's, with a cold start."""
-    lay, dtype = layout(engine.scene), fields.start.dtype
-    end, state = 6 + lay.dofs.size, engine.reset(fields)
-    q, v = (jnp.asarray(x.T[:, None], dtype) for x in (at.qpos, at.qvel))
-
-    def finger(x: jax.Array) -> jax.Array:
-        return jnp.moveaxis(x[6:end, 0].reshape(*lay.dofs.shape, -1), 0, 2)
-
-    return state._replace(
-        wrist=q[:6],
-        finger=finger(q),
-        position=q[end : end + 3],
-        quat=q[end + 3 :],
-        wrist_vel=v[:6],
-        finger_vel=finger(v),
-        linear_vel=v[end : end + 3],
-        angular_vel=v[end + 3 :],
-    )
 
 
 def measure(programs: dict[str, Program], repeats: int) -> dict[str, list[float]]:

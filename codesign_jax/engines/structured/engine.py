@@ -119,6 +119,25 @@ class StructuredEngine:
             acc,
         )
 
+    def place(self, state: State, qpos: jax.Array, qvel: jax.Array) -> State:
+        """The state at MuJoCo's qpos (world, nq) and qvel (world, nv); see `qpos` and `qvel`."""
+        lay, end = layout(self.scene), 6 + layout(self.scene).dofs.size
+        q, v = qpos.T[:, None], qvel.T[:, None]
+
+        def finger(x: jax.Array) -> jax.Array:
+            return jnp.moveaxis(x[6:end, 0].reshape(*lay.dofs.shape, -1), 0, 2)
+
+        return state._replace(
+            wrist=q[:6],
+            finger=finger(q),
+            position=q[end : end + 3],
+            quat=q[end + 3 :],
+            wrist_vel=v[:6],
+            finger_vel=finger(v),
+            linear_vel=v[end : end + 3],
+            angular_vel=v[end + 3 :],
+        )
+
     def qpos(self, state: State) -> jax.Array:
         """MuJoCo's qpos, shape (world, nq)."""
         finger = jnp.moveaxis(state.finger, 2, 0).reshape(-1, state.finger.shape[-1])

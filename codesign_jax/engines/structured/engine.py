@@ -17,8 +17,10 @@ from codesign_jax.engines.structured import (
 )
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
+from codesign_jax.engines.structured.fused import native
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
+from codesign_jax.engines.structured.integration import integrate
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
 from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.engines.structured.problem import Matrices, Problem, Spatial
@@ -92,7 +94,8 @@ class StructuredEngine:
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
-        fused = jax.default_backend() == "gpu" if fused is None else fused
+        if fused is None:
+            fused = jax.default_backend() == "gpu" or (self.conditional and native.available())
         lanes = (LANES if self.conditional else 0) if lanes is None else lanes
         self.fused, self.lanes = fused and not differentiable, 0 if differentiable else lanes
         self.burst = burst
@@ -236,8 +239,8 @@ class StructuredEngine:
         """See `Engine.rollout`; on a GPU in float32 one kernel runs it all, see `fused`."""
         batched = self._needs_batch()
         fits = self.fused and not batched and in_kernel(self.scene.effects)
-        if fits and not trajectory and ctrl.dtype == jnp.float32:
-            return self._one_kernel(fields, ctrl)
+        if fits and not trajectory and (self.conditional or ctrl.dtype == jnp.float32):
+            return on_all_cores(self._one_kernel, fields, ctrl)
         with jax.default_matmul_precision("highest"):
             if self.lanes and not batched:
                 return on_all_cores(partial(self._stream, trajectory=trajectory), fields, ctrl)
@@ -255,9 +258,10 @@ class StructuredEngine:
 
         # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
         limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
-        found, end = Program(self.scene, limits).simulate(
-            hand_lanes(self.scene, fields), self.reset(fields), ctrl
-        )
+        backend = jax.default_backend()
+        width = native.width() * 4 // ctrl.dtype.itemsize if backend == "cpu" else None
+        program = Program(self.scene, limits, backend=backend, width=width)
+        found, end = program.simulate(hand_lanes(self.scene, fields), self.reset(fields), ctrl)
         qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
         status = self._status(found["residual"])
         return Trace(
@@ -336,43 +340,3 @@ class StructuredEngine:
 def in_kernel(e: Effects) -> bool:
     """Whether the fused kernel simulates a scene's effects; the batch form simulates all."""
     return e.wrist and e.object_table and e.friction == "coulomb" and not e.neo_hookean
-
-
-def integrate(state: State, kin: Kinematics, acc: Acc, h: float) -> State:
-    """Semi-implicit Euler: velocities first, then positions with the new velocities."""
-    local = jnp.stack(
-        [total([kin.object[k, i] * acc.object[i] for i in range(3)]) for k in range(3)]
-    )
-    wrist_vel, finger_vel = state.wrist_vel + h * acc.wrist, state.finger_vel + h * acc.finger
-    linear, angular = state.linear_vel + h * acc.object[3:], state.angular_vel + h * local
-    return State(
-        state.wrist + h * wrist_vel,
-        state.finger + h * finger_vel,
-        state.position + h * linear,
-        _turn(state.quat, angular, h),
-        wrist_vel,
-        finger_vel,
-        linear,
-        angular,
-        acc,
-    )
-
-
-def _turn(quat: jax.Array, omega: jax.Array, h: float) -> jax.Array:
-    """Quaternion after turning with the body-frame angular velocity for a time h."""
-    square = total([omega[i] ** 2 for i in range(3)])
-    speed = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    half = 0.5 * h * jnp.where(square > 0, speed, 0.0)
-    # Without rotation the quotient is zero but its derivative is not.
-    axis = jnp.where(square > 0, omega / speed * jnp.sin(half), 0.5 * h * omega)
-    w, x, y, z = quat
-    a, (b, c, d) = jnp.cos(half), axis
-    turned = jnp.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )
-    return turned / jnp.sqrt(total([turned[i] ** 2 for i in range(4)]))

@@ -1,7 +1,8 @@
-"""The whole rollout as one GPU kernel: a block simulates a few worlds from start to end.
+"""The whole rollout as one kernel: a block simulates a few worlds from start to end.
 
-A lane is a finger of a world, a block one warp.  Blocks do not wait for each other: each does the
-Newton iterations that its own worlds need, and stops when they are all decided.
+A lane is a finger of a world; a block is one warp of a GPU or one vector of a CPU.  Blocks do not
+wait for each other: each does the Newton iterations that its own worlds need, and stops when they
+are all decided.
 """
 
 from functools import partial
@@ -12,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 
+from codesign_jax.engines.structured.fused import native
 from codesign_jax.engines.structured.fused.contacts import ContactSet
-from codesign_jax.engines.structured.fused.launch import launch
+from codesign_jax.engines.structured.fused.launch import Kernel, launch
 from codesign_jax.engines.structured.fused.ptx import LANES
 from codesign_jax.engines.structured.fused.step import Step
 from codesign_jax.engines.structured.fused.tables import Block, Table, anywhere
@@ -44,18 +46,24 @@ class Limits(NamedTuple):
 class Program:
     """Tables and kernel of a scene's rollout for one size of block."""
 
-    def __init__(self, scene: Scene, limits: Limits, *, block: int | None = None):
+    def __init__(
+        self, scene: Scene, limits: Limits, *, backend: str = "gpu", width: int | None = None
+    ):
         """Lays out the memory.
 
         Args:
           scene: The scene.
           limits: How hard each step is solved.
-          block: Worlds of a block, a power of two; by default as many as fill a warp.
+          backend: "gpu", "cpu", or "interpreter", which is Pallas' own and slow.
+          width: Lanes of a block, a power of two; more if a world has more fingers. By default
+            those of a warp or of a CPU's vector of 32 bit floats.
         """
+        self.backend = backend
+        width = width or (LANES if backend == "gpu" else native.width())
         self.scene, self.limits, self.lay = scene, limits, layout(scene)
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()
-        self.num_fingers, self.block = n, block or LANES // self.fingers
+        self.num_fingers, self.block = n, max(1, width // self.fingers)
         self.size = self.fingers * self.block
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
         self.palm_groups = -(-len(palm_points(scene)) // self.fingers)
@@ -206,39 +214,53 @@ class Program:
         pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]
         return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.size)
 
-    def run(
-        self, hand: HandLanes, state: State, ctrl: jax.Array, *, interpret: bool = False
-    ) -> dict[str, jax.Array]:
+    def run(self, hand: HandLanes, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
         """Runs a rollout; returns `TRACE` by name, shape (world, time)."""
-        return self.simulate(hand, state, ctrl, interpret=interpret)[0]
+        return self.simulate(hand, state, ctrl)[0]
 
     def simulate(
-        self, hand: HandLanes, state: State, ctrl: jax.Array, *, interpret: bool = False
+        self, hand: HandLanes, state: State, ctrl: jax.Array
     ) -> tuple[dict[str, jax.Array], State]:
-        """Runs a rollout; returns `TRACE` by name, shape (world, time), and the last states."""
+        """Runs a rollout.
+
+        Args:
+          hand: Constants of the worlds.
+          state: Their start states.
+          ctrl: Controls, shape (world, time, nu).
+
+        Returns:
+          `TRACE` by name, shape (world, time), and the last states.
+        """
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         blocks, steps, dtype = inputs[0].shape[0], ctrl.shape[1], ctrl.dtype
+        # A core runs block after block: they share what no block leaves to another.
+        scratch = 1 if self.backend == "cpu" else blocks
         shapes = [
             (blocks, self.fine.rows, self.size),
             (blocks, self.rest.rows, self.block),
-            (blocks, self.scratch.rows, self.size),
+            (scratch, self.scratch.rows, self.size),
             (blocks, steps, len(TRACE), self.block),
         ]
 
         def spec(shape: tuple[int, ...]) -> pl.BlockSpec:
-            return pl.BlockSpec((None, *shape[1:]), lambda i: (i, *[0] * (len(shape) - 1)))
+            own = shape[0] == blocks
+            return pl.BlockSpec((None, *shape[1:]), lambda i: (i * own, *[0] * (len(shape) - 1)))
 
         outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
         call = pl.pallas_call(
-            partial(self._kernel, steps, interpret),
+            partial(self._kernel, steps),
             grid=(blocks,),
             in_specs=[spec(x.shape) for x in inputs],
             out_specs=[spec(s) for s in shapes],
             out_shape=outputs,
-            interpret=interpret,
+            interpret=self.backend == "interpreter",
             name="grasp",
         )
-        out = call(*inputs) if interpret else launch(call, inputs, outputs)
+        if self.backend == "interpreter":
+            out = call(*inputs)
+        else:
+            kernel = Kernel(repr((self.scene, self.limits)), self.backend, self.size)
+            out = launch(call, inputs, outputs, kernel)
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(TRACE))[: ctrl.shape[0]]
         found = {name: trace[..., k] for k, name in enumerate(TRACE)}
@@ -251,9 +273,9 @@ class Program:
         acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
         return State(**wide, **narrow, acc=acc)
 
-    def _kernel(self, steps: int, interpret: bool, *refs: Any) -> None:
+    def _kernel(self, steps: int, *refs: Any) -> None:
         hand, world, fine0, rest0, arm, pressure, fine, rest, scratch, trace = refs
-        block = Block(self.fingers, self.block, barrier=not interpret)
+        block = Block(self.fingers, self.block, barrier=self.backend == "gpu")
         step = Step(self, block, hand, world, fine, rest, scratch)
         own = block.world
         _copy(fine0, fine, self.fine.rows)

@@ -1,32 +1,55 @@
-"""Runs a Pallas kernel on a GPU through `ptx`."""
+"""Runs a Pallas kernel, on a GPU through `ptx` or on a CPU through `llvm`."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from codesign_jax.engines.structured.fused import ptx
+from codesign_jax.engines.structured.fused import native, ptx
 
 
-def launch(call: Callable, inputs: tuple, outputs: list[jax.ShapeDtypeStruct]) -> list[jax.Array]:
+class Kernel(NamedTuple):
+    """What a kernel is.
+
+    Attributes:
+      origin: What determines its code besides the package's own.
+      backend: "gpu" or "cpu".
+      lanes: Lanes of a block.
+    """
+
+    origin: str
+    backend: str
+    lanes: int
+
+
+def launch(
+    call: Callable, inputs: tuple, outputs: list[jax.ShapeDtypeStruct], kernel: Kernel
+) -> list[jax.Array]:
     """Returns call(*inputs), where call is a `pallas_call` over the leading axis of its arrays.
 
     Args:
       call: The kernel as a function of arrays whose leading axis is the grid's.
       inputs: Its arguments.
       outputs: Shapes of its results.
+      kernel: What it is.
     """
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in inputs]
-    equation = _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr)
     shapes = [tuple(x.shape[1:]) for x in (*avals, *outputs)]
-    code = ptx.assemble(equation.params["jaxpr"], shapes, "grasp")
+
+    def trace() -> Any:
+        return _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr).params["jaxpr"]
+
+    if kernel.backend == "cpu":
+        layout = native.Layout(shapes, len(inputs), kernel.lanes, inputs[0].dtype.itemsize)
+        name = native.register(kernel.origin, trace, layout)
+        return list(jax.ffi.ffi_call(name, outputs)(*inputs))
     number = np.int32
     results = jax.ffi.ffi_call("__gpu$xla.gpu.ptx", outputs)(
         *inputs,
         name="grasp",
         kernel_type="ptx",
-        kernel_data=code,
+        kernel_data=ptx.assemble(trace(), shapes, "grasp"),
         grid_x=number(outputs[0].shape[0]),
         grid_y=number(1),
         grid_z=number(1),

@@ -41,8 +41,8 @@ class Ref(NamedTuple):
 
 
 _COMPARE = ("lt", "le", "gt", "ge", "eq", "ne")
-_INLINE = ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint")
-_SAME = (
+INLINE = ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint")
+SAME = (
     "broadcast_in_dim",
     "broadcast_to",
     "reshape",
@@ -50,7 +50,12 @@ _SAME = (
     "stop_gradient",
     "copy",
     "optimization_barrier",
+    "reshard",  # in a share of the worlds, see `cores`
 )
+
+# Taylor's polynomials in the square of an angle within pi / 4; the sine's is divided by the angle.
+SINE = (1 / 362880, -1 / 5040, 1 / 120, -1 / 6, 1.0)
+COSINE = (1 / 40320, -1 / 720, 1 / 24, -0.5, 1.0)
 
 
 def kind_of(aval: Any) -> str:
@@ -267,10 +272,10 @@ class Assembler:
     def equation(self, equation: Any, args: list) -> list:
         """Instructions of one operation."""
         name, params = equation.primitive.name, equation.params
-        if name in _INLINE:
+        if name in INLINE:
             inner = params.get("jaxpr", params.get("call_jaxpr"))
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
-        if name in _SAME:
+        if name in SAME:
             return args
         control = {"scan": self.loop, "while": self.while_loop, "cond": self.branch}
         if name in control:
@@ -388,22 +393,30 @@ def _number(value: float) -> Value:
     return Value("f32", None, value)
 
 
-def _turn(asm: Assembler, x: Value) -> tuple[Value, Value]:
-    """Quarter turns of an angle and what is left, within pi / 4 (Cody and Waite's reduction)."""
-    scaled = asm.compute("f32", "mul.f32", x, _number(2 / np.pi))
-    turns = asm.compute("f32", "cvt.rni.f32.f32", scaled)
-    rest, left = x, np.pi / 2
-    for bits in (12, 12, 24):  # the first two parts times a small whole number are exact
+def quarter_turn_parts() -> list[float]:
+    """Numbers that add up to pi / 2; the first two times a small whole number are exact."""
+    parts, left = [], np.pi / 2
+    for bits in (12, 12, 24):
         part = float(np.float32(left))
         if bits == 12:
             scale = 2.0 ** (bits - 1 - np.floor(np.log2(left)))
             part = float(np.floor(left * scale) / scale)
         left -= part
+        parts.append(part)
+    return parts
+
+
+def _turn(asm: Assembler, x: Value) -> tuple[Value, Value]:
+    """Quarter turns of an angle and what is left, within pi / 4 (Cody and Waite's reduction)."""
+    scaled = asm.compute("f32", "mul.f32", x, _number(2 / np.pi))
+    turns = asm.compute("f32", "cvt.rni.f32.f32", scaled)
+    rest = x
+    for part in quarter_turn_parts():
         rest = asm.compute("f32", "fma.rn.f32", turns, _number(-part), rest)
     return asm.compute("s32", "cvt.rzi.s32.f32", turns), rest
 
 
-def _polynomial(asm: Assembler, x: Value, coefficients: list[float]) -> Value:
+def _polynomial(asm: Assembler, x: Value, coefficients: tuple[float, ...]) -> Value:
     result = _number(coefficients[0])
     for c in coefficients[1:]:
         result = asm.compute("f32", "fma.rn.f32", result, x, _number(c))
@@ -416,9 +429,9 @@ def _sine(shift: int) -> Callable:
     def rule(asm: Assembler, equation: Any, x: Value) -> Value:
         turns, r = _turn(asm, x)
         square = asm.compute("f32", "mul.f32", r, r)
-        odd = _polynomial(asm, square, [1 / 362880, -1 / 5040, 1 / 120, -1 / 6, 1.0])
+        odd = _polynomial(asm, square, SINE)
         sine = asm.compute("f32", "mul.f32", odd, r)
-        cosine = _polynomial(asm, square, [1 / 40320, -1 / 720, 1 / 24, -0.5, 1.0])
+        cosine = _polynomial(asm, square, COSINE)
         quarter = asm.compute("s32", "add.s32", turns, shift)
         low = asm.compute("s32", "and.b32", quarter, 1)
         swapped = asm.compute("pred", "setp.ne.s32", low, 0)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import collision, inertia
 from codesign_jax.engines.structured import kinematics as kin
-from codesign_jax.engines.structured.engine import integrate
 from codesign_jax.engines.structured.fused.contacts import (
     direct,
     sphere_on_object,
@@ -28,6 +27,7 @@ from codesign_jax.engines.structured.fused.newton import (
 from codesign_jax.engines.structured.fused.tables import Block
 from codesign_jax.engines.structured.hand import apply_columns
 from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.integration import integrate
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise

@@ -140,7 +140,8 @@ class Block:
         """Makes the indices, inside a kernel; barrier: whether memory needs one."""
         self.fingers, self.worlds, self.size = fingers, worlds, fingers * worlds
         lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
-        self.world, self.finger = jax.lax.rem(lane, worlds), jax.lax.div(lane, worlds)
+        count = jnp.int32(worlds)
+        self.world, self.finger = jax.lax.rem(lane, count), jax.lax.div(lane, count)
         self._barrier = barrier
 
     def share(self, arrays: list[jax.Array], ref: Any, row: int) -> list[list[jax.Array]]:

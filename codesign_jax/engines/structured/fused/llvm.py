@@ -1,0 +1,582 @@
+"""Writes a Pallas kernel as LLVM's assembly language, for CPUs.
+
+A value over the lanes of a block is one vector, and every operation one vector instruction: XLA's
+own code for the CPU slices and copies small arrays for most of the time.  What is the same on all
+lanes (indices, conditions) is a scalar.  LLVM allocates registers and fuses multiplications with
+additions.  Source of the instructions: LLVM Language Reference Manual.
+"""
+
+import struct
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from codesign_jax.engines.structured.fused.ptx import (
+    COSINE,
+    INLINE,
+    SAME,
+    SINE,
+    quarter_turn_parts,
+)
+
+_FLOAT = {4: "float", 8: "double"}
+_INT_OPS: dict[str, Callable] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": lambda a, b: np.trunc(a / b).astype(np.int32),
+    "rem": np.fmod,
+    "max": np.maximum,
+    "min": np.minimum,
+}
+_COMPARE: dict[str, Callable] = {
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+}
+
+
+class Value(NamedTuple):
+    """An operand.
+
+    Attributes:
+      kind: "f" for a float, "i" for an int32, "b" for a truth value.
+      wide: Whether it has a value for each lane.
+      text: Its name; None if its value is known.
+      known: A number, or an array over the lanes.
+    """
+
+    kind: str
+    wide: bool
+    text: str | None
+    known: Any = None
+
+
+class Ref(NamedTuple):
+    """Memory of a block: name of its address, and its shape."""
+
+    address: str
+    shape: tuple[int, ...]
+
+
+def kind_of(dtype: Any) -> str:
+    """Kind of an array's elements."""
+    if dtype == np.bool_:
+        return "b"
+    return "i" if np.issubdtype(dtype, np.integer) else "f"
+
+
+class Writer:
+    """Writes the instructions of one block."""
+
+    def __init__(self, lanes: int, itemsize: int = 4):
+        """Starts empty.
+
+        Args:
+          lanes: Lanes of a block.
+          itemsize: Bytes of a float.
+        """
+        self.lanes, self.itemsize = lanes, itemsize
+        self.scalars = {"f": _FLOAT[itemsize], "i": "i32", "b": "i1"}
+        self.lines: list[str] = []
+        self.count, self.here = 0, "entry"
+        self.declared: set[str] = set()
+        self.same: dict[str, Value] = {}  # the scalar that was spread to a vector, by its name
+
+    # Text
+
+    def type(self, kind: str, wide: bool, lanes: int | None = None) -> str:
+        """Name of a type."""
+        scalar = self.scalars[kind]
+        return f"<{lanes or self.lanes} x {scalar}>" if wide else scalar
+
+    def name(self, prefix: str = "v") -> str:
+        """A new name."""
+        self.count += 1
+        return f"{prefix}{self.count}"
+
+    def emit(self, text: str) -> str:
+        """Adds an instruction; returns the name of its result."""
+        name = "%" + self.name()
+        self.lines.append(f"{name} = {text}")
+        return name
+
+    def start(self, label: str) -> None:
+        """Begins a basic block."""
+        self.lines.append(f"{label}:")
+        self.here = label
+
+    def number(self, kind: str, value: Any) -> str:
+        """A number as an operand."""
+        if kind == "f":
+            exact = np.float32(value) if self.itemsize == 4 else np.float64(value)
+            return "0x" + struct.pack(">d", float(exact)).hex().upper()
+        return str(int(value))
+
+    def operand(self, value: Value) -> str:
+        """A value as an operand, without its type."""
+        if value.text is not None:
+            return value.text
+        if not value.wide:
+            return self.number(value.kind, value.known)
+        each = np.broadcast_to(np.asarray(value.known), (self.lanes,))
+        scalar = self.scalars[value.kind]
+        return "<" + ", ".join(f"{scalar} {self.number(value.kind, v)}" for v in each) + ">"
+
+    def typed(self, value: Value) -> str:
+        """A value as an operand with its type."""
+        return f"{self.type(value.kind, value.wide)} {self.operand(value)}"
+
+    def spread(self, value: Value) -> Value:
+        """A scalar on all lanes."""
+        if value.wide:
+            return value
+        if value.text is None:
+            return value._replace(wide=True)
+        kind = self.type(value.kind, True)
+        first = self.emit(f"insertelement {kind} poison, {self.typed(value)}, i32 0")
+        zeros = f"<{self.lanes} x i32> zeroinitializer"
+        text = self.emit(f"shufflevector {kind} {first}, {kind} poison, {zeros}")
+        self.same[text] = value
+        return Value(value.kind, True, text)
+
+    def narrow(self, value: Value) -> Value:
+        """The scalar of a vector that is known to be the same on all lanes."""
+        if value.text is not None:
+            return self.same.get(value.text, value)
+        if value.wide and np.min(value.known) == np.max(value.known):
+            return Value(value.kind, False, None, np.min(value.known))
+        return value
+
+    def alike(self, *values: Value) -> list[Value]:
+        """All wide if one is."""
+        if any(v.wide for v in values):
+            return [self.spread(v) for v in values]
+        return list(values)
+
+    def compute(self, operation: str, *args: Value, kind: str | None = None) -> Value:
+        """The result of an instruction whose operands have one type."""
+        args = tuple(self.alike(*args))
+        first, wide = args[0], args[0].wide
+        operands = ", ".join(self.operand(a) for a in args)
+        text = self.emit(f"{operation} {self.type(first.kind, wide)} {operands}")
+        return Value(kind or first.kind, wide, text)
+
+    def intrinsic(self, name: str, *args: Value) -> Value:
+        """The result of one of LLVM's functions on floats."""
+        args = tuple(self.alike(*args))
+        kind = self.type("f", args[0].wide)
+        scalar = f"f{8 * self.itemsize}"
+        full = f"llvm.{name}.{f'v{self.lanes}' if args[0].wide else ''}{scalar}"
+        self.declared.add(f"declare {kind} @{full}({', '.join([kind] * len(args))})")
+        operands = ", ".join(self.typed(a) for a in args)
+        return Value("f", args[0].wide, self.emit(f"call contract {kind} @{full}({operands})"))
+
+    def fma(self, a: Value, b: Value, c: Value) -> Value:
+        """The product of a and b plus c, rounded once."""
+        return self.intrinsic("fma", a, b, c)
+
+    def select(self, which: Value, yes: Value, no: Value) -> Value:
+        """Lane by lane one of two values."""
+        yes, no = self.alike(yes, no)
+        if which.wide:
+            yes, no = self.spread(yes), self.spread(no)
+        text = self.emit(f"select {self.typed(which)}, {self.typed(yes)}, {self.typed(no)}")
+        return Value(yes.kind, yes.wide, text)
+
+    # Memory
+
+    def _address(self, ref: Ref, indices: list[Value]) -> str:
+        """Address of an element, of the first lane where an index has one for each."""
+        strides = np.cumprod([1, *ref.shape[:0:-1]])[::-1]
+        offset, address = 0, ref.address
+        for index, stride in zip(indices, strides, strict=True):
+            if index.text is None:
+                offset += int(stride) * int(np.min(index.known))
+                continue
+            assert not index.wide, "an index that is not known and differs between the lanes"
+            wide = self.emit(f"sext i32 {index.text} to i64")
+            step = self.emit(f"mul nsw i64 {wide}, {int(stride)}")
+            kind = self.scalars["f"]
+            address = self.emit(f"getelementptr inbounds {kind}, ptr {address}, i64 {step}")
+        if offset:
+            address = self.emit(
+                f"getelementptr inbounds {self.scalars['f']}, ptr {address}, i64 {offset}"
+            )
+        return address
+
+    def _indices(self, ref: Ref, equation: Any, leaves: list[Value]) -> list[Value]:
+        """Index in each dimension; a whole slice is the lane."""
+        (indexer,) = jax.tree.unflatten(equation.params["tree"], leaves)
+        found = []
+        for index, size in zip(indexer.indices, ref.shape, strict=True):
+            if isinstance(index, Value):
+                found.append(index if len(found) == len(ref.shape) - 1 else self.narrow(index))
+            elif isinstance(index, int | np.integer):
+                found.append(Value("i", False, None, int(index)))
+            else:  # a slice
+                assert index.size == size == self.lanes, (index, size)
+                found.append(Value("i", True, None, np.arange(size)))
+        assert not any(i.wide for i in found[:-1])
+        return found
+
+    def load(self, ref: Ref, indices: list[Value]) -> Value:
+        """Reads an element, or one for each lane, all within one row."""
+        address, align = self._address(ref, indices), self.itemsize
+        lane = indices[-1]
+        if not lane.wide:
+            return Value(
+                "f", False, self.emit(f"load {self.type('f', False)}, ptr {address}, align {align}")
+            )
+        pattern = np.asarray(lane.known) - np.min(lane.known)
+        count = int(pattern.max()) + 1
+        row = self.type("f", True, count)
+        value = self.emit(f"load {row}, ptr {address}, align {align}")
+        if count != self.lanes or (pattern != np.arange(self.lanes)).any():
+            value = self._shuffle(row, value, pattern)
+        return Value("f", True, value)
+
+    def store(self, ref: Ref, indices: list[Value], value: Value) -> None:
+        """Writes an element, or one for each lane; lanes with one index have one value."""
+        address, align = self._address(ref, indices), self.itemsize
+        lane = indices[-1]
+        if not lane.wide:
+            self.lines.append(f"store {self.typed(value)}, ptr {address}, align {align}")
+            return
+        value = self.spread(value)
+        pattern = np.asarray(lane.known) - np.min(lane.known)
+        places, first = np.unique(pattern, return_index=True)
+        assert (places == np.arange(places.size)).all(), "a row with holes"
+        row, text = self.type("f", True, places.size), self.operand(value)
+        if places.size != self.lanes or (pattern != np.arange(self.lanes)).any():
+            text = self._shuffle(self.type("f", True), text, first)
+        self.lines.append(f"store {row} {text}, ptr {address}, align {align}")
+
+    def _shuffle(self, kind: str, value: str, pattern: np.ndarray) -> str:
+        mask = ", ".join(f"i32 {int(p)}" for p in pattern)
+        return self.emit(
+            f"shufflevector {kind} {value}, {kind} poison, <{len(pattern)} x i32> <{mask}>"
+        )
+
+    # Control
+
+    def _phis(self, values: list[Value], source: str) -> tuple[list[Value], list[int]]:
+        """Values that a loop changes, and the lines to which their new values will be added."""
+        found, lines = [], []
+        for value in values:
+            name = "%" + self.name()
+            lines.append(len(self.lines))
+            kind = self.type(value.kind, value.wide)
+            self.lines.append(f"{name} = phi {kind} [ {self.operand(value)}, %{source} ]")
+            found.append(Value(value.kind, value.wide, name))
+        return found, lines
+
+    def _close(self, lines: list[int], values: list[Value], source: str) -> None:
+        for line, value in zip(lines, values, strict=True):
+            self.lines[line] += f", [ {self.operand(value)}, %{source} ]"
+
+    def loop(self, equation: Any, args: list) -> list:
+        """A scan without inputs and outputs: a loop of fixed length."""
+        p = equation.params
+        split = len(args) - len(equation.outvars)  # every result is carried
+        consts, start = args[:split], self._carried(equation.outvars, args[split:])
+        assert not p["reverse"]
+        label, end, source = self.name("L"), self.name("L"), self.here
+        self.lines.append(f"br label %{label}")
+        self.start(label)
+        values, lines = self._phis([Value("i", False, None, 0), *start], source)
+        inner = p["jaxpr"]
+        new = self.run(inner.jaxpr, inner.consts, [*consts, *values[1:]])
+        new = self._carried(equation.outvars, new)
+        following = self.emit(f"add nsw i32 {values[0].text}, 1")
+        going = self.emit(f"icmp slt i32 {following}, {p['length']}")
+        self._close(lines, [Value("i", False, following), *new], self.here)
+        self.lines.append(f"br i1 {going}, label %{label}, label %{end}")
+        self.start(end)
+        return new
+
+    def _carried(self, variables: Any, values: list[Value]) -> list[Value]:
+        """Values as wide as the variables that hold them."""
+        return [
+            self.spread(v) if var.aval.shape else v
+            for var, v in zip(variables, values, strict=True)
+        ]
+
+    def while_loop(self, equation: Any, args: list) -> list:
+        """A while loop; its condition is a scalar."""
+        p = equation.params
+        a, b = p["cond_nconsts"], p["body_nconsts"]
+        cond_consts, body_consts = args[:a], args[a : a + b]
+        start = self._carried(equation.outvars, args[a + b :])
+        top, inside, end, source = self.name("L"), self.name("L"), self.name("L"), self.here
+        self.lines.append(f"br label %{top}")
+        self.start(top)
+        values, lines = self._phis(start, source)
+        cond, body = p["cond_jaxpr"], p["body_jaxpr"]
+        (going,) = self.run(cond.jaxpr, cond.consts, [*cond_consts, *values])
+        self.lines.append(f"br {self.typed(going)}, label %{inside}, label %{end}")
+        self.start(inside)
+        new = self.run(body.jaxpr, body.consts, [*body_consts, *values])
+        self._close(lines, self._carried(equation.outvars, new), self.here)
+        self.lines.append(f"br label %{top}")
+        self.start(end)
+        return values
+
+    def branch(self, equation: Any, args: list) -> list:
+        """A conditional of two branches; its predicate is a scalar."""
+        which, operands = args[0], args[1:]
+        no, yes = equation.params["branches"]
+        if which.kind != "b":
+            which = self.compute("icmp ne", which, Value("i", False, None, 0), kind="b")
+        labels, end = (self.name("L"), self.name("L")), self.name("L")
+        self.lines.append(f"br {self.typed(which)}, label %{labels[0]}, label %{labels[1]}")
+        found, sources = [], []
+        for branch, label in zip((yes, no), labels, strict=True):
+            self.start(label)
+            values = self.run(branch.jaxpr, branch.consts, operands)
+            found.append(self._carried(equation.outvars, values))
+            sources.append(self.here)
+            self.lines.append(f"br label %{end}")
+        self.start(end)
+        results, lines = self._phis(found[0], sources[0])
+        self._close(lines, found[1], sources[1])
+        return results
+
+    def run(self, jaxpr: Any, consts: Any, args: list) -> list:
+        """Instructions of a jaxpr; returns its results."""
+        values: dict[Any, Any] = {}
+
+        def known(array: Any) -> Value:
+            array = np.asarray(array)
+            return Value(kind_of(array.dtype), bool(array.shape), None, array[()])
+
+        def read(atom: Any) -> Any:
+            return known(atom.val) if isinstance(atom, core.Literal) else values[atom]
+
+        values.update(zip(jaxpr.constvars, map(known, consts), strict=True))
+        values.update(zip(jaxpr.invars, args, strict=True))
+        for equation in jaxpr.eqns:
+            results = self.equation(equation, [read(v) for v in equation.invars])
+            values.update(zip(equation.outvars, results, strict=True))
+        return [read(v) for v in jaxpr.outvars]
+
+    def equation(self, equation: Any, args: list) -> list:
+        """Instructions of one operation."""
+        name, params = equation.primitive.name, equation.params
+        if name in INLINE:
+            inner = params.get("jaxpr", params.get("call_jaxpr"))
+            return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
+        if name in SAME:
+            wide = bool(equation.outvars[0].aval.shape)
+            return [self.spread(args[0]) if wide else args[0]]
+        control = {"scan": self.loop, "while": self.while_loop, "cond": self.branch}
+        if name in control:
+            return control[name](equation, args)
+        if name == "get":
+            ref, *leaves = args
+            return [self.load(ref, self._indices(ref, equation, leaves))]
+        if name == "swap":
+            ref, value, *leaves = args
+            self.store(ref, self._indices(ref, equation, leaves), value)
+            return [None]
+        if name not in _RULES:
+            raise NotImplementedError(f"no LLVM instruction for {name}")
+        return [_RULES[name](self, equation, *args)]
+
+
+def _arithmetic(name: str) -> Callable:
+    def rule(w: Writer, equation: Any, a: Value, b: Value) -> Value:
+        if a.kind == "f":
+            return w.compute(f"f{name} contract", a, b)
+        if a.text is None and b.text is None:
+            known = np.asarray(_INT_OPS[name](a.known, b.known), np.int32)
+            return Value("i", a.wide or b.wide, None, known)
+        signed = {"div": "sdiv", "rem": "srem"}.get(name, f"{name} nsw")
+        return w.compute(signed, a, b)
+
+    return rule
+
+
+def _compare(name: str) -> Callable:
+    def rule(w: Writer, equation: Any, a: Value, b: Value) -> Value:
+        if a.text is None and b.text is None:
+            wide = a.wide or b.wide
+            return Value("b", wide, None, np.asarray(_COMPARE[name](a.known, b.known)))
+        if a.kind == "f":
+            # A comparison with what is not a number is false, but "not equal" is true.
+            test = "fcmp une" if name == "ne" else f"fcmp o{name}"
+        else:
+            signed = a.kind == "i" and name not in ("eq", "ne")
+            test = f"icmp {'s' if signed else ''}{name}"
+        return w.compute(test, a, b, kind="b")
+
+    return rule
+
+
+def _extreme(test: str) -> Callable:
+    def rule(w: Writer, equation: Any, a: Value, b: Value) -> Value:
+        if a.kind == "i" and a.text is None and b.text is None:
+            return _arithmetic("max" if test == "gt" else "min")(w, equation, a, b)
+        a, b = w.alike(a, b)
+        order = f"fcmp o{test}" if a.kind == "f" else f"icmp s{test}"
+        return w.select(w.compute(order, a, b, kind="b"), a, b)
+
+    return rule
+
+
+def _logic(name: str) -> Callable:
+    def rule(w: Writer, equation: Any, a: Value, b: Value) -> Value:
+        return w.compute(name, a, b)
+
+    return rule
+
+
+def _not(w: Writer, equation: Any, a: Value) -> Value:
+    return w.compute("xor", a, Value(a.kind, a.wide, None, 1 if a.kind == "b" else -1))
+
+
+def _select_n(w: Writer, equation: Any, which: Value, no: Value, yes: Value) -> Value:
+    return w.select(which, yes, no)
+
+
+def _convert(w: Writer, equation: Any, x: Value) -> Value:
+    kind = kind_of(equation.outvars[0].aval.dtype)
+    if kind == x.kind:
+        return x
+    if x.text is None:
+        return Value(kind, x.wide, None, x.known)
+    if kind == "b":
+        test = "fcmp une" if x.kind == "f" else "icmp ne"
+        return w.compute(test, x, Value(x.kind, x.wide, None, 0), kind="b")
+    operation = {"bi": "zext", "bf": "uitofp", "if": "sitofp", "fi": "fptosi"}[x.kind + kind]
+    text = w.emit(f"{operation} {w.typed(x)} to {w.type(kind, x.wide)}")
+    return Value(kind, x.wide, text)
+
+
+def _one(w: Writer, value: float) -> Value:
+    return Value("f", False, None, value)
+
+
+def _divide(w: Writer, a: Value, b: Value) -> Value:
+    return w.compute("fdiv contract", a, b)
+
+
+def _power(w: Writer, equation: Any, x: Value) -> Value:
+    result = x
+    for _ in range(abs(equation.params["y"]) - 1):
+        result = w.compute("fmul contract", result, x)
+    return result if equation.params["y"] > 0 else _divide(w, _one(w, 1.0), result)
+
+
+def _turn(w: Writer, x: Value) -> tuple[Value, Value]:
+    """Quarter turns of an angle and what is left, within pi / 4 (Cody and Waite's reduction)."""
+    turns = w.intrinsic("rint", w.compute("fmul contract", x, _one(w, 2 / np.pi)))
+    rest = x
+    for part in quarter_turn_parts():
+        rest = w.fma(turns, _one(w, -part), rest)
+    text = w.emit(f"fptosi {w.typed(turns)} to {w.type('i', turns.wide)}")
+    return Value("i", turns.wide, text), rest
+
+
+def _polynomial(w: Writer, x: Value, coefficients: tuple[float, ...]) -> Value:
+    result = _one(w, coefficients[0])
+    for c in coefficients[1:]:
+        result = w.fma(result, x, _one(w, c))
+    return result
+
+
+def _sine(shift: int) -> Callable:
+    """Sine, or with a shift of one quarter turn cosine, by Taylor's polynomials to 1e-8."""
+
+    def rule(w: Writer, equation: Any, x: Value) -> Value:
+        if w.itemsize == 8:
+            return w.intrinsic("cos" if shift else "sin", x)
+        turns, r = _turn(w, x)
+        square = w.compute("fmul contract", r, r)
+        sine = w.compute("fmul contract", _polynomial(w, square, SINE), r)
+        cosine = _polynomial(w, square, COSINE)
+        quarter = w.compute("add", turns, Value("i", False, None, shift))
+
+        def bit(k: int) -> Value:
+            masked = w.compute("and", quarter, Value("i", False, None, k))
+            return w.compute("icmp ne", masked, Value("i", False, None, 0), kind="b")
+
+        value = w.select(bit(1), cosine, sine)
+        return w.select(bit(2), w.compute("fneg", value), value)
+
+    return rule
+
+
+def _sign(w: Writer, equation: Any, x: Value) -> Value:
+    below = w.compute("fcmp olt", x, _one(w, 0), kind="b")
+    above = w.compute("fcmp ogt", x, _one(w, 0), kind="b")
+    return w.select(below, _one(w, -1), w.select(above, _one(w, 1), _one(w, 0)))
+
+
+def _iota(w: Writer, equation: Any, *args: Value) -> Value:
+    return Value("i", True, None, np.arange(w.lanes, dtype=np.int32))
+
+
+def _over_lanes(w: Writer, equation: Any, x: Value) -> Value:
+    kind, full = w.type("i", True), f"llvm.vector.reduce.smax.v{w.lanes}i32"
+    w.declared.add(f"declare i32 @{full}({kind})")
+    return Value("i", False, w.emit(f"call i32 @{full}({w.typed(x)})"))
+
+
+_RULES: dict[str, Callable] = {
+    "add": _arithmetic("add"),
+    "add_any": _arithmetic("add"),
+    "sub": _arithmetic("sub"),
+    "mul": _arithmetic("mul"),
+    "div": _arithmetic("div"),
+    "rem": _arithmetic("rem"),
+    "neg": lambda w, e, x: w.compute("fneg", x),
+    "abs": lambda w, e, x: w.intrinsic("fabs", x),
+    "max": _extreme("gt"),
+    "min": _extreme("lt"),
+    "sqrt": lambda w, e, x: w.intrinsic("sqrt", x),
+    "rsqrt": lambda w, e, x: _divide(w, _one(w, 1.0), w.intrinsic("sqrt", x)),
+    "square": lambda w, e, x: w.compute("fmul contract", x, x),
+    "integer_pow": _power,
+    "sin": _sine(0),
+    "cos": _sine(1),
+    "sign": _sign,
+    **{name: _compare(name) for name in _COMPARE},
+    "and": _logic("and"),
+    "or": _logic("or"),
+    "xor": _logic("xor"),
+    "not": _not,
+    "select_n": _select_n,
+    "convert_element_type": _convert,
+    "iota": _iota,
+    "reduce_max": _over_lanes,
+}
+
+
+def write(jaxpr: Any, shapes: list[tuple[int, ...]], lanes: int, itemsize: int = 4) -> str:
+    """A function `block` of LLVM's language that runs a kernel on one block.
+
+    Args:
+      jaxpr: The kernel's jaxpr; its arguments are references to a block of each array.
+      shapes: Shapes of the blocks.
+      lanes: Lanes of a block.
+      itemsize: Bytes of a float.
+
+    Raises:
+      NotImplementedError: If the kernel does something that has no rule here.
+    """
+    writer = Writer(lanes, itemsize)
+    writer.run(jaxpr, [], [Ref(f"%a{k}", shape) for k, shape in enumerate(shapes)])
+    params = ", ".join(f"ptr noalias %a{k}" for k in range(len(shapes)))
+    body = "\n".join(writer.lines)
+    declarations = "\n".join(sorted(writer.declared))
+    return (
+        f"define internal void @block({params}) nounwind {{\nentry:\n{body}\nret void\n}}\n"
+        f"{declarations}\n"
+    )

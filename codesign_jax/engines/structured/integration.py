@@ -1,0 +1,47 @@
+"""Positions and velocities after a step."""
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State
+from codesign_jax.engines.structured.lanes import total
+
+
+def integrate(state: State, kin: Kinematics, acc: Acc, h: float) -> State:
+    """Semi-implicit Euler: velocities first, then positions with the new velocities."""
+    local = jnp.stack(
+        [total([kin.object[k, i] * acc.object[i] for i in range(3)]) for k in range(3)]
+    )
+    wrist_vel, finger_vel = state.wrist_vel + h * acc.wrist, state.finger_vel + h * acc.finger
+    linear, angular = state.linear_vel + h * acc.object[3:], state.angular_vel + h * local
+    return State(
+        state.wrist + h * wrist_vel,
+        state.finger + h * finger_vel,
+        state.position + h * linear,
+        _turn(state.quat, angular, h),
+        wrist_vel,
+        finger_vel,
+        linear,
+        angular,
+        acc,
+    )
+
+
+def _turn(quat: jax.Array, omega: jax.Array, h: float) -> jax.Array:
+    """Quaternion after turning with the body-frame angular velocity for a time h."""
+    square = total([omega[i] ** 2 for i in range(3)])
+    speed = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    half = 0.5 * h * jnp.where(square > 0, speed, 0.0)
+    # Without rotation the quotient is zero but its derivative is not.
+    axis = jnp.where(square > 0, omega / speed * jnp.sin(half), 0.5 * h * omega)
+    w, x, y, z = quat
+    a, (b, c, d) = jnp.cos(half), axis
+    turned = jnp.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ]
+    )
+    return turned / jnp.sqrt(total([turned[i] ** 2 for i in range(4)]))

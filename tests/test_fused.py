@@ -4,15 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental import pallas as pl
 
 from codesign_jax import control, model
 from codesign_jax.engines.structured import StructuredEngine, elimination
-from codesign_jax.engines.structured.fused import Limits, Program, ptx
+from codesign_jax.engines.structured.fused import Limits, Program, llvm, native, ptx
+from codesign_jax.engines.structured.fused.launch import Kernel, launch
 from codesign_jax.engines.structured.hand import hand_lanes
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from tests import small
 
 FINGERS, WORLDS = 4, 8
+LANES = 8
 
 
 def both(rng, shape, wide=True):
@@ -71,11 +74,9 @@ def grasp():
 def test_kernel_equals_the_engine(grasp):
     """The kernel, interpreted, and the batch engine on the way to the object and in contact."""
     scene, fields, ctrl = grasp
-    engine = StructuredEngine(scene, iterations=16, evaluations=10, tolerance=1e-7)
-    program = Program(scene, Limits(16, 10, 1e-7), block=4)
-    run = jax.jit(
-        lambda f, c: program.run(hand_lanes(scene, f), engine.reset(f), c, interpret=True)
-    )
+    engine = StructuredEngine(scene, iterations=16, evaluations=10, tolerance=1e-7, fused=False)
+    program = Program(scene, Limits(16, 10, 1e-7), backend="interpreter", width=8)
+    run = jax.jit(lambda f, c: program.run(hand_lanes(scene, f), engine.reset(f), c))
     got = run(fields, ctrl)
     with jax.default_matmul_precision("highest"):
         want = jax.jit(lambda f, c: engine._rollout(f, c, False))(fields, ctrl)
@@ -103,10 +104,130 @@ def test_kernel_becomes_ptx(grasp):
         ptx.Assembler().run(jaxpr.jaxpr, [], [ptx.Value("f32", "%f0")])
 
 
+def test_machine_code_equals_the_engine(grasp):
+    """The kernel on this CPU and the batch engine, solved to rounding in float64."""
+    scene, *_ = grasp
+    with jax.enable_x64(True):
+        params, trials = small.random_worlds(scene, 3, 5)
+        fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
+        ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :300]
+        settings = dict(iterations=60, evaluations=30, tolerance=1e-18)
+        got, want = (
+            jax.jit(StructuredEngine(scene, fused=fused, lanes=0, **settings).rollout)(fields, ctrl)
+            for fused in (True, False)
+        )
+    moved = np.abs(np.diff(np.asarray(want.height), axis=1)).max()
+    assert moved > 1e-4  # something touched the object
+    # Rounding of single steps is 1e-16; contact multiplies it.
+    for name in ("distance", "height", "speed", "last"):
+        a, b = getattr(got, name), getattr(want, name)
+        assert a.dtype == np.float64
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+def test_neighbours_in_a_block_change_no_bit(grasp):
+    """A world's numbers are the same whatever worlds share its vector."""
+    scene, fields, ctrl = grasp
+    run = jax.jit(StructuredEngine(scene).rollout)
+    orders = [np.array(o) for o in ([0, 1, 2], [2, 0, 1], [0, 0, 0], [1, 2, 2])]
+    alone = run(fields, ctrl)
+    for order in orders:
+        mixed = run(jax.tree.map(lambda v, o=order: v[o], fields), ctrl[order])
+        for name in ("distance", "height", "speed", "status"):
+            want = np.asarray(getattr(alone, name))[order]
+            np.testing.assert_array_equal(getattr(mixed, name), want, err_msg=name)
+
+
+def test_machine_code_is_kept(tmp_path):
+    """Beside JAX's compilation cache, under the kernel's name; without a cache it is built anew."""
+    built = []
+
+    def build():
+        built.append(1)
+        return b"code"
+
+    previous = jax.config.jax_compilation_cache_dir
+    try:
+        for folder, count in ((tmp_path / "new", 1), (tmp_path / "new", 1), (None, 2)):
+            jax.config.update("jax_compilation_cache_dir", folder and str(folder))
+            assert native._kept("grasp_a", build) == b"code" and len(built) == count
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "new"))
+        assert native._kept("grasp_b", build) == b"code" and len(built) == 3
+        (tmp_path / "file").touch()
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "file" / "none"))
+        assert native._kept("grasp_a", build) == b"code" and len(built) == 4
+    finally:
+        jax.config.update("jax_compilation_cache_dir", previous)
+
+
+def test_a_kernel_is_traced_once(grasp, monkeypatch):
+    """The second program of a scene finds its machine code; other limits are another kernel."""
+    scene, fields, ctrl = grasp
+    first = jax.jit(StructuredEngine(scene).rollout)(fields, ctrl)
+    monkeypatch.setattr(native.llvm, "write", lambda *_: pytest.fail("written again"))
+    again = jax.jit(StructuredEngine(scene).rollout)(fields, ctrl)
+    np.testing.assert_array_equal(first.distance, again.distance)
+    with pytest.raises(pytest.fail.Exception, match="written again"):
+        jax.jit(StructuredEngine(scene, tolerance=1e-5).rollout)(fields, ctrl)
+
+
+def test_what_has_no_instruction_is_named():
+    """Instead of a wrong result."""
+    jaxpr = jax.make_jaxpr(jnp.tanh)(1.0)
+    with pytest.raises(NotImplementedError, match="tanh"):
+        llvm.Writer(8).run(jaxpr.jaxpr, [], [llvm.Value("f", True, "%x")])
+
+
+OPERATIONS = {
+    "sine": (lambda x, y: jnp.sin(40 * x), 2e-7),
+    "cosine": (lambda x, y: jnp.cos(40 * x), 2e-7),
+    "sign": (lambda x, y: jnp.sign(x) + jnp.sign(0 * x), 0),
+    "power": (lambda x, y: x**3 - (1 + y * y) ** -2, 2e-6),
+    "root": (lambda x, y: jnp.sqrt(jnp.abs(x)) + jax.lax.rsqrt(1 + jnp.abs(y)), 1e-6),
+    "extremes": (lambda x, y: jnp.maximum(x, y) * jnp.minimum(x, y), 2e-6),
+    "logic": (lambda x, y: jnp.where((x < y) & ~(y > 0.3) | (x != x), x, y), 0),
+    "whole": (lambda x, y: x.astype(jnp.int32).astype(x.dtype), 0),
+    "loop": (lambda x, y: jax.lax.fori_loop(0, 7, lambda i, c: c + i * x, y), 1e-5),
+    "while": (
+        lambda x, y: jax.lax.while_loop(
+            lambda c: jnp.max((c < 9).astype(int)) > 0, lambda c: c + 1, y
+        ),
+        1e-5,
+    ),
+    "branch": (
+        lambda x, y: jax.lax.cond(jnp.max((x > 9).astype(jnp.int32)) > 0, lambda: x, lambda: y - x),
+        0,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_operations(name):
+    """Each instruction on a vector against NumPy's result through JAX."""
+    function, tolerance = OPERATIONS[name]
+    rng = np.random.default_rng(0)
+    x, y = 3 * rng.standard_normal((2, 5, LANES)).astype(np.float32)
+
+    def kernel(a, b, out):
+        out[0, :] = function(a[0, :], b[0, :])
+
+    def run(a, b):
+        spec = pl.BlockSpec((None, 1, LANES), lambda i: (i, 0, 0))
+        shape = jax.ShapeDtypeStruct((5, 1, LANES), jnp.float32)
+        call = pl.pallas_call(
+            kernel, grid=(5,), in_specs=[spec] * 2, out_specs=spec, out_shape=shape
+        )
+        return launch(call, (a, b), [shape], Kernel(f"test {name}", "cpu", LANES))[0][:, 0]
+
+    got = jax.jit(run)(x[:, None], y[:, None])
+    want = jnp.stack([jax.jit(function)(a, b) for a, b in zip(x, y, strict=True)])
+    np.testing.assert_allclose(got, want, rtol=tolerance, atol=tolerance)
+
+
 def test_state_tables_give_the_states_back(grasp):
     """Packed and unpacked, three worlds in blocks of four and two fingers: the same numbers."""
     scene, fields, _ = grasp
-    engine, program = StructuredEngine(scene), Program(scene, Limits(8, 8, 1e-6), block=4)
+    engine, program = StructuredEngine(scene), Program(scene, Limits(8, 8, 1e-6), width=8)
     state = engine.reset(fields)
     rng = np.random.default_rng(0)
     state = jax.tree.map(lambda v: jnp.asarray(rng.standard_normal(v.shape), v.dtype), state)

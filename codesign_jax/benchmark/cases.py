@@ -228,12 +228,18 @@ def quality(case: Case) -> dict:
     engine: Any = peers.build(case.engine, case.setting, case.scene)
     limits = (engine.iterations, max(engine.evaluations, 14), engine.tolerance)
     short = partial(work.window, case.scene, worlds, case.values["steps"])
-    if jax.default_backend() == "gpu":
+    if engine.fused:
         whole = partial(work.make_worlds, case.scene, worlds)
         grown = case.values.get("growth")
         distinct = case.values["distinct"]
         fields, ctrl = short(distinct=distinct) if grown else work.inputs(case.scene, whole())
-        program = fused.Program(case.scene, fused.Limits(*limits))
+        backend = jax.default_backend()
+        program = fused.Program(
+            case.scene,
+            fused.Limits(*limits),
+            backend=backend,
+            width=fused.lanes_of(backend, ctrl.dtype),
+        )
         found = jax.jit(lambda f, c: program.run(hand_lanes(case.scene, f), engine.reset(f), c))(
             fields, ctrl
         )

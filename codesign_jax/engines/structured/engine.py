@@ -2,6 +2,7 @@
 
 import copy
 from functools import partial
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import jax
@@ -17,7 +18,6 @@ from codesign_jax.engines.structured import (
 )
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
-from codesign_jax.engines.structured.fused import native
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.integration import integrate
@@ -79,10 +79,10 @@ class StructuredEngine:
             a tighter tolerance, as the derivative is that of the solution.
           checkpoint: Whether the derivative of a rollout stores only states and accelerations and
             repeats the rest of each step; costs nothing without a derivative.
-          fused: Whether one GPU kernel runs a rollout (float32, primitive shapes, no trajectory,
-            effects of `in_kernel`). By default on a GPU.
-          lanes: Worlds in flight at once, see `stream`; 0 steps all worlds in unison. By default
-            `LANES` on a CPU and 0 elsewhere.
+          fused: Whether one kernel runs a rollout where it can: primitive shapes, no trajectory,
+            effects of `in_kernel`, on a GPU float32. By default unless `lanes` is given.
+          lanes: Worlds in flight at once without the kernel, see `stream`; 0 steps all worlds in
+            unison. By default `LANES` on a CPU and 0 elsewhere.
           burst: Newton iterations of a round of the stream.
 
         Raises:
@@ -95,7 +95,7 @@ class StructuredEngine:
         self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
         if fused is None:
-            fused = jax.default_backend() == "gpu" or (self.conditional and native.available())
+            fused = lanes is None and _has_kernel()
         lanes = (LANES if self.conditional else 0) if lanes is None else lanes
         self.fused, self.lanes = fused and not differentiable, 0 if differentiable else lanes
         self.burst = burst
@@ -236,7 +236,7 @@ class StructuredEngine:
         return total([every[:, f : f + 1] for f in range(n)]) / (n * links)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """See `Engine.rollout`; on a GPU in float32 one kernel runs it all, see `fused`."""
+        """See `Engine.rollout`; where it can, one kernel runs it all, see `fused`."""
         batched = self._needs_batch()
         fits = self.fused and not batched and in_kernel(self.scene.effects)
         if fits and not trajectory and (self.conditional or ctrl.dtype == jnp.float32):
@@ -254,12 +254,12 @@ class StructuredEngine:
         return meshes or e.surface == "hull" or e.finger_finger
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array) -> Trace:
-        from codesign_jax.engines.structured.fused import Limits, Program
+        from codesign_jax.engines.structured.fused import Limits, Program, lanes_of
 
         # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
         limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
         backend = jax.default_backend()
-        width = native.width() * 4 // ctrl.dtype.itemsize if backend == "cpu" else None
+        width = lanes_of(backend, ctrl.dtype)
         program = Program(self.scene, limits, backend=backend, width=width)
         found, end = program.simulate(hand_lanes(self.scene, fields), self.reset(fields), ctrl)
         qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
@@ -335,6 +335,12 @@ class StructuredEngine:
         """Largest absolute generalized velocity; not finite if any velocity or position is not."""
         qvel, qpos = self.qvel(state), self.qpos(state)
         return jnp.abs(qvel).max(1) + 0.0 * qpos.sum(1)
+
+
+def _has_kernel() -> bool:
+    """Whether kernels can be compiled for this device."""
+    backend = jax.default_backend()
+    return backend == "gpu" or (backend == "cpu" and find_spec("llvmlite") is not None)
 
 
 def in_kernel(e: Effects) -> bool:

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 
-from codesign_jax.engines.structured.fused import native
 from codesign_jax.engines.structured.fused.contacts import ContactSet
 from codesign_jax.engines.structured.fused.launch import Kernel, launch
 from codesign_jax.engines.structured.fused.ptx import LANES
@@ -43,12 +42,19 @@ class Limits(NamedTuple):
     tolerance: float
 
 
+def lanes_of(backend: str, dtype: Any) -> int:
+    """Lanes of a block that fill a GPU's warp or a CPU's vector."""
+    if backend == "gpu":
+        return LANES
+    from codesign_jax.engines.structured.fused import native
+
+    return native.vector_bytes() // jnp.dtype(dtype).itemsize
+
+
 class Program:
     """Tables and kernel of a scene's rollout for one size of block."""
 
-    def __init__(
-        self, scene: Scene, limits: Limits, *, backend: str = "gpu", width: int | None = None
-    ):
+    def __init__(self, scene: Scene, limits: Limits, *, backend: str = "gpu", width: int = LANES):
         """Lays out the memory.
 
         Args:
@@ -56,10 +62,9 @@ class Program:
           limits: How hard each step is solved.
           backend: "gpu", "cpu", or "interpreter", which is Pallas' own and slow.
           width: Lanes of a block, a power of two; more if a world has more fingers. By default
-            those of a warp or of a CPU's vector of 32 bit floats.
+            those of a warp; see `lanes_of` for a CPU.
         """
         self.backend = backend
-        width = width or (LANES if backend == "gpu" else native.width())
         self.scene, self.limits, self.lay = scene, limits, layout(scene)
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.engines.structured.fused import native, ptx
+from codesign_jax.engines.structured.fused import ptx
 
 
 class Kernel(NamedTuple):
@@ -41,6 +41,8 @@ def launch(
         return _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr).params["jaxpr"]
 
     if kernel.backend == "cpu":
+        from codesign_jax.engines.structured.fused import native
+
         layout = native.Layout(shapes, len(inputs), kernel.lanes, inputs[0].dtype.itemsize)
         name = native.register(kernel.origin, trace, layout)
         return list(jax.ffi.ffi_call(name, outputs)(*inputs))

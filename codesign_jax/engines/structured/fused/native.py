@@ -1,4 +1,4 @@
-"""Runs a Pallas kernel on a CPU: machine code by LLVM, called by XLA.
+"""Runs a Pallas kernel on a CPU: machine code by LLVM, called by XLA.  Imported where it is used.
 
 XLA calls the code through its foreign function interface, of which only the memory layout is
 needed (c_api.h in `jax.ffi.include_dir`).  Machine code is kept beside JAX's compilation cache.
@@ -8,7 +8,6 @@ import contextlib
 import ctypes
 import functools
 import hashlib
-import importlib.util
 import os
 import re
 from collections.abc import Callable
@@ -16,6 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import llvmlite
+import llvmlite.binding as binding
 import numpy as np
 
 import codesign_jax
@@ -46,18 +47,11 @@ class Layout(NamedTuple):
     itemsize: int
 
 
-def available() -> bool:
-    """Whether LLVM is installed."""
-    return importlib.util.find_spec("llvmlite") is not None
-
-
 @functools.cache
-def width() -> int:
-    """Floats of 32 bits in a vector register of this CPU."""
-    import llvmlite.binding as binding
-
+def vector_bytes() -> int:
+    """Size of this CPU's vector registers."""
     features = binding.get_host_cpu_features()
-    return 16 if features.get("avx512f") else 8 if features.get("avx") else 4
+    return 64 if features.get("avx512f") else 32 if features.get("avx") else 16
 
 
 @functools.cache
@@ -147,10 +141,6 @@ def _handler(name: str, layout: Layout) -> str:
 
 
 def _machine() -> Any:
-    import llvmlite.binding as binding
-
-    if hasattr(binding, "initialize") and binding.llvm_version_info < (20,):
-        binding.initialize()
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     return binding.Target.from_default_triple().create_target_machine(
@@ -163,8 +153,6 @@ def _machine() -> Any:
 
 def _compile(text: str, machine: Any) -> bytes:
     """Object file of a program in LLVM's language."""
-    import llvmlite.binding as binding
-
     module = binding.parse_assembly(text)
     module.triple = machine.triple
     options = binding.create_pipeline_tuning_options(speed_level=2)
@@ -186,9 +174,6 @@ def _sources() -> str:
 
 def _name(kernel: str) -> str:
     """Name of the machine code of a kernel on this CPU, of this code and these versions."""
-    import llvmlite
-    import llvmlite.binding as binding
-
     made_by = (
         jax.__version__,
         llvmlite.__version__,
@@ -226,8 +211,6 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout) -> str:
       trace: Returns the kernel's jaxpr; its arguments are references to a block of each array.
       layout: Its arrays.
     """
-    import llvmlite.binding as binding
-
     name = _name(repr((origin, layout)))
     if name in _loaded:
         return name

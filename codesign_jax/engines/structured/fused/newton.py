@@ -19,7 +19,7 @@ from codesign_jax.engines.structured.fused.tables import (
 )
 from codesign_jax.engines.structured.inertia import Body
 from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
-from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.problem import Forces, Matrices
 
 
@@ -269,11 +269,13 @@ class Newton:
             )
 
         def body(carry: list) -> list:
-            count, arrays = carry[0], carry[1:]
-            alpha, low, high, _ = rebuild(arrays)
-            one, two = evaluate(alpha)
-            new = lanewise(solver.refine, alpha, low, high, one, two)
-            return [count + 1, *solid((*new, one), self.block.size)[0]]
+            count, old = carry[0], rebuild(carry[1:])
+            one, two = evaluate(old[0])
+            new = (*lanewise(solver.refine, *old[:3], one, two), one)
+            # A world that has its minimum stays, so that it does not depend on its neighbours.
+            searching = lanes([jnp.abs(carry[-1]) > goal], (), wide=False)
+            new = [lanewise(jnp.where, searching, a, b) for a, b in zip(new, old, strict=True)]
+            return [count + 1, *solid(tuple(new), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
             return (carry[0] < evaluations) & anywhere(jnp.abs(carry[-1]) > goal)

@@ -9,6 +9,8 @@ import argparse
 import sys
 from pathlib import Path
 
+import jax
+
 from codesign_jax import codesign, parameters, scene
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
@@ -30,7 +32,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="seed of run 0")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
-    parser.add_argument("--devices", type=int, default=1)
+    parser.add_argument("--devices", type=int, help="by default all that are visible")
     parser.add_argument("--every", type=int, help="steps between saves; by default 20 s")
     parser.add_argument("--minutes", type=float, help="save and stop after this time")
     parser.add_argument("--fresh", action="store_true", help="delete an earlier state")
@@ -48,11 +50,12 @@ def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], in
     overrides = common.parse_overrides([*plan.OVERRIDES[args.size], *args.set])
     the_scene = scene.load("paper", overrides=overrides)
     space = parameters.design_space(the_scene.hand, the_plan.preset)
-    chunk, calls = chunking(the_plan.worlds, args.chunk, args.devices)
+    devices = args.devices or jax.device_count()
+    chunk, calls = chunking(the_plan.worlds, args.chunk, devices)
     engine = make_engine(args.engine, the_scene)
-    worlds = Worlds(the_scene, engine, space, chunk=chunk, devices=args.devices)
+    worlds = Worlds(the_scene, engine, space, chunk=chunk, devices=devices)
     print(f"{args.experiment}: {the_plan.grasps:,} grasps, {the_plan.worlds:,} a step in {calls}")
-    print(f"call(s) of {chunk:,} worlds; the paper's total is {plan.TOTAL_GRASPS:,}", flush=True)
+    print(f"call(s) of {chunk:,} worlds on {devices} device(s)", flush=True)
     settings = record.settings(the_plan, the_scene, args.engine, args.seed, chunk)
     if isinstance(the_plan, plan.Landscape):
         return Grid(the_plan, the_scene, worlds, seed=args.seed), settings, the_plan.grasps

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
@@ -13,10 +14,11 @@ import pytest
 import scipy.stats
 from small import pinch, still
 
-from codesign_jax import cli, model, parameters, scene, schema
+from codesign_jax import cli, files, model, parameters, scene, schema
 from codesign_jax.accuracy import (
     beam,
     decision,
+    impulse,
     oracle,
     report,
     statistics,
@@ -64,6 +66,22 @@ def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
     mistaken.write_text('description = "x"\n[discretization]\nlink = 3\n[solver]\n')
     with pytest.raises(schema.SceneError, match="links"):
         scene.load("paper", accuracy=mistaken)
+
+
+def test_the_presets_files_and_the_front_page_state_what_was_measured(tmp_path, monkeypatch):
+    """As `scripts/accuracy_vs_time.py --report` writes them: new data without it would fail."""
+    monkeypatch.setattr(statistics, "RESAMPLES", 2)  # neither states an interval
+    found, readme, page = report.studies(ROOT / "docs"), tmp_path / "README.md", ROOT / "README.md"
+    stated = {n: files.find("accuracy", n).read_text() for n in PRESETS}
+    for preset_name, text in stated.items():  # the values alone, and what an earlier study found
+        values = [line for line in text.splitlines(True) if not line.startswith("# measured: ")]
+        (tmp_path / f"{preset_name}.toml").write_text("# measured: old\n" + "".join(values))
+    shutil.copy(page, readme)
+    shutil.copy(ROOT / "docs" / "accuracy.md", tmp_path)
+    report.make_summary(readme, tmp_path / "accuracy.md", tmp_path, found)
+    assert readme.read_text() == page.read_text()
+    assert stated == {n: (tmp_path / f"{n}.toml").read_text() for n in PRESETS}
+    assert all("# measured: finger tip" in text for text in stated.values())
 
 
 def test_the_command_line_takes_a_preset(capsys):
@@ -177,11 +195,30 @@ def test_states_and_accelerations_translate_between_the_engines(grasp):
         state = steps.to_state(engine, small, batch, found)
         np.testing.assert_array_equal(np.asarray(engine.qpos(state)), found.qpos)
         np.testing.assert_array_equal(np.asarray(engine.qvel(state)), found.qvel)
-        run = jax.jit(lambda b, s, u: engine.step(hand_lanes(small, b), s, u)[1].acc)
-        got = steps.from_acc(small, run(batch, state, found.ctrl.T), found.qpos)
+
+        @jax.jit
+        def run(batch, state, ctrl):
+            hand = hand_lanes(small, batch)
+            acc = engine.step(hand, state, ctrl)[1].acc
+            return acc, impulse.grip(engine, hand, state, ctrl, acc)
+
+        acc, grip = run(batch, state, found.ctrl.T)
+        got = steps.from_acc(small, acc, found.qpos)
     scale = np.maximum(np.linalg.norm(found.qacc, axis=1), steps.FLOOR)
     # As in test_structured: both solvers stop at rounding of their own.
     assert (np.linalg.norm(got - found.qacc, axis=1) / scale).max() < 1e-8
+    expected = [grip_in_c(exact, fields, found, i) for i in range(len(found.world))]
+    assert max(expected) > 0.1, "never touched"
+    # Accelerations agree to 1e-8 of 100 or more; a link of some grams makes 1e-8 N of that.
+    np.testing.assert_allclose(grip, expected, rtol=1e-8, atol=1e-7)
+
+
+def grip_in_c(exact, fields, samples, i):
+    m = oracle.model_of(exact, fields, samples.world[i])
+    data = mujoco.MjData(m)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = samples.qpos[i], samples.qvel[i], samples.ctrl[i]
+    mujoco.mj_forward(m, data)
+    return oracle.grip(exact, m, data)
 
 
 def test_tips_of_a_shorter_step_come_closer_to_the_reference():

@@ -2,10 +2,12 @@
 
 python scripts/reproduce.py 2d --out runs/reproduction           # on a GPU; again to resume
 python scripts/reproduce.py 2d --out runs/small --size cpu       # minutes on a CPU
+python scripts/reproduce.py 2d --parquet runs/2d.parquet         # every grasp, also afterwards
 python scripts/reproduce.py figures --data docs/data/reproduction
 """
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -14,7 +16,17 @@ import jax
 from codesign_jax import codesign, parameters, scene
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
-from codesign_jax.experiments import Batch, Grid, Stop, Worlds, drive, plan, record, results
+from codesign_jax.experiments import (
+    Batch,
+    Grid,
+    Stop,
+    Worlds,
+    drive,
+    parquet,
+    plan,
+    record,
+    results,
+)
 from codesign_jax.experiments.worlds import LIMIT, chunking
 from codesign_jax.schema import SceneError
 
@@ -38,6 +50,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--fresh", action="store_true", help="delete an earlier state")
     parser.add_argument("--commit", help="commit of the code where there is no git")
     parser.add_argument("--trials", type=Path, help="write every trial to this .npz")
+    parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
     parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
@@ -66,6 +79,8 @@ def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], in
 def simulate(args: argparse.Namespace) -> int:
     """Runs or resumes an experiment; 3 is the exit status of one that was stopped."""
     common.use_compilation_cache()
+    if args.parquet:
+        parquet.library()  # refused before hours of simulation, not after
     experiment, settings, grasps = build(args)
     state = args.out / f"{args.experiment}.state.npz"
     if args.fresh:
@@ -75,13 +90,17 @@ def simulate(args: argparse.Namespace) -> int:
     if not done.finished:
         print(f"stopped; the same command resumes from {state}")
         return 3
-    notes = results.provenance(settings, done, grasps, command=sys.argv, commit=args.commit)
-    for path in results.write(
-        args.out, args.experiment, results.summarize(experiment, done.record), notes
-    ):
-        print(path)
+    notes = args.out / f"{args.experiment}.json"
+    # A finished state from which a table is asked for: who made the results stays as it is.
+    if done.grasps or not notes.exists():
+        made = results.provenance(settings, done, grasps, command=sys.argv, commit=args.commit)
+        kept = results.summarize(experiment, done.record)
+        for path in results.write(args.out, args.experiment, kept, made):
+            print(path)
     if args.trials:
         print(results.write_trials(args.trials, done.record))
+    if args.parquet:
+        print(parquet.write(args.parquet, experiment, done.record, json.loads(notes.read_text())))
     return 0
 
 

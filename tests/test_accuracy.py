@@ -1,27 +1,21 @@
-"""The study of accuracy: its oracles, its statistics, its file, and a run of a tiny size."""
+"""The study of accuracy: presets, settings, oracles and the file of its records."""
 
 import dataclasses
 import json
-import runpy
-import shutil
-import sys
 from pathlib import Path
 
 import jax
 import mujoco
 import numpy as np
 import pytest
-import scipy.stats
 from small import pinch, still
 
-from codesign_jax import cli, files, model, parameters, scene, schema
+from codesign_jax import cli, model, parameters, scene, schema
 from codesign_jax.accuracy import (
     beam,
     decision,
     impulse,
     oracle,
-    report,
-    statistics,
     steps,
     study,
     tip,
@@ -66,22 +60,6 @@ def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
     mistaken.write_text('description = "x"\n[discretization]\nlink = 3\n[solver]\n')
     with pytest.raises(schema.SceneError, match="links"):
         scene.load("paper", accuracy=mistaken)
-
-
-def test_the_presets_files_and_the_front_page_state_what_was_measured(tmp_path, monkeypatch):
-    """As `scripts/accuracy_vs_time.py --report` writes them: new data without it would fail."""
-    monkeypatch.setattr(statistics, "RESAMPLES", 2)  # neither states an interval
-    found, readme, page = report.studies(ROOT / "docs"), tmp_path / "README.md", ROOT / "README.md"
-    stated = {n: files.find("accuracy", n).read_text() for n in PRESETS}
-    for preset_name, text in stated.items():  # the values alone, and what an earlier study found
-        values = [line for line in text.splitlines(True) if not line.startswith("# measured: ")]
-        (tmp_path / f"{preset_name}.toml").write_text("# measured: old\n" + "".join(values))
-    shutil.copy(page, readme)
-    shutil.copy(ROOT / "docs" / "accuracy.md", tmp_path)
-    report.make_summary(readme, tmp_path / "accuracy.md", tmp_path, found)
-    assert readme.read_text() == page.read_text()
-    assert stated == {n: (tmp_path / f"{n}.toml").read_text() for n in PRESETS}
-    assert all("# measured: finger tip" in text for text in stated.values())
 
 
 def test_the_command_line_takes_a_preset(capsys):
@@ -232,49 +210,6 @@ def test_tips_of_a_shorter_step_come_closer_to_the_reference():
     assert errors[1] / errors[0] == pytest.approx(9.5 / 4.5, rel=0.2)
 
 
-# --- statistics ----------------------------------------------------------------------------------
-
-
-def test_rank_correlation_and_its_interval_are_scipy_s():
-    rng = np.random.default_rng(3)
-    a = rng.integers(0, 6, 40) / 2.0  # with ties, as mean costs have
-    b = a + rng.normal(size=40)
-    expected = scipy.stats.spearmanr(a, b).statistic
-    assert statistics.spearman(a, b) == pytest.approx(expected, rel=1e-12)
-    found = statistics.resampled(lambda i: statistics.spearman(a[i], b[i]), 40)
-    interval = scipy.stats.bootstrap(
-        (a, b),
-        lambda x, y: scipy.stats.spearmanr(x, y).statistic,
-        paired=True,
-        vectorized=False,
-        n_resamples=1000,
-        method="percentile",
-        rng=np.random.default_rng(1),
-    ).confidence_interval
-    # Ends of an interval from a thousand resamples scatter by some hundredths.
-    np.testing.assert_allclose([found.low, found.high], interval, atol=0.05)
-
-
-def test_comparing_a_setting_with_itself_and_with_its_opposite():
-    cost = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0], [1.0, 0.0], [2.0, 2.0], [0.5, 0.0]])
-    same = statistics.compare(cost, cost)
-    assert same["same_verdict"].value == same["rank"].value == 1.0
-    assert same["offspring_moved"] == 0.0 and same["failed"] == 0
-    other = statistics.compare(3.0 - cost, cost)
-    assert other["rank"].value == pytest.approx(-1.0)
-    failed = cost.copy()
-    failed[0, 0] = np.nan
-    lost = statistics.compare(failed, cost)
-    assert lost["failed"] == 1
-    assert lost["same_verdict"].value == pytest.approx(11 / 12)  # a failed trial is not kept
-
-
-def test_fronts_and_orders():
-    assert statistics.front([(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (0.5, 9.0)]) == [3, 0, 2]
-    assert statistics.order([(h, 3.0 * h**2) for h in (1, 2, 4)]) == pytest.approx(2.0)
-    assert statistics.order([(1.0, 1.0)]) is None
-
-
 def test_populations_are_final_particles_of_every_quality():
     data = ROOT / "docs" / "data" / "reproduction"
     found = decision.populations(data, 12)
@@ -334,34 +269,3 @@ def test_cases_have_names_of_their_own():
 def test_names_of_timed_engines():
     assert name(Setting("mujoco")) == "mujoco"
     assert name(Setting(precision="float64")) == "structured float64"
-
-
-def test_a_tiny_study_runs_resumes_and_is_drawn(tmp_path, monkeypatch, capsys):
-    """The script with MuJoCo C alone: every part, a refused setting, the budget, page and CSV."""
-    data = tmp_path / "docs" / "data"
-    data.mkdir(parents=True)
-    page = tmp_path / "docs" / "accuracy.md"
-    page.write_text("<!-- results:begin -->\n<!-- results:end -->\n")
-    monkeypatch.chdir(ROOT)
-
-    def run(*more):
-        arguments = ["--size", "tiny", "--json", str(data / "accuracy_cpu.json")]
-        script = str(ROOT / "scripts" / "accuracy_vs_time.py")
-        monkeypatch.setattr(sys, "argv", [script, *arguments, "--engines", "mujoco", *more])
-        with pytest.raises(SystemExit) as end:
-            runpy.run_path(script, run_name="__main__")
-        return end.value.code
-
-    assert run("--budget", "0") == 3
-    assert run("--commit", "abc") == 0
-    records = json.loads((data / "accuracy_cpu.json").read_text())["records"]
-    # 20 ms with the scene's own contact constant, in the parts tip and impulse.
-    assert sum("refused" in r for r in records.values()) == 2
-    assert not [k for k, r in records.items() if "failed" in r]
-    capsys.readouterr()
-    assert run() == 0
-    assert ", 0 to do" in capsys.readouterr().out
-    text = report.make(tmp_path / "docs")
-    assert "refused" in text and "abc" in text
-    assert (tmp_path / "docs" / "figures" / "accuracy_cpu.png").stat().st_size > 10_000
-    assert "impulse_error" in (data / "accuracy_cpu.csv").read_text().splitlines()[0]

@@ -2,7 +2,7 @@
 
 import textwrap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib.figure
 import matplotlib.lines
@@ -85,13 +85,16 @@ def diagram(panels: dict[str, list[Point]], path: Path, title: str) -> None:
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes[len(panels) :]:
         axis.set_axis_off()
-    shown: dict[str, Any] = {}
-    names = [_panel(*item, shown) for item in zip(axes, panels.items(), strict=False)]
-    engines = dict.fromkeys(p.engine for points in panels.values() for p in points)
+    names = [_panel(*item) for item in zip(axes, panels.items(), strict=False)]
+    every = [p for points in panels.values() for p in points]
+    engines = dict.fromkeys(p.engine for p in every)
     lines = [matplotlib.lines.Line2D([], [], color=COLORS[e], lw=2) for e in engines]
+    shown = {p.knob if np.isfinite(p.error) else REFUSED for p in every}
     known = [k for k in (*MARKERS, REFUSED) if k in shown]
-    handles = [*lines, *(shown[k] for k in known)]
-    figure.legend(handles, [*engines, *known], loc="outside lower center", ncols=7, frameon=False)
+    for name in known:
+        look = {"marker": MARKERS.get(name, "x"), "color": "0.4" if name in MARKERS else "tab:red"}
+        lines.append(matplotlib.lines.Line2D([], [], ls="none", ms=8, **look))
+    figure.legend(lines, [*engines, *known], loc="outside lower center", ncols=7, frameon=False)
     figure.suptitle("\n".join(textwrap.wrap(title, 60 * columns)), fontsize=9)
     figure.draw_without_rendering()  # lays out: labels need to know where the points are
     figure.set_layout_engine("none")
@@ -101,9 +104,7 @@ def diagram(panels: dict[str, list[Point]], path: Path, title: str) -> None:
     figure.savefig(path)
 
 
-def _panel(
-    axis: Axes, item: tuple[str, list[Point]], shown: dict[str, Any]
-) -> tuple[list[labels.Label], np.ndarray]:
+def _panel(axis: Axes, item: tuple[str, list[Point]]) -> tuple[list[labels.Label], np.ndarray]:
     """Draws one error's points; returns the names to write and all points, shape (point, 2)."""
     name, points = item
     positive = [p.error for p in points if p.error > 0]
@@ -116,7 +117,7 @@ def _panel(
         line = np.array([(p.cost, p.error) for p in chosen]).reshape(-1, 2)
         axis.plot(*line.T, color=COLORS[engine], lw=1, alpha=0.6)
         for p in mine:
-            (shown[p.knob],) = axis.plot(
+            axis.plot(
                 p.cost, p.error, MARKERS[p.knob], color=COLORS[engine], mec="black", mew=0.4,
                 ms=13 if p.knob == "standard" else 6, ls="none",
             )  # fmt: skip
@@ -124,7 +125,7 @@ def _panel(
         texts += [(p.cost, p.error, p.label, "black") for p in named]
     refused = [p for p in points if not np.isfinite(p.error)]
     for p in refused:
-        (shown[REFUSED],) = axis.plot(p.cost, top, "x", color="tab:red", ms=8, mew=2, ls="none")
+        axis.plot(p.cost, top, "x", color="tab:red", ms=8, mew=2, ls="none")
         texts.append((p.cost, top, p.label, "tab:red"))
     axis.set(xscale="log", yscale="log", xlabel="wall s of a simulated s of a world", ylabel=name)
     axis.margins(x=0.08, y=0.08)

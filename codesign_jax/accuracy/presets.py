@@ -21,7 +21,7 @@ def presets_table(studies: dict[str, Study]) -> list[list[str]]:
     rows = [["preset", "setting", *(words for words, _ in ERRORS.values()), *costs]]
     for name, setting in PRESETS.items():
         errors = [full.error(part, setting) for part in ERRORS]
-        cells = ["–" if e is None else f"{e:.2g}" for e in errors]
+        cells = ["–" if e is None else f"{e:.3g}" for e in errors]
         for study in studies.values():
             cells += cost_cells(study.cost("structured", setting))
         rows.append([f"`{name}`", setting.label, *cells])
@@ -59,7 +59,7 @@ def _standing(study: Study, setting: Setting, part: str) -> str:
 def comment(name: str, studies: dict[str, Study]) -> str:
     """What was measured of a preset, as comment lines of its file."""
     setting, full = PRESETS[name], next(iter(studies.values()))
-    form = {"tip": "finger tip {:.2g} mm", "step": "acceleration of a step {:.0e}"}
+    form = {"tip": "finger tip {:.3g} mm", "step": "acceleration of a step {:.0e}"}
     form |= {"impulse": "contact impulse {:.1%}", "decision": "verdicts that flip {:.1%}"}
     errors = {part: full.error(part, setting) for part in form}
     words = [form[part].format(e) for part, e in errors.items() if e is not None]

@@ -93,7 +93,7 @@ def _found(study: Study, part: str, engine: str, limit: float) -> list[str]:
     p = study.cheapest(part, engine, limit)
     if p is None:
         return ["none", "–", "–", "–"]
-    return [named(p.label, engine), f"{p.error:.2g}", *cost_cells(p.cost)]
+    return [named(p.label, engine), f"{p.error:.3g}", *cost_cells(p.cost)]
 
 
 def front_page(full: Study, small: Study | None) -> list[list[str]]:

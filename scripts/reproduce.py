@@ -3,6 +3,7 @@
 python scripts/reproduce.py 2d --out runs/reproduction           # on a GPU; again to resume
 python scripts/reproduce.py 2d --out runs/small --size cpu       # minutes on a CPU
 python scripts/reproduce.py 2d --parquet runs/2d.parquet         # every grasp, also afterwards
+python scripts/reproduce.py types --videos docs/figures            # what the landscape's hands do
 python scripts/reproduce.py figures --data docs/data/reproduction
 """
 
@@ -28,6 +29,7 @@ from codesign_jax.experiments import (
     results,
 )
 from codesign_jax.experiments.worlds import LIMIT, chunking
+from codesign_jax.provenance import environment, git_state
 from codesign_jax.schema import SceneError
 
 
@@ -36,7 +38,7 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("experiment", choices=[*plan.PAPER, "figures"])
+    parser.add_argument("experiment", choices=[*plan.PAPER, "types", "figures"])
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
     parser.add_argument("--preset", dest="size", choices=list(plan.OVERRIDES), help="as --size")
@@ -53,6 +55,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
     parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
+    parser.add_argument("--videos", type=Path, help="folder for a video of each grasp type")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
     return parser.parse_args()
 
@@ -104,12 +107,51 @@ def simulate(args: argparse.Namespace) -> int:
     return 0
 
 
+def find_types(args: argparse.Namespace) -> int:
+    """Clusters what the hand does in the landscape's good designs, and shows it."""
+    from codesign_jax.experiments import grasp_types, statistics
+    from codesign_jax.experiments.figures import LANDSCAPE_THRESHOLD
+
+    common.use_compilation_cache()
+    common.use_all_cores(args.engine)
+    grid = statistics.load(args.data, "landscape")
+    if grid is None:
+        sys.exit(f"error: {args.data} holds no landscape.npz")
+    overrides = common.parse_overrides([*plan.OVERRIDES[args.size], *args.set])
+    the_scene = scene.load("paper", overrides=overrides)
+    space = parameters.design_space(the_scene.hand, "2d")
+    engine = make_engine(args.engine, the_scene)
+    found = statistics.load(args.data, "types")
+    if found is None or args.fresh:
+        arrays = grasp_types.study(grid[0], the_scene, engine, space, LANDSCAPE_THRESHOLD)
+        notes = {
+            "command": " ".join(["python", *sys.argv]),
+            **git_state(args.commit),
+            **environment(),
+            "settings": {
+                "scene_sha256": record.scene_hash(the_scene),
+                "engine": args.engine,
+                "threshold": LANDSCAPE_THRESHOLD,
+            },
+        }
+        results.write(args.data, "types", arrays, notes)
+    else:
+        arrays = found[0]
+    print(grasp_types.describe(grid[0], arrays))
+    if args.videos:
+        for path in grasp_types.videos(grid[0], arrays, the_scene, engine, space, args.videos):
+            print(path)
+    return 0
+
+
 def main() -> int:
     """Runs the command and returns the exit status."""
     args = parse()
-    if args.experiment != "figures":
+    if args.experiment not in ("types", "figures"):
         return simulate(args)
     try:
+        if args.experiment == "types":
+            return find_types(args)
         from codesign_jax.experiments import report
     except ModuleNotFoundError as error:
         sys.exit(f"error: {error.name} is missing: pip install 'codesign-jax[study]'")

@@ -211,7 +211,7 @@ def figure(tables: dict[str, tuple[Finals, list[Row]]], path: Path) -> None:
     axes[0].set_yticks(range(len(names)), names)
     axes[0].set(xlabel="best particles that still succeed", xlim=(-0.02, 1.02))
     axes[1].set(xlabel="their grasps without a loss", xlim=(-0.02, 1.02))
-    axes[0].legend(frameon=False, fontsize=8)
+    axes[1].legend(frameon=False, fontsize=8, loc="center left")
     for axis in axes:
         axis.grid(alpha=0.3, lw=0.4)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -40,7 +40,8 @@ class Optimize:
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
     accuracy: Text = None
-    """Discretization and solver instead of the scene's: fast, standard, reference, or a .toml."""
+    """Instead of the scene's discretization and solver: fast, standard, reference (their errors and
+    costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control."""
@@ -93,7 +94,8 @@ class Evaluate:
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
     accuracy: Text = None
-    """Discretization and solver instead of the scene's: fast, standard, reference, or a .toml."""
+    """Instead of the scene's discretization and solver: fast, standard, reference (their errors and
+    costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
     engine: Text = None
     """Engine that simulates; default: the run's, or structured."""

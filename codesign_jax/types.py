@@ -23,7 +23,8 @@ class Status(enum.IntFlag):
       SOLVER_CAP: The solver stopped at its cap of iterations in a step before the verdict. A
         warning: each iteration lowers the convex objective, so the step taken is the best found,
         and to exclude such trials would favour hands that touch little.
-      CONTACT_OVERFLOW: The engine had no room for a contact. Only MuJoCo C allocates contacts.
+      CONTACT_OVERFLOW: The engine had no room for a contact: MuJoCo C in its arena, the
+        structured engine for those between fingers.
       INVALID_START: Bad model fields, or bodies deep inside one another before the first step.
       STUCK: The released object neither left the hand nor rests on the table.
     """

@@ -2,7 +2,7 @@
 
 python scripts/accuracy_vs_time.py --json docs/data/accuracy_cpu.json --quick    # minutes
 python scripts/accuracy_vs_time.py --json docs/data/accuracy_h200.json           # on a GPU
-python scripts/accuracy_vs_time.py --report                # figures and docs/accuracy.md from data
+python scripts/accuracy_vs_time.py --report                # figures, pages and presets from data
 
 Every finished case is kept: the same command goes on where the last one stopped, and exits with 3
 if cases are left.  --parts and --engines choose among the cases.
@@ -17,6 +17,8 @@ import jax
 
 from codesign_jax.accuracy import study
 from codesign_jax.accuracy.store import Store
+
+SCENES = Path(study.__file__).parents[1] / "scenes" / "accuracy"
 
 
 def parse() -> argparse.Namespace:
@@ -50,7 +52,10 @@ def main() -> int:
     if args.report:
         from codesign_jax.accuracy import report
 
-        print(report.make(args.docs))
+        found = report.studies(args.docs)
+        print(report.make(args.docs, found))
+        page = args.docs / "accuracy.md"
+        report.make_summary(args.docs.parent / "README.md", page, SCENES, found)
         return 0
     gpu = jax.default_backend() == "gpu"
     if not gpu:

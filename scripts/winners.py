@@ -2,21 +2,23 @@
 
 python scripts/winners.py --out runs/winners.npz                  # on a GPU; again to resume
 python scripts/winners.py --out runs/small.npz --size tiny        # minutes on a CPU
+python scripts/winners.py --merge A.npz B.npz --out C.npz         # joins results of two machines
 python scripts/winners.py --report                                # figure and table from the data
 
-Variants: new trials, friction and stiffness changed, meshes never seen, a fine discretization, and
-MuJoCo C in float64 at either discretization (the best particle of each run).
---extra "hull:contact.surface=hull" adds a variant by its overrides.  Exit status 3: stopped at the
-budget; the same command resumes.
+Variants: new trials, friction and stiffness changed, the skinned hull, meshes never seen, a fine
+discretization, and MuJoCo C in float64 at either discretization (the best particle of each run).
+--extra "rough:contact.finger_table_friction=1.5" adds a variant by its overrides.  The .json beside
+the results lists every run with its command, commit, versions, device and the calls it made.  Exit
+status 3: stopped at the budget; the same command resumes.
 """
 
 import argparse
-import json
+import shlex
 import sys
 from pathlib import Path
 
 from codesign_jax import scene
-from codesign_jax.experiments import record, winners
+from codesign_jax.experiments import record, winners, winners_files
 from codesign_jax.experiments.winners import VARIANTS, Variant
 from codesign_jax.experiments.worlds import LIMIT
 from codesign_jax.provenance import environment, git_state
@@ -41,6 +43,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
     parser.add_argument("--budget", type=float, default=1e9, help="seconds to begin calls in")
     parser.add_argument("--commit", help="commit of the code where there is no git")
+    parser.add_argument("--merge", type=Path, nargs="+", metavar="FILE", help="joined into --out")
     parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
     parser.add_argument("--report", action="store_true", help="draw what --data holds and stop")
     parser.add_argument("--page", type=Path, default=Path("docs/results.md"))
@@ -65,14 +68,8 @@ def variants(args: argparse.Namespace) -> list[Variant]:
     return [known[n] for n in names]
 
 
-def main() -> int:
+def simulate(args: argparse.Namespace) -> int:
     """Runs the calls that are left and returns the exit status."""
-    args = parse()
-    if args.report:
-        from codesign_jax.experiments import winners_report
-
-        print(winners_report.make(args.data, args.figures, args.page))
-        return 0
     from codesign_jax.commands import common
 
     common.use_compilation_cache()
@@ -94,17 +91,37 @@ def main() -> int:
         "scene_sha256": record.scene_hash(scene.load("paper")),
         "set": list(args.set),
     }
+    made = winners_files.read(args.out)[2] if args.out.exists() else []
+    made.append(this_run(args))
+
+    def note(key: str) -> None:
+        winners_files.note(made, key)
+        winners_files.write_runs(args.out, settings, made)
+
     _, finished = winners.drive(
-        todo, args.out, settings, more=args.set, budget=args.budget, limit=args.chunk
+        todo, args.out, settings, more=args.set, budget=args.budget, limit=args.chunk, note=note
     )
-    notes = {
-        "command": " ".join(["python", *sys.argv]),
-        **git_state(args.commit),
-        **environment(),
-        "settings": settings,
-    }
-    args.out.with_suffix(".json").write_text(json.dumps(notes, indent=2) + "\n")
     return 0 if finished else 3
+
+
+def this_run(args: argparse.Namespace) -> winners_files.Run:
+    """Provenance of this process, which has made no call yet."""
+    command = shlex.join(["python", *sys.argv])
+    return {"command": command, **git_state(args.commit), **environment(), "calls": []}
+
+
+def main() -> int:
+    """Runs the command and returns the exit status."""
+    args = parse()
+    if args.merge:
+        print("\n".join(winners_files.merge(args.merge, args.out)))
+        return 0
+    if args.report:
+        from codesign_jax.experiments import winners_report
+
+        print(winners_report.make(args.data, args.figures, args.page))
+        return 0
+    return simulate(args)
 
 
 if __name__ == "__main__":

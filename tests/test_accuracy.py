@@ -1,25 +1,21 @@
-"""The study of accuracy: its oracles, its statistics, its file, and a run of a tiny size."""
+"""The study of accuracy: presets, settings, oracles and the file of its records."""
 
 import dataclasses
 import json
-import runpy
-import sys
 from pathlib import Path
 
 import jax
 import mujoco
 import numpy as np
 import pytest
-import scipy.stats
 from small import pinch, still
 
 from codesign_jax import cli, model, parameters, scene, schema
 from codesign_jax.accuracy import (
     beam,
     decision,
+    impulse,
     oracle,
-    report,
-    statistics,
     steps,
     study,
     tip,
@@ -177,11 +173,30 @@ def test_states_and_accelerations_translate_between_the_engines(grasp):
         state = steps.to_state(engine, small, batch, found)
         np.testing.assert_array_equal(np.asarray(engine.qpos(state)), found.qpos)
         np.testing.assert_array_equal(np.asarray(engine.qvel(state)), found.qvel)
-        run = jax.jit(lambda b, s, u: engine.step(hand_lanes(small, b), s, u)[1].acc)
-        got = steps.from_acc(small, run(batch, state, found.ctrl.T), found.qpos)
+
+        @jax.jit
+        def run(batch, state, ctrl):
+            hand = hand_lanes(small, batch)
+            acc = engine.step(hand, state, ctrl)[1].acc
+            return acc, impulse.grip(engine, hand, state, ctrl, acc)
+
+        acc, grip = run(batch, state, found.ctrl.T)
+        got = steps.from_acc(small, acc, found.qpos)
     scale = np.maximum(np.linalg.norm(found.qacc, axis=1), steps.FLOOR)
     # As in test_structured: both solvers stop at rounding of their own.
     assert (np.linalg.norm(got - found.qacc, axis=1) / scale).max() < 1e-8
+    expected = [grip_in_c(exact, fields, found, i) for i in range(len(found.world))]
+    assert max(expected) > 0.1, "never touched"
+    # Accelerations agree to 1e-8 of 100 or more; a link of some grams makes 1e-8 N of that.
+    np.testing.assert_allclose(grip, expected, rtol=1e-8, atol=1e-7)
+
+
+def grip_in_c(exact, fields, samples, i):
+    m = oracle.model_of(exact, fields, samples.world[i])
+    data = mujoco.MjData(m)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = samples.qpos[i], samples.qvel[i], samples.ctrl[i]
+    mujoco.mj_forward(m, data)
+    return oracle.grip(exact, m, data)
 
 
 def test_tips_of_a_shorter_step_come_closer_to_the_reference():
@@ -193,49 +208,6 @@ def test_tips_of_a_shorter_step_come_closer_to_the_reference():
         errors.append(tip.compare(found, reference)["tip_rms_mm"])
     # The reference's own step is a tenth of the smaller one: the ratio is 9.5 / 4.5 at first order.
     assert errors[1] / errors[0] == pytest.approx(9.5 / 4.5, rel=0.2)
-
-
-# --- statistics ----------------------------------------------------------------------------------
-
-
-def test_rank_correlation_and_its_interval_are_scipy_s():
-    rng = np.random.default_rng(3)
-    a = rng.integers(0, 6, 40) / 2.0  # with ties, as mean costs have
-    b = a + rng.normal(size=40)
-    expected = scipy.stats.spearmanr(a, b).statistic
-    assert statistics.spearman(a, b) == pytest.approx(expected, rel=1e-12)
-    found = statistics.resampled(lambda i: statistics.spearman(a[i], b[i]), 40)
-    interval = scipy.stats.bootstrap(
-        (a, b),
-        lambda x, y: scipy.stats.spearmanr(x, y).statistic,
-        paired=True,
-        vectorized=False,
-        n_resamples=1000,
-        method="percentile",
-        rng=np.random.default_rng(1),
-    ).confidence_interval
-    # Ends of an interval from a thousand resamples scatter by some hundredths.
-    np.testing.assert_allclose([found.low, found.high], interval, atol=0.05)
-
-
-def test_comparing_a_setting_with_itself_and_with_its_opposite():
-    cost = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0], [1.0, 0.0], [2.0, 2.0], [0.5, 0.0]])
-    same = statistics.compare(cost, cost)
-    assert same["same_verdict"].value == same["rank"].value == 1.0
-    assert same["offspring_moved"] == 0.0 and same["failed"] == 0
-    other = statistics.compare(3.0 - cost, cost)
-    assert other["rank"].value == pytest.approx(-1.0)
-    failed = cost.copy()
-    failed[0, 0] = np.nan
-    lost = statistics.compare(failed, cost)
-    assert lost["failed"] == 1
-    assert lost["same_verdict"].value == pytest.approx(11 / 12)  # a failed trial is not kept
-
-
-def test_fronts_and_orders():
-    assert statistics.front([(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (0.5, 9.0)]) == [3, 0, 2]
-    assert statistics.order([(h, 3.0 * h**2) for h in (1, 2, 4)]) == pytest.approx(2.0)
-    assert statistics.order([(1.0, 1.0)]) is None
 
 
 def test_populations_are_final_particles_of_every_quality():
@@ -297,34 +269,3 @@ def test_cases_have_names_of_their_own():
 def test_names_of_timed_engines():
     assert name(Setting("mujoco")) == "mujoco"
     assert name(Setting(precision="float64")) == "structured float64"
-
-
-def test_a_tiny_study_runs_resumes_and_is_drawn(tmp_path, monkeypatch, capsys):
-    """The script with MuJoCo C alone: every part, a refused setting, the budget, page and CSV."""
-    data = tmp_path / "docs" / "data"
-    data.mkdir(parents=True)
-    page = tmp_path / "docs" / "accuracy.md"
-    page.write_text("<!-- results:begin -->\n<!-- results:end -->\n")
-    monkeypatch.chdir(ROOT)
-
-    def run(*more):
-        arguments = ["--size", "tiny", "--json", str(data / "accuracy_cpu.json")]
-        script = str(ROOT / "scripts" / "accuracy_vs_time.py")
-        monkeypatch.setattr(sys, "argv", [script, *arguments, "--engines", "mujoco", *more])
-        with pytest.raises(SystemExit) as end:
-            runpy.run_path(script, run_name="__main__")
-        return end.value.code
-
-    assert run("--budget", "0") == 3
-    assert run("--commit", "abc") == 0
-    records = json.loads((data / "accuracy_cpu.json").read_text())["records"]
-    # 20 ms with the scene's own contact constant, in the parts tip and impulse.
-    assert sum("refused" in r for r in records.values()) == 2
-    assert not [k for k, r in records.items() if "failed" in r]
-    capsys.readouterr()
-    assert run() == 0
-    assert ", 0 to do" in capsys.readouterr().out
-    text = report.make(tmp_path / "docs")
-    assert "refused" in text and "abc" in text
-    assert (tmp_path / "docs" / "figures" / "accuracy_cpu.png").stat().st_size > 10_000
-    assert "impulse_error" in (data / "accuracy_cpu.csv").read_text().splitlines()[0]

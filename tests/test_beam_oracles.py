@@ -12,12 +12,10 @@ import mujoco
 import numpy as np
 import pytest
 from scipy import linalg, special
-from small import pinch, still
+from small import pinch
 
-from codesign_jax import hand, model, morphology
-from codesign_jax.types import Params
-
-HEIGHT, WALL = 0.020, 0.005
+from codesign_jax import hand
+from codesign_jax.accuracy import beam
 
 
 @functools.cache
@@ -42,55 +40,14 @@ def finger_scene(links, *, bending_only=True, gravity=0.0, timestep=0.01, shear_
     return dataclasses.replace(the_scene, hand=one, gravity=gravity)
 
 
-class Finger:
-    """A single finger's model with its beam properties; loads act at the tip's bottom layer."""
+class Finger(beam.Finger):
+    """The finger of `finger_scene`, waited for until even rounding has died away."""
 
-    def __init__(self, links, length=0.1, height=HEIGHT, **options):
-        self.scene = finger_scene(links, **options)
-        self.layout = model.layout(self.scene)
-        one = np.ones(1)
-        params = Params(length * one, height * one, WALL * one, np.zeros(()), np.zeros(6), 0 * one)
-        self.model = model.compile_model(self.scene, params, still())
-        self.data = mujoco.MjData(self.model)
-        self.data.qpos[2] = self.data.ctrl[2] = 0.3
-        self.length, self.links = length, links
-        material = self.scene.hand.material
-        self.beam = morphology.beam(
-            height,
-            WALL,
-            width=self.scene.hand.section.width,
-            shear_modulus=material.shear_modulus,
-            density=material.density,
-        )
-
-    def tip(self):
-        """Tip position (3,) and orientation (3, 3) in the frame of the finger's root."""
-        d, last = self.data, self.layout.bodies[0, -1]
-        palm = d.xmat[1].reshape(3, 3)
-        frame = d.xmat[last].reshape(3, 3)
-        end = d.xpos[last] + frame @ [self.length / self.links / 2, 0, 0]
-        return palm.T @ (end - d.xpos[1]), palm.T @ frame
+    def __init__(self, links, length=0.1, **options):
+        super().__init__(finger_scene(links, **options), length)
 
     def settle(self, force=(0, 0, 0), torque=(0, 0, 0), pressure=0.0, steps=3000):
-        """Steps under a load of fixed direction until nothing moves; returns the tip's pose."""
-        m, d, last = self.model, self.data, self.layout.bodies[0, -1]
-        d.ctrl[6] = pressure
-        mujoco.mj_kinematics(m, d)
-        mujoco.mj_comPos(m, d)
-        for _ in range(steps):
-            point = d.xpos[last] + d.xmat[last].reshape(3, 3) @ [
-                self.length / self.links / 2,
-                0,
-                0,
-            ]
-            palm, d.qfrc_applied[:] = d.xmat[1].reshape(3, 3), 0.0
-            mujoco.mj_applyFT(m, d, palm @ force, palm @ torque, point, last, d.qfrc_applied)
-            mujoco.mj_step(m, d)
-            if np.abs(d.qvel[:-6]).max() < 1e-11 and d.time > 0.1:
-                break
-        assert np.abs(d.qvel[:-6]).max() < 1e-10, "not at rest"
-        mujoco.mj_kinematics(m, d)
-        return self.tip()
+        return super().settle(force, torque, pressure, steps=steps, rest=1e-10)
 
 
 # --- statics -------------------------------------------------------------------------------------
@@ -121,22 +78,6 @@ def test_convergence_is_of_second_order():
     assert slope == pytest.approx(-2.0, abs=0.01)
 
 
-def elastica(alpha):
-    """w/L and u/L of a cantilever under a dead transverse tip load (Bisshopp and Drucker 1945)."""
-    from scipy import optimize
-
-    def phi(k):
-        return np.arcsin(1 / (k * np.sqrt(2)))
-
-    def gap(k):
-        return special.ellipk(k**2) - special.ellipkinc(phi(k), k**2) - np.sqrt(alpha)
-
-    k = optimize.brentq(gap, np.sqrt(0.5) + 1e-12, 1 - 1e-12, xtol=1e-15)
-    w = 1 - 2 / np.sqrt(alpha) * (special.ellipe(k**2) - special.ellipeinc(phi(k), k**2))
-    u = 1 - np.sqrt(2 * np.sin(np.arcsin(2 * k**2 - 1)) / alpha)
-    return w, u
-
-
 @pytest.mark.parametrize(
     "alpha, continuum, chain",
     [
@@ -147,7 +88,7 @@ def elastica(alpha):
 )
 def test_elastica(alpha, continuum, chain):
     """Large deflection at ten links: the table of docs/physics.md, recomputed here."""
-    np.testing.assert_allclose(elastica(alpha), continuum, atol=5e-9)
+    np.testing.assert_allclose(beam.elastica(alpha), continuum, atol=5e-9)
     finger = Finger(10, timestep=0.002)  # the dead load's own stiffness is explicit
     load = alpha * finger.beam.bending / finger.length**2
     position, _ = finger.settle(force=(0, 0, -load))

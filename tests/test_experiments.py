@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -123,10 +124,64 @@ def test_masks_open_one_domain_and_start_equally_often_in_either(name):
 def test_chunks_are_equal_and_waste_little():
     assert chunking(14_400) == (14_400, 1)
     assert chunking(32_400) == (16_200, 2)
+    assert chunking(32_400, devices=2) == (16_200, 2)
+    assert chunking(14_400, devices=4) == (3_600, 4)
     for worlds, limit, devices in ((32_400, 16_384, 8), (7, 3, 2), (5, 1, 4), (100, 99, 3)):
         size, calls = chunking(worlds, limit, devices)
-        assert size % devices == 0 and size <= max(limit, devices)
-        assert 0 <= size * calls - worlds < calls * devices + devices
+        assert size <= limit and 0 <= size * calls - worlds < calls
+        # One device finds the same chunk, so that a run can be repeated there bit by bit.
+        assert chunking(worlds, size).size == size
+
+
+TWO_DEVICES = """
+import sys
+from pathlib import Path
+import jax
+import numpy as np
+from toy import ToyEngine, tiny
+from codesign_jax import codesign
+from codesign_jax.experiments import Batch, Strategies, Worlds, drive
+
+plan = Strategies("2d", "2d", ("single", "concurrent"), 2, 3, 3, 3, 3)
+scene, space, _ = tiny()
+used, count = set(), jax.device_count()
+worlds = Worlds(scene, ToyEngine(scene), space, chunk=12, devices=count)
+simulate = worlds._simulate
+
+def spy(*args):
+    found = simulate(*args)
+    used.update(found.cost.devices())
+    return found
+
+worlds._simulate = spy
+batch = Batch(plan, scene, worlds, codesign.make_filter(space), seed=5)
+record = drive(batch, Path(sys.argv[1]).with_suffix(".state"), {}, say=lambda _: None).record
+assert len(used) == count, used
+assert simulate._cache_size() == count
+np.savez(sys.argv[1], **record)
+"""
+
+
+def test_two_devices_give_the_bits_of_one(tmp_path):
+    """Chunks of a step are dealt to the devices; 3 chunks on 2 leave one idle at the end."""
+    records = []
+    for count in (1, 2):
+        path = tmp_path / f"{count}.npz"
+        paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+        flags = f"--xla_force_host_platform_device_count={count}"
+        changed = {"XLA_FLAGS": flags, "PYTHONPATH": ":".join(paths), "JAX_PLATFORMS": "cpu"}
+        command = [sys.executable, "-c", TWO_DEVICES, str(path)]
+        subprocess.run(command, check=True, env=os.environ | changed)
+        with np.load(path) as file:
+            records.append({name: file[name] for name in file.files})
+    assert_equal(*records)
+    assert len(np.unique(records[0]["cost"])) > 5
+
+
+def test_more_devices_than_there_are_is_refused():
+    scene, space, engine = tiny()
+    with pytest.raises(ValueError, match="devices=99"):
+        Worlds(scene, engine, space, chunk=4, devices=99)
 
 
 @pytest.mark.parametrize(("strategy", "run"), [(0, 1), (1, 0), (2, 1)])
@@ -366,3 +421,12 @@ def test_the_script_stops_resumes_and_draws(tmp_path):
     assert drawn.returncode == 0 and (tmp_path / "figures" / "fig7a_success.png").exists()
     refused = call(*run, "--seed", "7")
     assert refused.returncode == 1 and "--fresh" in refused.stderr
+
+
+@pytest.mark.slow
+def test_the_structured_engine_gives_the_same_bits_on_two_devices(tmp_path):
+    path, command = tmp_path / "devices.json", [sys.executable, str(SCRIPT.with_name("devices.py"))]
+    subprocess.run([*command, "--json", str(path), "--size", "tiny"], check=True)
+    found = json.loads(path.read_text())
+    assert found["settings"]["chunk"] == 12 and found["compared"]["arrays"] > 10
+    assert [row["different_arrays"] for row in found["devices"].values()] == [[], []]

@@ -10,7 +10,9 @@ from codesign_jax import model, scene
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.structured import StructuredEngine, finger_pairs
 from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.schema import SceneError
+from codesign_jax.types import Status
 from tests import small
 from tests.test_structured import lanes_state
 
@@ -98,8 +100,8 @@ def test_concentric_spheres_have_a_normal():
     """Fingers that start inside one another push along MuJoCo's fallback axis, finitely."""
     the_scene = small.pinch("sphere", **SETTINGS)
     centre = jnp.zeros((3, 1, 1, 2, 1))
-    found = finger_pairs.contacts(the_scene, centre, jnp.full((1, 1, 2, 1), 0.01))
-    np.testing.assert_allclose(found.distance, -0.02, rtol=1e-6)
+    found = finger_pairs.contacts(Stages(None), the_scene, centre, jnp.full((1, 1, 2, 1), 0.01))
+    np.testing.assert_allclose(found.distance[0], -0.02, rtol=1e-6)
     oracle = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body><freejoint/><geom size=".01"/></body>
         <body><freejoint/><geom size=".01"/></body></worldbody></mujoco>"""
@@ -107,8 +109,39 @@ def test_concentric_spheres_have_a_normal():
     data = mujoco.MjData(oracle)
     mujoco.mj_forward(oracle, data)
     # MuJoCo's normal points from the first to the second, ours the other way.
-    np.testing.assert_allclose(found.normal.ravel(), -data.contact.frame[0, :3])
+    np.testing.assert_allclose(found.normal[:, 0].ravel(), -data.contact.frame[0, :3])
     np.testing.assert_allclose(data.contact.dist[0], -0.02)
+
+
+def test_slots_hold_the_pairs_that_touch():
+    """Random spheres: every touching pair of different fingers has one slot, in every world."""
+    the_scene, random = small.pinch("sphere", **SETTINGS), np.random.default_rng(0)
+    links, k, fingers, worlds = 4, 2, 3, 50
+    centre = 0.05 * random.normal(size=(3, links, k, fingers, worlds)).astype(np.float32)
+    radius = np.full((links, k, fingers, worlds), 0.01, np.float32)
+    c = finger_pairs.contacts(Stages(None), the_scene, jnp.asarray(centre), jnp.asarray(radius))
+    flat = centre.reshape(3, -1, worlds)
+    finger = np.arange(flat.shape[1]) % fingers
+    for w in range(worlds):
+        gap = np.linalg.norm(flat[:, :, None, w] - flat[:, None, :, w], axis=0) - 0.02
+        expected = gap[(finger[:, None] < finger) & (gap < 0)]
+        found = np.asarray(c.distance)[..., 0, w]
+        np.testing.assert_allclose(np.sort(found[found < 0]), np.sort(expected), atol=1e-8)
+        assert c.ends is not None and expected.size <= c.ends.touching[0, w] <= expected.size + 1
+    assert not finger_pairs.overflow(c).any() and np.asarray(c.active).sum(0).max() > 3
+
+
+def test_more_contacts_than_slots_are_an_overflow():
+    """All spheres in one place: a quarter of the pairs has a slot, and the status tells."""
+    the_scene = small.pinch("sphere", **SETTINGS)
+    centre, radius = jnp.zeros((3, 6, 2, 2, 1)), jnp.full((6, 2, 2, 1), 0.01)
+    c = finger_pairs.contacts(Stages(None), the_scene, centre, radius)
+    assert c.ends is not None and c.ends.touching == 144 and c.distance.shape[0] == 40
+    overflow = finger_pairs.overflow(c)
+    assert overflow.all()
+    engine = StructuredEngine(the_scene)
+    assert engine._status(jnp.zeros(1), overflow)[0] == Status.CONTACT_OVERFLOW
+    assert engine._status(jnp.zeros(1), ~overflow)[0] == Status.OK
 
 
 def test_not_with_the_hull():

@@ -13,7 +13,7 @@ import pytest
 from codesign_jax import model, parameters, rollout
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import make_engine
-from codesign_jax.experiments import record, winners, winners_report
+from codesign_jax.experiments import record, winners, winners_files, winners_report
 from codesign_jax.experiments.winners import STANDARD, VARIANTS, Finals, Task, Variant
 
 ROOT = Path(__file__).parents[1]
@@ -49,6 +49,8 @@ def test_variants_have_names_of_their_own_and_fit_on_a_command_line():
     names = [v.name for v in VARIANTS]
     assert len(set(names)) == len(names)
     assert not [n for n in names if "," in n or "|" in n]
+    surface = {v.name: v.scene(SMALL).effects.surface for v in VARIANTS}
+    assert [n for n in names if surface[n] != "spheres"] == ["hull"] and surface["hull"] == "hull"
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +78,17 @@ def test_a_drive_goes_on_where_it_stopped(finals, tmp_path):
     path, said, settings = tmp_path / "w.npz", [], {"size": "tiny"}
     todo = winners.tasks([finals], [Variant("MuJoCo C", engine="mujoco", best=True)], 2, 3)
     assert [t.block for t in todo] == [0, 1]
-    first, finished = winners.drive(todo[:1], path, settings, more=SMALL, say=said.append)
+    noted = []
+
+    def note(key):
+        stored = record.load(path, settings) if path.exists() else {}
+        noted.append((key, len(winners_files.calls(stored))))
+
+    first, finished = winners.drive(
+        todo[:1], path, settings, more=SMALL, say=said.append, note=note
+    )
     assert finished and len(said) == 1
+    assert noted == [("23d|MuJoCo C|0", 0)]  # before its numbers: none is ever without its run
     _, finished = winners.drive(todo, path, settings, more=SMALL, budget=-1.0, say=said.append)
     assert not finished and "1 of 2" in said[-1]
     every, finished = winners.drive(todo, path, settings, more=SMALL, say=said.append)
@@ -97,6 +108,60 @@ def made(kept, failed=()):
     for index in failed:
         status[index], cost[index] = 1, 3.0
     return cost, status
+
+
+def stored(path, runs, **variants):
+    """A file of one block of each variant, whose grasps all have one cost."""
+    results = {}
+    for name, cost in variants.items():
+        results[f"2d|{name}|0|cost"] = np.full((2, 1, 3), cost, np.float16)
+        results[f"2d|{name}|0|status"] = np.zeros((2, 1, 3), np.uint8)
+    record.save(path, results, {"size": "tiny"})
+    winners_files.write_runs(path, {"size": "tiny"}, runs)
+    return path
+
+
+def test_files_are_joined_with_their_runs(tmp_path):
+    a = stored(tmp_path / "a.npz", [{"command": "A", "calls": ["2d|x|0", "2d|y|0"]}], x=0, y=1)
+    b = stored(tmp_path / "b.npz", [{"command": "B", "calls": ["2d|y|0", "2d|z|0"]}], y=1, z=2)
+    out = tmp_path / "new" / "out.npz"
+    assert sorted(winners_files.merge([a, b], out)) == ["2d|x|0", "2d|y|0", "2d|z|0"]
+    results, _, runs = winners_files.read(out)
+    assert [float(results[f"2d|{v}|0|cost"].max()) for v in "xyz"] == [0, 1, 2]
+    assert [(r["command"], r["calls"]) for r in runs] == [
+        ("A", ["2d|x|0", "2d|y|0"]),
+        ("B", ["2d|z|0"]),
+    ]
+    with pytest.raises(record.StateError, match="exists and is not among"):
+        winners_files.merge([a, b], out)
+    c = stored(tmp_path / "c.npz", [{"command": "C", "calls": ["2d|z|0"]}], z=1)
+    with pytest.raises(record.StateError, match="c.npz: its 2d|z|0|cost differs"):
+        winners_files.merge([out, c], out)
+    other = tmp_path / "d.npz"
+    record.save(other, {}, {"size": "cpu"})
+    winners_files.write_runs(other, {"size": "cpu"}, [])
+    with pytest.raises(record.StateError, match="size: tiny and cpu"):
+        winners_files.merge([out, other], out)
+    (tmp_path / "c.json").unlink()
+    with pytest.raises(record.StateError, match="cannot be read from its .json"):
+        winners_files.merge([out, c], out)
+
+
+def test_an_early_file_s_command_is_not_held_for_calls_that_it_did_not_make(tmp_path):
+    path = stored(tmp_path / "a.npz", [], x=0, hull=1)
+    early = {"command": "python w.py --variants x", "commit": "abc", "settings": {"size": "tiny"}}
+    path.with_suffix(".json").write_text(json.dumps(early))
+    _, _, runs = winners_files.read(path)
+    assert [(r["command"], r["calls"]) for r in runs] == [
+        ("python w.py --variants x", ["2d|x|0"]),
+        (winners_files.UNKNOWN, ["2d|hull|0"]),
+    ]
+
+
+def test_a_call_repeated_after_a_kill_is_the_later_run_s():
+    runs = [{"command": "A", "calls": ["a", "b"]}, {"command": "B", "calls": []}]
+    winners_files.note(runs, "b")
+    assert [r["calls"] for r in runs] == [["a"], ["b"]]
 
 
 def test_shares_are_counted_over_successful_runs():
@@ -120,6 +185,21 @@ def test_shares_are_counted_over_successful_runs():
     assert first.every.value == pytest.approx(5 / 8)
     assert second.every.value == pytest.approx(4 / 8)
     assert second.failed == pytest.approx(1 / 32)
+    assert first.standard is None and second.standard == (3, pytest.approx(5 / 8))
+
+
+def test_a_variant_of_fewer_blocks_is_compared_in_the_same_trials():
+    """The standard loses an object in its second block, which the variant never met."""
+    finals = Finals("2d", "2d", np.zeros((2, 1, 2), np.float32), np.zeros((2, 1), np.float32))
+    kept, results = np.ones((2, 1, 3), bool), {}
+    late = kept.copy()
+    late[0, 0, 1] = False
+    for key, table in ((f"{STANDARD}|0", kept), (f"{STANDARD}|1", late), ("hull|0", kept)):
+        results[f"2d|{key}|cost"], results[f"2d|{key}|status"] = made(table)
+    first, second = winners_report.rows(results, finals)
+    assert (first.name, first.trials, first.counts) == (STANDARD, 6, (1, 2))
+    assert (second.name, second.trials, second.counts) == ("hull", 3, (2, 2))
+    assert second.standard == (2, 1.0) and second.p == 1.0 and second.same == 1.0
 
 
 def test_the_script_simulates_and_draws(tmp_path, monkeypatch, capsys):
@@ -137,16 +217,30 @@ def test_the_script_simulates_and_draws(tmp_path, monkeypatch, capsys):
     assert "unknown" in run(*small, "--variants", "MuJoCo D")
     assert not out.exists()
     assert run(*small, "--variants", "MuJoCo C", "--commit", "abc") == 0
-    assert json.loads(out.with_suffix(".json").read_text())["commit"] == "abc"
-    results = record.load(out, json.loads(out.with_suffix(".json").read_text())["settings"])
+    fine = ["--variants", "MuJoCo C at 1 ms and 20 links", "--set", "discretization.timestep=0.01"]
+    assert "set: " in run(*small, *fine)  # other settings: refused, and nothing is noted
+    extra = ["--extra", "rough:contact.finger_table_friction=1.5", "--variants", "MuJoCo C,rough"]
+    assert run(*small, *extra, "--commit", "def", "--budget", "-1") == 3
+    both = ["--experiments", "23d,2d", "--variants", "MuJoCo C", "--commit", "def"]
+    assert run(*small, *both) == 0
+    results, settings, runs = winners_files.read(out)
+    assert [(r["commit"], r["calls"]) for r in runs] == [
+        ("abc", ["23d|MuJoCo C|0"]),
+        ("def", ["2d|MuJoCo C|0"]),
+    ]
+    assert "'MuJoCo C'" in runs[0]["command"] and runs[0]["versions"]["mujoco"]
     # The standard's place is taken by the same grasps: every share of agreement is then one.
     for part in ("cost", "status"):
         results[f"23d|{STANDARD}|0|{part}"] = results[f"23d|MuJoCo C|0|{part}"]
-    np.savez(out, **results)
-    shutil.copy(DATA / "23d.npz", tmp_path)
+    runs.append({"command": "copied", "calls": [f"23d|{STANDARD}|0"]})
+    record.save(out, results, settings)
+    winners_files.write_runs(out, settings, runs)
+    for name in ("23d.npz", "2d.npz"):
+        shutil.copy(DATA / name, tmp_path)
     page = tmp_path / "results.md"
     page.write_text("<!-- winners:begin -->\nold\n<!-- winners:end -->\n")
     text = winners_report.make(tmp_path, tmp_path, page)
     assert "100.0 %" in text and "of 2" in text
+    assert "at commit abc, cpu" in text and "* `copied`: 6 grasps" in text
     assert "old" not in page.read_text() and text in page.read_text()
     assert (tmp_path / "winners.png").stat().st_size > 5_000

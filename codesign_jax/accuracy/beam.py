@@ -1,6 +1,7 @@
 """Closed forms of a beam beside MuJoCo's chain: what the number of links alone costs."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -62,73 +63,109 @@ def finger_scene(links: int) -> Scene:
 
 
 class Finger:
-    """MuJoCo's chain of one finger; it is loaded until nothing moves."""
+    """MuJoCo's chain of one finger; loads act at the tip's bottom layer.
 
-    def __init__(self, links: int):
-        """Compiles the finger."""
-        self.scene = finger_scene(links)
-        self.links, self.last = links, model.layout(self.scene).bodies[0, -1]
+    Attributes:
+      scene: The scene.
+      layout: Where things are in the model.
+      model: MuJoCo's model.
+      data: Its state.
+      length: Length of the finger [m].
+      links: Number of segments.
+      beam: Its properties as a beam.
+    """
+
+    def __init__(
+        self, scene: Scene, length: float = LENGTH, height: float = HEIGHT, wall: float = WALL
+    ):
+        """Compiles the finger of a scene, 0.3 m above the table; dimensions in m."""
+        self.scene, self.layout = scene, model.layout(scene)
+        self.length, self.links = length, scene.discretization.links
         one, zero = np.ones(1), np.zeros(())
-        params = Params(LENGTH * one, HEIGHT * one, WALL * one, zero, np.zeros(6), 0 * one)
+        params = Params(length * one, height * one, wall * one, zero, np.zeros(6), 0 * one)
         trial = Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), np.ones(()), np.ones(()))
-        self.model = model.compile_model(self.scene, params, trial)
+        self.model = model.compile_model(scene, params, trial)
         self.data = mujoco.MjData(self.model)
         self.data.qpos[2] = self.data.ctrl[2] = 0.3
-        material = self.scene.hand.material
+        material = scene.hand.material
         self.beam = morphology.beam(
-            HEIGHT,
-            WALL,
-            width=self.scene.hand.section.width,
+            height,
+            wall,
+            width=scene.hand.section.width,
             shear_modulus=material.shear_modulus,
             density=material.density,
         )
 
-    def tip(self) -> np.ndarray:
-        """Tip in the frame of the finger's root [m], shape (3,); the data's kinematics are used."""
-        d = self.data
-        palm, frame = (d.xmat[b].reshape(3, 3) for b in (1, self.last))
-        end = d.xpos[self.last] + frame @ [LENGTH / self.links / 2, 0, 0]
-        return palm.T @ (end - d.xpos[1])
+    def tip(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position [m], (3,), and orientation, (3, 3), of the tip in the frame of the root."""
+        palm, frame = (self.data.xmat[b].reshape(3, 3) for b in (1, self.layout.bodies[0, -1]))
+        return palm.T @ (self._end() - self.data.xpos[1]), palm.T @ frame
 
-    def settle(self, load: float = 0.0, turn: float = 0.0, steps: int = 20_000) -> np.ndarray:
-        """Tip at rest over L: lateral offset and axial shortening, shape (2,).
+    def _end(self) -> np.ndarray:
+        d, last = self.data, self.layout.bodies[0, -1]
+        return d.xpos[last] + d.xmat[last].reshape(3, 3) @ [self.length / self.links / 2, 0, 0]
+
+    def settle(
+        self,
+        force: Sequence[float] = (0, 0, 0),
+        torque: Sequence[float] = (0, 0, 0),
+        pressure: float = 0.0,
+        *,
+        steps: int = 20_000,
+        rest: float = 1e-9,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The tip, see `tip`, under a load of fixed direction, after steps until nothing moves.
 
         Args:
-          load: Dead transverse load at the tip, alpha = P L^2 / E I.
-          turn: Angle to which the pressure bends the finger [rad].
+          force: Force on the tip in the palm's frame [N], shape (3,).
+          torque: Moment on it [N m], shape (3,).
+          pressure: Pressure [Pa].
           steps: Time steps after which it must be at rest.
+          rest: Largest speed at rest [rad/s or m/s].
 
         Raises:
-          RuntimeError: If it is not.
+          RuntimeError: If it is not at rest.
         """
-        m, d, force = self.model, self.data, load * self.beam.bending / LENGTH**2
-        d.ctrl[6] = turn * self.beam.bending / LENGTH / self.beam.moment_per_pressure
+        m, d, last = self.model, self.data, self.layout.bodies[0, -1]
+        d.ctrl[6] = pressure
         mujoco.mj_kinematics(m, d)
         mujoco.mj_comPos(m, d)
         for _ in range(steps):
-            palm = d.xmat[1].reshape(3, 3)
-            end, d.qfrc_applied[:] = d.xpos[1] + palm @ self.tip(), 0.0
-            down = palm @ [0, 0, -force]
-            mujoco.mj_applyFT(m, d, down, np.zeros(3), end, self.last, d.qfrc_applied)
+            palm, d.qfrc_applied[:] = d.xmat[1].reshape(3, 3), 0.0
+            load = palm @ force, palm @ torque
+            mujoco.mj_applyFT(m, d, *load, self._end(), last, d.qfrc_applied)
             mujoco.mj_step(m, d)
             # The object, last in qvel, falls or rests; it is not what is waited for.
-            if d.time > 0.1 and np.abs(d.qvel[:-6]).max() < 1e-9:
+            if d.time > 0.1 and np.abs(d.qvel[:-6]).max() < rest:
                 break
         else:
             raise RuntimeError(f"a finger of {self.links} links did not come to rest")
         mujoco.mj_kinematics(m, d)
-        x, _, z = self.tip() / LENGTH
-        return np.array([-z, 1 - x])
+        return self.tip()
 
 
 def errors(links: int, loads: tuple[float, ...], turns: tuple[float, ...]) -> dict[str, float]:
-    """Distance of the chain's tip from the closed form, over L, by name of the load."""
+    """Distance of the chain's tip from the closed form, over L, by name of the load.
+
+    Args:
+      links: Number of segments.
+      loads: Dead transverse loads at the tip, alpha = P L^2 / E I.
+      turns: Angles to which the pressure bends the finger [deg], growing.
+    """
     found = {}
     for alpha in loads:
-        tip = Finger(links).settle(load=alpha)
-        found[f"elastica {alpha:g}"] = float(np.linalg.norm(tip - elastica(alpha)))
-    finger = Finger(links)
+        finger = Finger(finger_scene(links))
+        load = alpha * finger.beam.bending / LENGTH**2
+        found[f"elastica {alpha:g}"] = _away(finger.settle(force=(0, 0, -load)), elastica(alpha))
+    finger = Finger(finger_scene(links))
     for turn in turns:  # in growing order: a jump would swing the finger through itself
-        tip = finger.settle(turn=np.deg2rad(turn))
-        found[f"arc {turn:g} deg"] = float(np.linalg.norm(tip - arc(np.deg2rad(turn))))
+        angle = np.deg2rad(turn)
+        pressure = angle * finger.beam.bending / LENGTH / finger.beam.moment_per_pressure
+        found[f"arc {turn:g} deg"] = _away(finger.settle(pressure=pressure), arc(angle))
     return found
+
+
+def _away(tip: tuple[np.ndarray, np.ndarray], exact: tuple[float, float]) -> float:
+    """Distance of a tip from a lateral offset and an axial shortening, over L."""
+    x, _, z = tip[0] / LENGTH
+    return float(np.hypot(-z - exact[0], 1 - x - exact[1]))

@@ -1,13 +1,17 @@
 """Work-precision diagrams: error against time, with Pareto fronts and failed settings."""
 
+import textwrap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib.figure
 import matplotlib.lines
 import numpy as np
+from matplotlib.axes import Axes
 
+from codesign_jax.accuracy import labels, statistics
 from codesign_jax.accuracy.settings import LINKS, TIMESTEPS, Setting
+from codesign_jax.scene import load as load_scene
 
 COLORS = {"structured": "tab:blue", "mujoco": "tab:green", "mjx": "tab:orange"}
 MARKERS = {
@@ -16,10 +20,19 @@ MARKERS = {
     "links": "s",
     "axes": "v",
     "spheres": "D",
+    "surface": "h",
     "iterations": "P",
     "precision": "X",
     "several": "^",
 }
+REFUSED = "refused or failed"
+GRASP = load_scene("paper").phases.ungrasp
+"""Simulated time of a grasp [s]."""
+
+
+def grasps(cost: float) -> float:
+    """Grasps a second at a cost [wall s of a simulated s of a world]; its own inverse."""
+    return 1 / (cost * GRASP)
 
 
 class Point(NamedTuple):
@@ -48,6 +61,7 @@ def knob(setting: Setting) -> str:
         "links": ("links",),
         "axes": ("axes",),
         "spheres": ("spheres",),
+        "surface": ("extra",),
         "iterations": ("iterations",),
         "precision": ("precision",),
     }.items():
@@ -57,61 +71,71 @@ def knob(setting: Setting) -> str:
 
 
 def diagram(panels: dict[str, list[Point]], path: Path, title: str) -> None:
-    """Draws panels of error against cost.
+    """Draws panels of error against cost, each engine's Pareto front as a line with names.
 
     Args:
       panels: Points by the name of the error.
       path: Picture.
       title: Machine and batch.
     """
-    from codesign_jax.accuracy.statistics import front
-
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
-    figure = matplotlib.figure.Figure((5.2 * columns, 3.6 * rows), dpi=120, layout="constrained")
+    size = 6.4 * columns, 4.4 * rows + 1.0
+    figure = matplotlib.figure.Figure(size, dpi=120, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    shown: dict[str, Any] = {}
-    for axis, (name, points) in zip(axes, panels.items(), strict=False):
-        good = [p for p in points if np.isfinite(p.error)]
-        positive = [p.error for p in good if p.error > 0]
-        floor = 0.5 * min(positive, default=1e-3)
-        top = 2.5 * max(positive, default=1.0)
-        for engine in dict.fromkeys(p.engine for p in points):
-            mine = [p for p in good if p.engine == engine]
-            chosen = front([(p.cost, max(p.error, floor)) for p in mine])
-            line = [(mine[i].cost, max(mine[i].error, floor)) for i in chosen]
-            if line:
-                axis.plot(*zip(*line, strict=True), color=COLORS[engine], lw=1, alpha=0.6)
-            for p in mine:
-                size = 13 if p.knob == "standard" else 6
-                (shown[p.knob],) = axis.plot(
-                    p.cost, max(p.error, floor), MARKERS[p.knob], color=COLORS[engine], ms=size,
-                    mec="black", mew=0.4, ls="none",
-                )  # fmt: skip
-            for i in chosen:
-                where = mine[i].cost, max(mine[i].error, floor)
-                # Labels above and below in turn, where the points of a front lie close.
-                away = (4, 4) if chosen.index(i) % 2 else (4, -9)
-                axis.annotate(mine[i].label, where, fontsize=5.5, xytext=away,
-                              textcoords="offset points")  # fmt: skip
-            failed = [p for p in points if p.engine == engine and not np.isfinite(p.error)]
-            for p in failed:
-                (shown["refused or failed"],) = axis.plot(
-                    p.cost, top, "x", color="tab:red", ms=8, mew=2, ls="none"
-                )
-                axis.annotate(p.label, (p.cost, top), fontsize=5.5, color="tab:red",
-                              xytext=(4, -8), textcoords="offset points")  # fmt: skip
-        axis.set(xscale="log", yscale="log", title=name, xlabel="wall s a simulated s and world")
-        axis.grid(alpha=0.3, which="both", lw=0.4)
     for axis in axes[len(panels) :]:
         axis.set_axis_off()
-    engines = dict.fromkeys(p.engine for points in panels.values() for p in points)
+    names = [_panel(*item) for item in zip(axes, panels.items(), strict=False)]
+    every = [p for points in panels.values() for p in points]
+    engines = dict.fromkeys(p.engine for p in every)
     lines = [matplotlib.lines.Line2D([], [], color=COLORS[e], lw=2) for e in engines]
-    handles, names = [*lines, *shown.values()], [*engines, *shown]
-    figure.legend(handles, names, loc="outside lower center", ncols=6, frameon=False, fontsize=8)
-    figure.suptitle(title, fontsize=9)
+    shown = {p.knob if np.isfinite(p.error) else REFUSED for p in every}
+    known = [k for k in (*MARKERS, REFUSED) if k in shown]
+    for name in known:
+        look = {"marker": MARKERS.get(name, "x"), "color": "0.4" if name in MARKERS else "tab:red"}
+        lines.append(matplotlib.lines.Line2D([], [], ls="none", ms=8, **look))
+    figure.legend(lines, [*engines, *known], loc="outside lower center", ncols=7, frameon=False)
+    figure.suptitle("\n".join(textwrap.wrap(title, 60 * columns)), fontsize=9)
+    figure.draw_without_rendering()  # lays out: labels need to know where the points are
+    figure.set_layout_engine("none")
+    for axis, (texts, points) in zip(axes, names, strict=False):
+        labels.add(axis, texts, points)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
+
+
+def _panel(axis: Axes, item: tuple[str, list[Point]]) -> tuple[list[labels.Label], np.ndarray]:
+    """Draws one error's points; returns the names to write and all points, shape (point, 2)."""
+    name, points = item
+    positive = [p.error for p in points if p.error > 0]
+    floor, top = 0.5 * min(positive, default=1e-3), 2.5 * max(positive, default=1.0)
+    drawn = [p._replace(error=max(p.error, floor)) for p in points]  # log of no error at all
+    texts: list[labels.Label] = []
+    for engine in dict.fromkeys(p.engine for p in points):
+        mine = [p for p in drawn if p.engine == engine and np.isfinite(p.error)]
+        chosen = [mine[i] for i in statistics.front([(p.cost, p.error) for p in mine])]
+        line = np.array([(p.cost, p.error) for p in chosen]).reshape(-1, 2)
+        axis.plot(*line.T, color=COLORS[engine], lw=1, alpha=0.6)
+        for p in mine:
+            axis.plot(
+                p.cost, p.error, MARKERS[p.knob], color=COLORS[engine], mec="black", mew=0.4,
+                ms=13 if p.knob == "standard" else 6, ls="none",
+            )  # fmt: skip
+        named = chosen + [p for p in mine if p.knob == "standard" and p not in chosen]
+        texts += [(p.cost, p.error, p.label, "black") for p in named]
+    refused = [p for p in points if not np.isfinite(p.error)]
+    for p in refused:
+        axis.plot(p.cost, top, "x", color="tab:red", ms=8, mew=2, ls="none")
+        texts.append((p.cost, top, p.label, "tab:red"))
+    axis.set(xscale="log", yscale="log", xlabel="wall s of a simulated s of a world", ylabel=name)
+    axis.margins(x=0.08, y=0.08)
+    axis.grid(alpha=0.3, which="both", lw=0.4)
+    # Matplotlib asks for limits at zero as well.
+    both = lambda x: grasps(np.maximum(x, 1e-300))  # noqa: E731
+    other = axis.secondary_xaxis("top", functions=(both, both))
+    other.set_xlabel("grasps/s")
+    where = [(p.cost, p.error if np.isfinite(p.error) else top) for p in drawn]
+    return texts, np.array(where)
 
 
 def convergence(lines: dict[str, list[tuple[float, float]]], path: Path) -> None:
@@ -121,13 +145,11 @@ def convergence(lines: dict[str, list[tuple[float, float]]], path: Path) -> None
       lines: (size, error) by name; the names that speak of the time step go left.
       path: Picture.
     """
-    from codesign_jax.accuracy.statistics import order
-
-    figure = matplotlib.figure.Figure((9.6, 3.6), dpi=120, layout="constrained")
+    figure = matplotlib.figure.Figure((9.6, 4.4), dpi=120, layout="constrained")
     left, right = figure.subplots(1, 2)
     for name, points in lines.items():
         axis = left if "time step" in name else right
-        slope = order(points)
+        slope = statistics.order(points)
         label = name + ("" if slope is None else f": order {slope:.2f}")
         if points:
             axis.loglog(*zip(*sorted(points), strict=True), marker="o", ms=4, label=label)
@@ -138,7 +160,8 @@ def convergence(lines: dict[str, list[tuple[float, float]]], path: Path) -> None
     for axis in (left, right):
         axis.xaxis.minorticks_off()
         if axis.lines:
-            axis.legend(frameon=False, fontsize=7)
+            axis.legend(frameon=False, fontsize=7, loc="upper center",
+                        bbox_to_anchor=(0.5, -0.16), ncols=2)  # fmt: skip
         axis.grid(alpha=0.3, which="both", lw=0.4)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)

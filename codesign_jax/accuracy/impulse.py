@@ -3,11 +3,18 @@
 from typing import Any
 
 import jax
-import mujoco
+import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.accuracy import oracle, worlds
 from codesign_jax.accuracy.settings import Setting
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.contact import respond
+from codesign_jax.engines.structured.hand import HandLanes, hand_lanes
+from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.engines.structured.lanes import Stages, dot
+from codesign_jax.engines.structured.problem import propagate, relative
+from codesign_jax.model import ModelFields
 
 # The arm comes down in 0.5 s, the fingers are inflated in the next 0.5 s, on an object at rest.
 # The forces are summed up to 0.2 s later, before the lift; no world ends early.
@@ -25,13 +32,12 @@ def forces(setting: Setting, hands: int, seconds: float = SECONDS) -> tuple[np.n
     """Normal force of the hand on the object [N] before every step, shape (hand, time).
 
     Args:
-      setting: The setting.
+      setting: The setting, of MuJoCo C or the structured engine.
       hands: Hands that hold their objects, in turn with every shape.
       seconds: Simulated time.
 
     Returns:
-      The forces and the time step [s].  Those of engines other than MuJoCo C are MuJoCo's,
-      converged, in the states that the engine went through.
+      The forces and the time step [s].
     """
     with worlds.floats(setting.wide or setting.engine == "mujoco") as dtype:
         scene = setting.scene(CLOSING)
@@ -41,10 +47,8 @@ def forces(setting: Setting, hands: int, seconds: float = SECONDS) -> tuple[np.n
         fields, ctrl = worlds.inputs(scene, chosen, dtype)
         step = scene.discretization.timestep
         ctrl = ctrl[:, : round(seconds / step)]
-        if setting.engine != "mujoco":
-            engine = setting.make(scene)
-            run = jax.jit(lambda f, c: engine.rollout(f, c, trajectory=True).qpos)
-            qpos = np.asarray(run(fields, ctrl), np.float64)
+        if setting.engine == "structured":
+            return _structured(setting.make(scene), fields, ctrl), step
 
     def simulate(world: int) -> list[float]:
         found: list[float] = []
@@ -53,19 +57,51 @@ def forces(setting: Setting, hands: int, seconds: float = SECONDS) -> tuple[np.n
         oracle.advance(model, fields.start[world], ctrl[world], range(ctrl.shape[1]), visit)
         return found
 
-    def replay(world: int) -> list[float]:
-        model, states = oracle.model_of(scene, fields, world), qpos[world]
-        data, found = mujoco.MjData(model), []
-        for k, state in enumerate(states):
-            if k:  # semi-implicit Euler: the step's new velocities moved the positions
-                mujoco.mj_differentiatePos(model, data.qvel, step, states[k - 1], state)
-            data.qpos[:], data.ctrl[:] = state, ctrl[world, k]
-            mujoco.mj_forward(model, data)
-            found.append(oracle.grip(scene, model, data))
-        return found
+    return np.array(oracle.each_world(simulate, hands)), step
 
-    run = simulate if setting.engine == "mujoco" else replay
-    return np.array(oracle.each_world(run, hands)), step
+
+def _structured(engine: Any, fields: ModelFields, ctrl: np.ndarray) -> np.ndarray:
+    hand = hand_lanes(engine.scene, jax.tree.map(jnp.asarray, fields))
+
+    @jax.jit
+    def run(hand: HandLanes, state: State, ctrl: jax.Array) -> jax.Array:
+        def advance(state: State, u: jax.Array):
+            new, info = engine.step(hand, state, u)
+            return new, grip(engine, hand, state, u, info.acc)
+
+        return jax.lax.scan(advance, state, ctrl)[1]
+
+    with jax.default_matmul_precision("highest"):
+        found = run(hand, engine.reset(fields), jnp.moveaxis(jnp.asarray(ctrl), 0, -1))
+    return np.asarray(found, np.float64).T
+
+
+def grip(
+    engine: StructuredEngine, hand: HandLanes, state: State, ctrl: jax.Array, acc: Acc
+) -> jax.Array:
+    """Sum of the normal forces of fingers and palm on the object [N], shape (world,).
+
+    The cone's response (`contact.respond`) at the accelerations that a step found, as the engine
+    itself pushes: of spheres or of the hull, which MuJoCo C does not know.
+
+    Args:
+      engine: The engine.
+      hand: The worlds' hands.
+      state: Their states before the step.
+      ctrl: Controls of the step, shape (nu, world).
+      acc: Accelerations of the step.
+    """
+    run = Stages(None)
+    problem, velocity = engine.problem(run, hand, state, ctrl)
+    motion = propagate(run, problem.kin, acc)
+    found = jnp.zeros(ctrl.shape[1], ctrl.dtype)
+    for name, contacts in problem.contacts.items():
+        if name.endswith("_object"):
+            moved, moving = (contacts.relative(relative(name, m)) for m in (motion, velocity))
+            force = respond(contacts, moved - contacts.reference(moving)).force
+            normal = dot(force[:3], contacts.normal)
+            found = found + normal.sum(tuple(range(normal.ndim - 1)))
+    return found
 
 
 def summary(force: np.ndarray, step: float) -> dict[str, list[float]]:

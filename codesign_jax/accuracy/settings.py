@@ -1,4 +1,4 @@
-"""Settings whose error and cost are measured: time step, links, axes, spheres, solver, floats."""
+"""Settings whose error and cost are measured: time step, links, axes, surface, solver, floats."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -56,7 +56,7 @@ class Setting:
             parts.append(f"{self.iterations} it." if self.iterations else "exact")
         parts += ["float64"] * (self.engine != "mujoco" and self.precision == "float64")
         parts += ["contact kept"] * self.keep_contact
-        return ", ".join([*parts, *self.extra])
+        return ", ".join([*parts, *(e.rsplit(".", 1)[-1] for e in self.extra)])
 
     @property
     def wide(self) -> bool:
@@ -122,6 +122,8 @@ PRESETS = {
     "reference": Setting(timestep=1.0, links=20),
 }
 """The presets' discretizations in the structured engine, whose solver is its own."""
+HULL = Setting(extra=("effects.surface=hull",))
+"""The skinned hull as the fingers' surface, in the structured engine alone: see docs/hull.md."""
 TIMESTEPS = (1.0, 2.0, 5.0, 10.0, 20.0)
 LINKS = (3, 5, 10, 20, 40)
 SPHERES = (1, 2, 4)
@@ -152,4 +154,6 @@ def one_at_a_time(engine: str) -> list[Setting]:
     if engine != "mujoco":
         found.append(dataclasses.replace(base, precision="float64"))
     found.append(dataclasses.replace(base, timestep=20.0, keep_contact=True))
+    if engine == "structured":
+        found.append(HULL)
     return list(dict.fromkeys(found))

@@ -23,7 +23,7 @@ ALPHA = 0.2
 
 
 def load(files: Iterable[Path]) -> tuple[Records, list[dict[str, Any]]]:
-    """Records of files, later files' first of the same case, and the runs that made them."""
+    """Records of files, the last file's of a case, and the runs that made them."""
     found: dict[str, dict[str, Any]] = {}
     runs: list[dict[str, Any]] = []
     for file in files:
@@ -31,7 +31,8 @@ def load(files: Iterable[Path]) -> tuple[Records, list[dict[str, Any]]]:
         for key, record in data["records"].items():
             values = dict(record["setting"])
             values["extra"] = tuple(values["extra"])
-            found[key] = record | {"of": Setting(**values)}
+            # A file counts its own runs.
+            found[key] = record | {"of": Setting(**values), "run": len(runs) + record["run"]}
         runs += data["runs"]
     return list(found.values()), runs
 

@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from codesign_jax.accuracy import beam, decision, impulse, steps, timing, tip
-from codesign_jax.accuracy.settings import LINKS, STANDARD, TIMESTEPS, Setting, one_at_a_time, sweep
+from codesign_jax.accuracy.settings import (
+    HULL,
+    LINKS,
+    PRESETS,
+    STANDARD,
+    TIMESTEPS,
+    Setting,
+    one_at_a_time,
+    sweep,
+)
 from codesign_jax.accuracy.store import Case
 
 PARTS = ("tip", "step", "impulse", "decision", "time")
@@ -194,7 +203,8 @@ def _impulse(size: Size, engines: Sequence[str]) -> list[Case]:
     for engine in ("mujoco", *(e for e in engines if e == "structured")):
         every = settings(size, engine)
         if engine == "structured":
-            every = [s for s in every if s in (every[0], Setting(precision="float64"))]
+            # MuJoCo C's error stands for the rest; it has no hull.
+            every = [s for s in every if s in (every[0], Setting(precision="float64"), HULL)]
         found += [(s, ()) for s in every]
     return [
         Case("impulse", s, more, partial(_forces, s, size.hands)) for s, more in found
@@ -252,10 +262,17 @@ def _decide(setting, names, first, trials, particles, data, moved) -> dict[str, 
 def _time(size: Size, engines: Sequence[str], *, gpu: bool) -> list[Case]:
     batch = size.gpu_worlds if gpu else size.worlds
     found, timed = [], [e for e in engines if e != "mjx"]
-    for setting in settings(size, "structured"):
+    every = settings(size, "structured")
+    if size.name != "tiny":  # a preset's cost is wanted at every size
+        every = list(dict.fromkeys([*every, *PRESETS.values()]))
+    for setting in every:
         if setting.precision == "float64" or setting.keep_contact:
             continue
         each = [replace(setting, engine=e) for e in timed]
+        if setting.extra:
+            each = [s for s in each if s.engine == "structured"]
+        if not each:
+            continue
         if setting == settings(size, "structured")[0]:
             each += [replace(setting, engine=e) for e in engines if e == "mjx"]
             if "structured" in engines:

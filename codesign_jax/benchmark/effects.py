@@ -150,7 +150,13 @@ class Program(NamedTuple):
 
 
 def compile_steps(
-    scene: Scene, worlds: Worlds, at: Moment, compiled: dict[str, Any], *, new: bool = True
+    scene: Scene,
+    worlds: Worlds,
+    at: Moment,
+    compiled: dict[str, Any],
+    *,
+    new: bool = True,
+    step: Callable | None = None,
 ) -> Program:
     """Compiles steps of the structured engine from a state of the grasps.
 
@@ -161,6 +167,7 @@ def compile_steps(
       compiled: Programs by digest: effects that are not in the step give the same text, and the
         same program.
       new: Whether a program that is not among them is compiled.
+      step: From hand, state and controls (nu, world) to the next state; by default the engine's.
     """
     engine = StructuredEngine(scene, lanes=0, fused=False)
     fields, ctrl = inputs(scene, worlds)
@@ -169,10 +176,12 @@ def compile_steps(
     state = engine.place(engine.reset(fields), q, v)
     rows = jnp.moveaxis(ctrl[:, at.step : at.step + STEPS], 0, -1)
 
-    def steps(hand: Any, state: State, rows: jax.Array) -> State:
-        return jax.lax.scan(lambda s, u: (engine.step(hand, s, u)[0], None), state, rows)[0]
+    one = step or (lambda *args: engine.step(*args)[0])
 
-    size = program_size(engine.step, hand, state, rows[0])
+    def steps(hand: Any, state: State, rows: jax.Array) -> State:
+        return jax.lax.scan(lambda s, u: (one(hand, s, u), None), state, rows)[0]
+
+    size = program_size(step or engine.step, hand, state, rows[0])
     lowered = jax.jit(steps).lower(hand, state, rows)
     digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
     each = hand.shape.shape[1]

@@ -35,11 +35,11 @@ def main(options: "Optimize") -> int:
     common.use_compilation_cache()
     common.use_all_cores(options.engine)
     scene, settings = resolve(options)
+    notes = _preflight(scene, settings)
     if options.dry_run:
-        print("".join(f"{note}\n" for note in _preflight(scene, settings)), end="")
+        print("".join(f"{note}\n" for note in notes), end="")
         _dry_run(scene, settings)
         return 0
-    notes = _preflight(scene, settings)
     plan = runs.prepare(scene, settings)
     print("".join(f"{note}\n" for note in [*notes, *common.mesh_notes(scene)]), end="")
     folder = options.out or _default_folder(scene, settings)

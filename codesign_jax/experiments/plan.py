@@ -112,9 +112,11 @@ class Landscape:
 
 SWITCHES = tuple(f"switch-{k}" for k in (1, 2, 4, 8, 16, 32))
 
+_TWO = Strategies("2d", "2d", ("single", *SWITCHES, "concurrent"), 30, 10, 64, 6, 36)
+_MANY = Strategies("23d", "23d", ("single", "switch-1", "concurrent"), 30, 60, 128, 6, 72)
 PAPER: dict[str, Strategies | Landscape] = {
-    "2d": Strategies("2d", "2d", ("single", *SWITCHES, "concurrent"), 30, 10, 64, 6, 36),
-    "23d": Strategies("23d", "23d", ("single", "switch-1", "concurrent"), 30, 60, 128, 6, 72),
+    "2d": _TWO,
+    "23d": _MANY,
     "landscape": Landscape("landscape", "2d", 60, 36),
 }
 
@@ -124,6 +126,7 @@ TOTAL_GRASPS = sum(PAPER_GRASPS.values())
 
 _FEW = ("single", "switch-1", "switch-4", "concurrent")
 # Two links and few runs: the whole path in seconds.  Four links: some minutes on two cores.
+# Short: the paper's width for a few steps, to measure devices with.
 SMALL: dict[str, dict[str, Strategies | Landscape]] = {
     "tiny": {
         "2d": Strategies("2d", "2d", ("single", "concurrent"), 2, 2, 2, 3, 3),
@@ -135,11 +138,17 @@ SMALL: dict[str, dict[str, Strategies | Landscape]] = {
         "23d": Strategies("23d", "23d", ("single", "concurrent"), 2, 12, 16, 3, 6),
         "landscape": Landscape("landscape", "2d", 12, 6),
     },
+    "short": {
+        "2d": dataclasses.replace(_TWO, episodes=33, test_trials=6),
+        "23d": dataclasses.replace(_MANY, episodes=8, test_trials=6),
+        "landscape": Landscape("landscape", "2d", 60, 12),
+    },
 }
 OVERRIDES = {
     "paper": (),
     "tiny": ("discretization.links=2",),
     "cpu": ("discretization.links=4",),
+    "short": (),
 }
 """What the sizes change in the scene; the paper's change nothing."""
 

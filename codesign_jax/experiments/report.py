@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign_jax.experiments import figures, statistics
+from codesign_jax.experiments import figures, grasp_types, statistics
 from codesign_jax.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
 from codesign_jax.experiments.statistics import RULES, Interval, Study
 
@@ -35,10 +35,17 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
         if study:
             figures.success(study, pictures / f"fig{number}a_success.png")
             figures.convergence(study, pictures / f"fig{number}b_convergence.png")
+    types = statistics.load(data, "types")
     if grid:
-        figures.landscape(grid[0], pictures / "fig8_landscape.png")
+        dots = types[0]["type"] if types else None
+        figures.landscape(grid[0], pictures / "fig8_landscape.png", types=dots)
     if page:
         fill(page, text)
+    if grid and types:
+        table = grasp_types.describe(grid[0], types[0])
+        if page:
+            fill(page, table, "types")
+        text += f"\n\n{table}"
     return text
 
 

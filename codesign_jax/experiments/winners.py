@@ -69,6 +69,7 @@ VARIANTS = (
     Variant("friction +30 %", friction=1.3),
     Variant("stiffness -20 %", stiffness=0.8),
     Variant("stiffness +20 %", stiffness=1.2),
+    Variant("hull", overrides=("effects.surface=hull",)),
     Variant("1 ms and 20 links", overrides=FINE),
     Variant("unseen meshes", objects="household"),
     Variant("MuJoCo C", engine="mujoco", best=True, blocks=2),
@@ -195,6 +196,7 @@ def drive(
     budget: float = np.inf,
     limit: int = LIMIT,
     say: Callable[[str], None] = print,
+    note: Callable[[str], None] = lambda key: None,
 ) -> tuple[Arrays, bool]:
     """Runs the calls that are left; the same call starts and resumes.
 
@@ -206,6 +208,7 @@ def drive(
       budget: Seconds to begin calls in.
       limit: Most worlds of a call of the engine.
       say: Told one line a call.
+      note: Told the key of a call before its results are written.
 
     Returns:
       The results, and whether all calls are done.
@@ -225,6 +228,7 @@ def drive(
         seconds = time.monotonic() - start
         longest = max(longest, seconds)
         results |= new | {f"{task.key}|seconds": np.float64(seconds)}
+        note(task.key)
         records.save(path, results, settings)
         cost = new[f"{task.key}|cost"]
         say(

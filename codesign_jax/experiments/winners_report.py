@@ -1,6 +1,5 @@
 """From the winners' results to a table and a figure."""
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -8,11 +7,12 @@ import matplotlib.figure
 import numpy as np
 
 from codesign_jax.codesign import SUCCESS_COST
-from codesign_jax.experiments import statistics, winners
+from codesign_jax.experiments import statistics, winners, winners_files
 from codesign_jax.experiments.record import Arrays
 from codesign_jax.experiments.report import fill
 from codesign_jax.experiments.statistics import Interval
 from codesign_jax.experiments.winners import STANDARD, VARIANTS, Finals
+from codesign_jax.experiments.winners_files import Run
 from codesign_jax.types import failed
 
 MARK = "winners"
@@ -32,7 +32,9 @@ class Row(NamedTuple):
       trials: Trials of a particle.
       best: Share of the successful runs whose best particle still succeeds, and its counts.
       counts: Best particles that succeed, and successful runs.
-      p: Paired test of these against the standard in the same trials; None for itself.
+      standard: Successful runs whose best particle succeeds under the standard in the same trials,
+        and the share of all final particles that do; None for the standard and other objects.
+      p: Paired test of the former against the variant's; None likewise.
       every: Share of all final particles that succeed; None if they were not simulated.
       kept: Share of the best particles' grasps without a loss.
       same: Share of these grasps with the standard's verdict, in the same trials.
@@ -43,6 +45,7 @@ class Row(NamedTuple):
     trials: int
     best: Interval
     counts: tuple[int, int]
+    standard: tuple[int, float] | None
     p: float | None
     every: Interval | None
     kept: Interval
@@ -61,27 +64,41 @@ def make(data: Path, pictures: Path, page: Path | None) -> str:
     Returns:
       The table in Markdown.
     """
-    with np.load(data / "winners.npz", allow_pickle=False) as file:
-        results = {k: file[k] for k in file.files}
+    results, _, runs = winners_files.read(data / "winners.npz")
     tables = {}
-    for name in dict.fromkeys(k.split("|")[0] for k in results if "|" in k):
-        shapes = [results[k].shape for k in results if k.startswith(name) and k.endswith("cost")]
+    for name in dict.fromkeys(k.split("|")[0] for k in winners_files.calls(results)):
+        shapes = [
+            results[f"{k}|cost"].shape
+            for k in winners_files.calls(results)
+            if k.startswith(f"{name}|")
+        ]
         finals = winners.finals(data, name, *np.max(shapes, axis=0)[:2])
         tables[name] = (finals, rows(results, finals))
     figure(tables, pictures / "winners.png")
     text = "\n\n".join(_markdown(*table) for table in tables.values())
-    notes = json.loads((data / "winners.json").read_text())
-    text += f"\n\nMade by `{notes['command']}` at commit {str(notes['commit'])[:12]}, "
-    text += f"{notes['device']}; {sum(v.size for k, v in results.items() if k.endswith('cost')):,} "
-    text += "grasps."
+    text += f"\n\n{made_by(results, runs)}"
     if page:
         fill(page, text, MARK)
     return text
 
 
+def made_by(results: Arrays, runs: list[Run]) -> str:
+    """The runs behind the table, with the grasps of each, as a Markdown list."""
+    lines = ["Made by", ""]
+    for run in runs:
+        grasps = sum(results[f"{key}|cost"].size for key in run["calls"])
+        commit = f" at commit {str(run['commit'])[:12]}" if run.get("commit") else ""
+        device = f", {run['device']}" if run.get("device") else ""
+        lines.append(f"* `{run['command']}`{commit}{device}: {grasps:,} grasps")
+    return "\n".join(lines)
+
+
 def rows(results: Arrays, finals: Finals) -> list[Row]:
-    """One row a variant of an experiment, the standard first."""
-    names = dict.fromkeys(k.split("|")[1] for k in results if k.startswith(f"{finals.name}|"))
+    """One row a variant of an experiment, in the order of `VARIANTS`, then extra ones."""
+    calls = [k.split("|") for k in winners_files.calls(results)]
+    there = {variant for name, variant, block in calls if name == finals.name and block == "0"}
+    known = [v.name for v in VARIANTS]
+    names = [n for n in known if n in there] + sorted(there - set(known))
     standard = winners.gather(results, finals.name, STANDARD)
     found = []
     for name in names:
@@ -104,34 +121,35 @@ def _row(
     status: np.ndarray,
     standard: tuple[np.ndarray, np.ndarray] | None,
 ) -> Row:
-    runs, particles, trials = cost.shape
     top = cost[:, 0], status[:, 0]  # the best particle of each run is its first
-    won = finals.successful
-    good = solved(*top)
-    kept = (top[0] < SUCCESS_COST) & ~failed(top[1])
-    p = same = None
-    shared = None if standard is None else standard[0].shape[-1]
+    won, good, kept = finals.successful, solved(*top), _kept(*top)
     # Other objects have trials of their own.
     other_objects = {v.name for v in VARIANTS if v.objects}
-    if shared and standard and won.any() and name != STANDARD and name not in other_objects:
-        n = min(trials, shared)
-        other = [v[:, 0, :n] for v in standard]
-        mine = [v[:, :n] for v in top]
-        p = statistics.mcnemar(solved(*mine)[won], solved(*other)[won])
-        theirs = (other[0] < SUCCESS_COST) & ~failed(other[1])
-        same = float((kept[:, :n] == theirs)[won].mean())
+    shared = p = same = None
+    if standard and won.any() and name != STANDARD and name not in other_objects:
+        n = min(cost.shape[-1], standard[0].shape[-1])
+        same_trials = [v[..., :n] for v in standard]
+        theirs = solved(*same_trials)
+        shared = int(theirs[won, 0].sum()), float(theirs.mean())
+        p = statistics.mcnemar(solved(*(v[:, :n] for v in top))[won], theirs[won, 0])
+        same = float((kept[:, :n] == _kept(*(v[:, 0] for v in same_trials)))[won].mean())
     by_run = solved(cost, status).mean(1)
     return Row(
         name,
-        trials,
+        cost.shape[-1],
         statistics.wilson(int(good[won].sum()), max(int(won.sum()), 1)),
         (int(good[won].sum()), int(won.sum())),
+        shared,
         p,
-        statistics.bootstrap(by_run, lambda v: v.mean(-1)) if particles > 1 else None,
+        statistics.bootstrap(by_run, lambda v: v.mean(-1)) if cost.shape[1] > 1 else None,
         statistics.bootstrap(kept[won].mean(1), lambda v: v.mean(-1)) if won.any() else NOTHING,
         same,
         float(failed(status).mean()),
     )
+
+
+def _kept(cost: np.ndarray, status: np.ndarray) -> np.ndarray:
+    return (cost < SUCCESS_COST) & ~failed(status)
 
 
 def _percent(value: Interval | None) -> str:
@@ -145,20 +163,22 @@ def _markdown(finals: Finals, found: list[Row]) -> str:
         f"{finals.name}: {finals.particles.shape[0]} concurrent runs, of which "
         f"{int(finals.successful.sum())} succeeded",
         "",
-        "| simulated again | trials | best particles of successful runs that still succeed | p "
-        "| their grasps kept | same verdict as the standard | all final particles that succeed "
-        "| failed trials |",
-        "|---|---|---|---|---|---|---|---|",
+        "| simulated again | trials | best particles of successful runs that still succeed "
+        "| the standard in these trials | p | their grasps kept | same verdict as the standard "
+        "| all final particles that succeed | the standard in these trials | failed trials |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in found:
         cells: list[Any] = [
             r.name,
             r.trials,
             f"{r.counts[0]} of {r.counts[1]}: {_percent(r.best)}",
+            "" if r.standard is None else r.standard[0],
             "" if r.p is None else "< 0.001" if r.p < 1e-3 else f"{r.p:.3f}",
             _percent(r.kept),
             "" if r.same is None else f"{100 * r.same:.1f} %",
             _percent(r.every),
+            "" if r.standard is None or r.every is None else f"{100 * r.standard[1]:.0f} %",
             f"{100 * r.failed:.2f} %",
         ]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
@@ -166,14 +186,17 @@ def _markdown(finals: Finals, found: list[Row]) -> str:
 
 
 def figure(tables: dict[str, tuple[Finals, list[Row]]], path: Path) -> None:
-    """Shares that hold, with intervals: best particles' grasps, and best particles that succeed."""
+    """Shares that hold, with intervals: best particles that succeed, and their grasps.
+
+    A black stroke is the standard's share in the variant's trials: more trials are harder to pass.
+    """
     picture = matplotlib.figure.Figure((8.4, 3.6), dpi=120, layout="constrained")
     axes = picture.subplots(1, 2, sharey=True)
     names = list(dict.fromkeys(r.name for _, found in tables.values() for r in found))[::-1]
     for k, (name, (finals, found)) in enumerate(tables.items()):
+        y = [names.index(r.name) + 0.12 - 0.24 * k for r in found]
         for axis, part in zip(axes, ("best", "kept"), strict=True):
             values = [getattr(r, part) for r in found]
-            y = [names.index(r.name) + 0.12 - 0.24 * k for r in found]
             x = np.array([v.value for v in values])
             ends = np.array([[v.value - v.low, v.high - v.value] for v in values]).T
             label = f"{name}: {int(finals.successful.sum())} runs"
@@ -181,10 +204,14 @@ def figure(tables: dict[str, tuple[Finals, list[Row]]], path: Path) -> None:
                 x, y, xerr=np.maximum(ends, 0), fmt="o", ms=4, capsize=2,
                 color=_COLORS.get(name, "tab:gray"), label=label,
             )  # fmt: skip
+        there = [(r.standard[0] / r.counts[1], h) for r, h in zip(found, y, strict=True)
+                 if r.standard]  # fmt: skip
+        if there:
+            axes[0].plot(*zip(*there, strict=True), "|", ms=9, color="black")
     axes[0].set_yticks(range(len(names)), names)
     axes[0].set(xlabel="best particles that still succeed", xlim=(-0.02, 1.02))
     axes[1].set(xlabel="their grasps without a loss", xlim=(-0.02, 1.02))
-    axes[0].legend(frameon=False, fontsize=8)
+    axes[1].legend(frameon=False, fontsize=8, loc="center left")
     for axis in axes:
         axis.grid(alpha=0.3, lw=0.4)
     path.parent.mkdir(parents=True, exist_ok=True)

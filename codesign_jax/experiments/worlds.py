@@ -1,13 +1,14 @@
-"""Flat batches of worlds: one compiled program, called chunk by chunk, on one or more devices."""
+"""Flat batches of worlds: one program, called chunk by chunk, on one or more devices."""
 
+import contextlib
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 
 from codesign_jax import rollout
 from codesign_jax.engines import Engine
+from codesign_jax.engines.structured import cores
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Trial
@@ -29,25 +30,26 @@ class Chunking(NamedTuple):
 
 
 def chunking(worlds: int, limit: int = LIMIT, devices: int = 1) -> Chunking:
-    """Cuts a step's worlds into the fewest equal chunks under a limit.
+    """Cuts a step's worlds into the fewest equal chunks under a limit, at least one a device.
 
-    Equal chunks waste nothing: a short last one would be filled up with worlds nobody reads.
+    Equal chunks waste nothing: a short last one would be filled up with worlds nobody reads.  A
+    chunk found for several devices is found for one as well if it is the limit.
 
     Args:
       worlds: Worlds of a step.
       limit: Largest number of worlds in one call.
-      devices: Devices that share a call; the size is a multiple of it.
+      devices: Devices that the calls are dealt to.
     """
-    calls = -(-worlds // max(limit - limit % devices, devices))
-    each = -(-worlds // calls)
-    return Chunking(-(-each // devices) * devices, calls)
+    calls = max(-(-worlds // limit), min(devices, worlds))
+    return Chunking(-(-worlds // calls), calls)
 
 
 class Worlds:
     """Simulates worlds of one scene in chunks of one size.
 
     The engine sees one flat batch, never a vmap: on a GPU it is one kernel without a batching
-    rule.  The same chunk gives the same bits; another one may round differently.
+    rule.  The same chunk gives the same bits, on however many devices; another one may round
+    differently.
     """
 
     def __init__(
@@ -59,28 +61,28 @@ class Worlds:
           scene: The scene.
           engine: Engine that simulates.
           space: Design space of the particles.
-          chunk: Worlds of one call, a multiple of `devices`.
-          devices: Devices that share a call.
+          chunk: Worlds of one call.
+          devices: Devices that calls are dealt to in turn.
 
         Raises:
-          ValueError: If the chunk cannot be shared equally or there are fewer devices.
+          ValueError: If there are fewer devices.
         """
         available = jax.devices()
-        if chunk % devices or devices > len(available):
-            raise ValueError(f"{chunk=} worlds do not fit {devices=}; {len(available)} available")
-        self.scene, self.space, self.chunk, self.devices = scene, space, chunk, devices
+        if not 1 <= devices <= len(available):
+            raise ValueError(f"{devices=}; {len(available)} available")
+        self.scene, self.space, self.chunk = scene, space, chunk
+        # With one device the engine may still share a call between a CPU's cores.
+        self.devices = available[:devices] if devices > 1 else [None]
         self.grasps = 0
+        alone = cores.on_one_core if devices > 1 else contextlib.nullcontext
 
         def simulate(designs: jax.Array, trials: Trial) -> Outcome:
             params = jax.vmap(space.params)(designs)
-            return rollout.simulate(scene, engine, params, trials)[0]
+            with alone():
+                return rollout.simulate(scene, engine, params, trials)[0]
 
-        if devices > 1:
-            mesh, split = Mesh(np.array(available[:devices]), ("world",)), PartitionSpec("world")
-            # The kernel says nothing about replication, so there is nothing to check.
-            simulate = jax.shard_map(
-                simulate, mesh=mesh, in_specs=split, out_specs=split, check_vma=False
-            )
+        # A program of its own on each device instead of one over all: its shapes, and with them
+        # its bits, are those of a single device.
         self._simulate = jax.jit(simulate)
 
     def evaluate(self, designs: np.ndarray, trials: Trial) -> Outcome:
@@ -98,14 +100,23 @@ class Worlds:
         trials = jax.tree.map(np.asarray, trials)
         flat = np.asarray(designs).reshape(-1, designs.shape[-1])
         total, parts = int(np.prod(shape)), []
-        for start in range(0, total, self.chunk):
-            # Filled up with the last world, so that every call has the compiled size.
-            world = np.minimum(np.arange(start, start + self.chunk), total - 1)
-            _, run, particle, trial = np.unravel_index(world, shape)
-            del particle
-            part = self._simulate(
-                flat[world // shape[3]], jax.tree.map(lambda v, r=run, t=trial: v[r, t], trials)
-            )
-            parts.append(jax.tree.map(np.asarray, part))
+        starts = list(range(0, total, self.chunk))
+        if self.grasps == 0:  # every device compiles now, also those with nothing to do yet
+            starts += starts[-1:] * (len(self.devices) - len(starts))
+        for first in range(0, len(starts), len(self.devices)):
+            # Calls return at once; the devices work until the results are asked for.
+            running = [
+                self._call(flat, trials, shape, start, device)
+                for start, device in zip(starts[first:], self.devices, strict=False)
+            ]
+            parts += [jax.tree.map(np.asarray, part) for part in running]
         self.grasps += total
         return jax.tree.map(lambda *v: np.concatenate(v)[:total].reshape(shape), *parts)
+
+    def _call(self, flat, trials: Trial, shape: tuple[int, ...], start: int, device) -> Outcome:
+        """Begins to simulate the chunk that starts at a world."""
+        # Filled up with the last world, so that every call has the compiled size.
+        world = np.minimum(np.arange(start, start + self.chunk), int(np.prod(shape)) - 1)
+        _, run, _, trial = np.unravel_index(world, shape)
+        chosen = flat[world // shape[3]], jax.tree.map(lambda v: v[run, trial], trials)
+        return self._simulate(*jax.device_put(chosen, device))

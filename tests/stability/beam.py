@@ -7,6 +7,7 @@ import numpy as np
 from scipy import linalg
 
 from codesign_jax import model, morphology
+from codesign_jax.accuracy import beam
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.types import Params
 from tests import small
@@ -144,15 +145,13 @@ case(2, "roll-up to a full circle", "tip to root over length", engine="mujoco")(
 )
 def elastica_error(engine, step, precision):
     """Bisshopp and Drucker (1945), at ten links; the dead load is explicit, so from 2 ms on."""
-    from tests.test_beam_oracles import elastica
-
     worst = 0.0
     for alpha in (1, 2, 10):
         finger = Finger(10, timestep=0.01 * step)
         load = alpha * finger.beam.bending / finger.length**2
         position, _ = finger.settle(force=(0, 0, -load), steps=40000)
         tip = np.array([-position[2], finger.length - position[0]]) / finger.length
-        worst = max(worst, np.abs(tip / elastica(alpha) - 1).max())
+        worst = max(worst, np.abs(tip / beam.elastica(alpha) - 1).max())
     return Found(worst, 5e-3, "base step 2 ms")
 
 
@@ -173,16 +172,16 @@ def bend_45(engine, step, precision):
     for load, expected in ((300, (58.84, 22.33, 40.08)), (600, (47.23, 15.79, 53.37))):
         finger = Finger(60, length=np.pi / 4, bending_only=False, timestep=0.01 * step)
         m, dofs = finger.model, finger.layout.dofs[0]
-        beam = finger.beam.bending
+        bending = finger.beam.bending
         spacing, h = finger.length / finger.links, m.opt.timestep
-        k = beam / spacing
+        k = bending / spacing
         m.jnt_stiffness[dofs] = k
         beta = 1.0  # near critical for the first mode of 0.2 Hz, to be at rest soon
         m.dof_damping[dofs] = beta * k + h * k
         m.dof_armature[dofs] = h * (beta * k + h * k)
         m.qpos_spring[dofs[:, 1]] = np.pi / 4 / finger.links
         finger.data.qpos[dofs[:, 1]] = np.pi / 4 / finger.links
-        force = load * 100.0**2 / 8.333e5 * beam
+        force = load * 100.0**2 / 8.333e5 * bending
         position, _ = finger.settle(force=(0, 0, force), steps=60000)
         # Theirs: the root's tangent is their y, the centre of curvature on their x, load along z.
         worst = max(worst, np.abs(100 * position / np.array(expected) - 1).max())

@@ -14,7 +14,6 @@ from codesign_jax import control, model, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.hand import hand_lanes
-from codesign_jax.engines.structured.kinematics import Acc
 from codesign_jax.scene import Scene
 from tests import small
 
@@ -163,8 +162,7 @@ class Bench:
             engine = StructuredEngine(self.scene, tolerance=self.tolerance)
 
             def start(fields, qvel):
-                state = engine.reset(fields)
-                return hand_lanes(self.scene, fields), moving(engine, state, qvel)
+                return hand_lanes(self.scene, fields), moving(engine, fields, qvel)
 
             def advance(hand, state, ctrl):
                 def one(state, u):
@@ -177,16 +175,6 @@ class Bench:
         return self._programs[worlds]
 
 
-def moving(engine: StructuredEngine, state, qvel):
-    """The state with velocities (world, nv) and a cold warm start."""
-    lay = model.layout(engine.scene)
-    v, end = qvel.T[:, None], 6 + lay.dofs.size
-    finger = jnp.moveaxis(v[6:end, 0].reshape(*lay.dofs.shape, -1), 0, 2)
-    zero = jnp.zeros_like
-    return state._replace(
-        wrist_vel=v[:6],
-        finger_vel=finger,
-        linear_vel=v[end : end + 3],
-        angular_vel=v[end + 3 :],
-        acc=Acc(zero(v[:6]), zero(finger), zero(v[:6])),
-    )
+def moving(engine: StructuredEngine, fields, qvel):
+    """Start states of fields with velocities (world, nv)."""
+    return engine.place(engine.reset(fields), fields.start, qvel)

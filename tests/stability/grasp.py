@@ -129,7 +129,7 @@ def one_step(base, fields, ctrl, qpos, qvel, precision):
         engine = StructuredEngine(base, iterations=100, evaluations=16, tolerance=tolerance)
 
         def step(fields, ctrl, qvel):
-            state = moving(engine, engine.reset(fields), qvel)
+            state = moving(engine, fields, qvel)
             new, info = engine.step(hand_lanes(base, fields), state, ctrl)
             acc = info.acc
             return engine.qvel(new._replace(wrist_vel=acc.wrist, finger_vel=acc.finger)), (

@@ -41,6 +41,18 @@ class Cone(NamedTuple):
     roll: jax.Array | float | None = None
 
 
+class Ends(NamedTuple):
+    """The two links of contacts between fingers.
+
+    Attributes:
+      link: Index of the links in (link, finger), shape (2, slot, 1, world) int32.
+      touching: Number of pairs that touch, also of those without a slot, shape (1, world) int32.
+    """
+
+    link: jax.Array
+    touching: jax.Array
+
+
 class Contacts(NamedTuple):
     """A set of contacts between the same two bodies or kinds of bodies.
 
@@ -51,6 +63,7 @@ class Contacts(NamedTuple):
       cone: Their parameters.
       lever: Of points that follow a joint's rotation in part, see `hull`, the arm at which they do,
         shape (3, ...).
+      ends: Of contacts between fingers their links, see `finger_pairs`.
     """
 
     point: jax.Array
@@ -58,6 +71,7 @@ class Contacts(NamedTuple):
     distance: jax.Array
     cone: Cone
     lever: jax.Array | None = None
+    ends: "Ends | None" = None
 
     @property
     def active(self) -> jax.Array:

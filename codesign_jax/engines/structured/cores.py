@@ -1,7 +1,9 @@
 """Worlds shared between a CPU's cores, which JAX sees as devices if told so at the start."""
 
+import contextlib
+import contextvars
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -10,6 +12,18 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 _SMALLEST = 8  # worlds a core below which a share costs as much as the whole
+
+_alone = contextvars.ContextVar("alone", default=False)
+
+
+@contextlib.contextmanager
+def on_one_core() -> Iterator[None]:
+    """What is traced in this context stays on its device: the caller shares worlds out itself."""
+    token = _alone.set(True)
+    try:
+        yield
+    finally:
+        _alone.reset(token)
 
 
 def use_all_cores() -> None:
@@ -36,7 +50,7 @@ def on_all_cores(function: Callable[..., Any], *args: Any) -> Any:
     worlds = jax.tree.leaves(args)[0].shape[0]
     devices = jax.devices("cpu") if jax.default_backend() == "cpu" else []
     cores = len(devices)
-    if cores < 2 or worlds < cores * _SMALLEST:
+    if cores < 2 or _alone.get() or worlds < cores * _SMALLEST:
         return function(*args)
     share = -(-worlds // cores)
     order = np.arange(share * cores).reshape(share, cores).T.ravel()

@@ -42,12 +42,15 @@ class StepInfo(NamedTuple):
       residual: Relative Newton decrement of each world, shape (1, world).
       iterations: Newton iterations of the batch, shape ().
       centre: Hand centre, world frame, shape (3, 1, world).
+      overflow: Whether more pairs of spheres of different fingers touch than there are slots, shape
+        (1, world); None without such contacts.
     """
 
     acc: Acc
     residual: jax.Array
     iterations: jax.Array
     centre: jax.Array
+    overflow: jax.Array | None = None
 
 
 class StructuredEngine:
@@ -185,9 +188,7 @@ class StructuredEngine:
             if e.finger_table:
                 found["finger_table"] = on_table(spheres, hand.radius)
             if e.finger_finger and self.scene.num_fingers > 1:
-                found["finger_finger"] = run(
-                    lambda s, r: finger_pairs.contacts(scene, s, r), spheres, hand.radius
-                )
+                found["finger_finger"] = finger_pairs.contacts(run, scene, spheres, hand.radius)
         if e.surface == "hull" and (e.finger_object or e.finger_table):
             skin = run(lambda h, k: hull.vertices(scene, h, k), hand, kin)
             if e.finger_object:
@@ -225,7 +226,10 @@ class StructuredEngine:
             solution = solution._replace(acc=solution.acc._replace(wrist=problem.arm))
         new = run(lambda s, k, a: integrate(s, k, a, h), state, problem.kin, solution.acc)
         centre = self._centre(hand, problem.kin, problem.body) + state.wrist[:3]
-        return new, StepInfo(solution.acc, solution.residual, solution.iterations, centre)
+        pairs = problem.contacts.get("finger_finger")
+        overflow = None if pairs is None else finger_pairs.overflow(pairs)
+        solved = solution.acc, solution.residual, solution.iterations
+        return new, StepInfo(*solved, centre, overflow)
 
     def _centre(self, hand: HandLanes, kin: Kinematics, body: Bodies) -> jax.Array:
         """Mean position of the segments in the palm's frame: half weight for the half segments."""
@@ -302,7 +306,7 @@ class StructuredEngine:
                 state.position[2, 0],
                 speed,
                 self.qpos(state) if trajectory else jnp.zeros((u.shape[1], 0), u.dtype),
-                self._status(info.residual[0]),
+                self._status(info.residual[0], info.overflow),
             )
             new_speed = self._speed(new)
             was_good = speed <= limits.speed
@@ -323,9 +327,12 @@ class StructuredEngine:
         limit = self.scene.limits.speed
         return implicit.checkpointed(self.step, solved.step, lambda s: self._speed(s) <= limit)
 
-    def _status(self, residual: jax.Array) -> jax.Array:
-        """SOLVER_CAP where a step ended above the tolerance, int32 of the residual's shape."""
-        return jnp.where(residual > self.tolerance, int(Status.SOLVER_CAP), 0).astype(jnp.int32)
+    def _status(self, residual: jax.Array, overflow: jax.Array | None = None) -> jax.Array:
+        """SOLVER_CAP above the tolerance, CONTACT_OVERFLOW; int32 of the residual's shape."""
+        status = jnp.where(residual > self.tolerance, int(Status.SOLVER_CAP), 0).astype(jnp.int32)
+        if overflow is None:
+            return status
+        return status | jnp.where(overflow[0], int(Status.CONTACT_OVERFLOW), 0)
 
     def _flat(self, state: State) -> jax.Array:
         """Generalized positions and velocities, shape (world, nq + nv)."""

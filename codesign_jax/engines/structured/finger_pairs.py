@@ -1,33 +1,37 @@
-"""Contacts between spheres of different fingers, which couple the chains.
+"""Contacts between spheres of different fingers: which pairs touch, and what they do to the links.
 
-Every sphere of one finger is a candidate against every sphere of another; pairs of fingers are in
-the lexical order (0, 1), (0, 2), ..., the relative motion is the first finger's minus the second's.
-Items have the axes (link, k, link of the second, k of the second, pair, world).
-
-With these contacts the Newton matrix is H = P + F: P is what one elimination solves, F couples two
-fingers.  H x = g is solved by conjugate gradients preconditioned with P, started at z = P^-1 g
-(Nocedal and Wright, Numerical Optimization, 2006, ch. 5).  P^-1 H is the identity but for three
-directions a contact, so that the iteration ends after at most 3 n + 1 steps for n contacts, and
-often far earlier.  Since H >= P, the residual r has |x - H^-1 g|_H^2 <= r'P^-1 r, which is known:
-that is where it stops.  All residuals are J'L for spatial forces L on the links, which is all that
-has to be stored.  A result that does not descend gives way to z, which always does; the exact line
-search thus decreases the objective in every Newton step however early the iteration is cut off.
+Every sphere of one finger is a candidate against every sphere of another; the relative motion is
+the first finger's minus the second's.  Few candidates touch, so that once a step a broad phase
+finds those that do and gives each a slot: slots have the axes (slot, 1, world), those in use come
+first, and whatever an iteration does ends after the last block of slots that any world uses.
 """
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from codesign_jax.engines.structured.collision import make_cone
-from codesign_jax.engines.structured.contact import Contacts, contact_wrench, respond
-from codesign_jax.engines.structured.lanes import Stages, dot, sum_axis, sum_fingers, total
+from codesign_jax.engines.structured.contact import (
+    Contacts,
+    Ends,
+    Line,
+    contact_wrench,
+    slopes,
+)
+from codesign_jax.engines.structured.lanes import Stages, dot, sum_items, total
 from codesign_jax.scene import Scene
 
-ITERATIONS = 60
-"""Largest number of conjugate gradient steps; a longer one would be of rounding."""
+BLOCK = 8
+"""Slots that are done at a time."""
+SHARE = 4
+"""Every fourth candidate can touch at once: fingers that start inside one another touch with up to
+0.22 of theirs (500 random designs; docs/hull.md).  A world with more is a failed one."""
+MARGIN = 1e-5
+"""Of the squared distance: the broad phase leaves the last digit to the exact distance."""
 
 
 def finger_pairs(fingers: int) -> list[tuple[int, int]]:
@@ -35,31 +39,84 @@ def finger_pairs(fingers: int) -> list[tuple[int, int]]:
     return list(itertools.combinations(range(fingers), 2))
 
 
-def _both(x: jax.Array, fingers_axis: int) -> tuple[jax.Array, jax.Array]:
-    """Values of the first and the second fingers of all pairs, stacked along the finger axis."""
-    pairs = finger_pairs(x.shape[fingers_axis])
-
-    def pick(side: int) -> jax.Array:
-        return jnp.concatenate(
-            [jax.lax.slice_in_dim(x, p[side], p[side] + 1, axis=fingers_axis) for p in pairs],
-            fingers_axis,
-        )
-
-    return pick(0), pick(1)
+def slots(candidates: int) -> int:
+    """Number of slots of a world: whole blocks."""
+    return BLOCK * -(-candidates // (BLOCK * SHARE))
 
 
-def contacts(scene: Scene, centre: jax.Array, radius: jax.Array) -> Contacts:
-    """Contacts of all pairs of spheres.
+def contacts(run: Stages, scene: Scene, centre: jax.Array, radius: jax.Array) -> Contacts:
+    """Contacts of the pairs of spheres that touch.
 
     Args:
+      run: Runs the stages.
       scene: The scene.
       centre: Sphere centres, shape (3, link, k, finger, world).
-      radius: Radii, shape (link, k, finger, world).
+      radius: Radii [m], shape (link, k, finger, world).
     """
-    a, b = _both(centre, 3)
-    a, b = a[:, :, :, None, None], b[:, None, None]
-    ra, rb = _both(radius, 2)
-    ra, rb = ra[:, :, None, None], rb[None, None]
+    links, k, fingers, worlds = radius.shape
+    first, second = _candidates(links, k, fingers)
+    fits = run(_near, jax.lax.stop_gradient(centre), radius)
+    touching = fits.sum(0, dtype=jnp.int32)[None]
+    chosen = run.only_if(touching.any())(lambda f: _choose(f, slots(len(first))), fits)
+    ends = jnp.stack([jnp.asarray(s, jnp.int32)[chosen] for s in (first, second)])
+    used = jnp.arange(slots(len(first)))[:, None] < touching
+
+    def place(centre: jax.Array, radius: jax.Array, ends: jax.Array, used: jax.Array):
+        return _place(centre.reshape(3, -1, worlds), radius.reshape(-1, worlds), ends, used)
+
+    found = run.only_if(touching.any())(place, centre, radius, ends, used)
+    point, normal, gap = (x[..., None, :] for x in found)
+    link = (ends // (k * fingers)) * fingers + ends % fingers
+    cone = make_cone(scene, scene.contact.finger_finger_friction, bodies=2)
+    return Contacts(point, normal, gap, cone, ends=Ends(link[:, :, None], touching))
+
+
+def _candidates(links: int, k: int, fingers: int) -> tuple[np.ndarray, np.ndarray]:
+    """Spheres of all candidates, as indices in (link, k, finger), in the order of `_near`."""
+    index = np.arange(links * k * fingers).reshape(links * k, fingers)
+    pairs = finger_pairs(fingers)
+    first = np.concatenate([np.repeat(index[:, a], links * k) for a, _ in pairs])
+    second = np.concatenate([np.tile(index[:, b], links * k) for _, b in pairs])
+    return first, second
+
+
+def _near(centre: jax.Array, radius: jax.Array) -> jax.Array:
+    """Broad phase: which candidates may touch, shape (candidate, world)."""
+    *_, fingers, worlds = radius.shape
+    c, r = centre.reshape(3, -1, fingers, worlds), radius.reshape(-1, fingers, worlds)
+    found = []
+    for a, b in finger_pairs(fingers):
+        away = c[:, :, None, a] - c[:, None, :, b]
+        reach = r[:, None, a] + r[None, :, b]
+        found.append((dot(away, away) < (1.0 + MARGIN) * reach**2).reshape(-1, worlds))
+    return jnp.concatenate(found)
+
+
+def _choose(fits: jax.Array, count: int) -> jax.Array:
+    """The first candidates that fit, in every world, shape (slot, world); 0 where there is none."""
+    # The s-th lies behind as many as have a sum of at most s: found by bisection.
+    sums = jnp.cumsum(fits, axis=0, dtype=jnp.int32)
+    wanted = jnp.arange(count, dtype=jnp.int32)[:, None]
+    low = jnp.zeros((count, fits.shape[1]), jnp.int32)
+    step = 1 << (fits.shape[0].bit_length() - 1)
+    while step:
+        probe = jnp.minimum(low + step, fits.shape[0])
+        at = jnp.take_along_axis(sums, probe - 1, axis=0, mode="clip")
+        low, step = jnp.where(at <= wanted, probe, low), step // 2
+    return jnp.where(low < fits.shape[0], low, 0)
+
+
+def _place(centre: jax.Array, radius: jax.Array, ends: jax.Array, used: jax.Array):
+    """Points, normals and distances of pairs of spheres, shapes (3, slot, world) and (slot, world).
+
+    Args:
+      centre: Shape (3, sphere, world).
+      radius: Shape (sphere, world).
+      ends: Indices of the spheres, shape (2, slot, world).
+      used: Which slots are in use, shape (slot, world).
+    """
+    a, b = (jnp.take_along_axis(centre, e[None], axis=1, mode="clip") for e in ends)
+    ra, rb = (jnp.take_along_axis(radius, e, axis=0, mode="clip") for e in ends)
     away = a - b
     square = dot(away, away)
     apart = square > 0
@@ -69,119 +126,105 @@ def contacts(scene: Scene, centre: jax.Array, radius: jax.Array) -> Contacts:
     normal = jnp.where(apart, away / length, fallback)
     gap = jnp.where(apart, length, 0.0) - (ra + rb)
     point = a - normal * (ra + 0.5 * gap)
-    cone = make_cone(scene, scene.contact.finger_finger_friction, bodies=2)
-    return Contacts(point, normal, gap, cone)
+    return point, normal, jnp.where(used, gap, 0.0)
 
 
-def relative(links: jax.Array) -> jax.Array:
-    """Relative spatial motion of all pairs of links, shape (6, link, 1, link, 1, pair, world)."""
-    first, second = _both(links, 2)
-    return first[:, :, None, None, None] - second[:, None, None, :, None]
-
-
-def link_wrench(c: Contacts, force: jax.Array) -> jax.Array:
-    """Spatial forces on the links, shape (6, link, finger, world), from those on the contacts."""
-    wrench = sum_axis(sum_axis(contact_wrench(c, force), 4), 2)  # (6, link, link, pair, world)
-    first, second = sum_axis(wrench, 2), sum_axis(wrench, 1)
-    pairs = first.shape[2]
-    fingers = next(n for n in range(2, pairs + 2) if len(finger_pairs(n)) == pairs)
-    sums = []
-    for f in range(fingers):
-        terms = [first[:, :, i] for i, p in enumerate(finger_pairs(fingers)) if p[0] == f]
-        terms += [-second[:, :, i] for i, p in enumerate(finger_pairs(fingers)) if p[1] == f]
-        sums.append(total(terms))
-    return jnp.stack(sums, 2)
-
-
-class Coupling(NamedTuple):
-    """Response of the pairs of fingers at an iterate.
-
-    Attributes:
-      contacts: The contacts.
-      hessian: Their Hessians, upper triangles, shape (6, ...).
-      push: Their forces on the links, shape (6, link, finger, world).
-    """
-
-    contacts: Contacts
-    hessian: jax.Array
-    push: jax.Array
-
-    def apply(self, links: jax.Array) -> jax.Array:
-        """F: forces on the links, (6, link, finger, world), of the links' motion."""
-        d = self.contacts.relative(relative(links))
-        xx, xy, xz, yy, yz, zz = self.hessian
-        rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-        return link_wrench(self.contacts, jnp.stack([dot(jnp.stack(r), d) for r in rows]))
-
-
-def coupling(run: Stages, c: Contacts, jar: jax.Array) -> Coupling:
-    """Evaluates the pairs of fingers at jar."""
-
-    def evaluate(c: Contacts, jar: jax.Array) -> tuple[jax.Array, jax.Array]:
-        response = respond(c, jar)
-        return response.hessian, link_wrench(c, response.force)
-
-    return Coupling(c, *run(evaluate, c, jar))
-
-
-def product(force: jax.Array, links: jax.Array) -> jax.Array:
-    """Work of forces on the links, both (6, link, finger, world), shape (1, world)."""
-    return sum_fingers(sum_axis(dot(force, links), 0))
-
-
-def correct(
-    run: Stages,
-    pairs: Coupling,
-    start: tuple,
-    descent: jax.Array,
-    idle: jax.Array,
-    precondition: Callable[[jax.Array], tuple],
-    tolerance: float,
-) -> tuple:
-    """Solves (P + F) x = g by preconditioned conjugate gradients.
+def relative(links: jax.Array, ends: jax.Array) -> jax.Array:
+    """Relative spatial motion of pairs of links.
 
     Args:
-      run: Runs the stages of the pairs.
-      pairs: F.
-      start: z = P^-1 g as accelerations and spatial motion.
-      descent: g'z, shape (1, world).
-      idle: Worlds for which nothing is done, shape (1, world).
-      precondition: P^-1 J'L of forces L on the links, as accelerations and spatial motion.
-      tolerance: Squared error of x, relative to its squared size, both as measured by H.
+      links: Motion of the links, shape (6, link, finger, world).
+      ends: Their indices, shape (2, slot, 1, world).
 
     Returns:
-      x as accelerations and spatial motion.
+      Shape (6, slot, 1, world).
     """
+    flat = links.reshape(6, -1, links.shape[-1])
+    first, second = (jnp.take_along_axis(flat, e[None, :, 0], axis=1, mode="clip") for e in ends)
+    return (first - second)[:, :, None]
 
-    def apply(motion) -> jax.Array:
-        return run(lambda p, v: p.apply(v), pairs, motion.link)
 
-    def plus(x, scale, p):
-        return jax.tree.map(lambda a, b: a + scale * b, x, p)
+def ends_of(c: Contacts) -> Ends:
+    """The links of contacts between fingers."""
+    assert c.ends is not None
+    return c.ends
 
-    def body(carry: tuple) -> tuple:
-        x, gx, r, p, q, rz, count = carry
-        fp = apply(p[1])
-        going = rz > tolerance * jnp.abs(gx)
-        # q = P p in forces, so that p'H p = p'q + p'F p and g'p = z'q.
-        curvature = product(q + fp, p[1].link)
-        alpha = jnp.where(going, rz / jnp.where(curvature > 0, curvature, 1.0), 0.0)
-        x, r = plus(x, alpha, p), r - alpha * (q + fp)
-        gx = gx + alpha * product(q, start[1].link)
-        z = precondition(r)
-        new = jnp.maximum(product(r, z[1].link), 0.0)
-        beta = new / jnp.where(rz > 0, rz, 1.0)
-        return x, gx, r, plus(z, beta, p), r + beta * q, jnp.where(going, new, rz), count + 1
 
-    def going(carry: tuple) -> jax.Array:
-        return (carry[6] < ITERATIONS) & jnp.any(carry[5] > tolerance * jnp.abs(carry[1]))
+def overflow(c: Contacts) -> jax.Array:
+    """Worlds in which more pairs touch than there are slots, shape (1, world)."""
+    return ends_of(c).touching > c.distance.shape[0]
 
-    def iterate(r: jax.Array) -> tuple:
-        z = precondition(r)
-        rz = jnp.maximum(product(r, z[1].link), 0.0)
-        first = (start, descent, r, z, r, rz, jnp.zeros((), jnp.int32))
-        x, gx, *_ = jax.lax.while_loop(going, body, first)
-        return jax.tree.map(lambda a, b: jnp.where(gx > 0, a, b), x, start)
 
-    r = jnp.where(idle, 0.0, -apply(start[1]))
-    return jax.lax.cond(pairs.contacts.active.any(), iterate, lambda _: start, r)
+def blocks(c: Contacts) -> jax.Array:
+    """Number of blocks of slots that any world uses, shape ()."""
+    used = jnp.minimum(ends_of(c).touching.max(), c.distance.shape[0])
+    return (used + BLOCK - 1) // BLOCK
+
+
+def each_block(c: Contacts, function: Callable, each: tuple, start: Any) -> Any:
+    """Folds function(carry, block's first slot, contacts, *each) over the blocks in use."""
+    # Planes to the compiler, as in `lanes.scan_links`.
+    every = (c.point, c.normal, c.distance, ends_of(c).link, *each)
+    planes = [x.reshape(-1, x.shape[-3], x.shape[-1]) for x in every]
+
+    def body(i: jax.Array, carry: Any) -> Any:
+        cut = [
+            jax.lax.dynamic_slice_in_dim(p, BLOCK * i, BLOCK, 1).reshape(
+                *x.shape[:-3], BLOCK, *x.shape[-2:]
+            )
+            for p, x in zip(planes, every, strict=True)
+        ]
+        part = c._replace(
+            point=cut[0], normal=cut[1], distance=cut[2], ends=ends_of(c)._replace(link=cut[3])
+        )
+        return function(carry, BLOCK * i, part, *cut[4:])
+
+    return jax.lax.fori_loop(0, blocks(c), body, start)
+
+
+def store(whole: jax.Array, part: jax.Array, at: jax.Array) -> jax.Array:
+    """Array of all slots with those of a block written from slot `at` on."""
+    return jax.lax.dynamic_update_slice_in_dim(whole, part, at, whole.ndim - 3)
+
+
+def on_links(c: Contacts, force: jax.Array, like: jax.Array) -> jax.Array:
+    """Spatial forces on the links, shaped as `like`, (6, link, finger, world), of a few slots."""
+    wrench = contact_wrench(c, force)[:, :, 0]
+    index = jnp.arange(like.shape[1] * like.shape[2])[:, None, None]
+    first, second = (index == e[None, :, 0] for e in ends_of(c).link)
+    # No scatter: a CPU does them one number after the other.
+    zero = jnp.zeros((), like.dtype)
+    terms = [
+        jnp.where(first[:, s], wrench[:, None, s], zero)
+        - jnp.where(second[:, s], wrench[:, None, s], zero)
+        for s in range(wrench.shape[1])
+    ]
+    return total(terms).reshape(like.shape)
+
+
+def jar_of(run: Stages, c: Contacts, links: jax.Array) -> jax.Array:
+    """J a of accelerations of the links, (6, link, finger, world), shape (3, slot, 1, world)."""
+
+    def add(whole: jax.Array, at: jax.Array, part: Contacts) -> jax.Array:
+        return store(whole, part.relative(relative(links, ends_of(part).link)), at)
+
+    def fill(c: Contacts) -> jax.Array:
+        return each_block(c, add, (), jnp.zeros_like(c.point))
+
+    return run(fill, c)
+
+
+def line_slopes(
+    run: Stages, c: Contacts, ray: Line, alpha: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """First and second derivative of the cost of all slots along the line, shape (1, world)."""
+
+    def add(sums: tuple, _: jax.Array, part: Contacts, *ray: jax.Array) -> tuple:
+        return tuple(
+            s + sum_items(v) for s, v in zip(sums, slopes(part, Line(*ray), alpha), strict=True)
+        )
+
+    def fold(c: Contacts, ray: Line) -> tuple:
+        return each_block(c, add, tuple(ray), (jnp.zeros_like(alpha),) * 2)
+
+    return run(fold, c, ray)

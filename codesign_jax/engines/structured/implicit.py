@@ -103,7 +103,7 @@ def adjoint(run: Stages, problem: Problem, velocity: Spatial, acc: Acc, cotangen
         n: runs[n](lambda *v, n=n: _jar(n, *v), c, motion, velocity)
         for n, c in problem.contacts.items()
     }
-    pushes, pairs = respond_all(runs, problem.contacts, jar)
+    pushes, pairs = respond_all(runs, problem.contacts, jar, motion)
     pushes = {n: (inertia, jnp.zeros_like(wrench)) for n, (inertia, wrench) in pushes.items()}
     if pairs is not None:
         pairs = pairs._replace(push=jnp.zeros_like(pairs.push))
@@ -136,7 +136,7 @@ def residual_power(
 
         def pushed(c: Contacts, motion: Spatial, velocity: Spatial, along: Spatial, name=name):
             force = respond(c, _jar(name, c, motion, velocity)).force
-            return sum_items(dot(force, c.relative(relative(name, along))))
+            return sum_items(dot(force, c.relative(relative(name, along, c))))
 
         active = run.only_if(c.active.any())
         power = power - active(pushed, c, motion, velocity, along)
@@ -145,8 +145,8 @@ def residual_power(
 
 def _jar(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Array:
     """J a - aref of a set of contacts."""
-    speed = c.relative(relative(name, velocity))
-    return c.relative(relative(name, motion)) - c.reference(speed)
+    speed = c.relative(relative(name, velocity, c))
+    return c.relative(relative(name, motion, c)) - c.reference(speed)
 
 
 def checkpointed(step: Callable, resume: Callable, good: Callable[[State], jax.Array]) -> Callable:

@@ -3,13 +3,13 @@
 A contact acts on a link as a wrench and a 6 x 6 contact inertia X'KX: the cost is that of a chain.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured import coupling, hull
 from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured import finger_pairs, hull
 from codesign_jax.engines.structured.contact import (
     Contacts,
     contact_inertia,
@@ -38,6 +38,24 @@ from codesign_jax.engines.structured.problem import (
 )
 
 
+class Eliminated(NamedTuple):
+    """An eliminated Newton system, from the tips to the object.
+
+    Attributes:
+      fingers: Factors of the fingers' joints, leading axis (link,).
+      hinges: Of the wrist's hinges; None with a rigid arm.
+      slides: Of its slides; None with a rigid arm.
+      q: Matrix that is left of the object, shape (6, 6, 1, world).
+      r_object: Force that is left on it, shape (6, 1, world).
+    """
+
+    fingers: el.Kept
+    hinges: el.Kept | None
+    slides: el.Kept | None
+    q: jax.Array
+    r_object: jax.Array
+
+
 def newton_step(
     run: Stages, problem: Problem, force: Forces, pushes: dict[str, tuple[jax.Array, jax.Array]]
 ) -> tuple[Acc, Spatial]:
@@ -53,11 +71,24 @@ def newton_step(
     Returns:
       The step in the joints and its spatial motion.
     """
+    return substitute(run, problem, eliminate(run, problem, force, pushes))
+
+
+def eliminate(
+    run: Stages,
+    problem: Problem,
+    force: Forces,
+    pushes: dict[str, tuple[jax.Array, jax.Array]],
+    *,
+    keep: bool = False,
+) -> Eliminated:
+    """First half of `newton_step`; keep: also what `eliminate_again` needs."""
     kin, hand = problem.kin, problem.hand
 
     def next_joint(node: el.Quadratic, link: tuple):
         (axes, arm, tau), (own, joint) = link
-        return el.eliminate(run, run(add_link, node, own), axes, arm, tau, joint)
+        node, kept = el.eliminate_and_keep(run, run(add_link, node, own), axes, arm, tau, joint)
+        return node, kept if keep else kept._replace(inverse=())
 
     # Sums over all links at once: the recursion then slices fewer arrays.
     terms = {n: v for n, v in pushes.items() if n.startswith("finger")}
@@ -66,50 +97,89 @@ def newton_step(
     terms |= _of_links(skin, slice(1, None))
     own = run(link_terms, problem.matrix.link, force.link, terms), joints
     links = (kin.axes, hand.armature, force.finger)
-    node, factors = scan_links(next_joint, _nothing(force.link[:, 0]), links, own, reverse=True)
+    held = any(n.endswith("_object") for n in pushes)
+    node = _nothing(force.link[:, 0], held)
+    node, fingers = scan_links(next_joint, node, links, own, reverse=True)
     if skin:  # what the first joints' rows add to the palm
         zero = jnp.zeros_like(node.p), jnp.zeros_like(node.r)
         node = run(lambda n, s: add_link(n, link_terms(*zero, _of_links(s, 0))), node, skin)
     node = run(add_palm, node, problem.matrix, force, pushes)
-    joints, palm, obj = _palm_step(run, problem, force, node)
+    if problem.arm is not None:  # known: no step
+        return Eliminated(fingers, None, None, node.q, node.r_object)
+    arm, wrist = hand.wrist_armature, force.wrist
+    node, hinges = el.eliminate_and_keep(run, node, kin.wrist_axes, arm[3:], wrist[3:])
+    node, slides = el.eliminate_and_keep(run, node, wrist_slides(arm), arm[:3], wrist[:3])
+    return Eliminated(fingers, hinges, slides, node.q, node.r_object)
+
+
+def eliminate_again(
+    run: Stages, problem: Problem, done: Eliminated, links: jax.Array
+) -> Eliminated:
+    """The same matrix with no forces but those on the links, shape (6, link, finger, world)."""
+    kin, slides = problem.kin, wrist_slides(problem.hand.wrist_armature)
+
+    def next_joint(node: tuple, link: tuple):
+        (axes, kept), push = link
+        r, ro, factors = el.eliminate_again(run, axes, kept, node[0] + push, node[1])
+        return (r, ro), factors.z
+
+    none = jnp.zeros_like(links[:, 0])
+    each = (kin.axes, done.fingers)
+    (r, ro), z = scan_links(next_joint, (none, none), each, links, reverse=True)
+    r, ro = sum_fingers(r), sum_fingers(ro)
+    fingers = done.fingers._replace(factors=done.fingers.factors._replace(z=z))
+    if done.hinges is None or done.slides is None:
+        return done._replace(fingers=fingers, r_object=ro)
+    r, ro, hinges = el.eliminate_again(run, kin.wrist_axes, done.hinges, r, ro)
+    _, ro, slides = el.eliminate_again(
+        run, wrist_slides(problem.hand.wrist_armature), done.slides, r, ro
+    )
+    hinges, slides = done.hinges._replace(factors=hinges), done.slides._replace(factors=slides)
+    return Eliminated(fingers, hinges, slides, done.q, ro)
+
+
+def substitute(run: Stages, problem: Problem, done: Eliminated) -> tuple[Acc, Spatial]:
+    """Second half of `newton_step`: the step in the joints and its spatial motion."""
+    kin, like = problem.kin, done.fingers.factors.w[0, 0]
+    joints, palm, obj = _palm_step(run, problem, done)
 
     def next_link(parent: jax.Array, link: tuple):
         a, motion = run(el.substitute, *link[0], parent, obj)
         return motion, (a, motion)
 
-    first_link = palm + jnp.zeros_like(force.link[:, 0])
-    _, (fingers, motions) = scan_links(next_link, first_link, (kin.axes, factors))
+    _, (fingers, motions) = scan_links(
+        next_link, palm + jnp.zeros_like(like), (kin.axes, done.fingers.factors)
+    )
     at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
     acc = Acc(jnp.concatenate(joints), fingers, at_centre)
     return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
 
 
 def _palm_step(
-    run: Stages, problem: Problem, force: Forces, node: el.Quadratic
+    run: Stages, problem: Problem, done: Eliminated
 ) -> tuple[list[jax.Array], jax.Array, jax.Array]:
     """Steps of the wrist's joints, and spatial steps of palm and object."""
-    if problem.arm is not None:  # known: no step
-        obj = el.solve_object(run, node.q, node.r_object)
-        return [jnp.zeros_like(problem.arm)], jnp.zeros_like(obj), obj
-    arm, axes = problem.hand.wrist_armature, problem.kin.wrist_axes
-    node, hinges = el.eliminate(run, node, axes, arm[3:], force.wrist[3:])
-    slide_axes = wrist_slides(arm)
-    node, slides = el.eliminate(run, node, slide_axes, arm[:3], force.wrist[:3])
-    obj = el.solve_object(run, node.q, node.r_object)
-    first, palm = run(el.substitute, slide_axes, slides, jnp.zeros_like(obj), obj)
-    second, palm = run(el.substitute, axes, hinges, palm, obj)
+    obj = el.solve_object(run, done.q, done.r_object)
+    if done.hinges is None or done.slides is None:
+        return [jnp.zeros_like(problem.hand.wrist_armature)], jnp.zeros_like(obj), obj
+    axes = wrist_slides(problem.hand.wrist_armature)
+    first, palm = run(el.substitute, axes, done.slides.factors, jnp.zeros_like(obj), obj)
+    second, palm = run(el.substitute, problem.kin.wrist_axes, done.hinges.factors, palm, obj)
     return [first, second], palm, obj
 
 
 def respond_all(
-    runs: dict[str, Stages], contacts: dict[str, Contacts], jar: dict[str, jax.Array]
-) -> tuple[dict[str, tuple[jax.Array, jax.Array]], finger_pairs.Coupling | None]:
+    runs: dict[str, Stages],
+    contacts: dict[str, Contacts],
+    jar: dict[str, jax.Array],
+    motion: Spatial,
+) -> tuple[dict[str, tuple[jax.Array, jax.Array]], coupling.Coupling | None]:
     """What the contacts add to the Newton system: to its elimination, and between the fingers."""
     name = "finger_finger"
     pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items() if n != name}
     if name not in contacts:
         return pushes, None
-    return pushes, finger_pairs.coupling(runs[name], contacts[name], jar[name])
+    return pushes, coupling.coupling(runs[name], contacts[name], jar[name], motion.link)
 
 
 def linear_solve(
@@ -117,7 +187,7 @@ def linear_solve(
     problem: Problem,
     force: Forces,
     pushes: dict[str, tuple[jax.Array, jax.Array]],
-    pairs: finger_pairs.Coupling | None,
+    pairs: coupling.Coupling | None,
     idle: jax.Array | None = None,
     tolerance: float = 1e-6,
 ) -> tuple[Acc, Spatial]:
@@ -135,18 +205,17 @@ def linear_solve(
     if pairs is None:
         return newton_step(run, problem, force, pushes)
     force = force._replace(link=force.link + pairs.push)
-    step, motion = newton_step(run, problem, force, pushes)
+    done = eliminate(run, problem, force, pushes, keep=True)
+    step, motion = substitute(run, problem, done)
     descent = decrement(-work(run, force, step, motion), pushes, motion, None)
-    none, still = jax.tree.map(jnp.zeros_like, (force, pushes))
-    still = {n: (inertia, still[n][1]) for n, (inertia, _) in pushes.items()}
 
-    def precondition(links: jax.Array) -> tuple[Acc, Spatial]:
-        return newton_step(run, problem, none._replace(link=links), still)
+    def again(links: jax.Array) -> tuple[Acc, Spatial]:
+        return substitute(run, problem, eliminate_again(run, problem, done, links))
 
     active = run.only_if(pairs.contacts.active.any())
-    start = step, motion
     idle = jnp.zeros_like(descent, bool) if idle is None else idle
-    return finger_pairs.correct(active, pairs, start, descent, idle, precondition, tolerance)
+    start = step, motion
+    return coupling.correct(active, pairs, start, descent, idle, again, tolerance)
 
 
 def _of_links(skin: dict, rows: slice | int) -> dict:
@@ -157,10 +226,17 @@ def _of_links(skin: dict, rows: slice | int) -> dict:
     }
 
 
-def _nothing(like: jax.Array) -> el.Quadratic:
-    """The objective beyond the finger tips, for vectors shaped as `like`, (6, finger, world)."""
-    matrix = jnp.zeros((6, *like.shape), like.dtype)
-    return el.Quadratic(matrix, matrix, matrix, jnp.zeros_like(like), jnp.zeros_like(like))
+def _nothing(like: jax.Array, held: bool) -> el.Quadratic:
+    """The objective beyond the finger tips, for vectors shaped as `like`, (6, finger, world).
+
+    Args:
+      like: Such a vector.
+      held: Whether anything of the hand may touch the object: if not it is a body by itself.
+    """
+    matrix, none = jnp.zeros((6, *like.shape), like.dtype), jnp.zeros_like(like)
+    if not held:
+        return el.Quadratic(matrix, None, None, none, None)
+    return el.Quadratic(matrix, matrix, matrix, none, none)
 
 
 class Own(NamedTuple):
@@ -196,9 +272,11 @@ def add_link(node: el.Quadratic, own: Own) -> el.Quadratic:
 
 def add_palm(node: el.Quadratic, matrix: Matrices, force: Forces, pushes: dict) -> el.Quadratic:
     """Sums the fingers and adds the palm, the object and their contacts."""
-    p, c, q, r, ro = (sum_fingers(v) for v in node)
+    sums: Any = [None if v is None else sum_fingers(v) for v in node]
+    p, c, q, r, ro = sums
     p, r = p + matrix.palm, r + force.palm
-    q, ro = q + matrix.object, ro + force.object
+    q = matrix.object if q is None else q + matrix.object
+    ro = force.object if ro is None else ro + force.object
     if "object_table" in pushes:
         inertia, wrench = pushes["object_table"]
         q, ro = q + inertia, ro + wrench
@@ -234,7 +312,7 @@ def _push(stages: Stages, name: str, c: Contacts, jar: jax.Array) -> tuple[jax.A
 
 
 def decrement(
-    slope: jax.Array, pushes: dict, step: Spatial, pairs: finger_pairs.Coupling | None
+    slope: jax.Array, pushes: dict, step: Spatial, pairs: coupling.Coupling | None
 ) -> jax.Array:
     """Newton decrement -p'gradient, shape (1, world): twice the decrease that the step predicts."""
     pushed = -slope
@@ -245,5 +323,5 @@ def decrement(
         )
         pushed = pushed + sum_items(product)
     if pairs is not None:
-        pushed = pushed + finger_pairs.product(pairs.push, step.link)
+        pushed = pushed + coupling.product(pairs.push, step.link)
     return jnp.maximum(pushed, 0.0)

@@ -98,11 +98,17 @@ def on_links(name: str) -> bool:
     return name.startswith(("finger", "hull"))
 
 
-def relative(name: str, motion: Spatial) -> jax.Array:
-    """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
+def relative(name: str, motion: Spatial, c: Contacts | None = None) -> jax.Array:
+    """Relative spatial motion of a pair of bodies, with axes for the contacts' items.
+
+    Args:
+      name: The pair.
+      motion: Motion of all bodies.
+      c: The contacts, of which those between fingers tell their links.
+    """
     obj = motion.object
-    if name == "finger_finger":
-        return finger_pairs.relative(motion.link)
+    if c is not None and c.ends is not None:
+        return finger_pairs.relative(motion.link, c.ends.link)
     if name.startswith("hull"):
         moved = hull.across_joints(motion.palm, motion.link)
         if name == "hull_object":

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import hull
+from codesign_jax.engines.structured import finger_pairs, hull
 from codesign_jax.engines.structured.contact import (
     Contacts,
     line,
@@ -95,10 +95,12 @@ def line_search(
         alpha, low, high = carry
         first, second = slope + alpha * curvature, curvature
         for n, c in contacts.items():
-            if c.lever is None:
-                f, s = run[n](summed, c, rays[n], alpha)
-            else:
+            if c.lever is not None:
                 f, s = hull.line_slopes(run[n], c, rays[n], alpha)
+            elif c.ends is not None:
+                f, s = finger_pairs.line_slopes(run[n], c, rays[n], alpha)
+            else:
+                f, s = run[n](summed, c, rays[n], alpha)
             first, second = first + f, second + s
         return refine(alpha, low, high, first, second)
 
@@ -136,9 +138,13 @@ def solve(
     runs = {n: run.only_if(c.active.any()) for n, c in contacts.items()}
 
     def initial(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Array:
-        return c.relative(relative(name, motion)) - c.reference(
-            c.relative(relative(name, velocity))
-        )
+        speed = c.relative(relative(name, velocity, c))
+        return c.relative(relative(name, motion, c)) - c.reference(speed)
+
+    def along(name: str, c: Contacts, motion: Spatial) -> jax.Array:
+        if c.ends is not None:
+            return finger_pairs.jar_of(runs[name], c, motion.link)
+        return runs[name](lambda c, m: c.relative(relative(name, m, c)), c, motion)
 
     motion = propagate(run, problem.kin, start)
     jar = {
@@ -150,15 +156,12 @@ def solve(
         acc, motion, jar, before, count = carry
         inertial = inertial_forces(run, problem, acc, motion)
         force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))
-        pushes, pairs = respond_all(runs, contacts, jar)
+        pushes, pairs = respond_all(runs, contacts, jar, motion)
         idle = None if pairs is None else before <= tolerance
         step, step_motion = linear_solve(run, problem, force, pushes, pairs, idle)
         slope = -work(run, force, step, step_motion)
         curvature = work(run, inertial_forces(run, problem, step, step_motion), step, step_motion)
-        jar_step = {
-            n: runs[n](lambda c, m, n=n: c.relative(relative(n, m)), c, step_motion)
-            for n, c in contacts.items()
-        }
+        jar_step = {n: along(n, c, step_motion) for n, c in contacts.items()}
         alpha = line_search(runs, contacts, jar, jar_step, slope, curvature, evaluations)
         # A world that is done stays as it is, so that its result does not depend on the others.
         done = before <= tolerance
@@ -182,7 +185,10 @@ def solve(
 
 
 def _solve_free(run: Stages, problem: Problem, start: Acc) -> Solution:
-    """Without contacts the objective is quadratic: one elimination solves it."""
+    """Without contacts the objective is quadratic: one elimination solves it, from anywhere."""
+    if problem.arm is None:
+        acc, _ = newton_step(run, problem, Forces(*problem.smooth), {})
+        return Solution(acc, jnp.zeros_like(start.wrist[0]), jnp.ones((), jnp.int32))
     motion = propagate(run, problem.kin, start)
     inertial = inertial_forces(run, problem, start, motion)
     force = Forces(*(s - m for s, m in zip(problem.smooth, inertial, strict=True)))

@@ -1,0 +1,141 @@
+"""Every grasp as a row: counts, values, provenance, and what is said without pyarrow."""
+
+import json
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+from toy import ToyEngine, tiny
+
+from codesign_jax import codesign
+from codesign_jax.experiments import Batch, Grid, Landscape, Strategies, Worlds, drive, parquet
+from codesign_jax.schema import SceneError
+from codesign_jax.types import Status, failed
+
+ROOT = Path(__file__).parents[1]
+PLAN = Strategies("2d", "2d", ("single", "switch-1", "concurrent"), 2, 4, 3, 3, 6)
+NOTES = {"command": "python", "commit": "abc", "versions": {"jax": "0"}}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A batch over the toy engine, some of whose worlds fail, and its record."""
+    scene, space, _ = tiny()
+    worlds = Worlds(scene, ToyEngine(scene, failing=[1, 40]), space, chunk=PLAN.worlds)
+    batch = Batch(PLAN, scene, worlds, codesign.make_filter(space), seed=5)
+    path = tmp_path_factory.mktemp("run") / "state.npz"
+    return batch, drive(batch, path, {}, say=lambda _: None).record
+
+
+def columns(path):
+    """Columns of a file as NumPy arrays or lists of strings."""
+    table = pyarrow.parquet.read_table(path)
+    return {
+        name: np.array(table[name].to_pylist(), object if name == "episode" else None)
+        for name in table.column_names
+    }
+
+
+def test_one_row_a_grasp_with_the_stored_values(finished, tmp_path):
+    batch, record = finished
+    path = parquet.write(tmp_path / "new" / "2d.parquet", batch, record, NOTES)
+    assert sorted(p.name for p in path.parent.iterdir()) == ["2d.parquet"]
+    rows = columns(path)
+    assert len(rows["cost"]) == PLAN.grasps == 3 * 2 * 4 * 3 * 5
+    assert set(rows["experiment"]) == {"2d"}
+    named = [rows[n] for n in parquet._STRATEGIES if n not in ("cost", "status")]
+    keys = list(zip(*named, strict=True))
+    assert len(set(keys)) == PLAN.grasps  # no grasp twice
+    strategy = np.array([PLAN.strategies.index(s) for s in rows["strategy"]])
+    index = [strategy, rows["run"], rows["particle"], rows["trial"]]
+    test = rows["phase"] == parquet.TEST
+    assert test.sum() == 3 * 2 * 4 * 6 and all(e is None for e in rows["episode"][test])
+    at = tuple(i[test] for i in index[:-1]) + (PLAN.trials + rows["trial"][test],)
+    for name in ("cost", "status"):
+        np.testing.assert_array_equal(rows[name][test], record[f"test_{name}"][at])
+    episode = rows["episode"][~test].astype(int)
+    at = (strategy[~test], rows["run"][~test], episode, rows["particle"][~test])
+    status = record["status"][(*at, rows["trial"][~test])]
+    np.testing.assert_array_equal(rows["status"][~test], status)
+    bad = failed(status)
+    assert bad.any() and (rows["cost"][~test][bad] == 3.0).all()
+    # The optimiser's own costs of particles: the mean over the trials that did not fail.
+    total, count = np.zeros((2, *record["cost"].shape))
+    np.add.at(total, tuple(i[~bad] for i in at), rows["cost"][~test][~bad])
+    np.add.at(count, tuple(i[~bad] for i in at), 1)
+    means = np.where(count > 0, total / np.maximum(count, 1), 3.0)
+    np.testing.assert_allclose(means, record["cost"], atol=1e-5)
+
+
+def test_types_and_provenance_are_in_the_schema(finished, tmp_path):
+    path = parquet.write(tmp_path / "2d.parquet", *finished, NOTES)
+    schema = pyarrow.parquet.read_schema(path)
+    assert json.loads(schema.metadata[b"provenance"]) == NOTES
+    bits = json.loads(schema.metadata[b"status_bits"])
+    assert bits == {str(int(s)): s.name for s in Status if s}
+    types = {f.name: str(f.type) for f in schema}
+    assert (types["cost"], types["status"], types["episode"]) == ("float", "uint8", "int16")
+    assert types["strategy"] == "dictionary<values=string, indices=int8, ordered=0>"
+    assert all(f.metadata[b"description"] for f in schema)
+
+
+def test_what_was_not_simulated_yet_has_no_rows(finished, tmp_path):
+    batch, record = finished
+    for step, grasps in ((1, 1), (PLAN.episodes, 3), (PLAN.episodes + 1, 4)):
+        path = tmp_path / f"{step}.parquet"
+        parquet.write(path, batch, record | {"step": np.int64(step)}, {})
+        rows = pyarrow.parquet.read_metadata(path).num_rows
+        assert rows == grasps * PLAN.worlds
+
+
+def test_a_landscape_s_rows_name_their_point(tmp_path):
+    scene, space, engine = tiny()
+    plan = Landscape("landscape", "2d", 3, 4, block=2)
+    grid = Grid(plan, scene, Worlds(scene, engine, space, chunk=18), seed=5)
+    record = grid.start()
+    for step in (1, 2):
+        grid.step(record)
+        path = parquet.write(tmp_path / f"{step}.parquet", grid, record, NOTES)
+        rows = columns(path)
+        assert len(rows["cost"]) == 9 * 2 * step
+    field = pyarrow.parquet.read_schema(path).field("first")
+    assert field.metadata[b"parameter"].decode() == space.names[0]
+    designs = space.in_units(record["designs"]).astype(np.float32)
+    for i, j, t in ((0, 0, 0), (2, 1, 3), (1, 2, 2)):
+        row = (rows["first"] == designs[i, j, 0]) & (rows["second"] == designs[i, j, 1])
+        row &= rows["trial"] == t
+        assert row.sum() == 1
+        assert rows["cost"][row] == record["trial_cost"][i, j, t]
+
+
+def test_without_pyarrow_nothing_is_simulated(finished, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(SceneError, match=r"pip install 'codesign-jax\[parquet\]'"):
+        parquet.write(tmp_path / "x.parquet", *finished, NOTES)
+    arguments = ["reproduce.py", "2d", "--size", "tiny", "--engine", "mujoco"]
+    arguments += ["--out", str(tmp_path / "out"), "--parquet", str(tmp_path / "x.parquet")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit, match="needs pyarrow: pip install"):
+        runpy.run_path(str(ROOT / "scripts" / "reproduce.py"), run_name="__main__")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_script_writes_rows_and_again_from_a_finished_state(tmp_path, monkeypatch):
+    def run(*more):
+        arguments = ["reproduce.py", "landscape", "--size", "tiny", "--engine", "mujoco"]
+        arguments += ["--out", str(tmp_path), *more]
+        monkeypatch.setattr(sys, "argv", arguments)
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(ROOT / "scripts" / "reproduce.py"), run_name="__main__")
+        assert end.value.code == 0
+
+    run("--commit", "abc")
+    before = (tmp_path / "landscape.json").read_text()
+    run("--commit", "def", "--parquet", str(tmp_path / "grasps.parquet"))
+    assert (tmp_path / "landscape.json").read_text() == before
+    rows = pyarrow.parquet.read_table(tmp_path / "grasps.parquet")
+    assert rows.num_rows == 12
+    assert json.loads(rows.schema.metadata[b"provenance"]) == json.loads(before)

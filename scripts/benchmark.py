@@ -34,7 +34,7 @@ SIZES = {
     },
 }
 # Worlds of the smaller cases, and steps of a short rollout.
-SMALL = {"cpu": {"reference": 360, "growth": 24}, "gpu": {"reference": 1728, "growth": 16384}}
+SMALL = {"cpu": {"reference": 360, "growth": 120}, "gpu": {"reference": 1728, "growth": 16384}}
 DISTINCT, STEPS, MJX_STEPS = 24, 50, 20
 QUICK = {"worlds": [12], "reference": 12, "growth": 6, "steps": 10}
 GROWTH = (

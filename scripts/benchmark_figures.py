@@ -141,6 +141,18 @@ def compared(found: dict[str, Any]) -> str:
 
 
 READ = {
+    "cpu": """
+Read from these tables:
+
+* The structured engine's kernel does 19 times the grasps of MuJoCo C on both cores, at 60 and at
+  360 worlds, and 17 times those of its own batch form (`unison`), which it replaced as the default
+  on CPUs. Same verdicts on all 360 grasps.
+* Stock MJX steps 64 worlds a second: two thousand times fewer.
+* Linear in links (exponent 0.93 from 10 to 40) and in fingers (1.02).
+* Compiling: most is Python that traces the kernel. A new process that finds its machine code and
+  XLA's program in the cache does neither; the number in brackets still traces, because the case was
+  the first of its process.
+""".strip(),
     "h200": """
 Read from these tables:
 
@@ -154,7 +166,11 @@ Read from these tables:
   (18 kB a link) outgrow the caches, and a block waits for the slowest of its eight worlds.
 * Growth against fingers and spheres was measured at 4,096 worlds, against links at 16,384. Fingers
   fill a warp in powers of two: six cost as much memory as eight.
-""".strip()
+* Since this run a world that has found its step length no longer moves with its neighbours' search,
+  so that its numbers do not depend on them. At 1,728, 16,384 and 65,536 worlds in contact the kernel
+  then did 3.32, 6.46 and 6.49 million world-steps/s instead of 3.44, 6.55 and 6.57 (commit 8e36a53,
+  same command with --parts window; `data/convergence_h200.json` has its verdicts).
+""".strip(),
 }
 
 

@@ -72,11 +72,11 @@ _GPU = {"structured": 16_384, "mujoco": 96, "mjx": 1_728}
 SIZES = {
     "full": Size(
         "full", (0.1, 0.05), 40, 80, 12, 2.4, 40, 60, 24, 6,
-        {"structured": 120, "mujoco": 60, "mjx": 12}, _GPU, 50, 5,
+        {"structured": 480, "mujoco": 60, "mjx": 12}, _GPU, 50, 5,
     ),
     "quick": Size(
         "quick", (0.5, 0.25), 20, 40, 3, 1.0, 8, 12, 6, 6,
-        {"structured": 60, "mujoco": 24, "mjx": 6}, _GPU, 20, 5, 2.0, 20,
+        {"structured": 240, "mujoco": 24, "mjx": 6}, _GPU, 50, 5, 2.0, 20,
     ),
     "tiny": Size(
         "tiny", (2.0, 1.0), 4, 5, 2, 0.3, 2, 3, 3, 3,

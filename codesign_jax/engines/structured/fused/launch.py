@@ -38,7 +38,9 @@ def launch(
     shapes = [tuple(x.shape[1:]) for x in (*avals, *outputs)]
 
     def trace() -> Any:
-        return _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr).params["jaxpr"]
+        # A block knows nothing of the devices that share the worlds, and traces sooner without.
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            return _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr).params["jaxpr"]
 
     if kernel.backend == "cpu":
         from codesign_jax.engines.structured.fused import native

@@ -168,8 +168,8 @@ Read from these tables:
   fill a warp in powers of two: six cost as much memory as eight.
 * Since this run a world that has found its step length no longer moves with its neighbours' search,
   so that its numbers do not depend on them. At 1,728, 16,384 and 65,536 worlds in contact the
-  kernel then did 3.32, 6.46 and 6.49 million world-steps/s instead of 3.44, 6.55 and 6.57 (commit 8e36a53,
-  same command with --parts window; `data/convergence_h200.json` has its verdicts).
+  kernel then did 3.32, 6.46 and 6.49 million world-steps/s instead of 3.44, 6.55 and 6.57
+  (commit 8e36a53, same command with --parts window; `data/convergence_h200.json` has its verdicts).
 """.strip(),
 }
 

@@ -134,17 +134,23 @@ def test_streamed_worlds_of_the_new_models():
         )
         world, trial = small.hand_world(scene)
         lengths = np.linspace(0.07, 0.13, 6)
-        params = small.stack(*[world._replace(length=0 * world.length + x) for x in lengths])
-        trials = small.stack(*[trial] * len(lengths))
-        fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
-        ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :230]
-        found = [
-            jax.jit(StructuredEngine(scene, tolerance=1e-16, lanes=n).rollout)(fields, ctrl)
-            for n in (0, 2)
-        ]
-    # As in test_structured: rounding, on the way to the object and in touch with the table.
-    np.testing.assert_allclose(found[1].distance, found[0].distance, atol=1e-10)
-    assert np.ptp(found[0].distance[:, -1]) > 1e-3
+
+        def distance(lengths, lanes):
+            params = small.stack(*[world._replace(length=0 * world.length + x) for x in lengths])
+            trials = small.stack(*[trial] * len(lengths))
+            fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
+            ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :230]
+            engine = StructuredEngine(scene, tolerance=1e-16, lanes=lanes)
+            return np.asarray(jax.jit(engine.rollout)(fields, ctrl).distance)
+
+        unison, moved = distance(lengths, 0), distance(lengths * (1 + 1e-14), 0)
+        streamed = distance(lengths, 2)
+    # The longest finger slips on the table from step 211 on and multiplies a change of 1e-14 in its
+    # length by seven a step: the stream's rounding may grow as that change does, and no further.
+    error, chaos = np.abs(streamed - unison), np.abs(moved - unison)
+    assert (error <= 1e-10 + 10 * chaos).all()
+    assert (error[:, :210] < 1e-10).all() and (error < 1e-10).all(1).sum() >= 5
+    assert np.ptp(unison[:, -1]) > 1e-3
 
 
 @slow

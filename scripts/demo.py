@@ -1,6 +1,6 @@
 """A 2D co-design from a poor seed to a design that grasps, with figure, animation and pictures.
 
-`make demo` runs it: a minute and a half on two cores.  It is `codesign optimize` and `codesign
+`make demo` runs it: two minutes on two cores.  It is `codesign optimize` and `codesign
 evaluate` with the arguments below; further arguments go to the former, such as --fresh or --seed 1.
 The sizes are the paper's.  Not every seed succeeds, see README.md.
 """

@@ -21,7 +21,7 @@ from codesign_jax import control, cost, model, parameters, rollout, scene
 from codesign_jax.benchmark import measure
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.fused import Limits, Program, lanes_of
+from codesign_jax.engines.structured.fused import Limits, Program
 from codesign_jax.engines.structured.hand import hand_lanes
 from codesign_jax.types import Trace, failed
 
@@ -55,9 +55,7 @@ def outcome(trace: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def kernel(limits: Limits, fields: model.ModelFields, ctrl: jax.Array) -> tuple[Any, dict]:
     """Trace of the kernel, and its time, iterations and share of steps above tolerance."""
-    backend = jax.default_backend()
-    width = lanes_of(backend, ctrl.dtype)
-    engine, program = StructuredEngine(SCENE), Program(SCENE, limits, backend=backend, width=width)
+    engine, program = StructuredEngine(SCENE), Program.here(SCENE, limits, ctrl.dtype)
     run = jax.jit(lambda f, c: program.run(hand_lanes(SCENE, f), engine.reset(f), c))
     jax.block_until_ready(run(fields, ctrl))
     start = time.perf_counter()

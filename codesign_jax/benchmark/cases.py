@@ -233,13 +233,7 @@ def quality(case: Case) -> dict:
         grown = case.values.get("growth")
         distinct = case.values["distinct"]
         fields, ctrl = short(distinct=distinct) if grown else work.inputs(case.scene, whole())
-        backend = jax.default_backend()
-        program = fused.Program(
-            case.scene,
-            fused.Limits(*limits),
-            backend=backend,
-            width=fused.lanes_of(backend, ctrl.dtype),
-        )
+        program = fused.Program.here(case.scene, fused.Limits(*limits), ctrl.dtype)
         found = jax.jit(lambda f, c: program.run(hand_lanes(case.scene, f), engine.reset(f), c))(
             fields, ctrl
         )

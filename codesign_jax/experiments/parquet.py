@@ -19,7 +19,16 @@ from codesign_jax.types import Status
 EPISODE, TEST = "episode", "test"
 """Phases of an experiment on strategies."""
 
-_STATUS = "bits of codesign_jax.types.Status, named in the schema's metadata; 0: none"
+_OUTCOME = {
+    "cost": (
+        "float32",
+        "cost of the grasp, 0 (kept) to the scene's maximum (lost at once, failed)",
+    ),
+    "status": (
+        "uint8",
+        "bits of codesign_jax.types.Status, named in the schema's metadata; 0: none",
+    ),
+}
 _STRATEGIES = {
     "experiment": ("name", "name of the experiment"),
     "strategy": ("name", "what opened the parameters, see codesign_jax.optimize.schedule"),
@@ -28,22 +37,14 @@ _STRATEGIES = {
     "episode": ("int16", "episode from 0; null in the test"),
     "particle": ("int16", "particle of the episode, or final particle in the test"),
     "trial": ("int16", "trial of the particle in this episode or in the test, from 0"),
-    "cost": (
-        "float32",
-        "cost of the grasp, 0 (kept) to the scene's maximum (lost at once, failed)",
-    ),
-    "status": ("uint8", _STATUS),
+    **_OUTCOME,
 }
 _GRID = {
     "experiment": ("name", "name of the experiment"),
     "first": ("float32", "first parameter of the grid"),
     "second": ("float32", "second parameter of the grid"),
     "trial": ("int16", "trial of the point, from 0; every point meets the same ones"),
-    "cost": (
-        "float32",
-        "cost of the grasp, 0 (kept) to the scene's maximum (lost at once, failed)",
-    ),
-    "status": ("uint8", _STATUS),
+    **_OUTCOME,
 }
 
 

@@ -258,13 +258,11 @@ class StructuredEngine:
         return meshes or e.surface == "hull" or e.finger_finger
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array) -> Trace:
-        from codesign_jax.engines.structured.fused import Limits, Program, lanes_of
+        from codesign_jax.engines.structured.fused import Limits, Program
 
         # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
         limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
-        backend = jax.default_backend()
-        width = lanes_of(backend, ctrl.dtype)
-        program = Program(self.scene, limits, backend=backend, width=width)
+        program = Program.here(self.scene, limits, ctrl.dtype)
         found, end = program.simulate(hand_lanes(self.scene, fields), self.reset(fields), ctrl)
         qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
         status = self._status(found["residual"])

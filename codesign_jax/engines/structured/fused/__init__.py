@@ -1,5 +1,5 @@
 """The structured engine's rollout as one kernel."""
 
-from codesign_jax.engines.structured.fused.kernel import TRACE, Limits, Program, lanes_of
+from codesign_jax.engines.structured.fused.kernel import TRACE, Limits, Program
 
-__all__ = ["TRACE", "Limits", "Program", "lanes_of"]
+__all__ = ["TRACE", "Limits", "Program"]

@@ -42,15 +42,6 @@ class Limits(NamedTuple):
     tolerance: float
 
 
-def lanes_of(backend: str, dtype: Any) -> int:
-    """Lanes of a block that fill a GPU's warp or a CPU's vector."""
-    if backend == "gpu":
-        return LANES
-    from codesign_jax.engines.structured.fused import native
-
-    return native.vector_bytes() // jnp.dtype(dtype).itemsize
-
-
 class Program:
     """Tables and kernel of a scene's rollout for one size of block."""
 
@@ -62,7 +53,7 @@ class Program:
           limits: How hard each step is solved.
           backend: "gpu", "cpu", or "interpreter", which is Pallas' own and slow.
           width: Lanes of a block, a power of two; more if a world has more fingers. By default
-            those of a warp; see `lanes_of` for a CPU.
+            those of a warp.
         """
         self.backend = backend
         self.scene, self.limits, self.lay = scene, limits, layout(scene)
@@ -74,6 +65,16 @@ class Program:
         self.palm_groups = -(-len(palm_points(scene)) // self.fingers)
         self.sets = self._sets()
         self._tables()
+
+    @classmethod
+    def here(cls, scene: Scene, limits: Limits, dtype: Any) -> "Program":
+        """The program for this device and type, whose blocks fill a GPU's warp or CPU's vector."""
+        if (backend := jax.default_backend()) != "cpu":
+            return cls(scene, limits)
+        from codesign_jax.engines.structured.fused import native
+
+        width = native.vector_bytes() // jnp.dtype(dtype).itemsize
+        return cls(scene, limits, backend=backend, width=width)
 
     def _sets(self) -> list[ContactSet]:
         e, k = self.scene.effects, self.k

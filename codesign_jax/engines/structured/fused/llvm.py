@@ -12,15 +12,8 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.extend import core
 
-from codesign_jax.engines.structured.fused.ptx import (
-    COSINE,
-    INLINE,
-    SAME,
-    SINE,
-    quarter_turn_parts,
-)
+from codesign_jax.engines.structured.fused.walk import COSINE, SINE, Walker, quarter_turn_parts
 
 _FLOAT = {4: "float", 8: "double"}
 _INT_OPS: dict[str, Callable] = {
@@ -72,8 +65,10 @@ def kind_of(dtype: Any) -> str:
     return "i" if np.issubdtype(dtype, np.integer) else "f"
 
 
-class Writer:
+class Writer(Walker):
     """Writes the instructions of one block."""
+
+    language = "LLVM"
 
     def __init__(self, lanes: int, itemsize: int = 4):
         """Starts empty.
@@ -87,7 +82,9 @@ class Writer:
         self.lines: list[str] = []
         self.count, self.here = 0, "entry"
         self.declared: set[str] = set()
-        self.same: dict[str, Value] = {}  # the scalar that was spread to a vector, by its name
+        self.spread_from: dict[
+            str, Value
+        ] = {}  # the scalar that was spread to a vector, by its name
 
     # Text
 
@@ -143,13 +140,13 @@ class Writer:
         first = self.emit(f"insertelement {kind} poison, {self.typed(value)}, i32 0")
         zeros = f"<{self.lanes} x i32> zeroinitializer"
         text = self.emit(f"shufflevector {kind} {first}, {kind} poison, {zeros}")
-        self.same[text] = value
+        self.spread_from[text] = value
         return Value(value.kind, True, text)
 
     def narrow(self, value: Value) -> Value:
         """The scalar of a vector that is known to be the same on all lanes."""
         if value.text is not None:
-            return self.same.get(value.text, value)
+            return self.spread_from.get(value.text, value)
         if value.wide and np.min(value.known) == np.max(value.known):
             return Value(value.kind, False, None, np.min(value.known))
         return value
@@ -348,46 +345,23 @@ class Writer:
         self._close(lines, found[1], sources[1])
         return results
 
-    def run(self, jaxpr: Any, consts: Any, args: list) -> list:
-        """Instructions of a jaxpr; returns its results."""
-        values: dict[Any, Any] = {}
+    # What a walk asks for
 
-        def known(array: Any) -> Value:
-            array = np.asarray(array)
-            return Value(kind_of(array.dtype), bool(array.shape), None, array[()])
+    def constant(self, array: np.ndarray) -> Value:
+        """See `Walker`."""
+        return Value(kind_of(array.dtype), bool(array.shape), None, array[()])
 
-        def read(atom: Any) -> Any:
-            return known(atom.val) if isinstance(atom, core.Literal) else values[atom]
+    def same(self, equation: Any, value: Value) -> Value:
+        """See `Walker`."""
+        return self.spread(value) if equation.outvars[0].aval.shape else value
 
-        values.update(zip(jaxpr.constvars, map(known, consts), strict=True))
-        values.update(zip(jaxpr.invars, args, strict=True))
-        for equation in jaxpr.eqns:
-            results = self.equation(equation, [read(v) for v in equation.invars])
-            values.update(zip(equation.outvars, results, strict=True))
-        return [read(v) for v in jaxpr.outvars]
+    def get(self, equation: Any, ref: Ref, leaves: list[Value]) -> Value:
+        """See `Walker`."""
+        return self.load(ref, self._indices(ref, equation, leaves))
 
-    def equation(self, equation: Any, args: list) -> list:
-        """Instructions of one operation."""
-        name, params = equation.primitive.name, equation.params
-        if name in INLINE:
-            inner = params.get("jaxpr", params.get("call_jaxpr"))
-            return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
-        if name in SAME:
-            wide = bool(equation.outvars[0].aval.shape)
-            return [self.spread(args[0]) if wide else args[0]]
-        control = {"scan": self.loop, "while": self.while_loop, "cond": self.branch}
-        if name in control:
-            return control[name](equation, args)
-        if name == "get":
-            ref, *leaves = args
-            return [self.load(ref, self._indices(ref, equation, leaves))]
-        if name == "swap":
-            ref, value, *leaves = args
-            self.store(ref, self._indices(ref, equation, leaves), value)
-            return [None]
-        if name not in _RULES:
-            raise NotImplementedError(f"no LLVM instruction for {name}")
-        return [_RULES[name](self, equation, *args)]
+    def swap(self, equation: Any, ref: Ref, value: Value, leaves: list[Value]) -> None:
+        """See `Walker`."""
+        self.store(ref, self._indices(ref, equation, leaves), value)
 
 
 def _arithmetic(name: str) -> Callable:
@@ -529,7 +503,7 @@ def _over_lanes(w: Writer, equation: Any, x: Value) -> Value:
     return Value("i", False, w.emit(f"call i32 @{full}({w.typed(x)})"))
 
 
-_RULES: dict[str, Callable] = {
+Writer.rules = {
     "add": _arithmetic("add"),
     "add_any": _arithmetic("add"),
     "sub": _arithmetic("sub"),

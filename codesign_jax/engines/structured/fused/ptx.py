@@ -12,7 +12,14 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.extend import core
+
+from codesign_jax.engines.structured.fused.walk import (
+    COMPARE,
+    COSINE,
+    SINE,
+    Walker,
+    quarter_turn_parts,
+)
 
 HEADER = ".version 7.8\n.target sm_80\n.address_size 64\n"
 LANES = 32
@@ -40,24 +47,6 @@ class Ref(NamedTuple):
     shape: tuple[int, ...]
 
 
-_COMPARE = ("lt", "le", "gt", "ge", "eq", "ne")
-INLINE = ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint")
-SAME = (
-    "broadcast_in_dim",
-    "broadcast_to",
-    "reshape",
-    "squeeze",
-    "stop_gradient",
-    "copy",
-    "optimization_barrier",
-    "reshard",  # in a share of the worlds, see `cores`
-)
-
-# Taylor's polynomials in the square of an angle within pi / 4; the sine's is divided by the angle.
-SINE = (1 / 362880, -1 / 5040, 1 / 120, -1 / 6, 1.0)
-COSINE = (1 / 40320, -1 / 720, 1 / 24, -0.5, 1.0)
-
-
 def kind_of(aval: Any) -> str:
     """Type of registers for an array."""
     if aval.dtype == np.bool_:
@@ -72,8 +61,10 @@ def immediate(kind: str, number: Any) -> str:
     return str(int(number))
 
 
-class Assembler:
+class Assembler(Walker):
     """Writes the instructions of one kernel."""
+
+    language = "PTX"
 
     def __init__(self) -> None:
         """Starts empty."""
@@ -252,51 +243,34 @@ class Assembler:
             self.emit(f"{label}:")
         return results
 
-    def run(self, jaxpr: Any, consts: Any, args: list) -> list:
-        """Instructions of a jaxpr; returns its results."""
-        values: dict[Any, Any] = {}
+    # What a walk asks for
 
-        def read(atom: Any) -> Any:
-            if isinstance(atom, core.Literal):
-                return Value(kind_of(atom.aval), None, np.asarray(atom.val)[()])
-            return values[atom]
+    def constant(self, array: np.ndarray) -> Value:
+        """See `Walker`."""
+        return Value(kind_of(array), None, array[()])
 
-        numbers = [Value(kind_of(c), None, np.asarray(c)[()]) for c in map(np.asarray, consts)]
-        values.update(zip(jaxpr.constvars, numbers, strict=True))
-        values.update(zip(jaxpr.invars, args, strict=True))
-        for equation in jaxpr.eqns:
-            results = self.equation(equation, [read(v) for v in equation.invars])
-            values.update(zip(equation.outvars, results, strict=True))
-        return [read(v) for v in jaxpr.outvars]
+    def same(self, equation: Any, value: Value) -> Value:
+        """See `Walker`; a register has no shape."""
+        return value
+
+    def get(self, equation: Any, ref: Ref, leaves: list[Value]) -> Value:
+        """See `Walker`."""
+        at = self.pointer(ref, self.indices(ref, equation, leaves))
+        result = Value("f32", self.register("f32"))
+        self.emit(f"ld.global.f32 {result.name}, {at};")
+        return result
+
+    def swap(self, equation: Any, ref: Ref, value: Value, leaves: list[Value]) -> None:
+        """See `Walker`."""
+        at = self.pointer(ref, self.indices(ref, equation, leaves))
+        self.emit(f"st.global.f32 {at}, {self.operand(value)};")
 
     def equation(self, equation: Any, args: list) -> list:
-        """Instructions of one operation."""
-        name, params = equation.primitive.name, equation.params
-        if name in INLINE:
-            inner = params.get("jaxpr", params.get("call_jaxpr"))
-            return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
-        if name in SAME:
-            return args
-        control = {"scan": self.loop, "while": self.while_loop, "cond": self.branch}
-        if name in control:
-            return control[name](equation, args)
-        if name == "get":
-            ref, *leaves = args
-            at = self.pointer(ref, self.indices(ref, equation, leaves))
-            result = Value("f32", self.register("f32"))
-            self.emit(f"ld.global.f32 {result.name}, {at};")
-            return [result]
-        if name == "swap":
-            ref, value, *leaves = args
-            at = self.pointer(ref, self.indices(ref, equation, leaves))
-            self.emit(f"st.global.f32 {at}, {self.operand(value)};")
-            return [None]
-        if name in ("debug_barrier", "debug_barrier_p"):
+        """See `Walker`; lanes may have to wait for each other."""
+        if equation.primitive.name in ("debug_barrier", "debug_barrier_p"):
             self.emit("bar.warp.sync 0xffffffff;")
             return []
-        if name not in _RULES:
-            raise NotImplementedError(f"no PTX for {name}")
-        return [_RULES[name](self, equation, *args)]
+        return super().equation(equation, args)
 
 
 def _same_kind(name: str) -> Callable:
@@ -393,19 +367,6 @@ def _number(value: float) -> Value:
     return Value("f32", None, value)
 
 
-def quarter_turn_parts() -> list[float]:
-    """Numbers that add up to pi / 2; the first two times a small whole number are exact."""
-    parts, left = [], np.pi / 2
-    for bits in (12, 12, 24):
-        part = float(np.float32(left))
-        if bits == 12:
-            scale = 2.0 ** (bits - 1 - np.floor(np.log2(left)))
-            part = float(np.floor(left * scale) / scale)
-        left -= part
-        parts.append(part)
-    return parts
-
-
 def _turn(asm: Assembler, x: Value) -> tuple[Value, Value]:
     """Quarter turns of an angle and what is left, within pi / 4 (Cody and Waite's reduction)."""
     scaled = asm.compute("f32", "mul.f32", x, _number(2 / np.pi))
@@ -462,7 +423,7 @@ def _over_lanes(asm: Assembler, equation: Any, x: Value) -> Value:
     return result
 
 
-_RULES: dict[str, Callable] = {
+Assembler.rules = {
     "add": _add,
     "add_any": _add,
     "sub": _sub,
@@ -480,7 +441,7 @@ _RULES: dict[str, Callable] = {
     "sin": _sine(0),
     "cos": _sine(1),
     "sign": _sign,
-    **{name: _compare(name) for name in _COMPARE},
+    **{name: _compare(name) for name in COMPARE},
     "and": _logic("and"),
     "or": _logic("or"),
     "xor": _logic("xor"),

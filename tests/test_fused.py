@@ -1,5 +1,7 @@
 """The rollout kernel: component-wise evaluation, assembly, and equality with the batch engine."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -178,6 +180,51 @@ def test_what_has_no_instruction_is_named():
         llvm.Writer(8).run(jaxpr.jaxpr, [], [llvm.Value("f", True, "%x")])
 
 
+def ptx_of(kernel, rows):
+    """A kernel's PTX; it has one array of rows."""
+    spec = pl.BlockSpec((None, rows, ptx.LANES), lambda i: (i, 0, 0))
+    shape = jax.ShapeDtypeStruct((1, rows, ptx.LANES), jnp.float32)
+    call = pl.pallas_call(kernel, grid=(1,), in_specs=[spec], out_specs=spec, out_shape=shape)
+    (equation,) = jax.make_jaxpr(call)(shape).eqns
+    return ptx.assemble(equation.params["jaxpr"], [(rows, ptx.LANES)] * 2, "test")
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_loop_asks_for_what_it_reads_later(reverse):
+    """Rows 2 k + 3 and 2 k + 4 of round k: as many rounds on as memory takes, in their order."""
+    count = 8
+
+    def kernel(x, out):
+        def body(k, total):
+            at = 2 * (count - 1 - k if reverse else k)
+            return total + x[at + 3, :] * x[at + 4, :]
+
+        out[0, :] = jax.lax.fori_loop(0, count, body, x[0, :])
+
+    lines = ptx_of(kernel, 32).splitlines()
+    (asked,) = [line for line in lines if line.startswith("prefetch.global.L1")]
+    offset = int(asked.split("+")[1].rstrip("];"))
+    row, reads = 4 * ptx.LANES, [line for line in lines if line.startswith("ld.global")]
+    begin = next(k for k, line in enumerate(lines) if line.startswith("L0"))
+    body = [k for k, line in enumerate(lines) if k > begin and line.startswith("ld.global")]
+    rounds = (offset / row - 3) / (-2 if reverse else 2)
+    assert len(reads) == 3 and rounds == int(rounds) >= 1
+    length = next(k for k, line in enumerate(lines) if "bra.uni L0" in line) - begin
+    assert rounds * length >= ptx.AHEAD > (rounds - 1) * (length - 10)
+    # Two rows: lane 0 asks for the first one, all others for the second one.
+    assert "min.s32 %n2, %lane, 1;" in lines and lines.index(asked) < body[0]
+
+
+@pytest.mark.parametrize(("width", "mask"), [((2, 8), 8), ((2, 16), 16), ((32,), 31)])
+def test_lanes_swap_by_a_mask(width, mask):
+    """PTX exchanges registers between the lanes that a reversed axis exchanges."""
+
+    def kernel(x, out):
+        out[0, :] = jax.lax.rev(x[0, :].reshape(-1, *width), (1,)).reshape(ptx.LANES)
+
+    assert f"shfl.sync.bfly.b32 %f1, %f0, {mask}, 31" in ptx_of(kernel, 1)
+
+
 OPERATIONS = {
     "sine": (lambda x, y: jnp.sin(40 * x), 2e-7),
     "cosine": (lambda x, y: jnp.cos(40 * x), 2e-7),
@@ -187,6 +234,7 @@ OPERATIONS = {
     "extremes": (lambda x, y: jnp.maximum(x, y) * jnp.minimum(x, y), 2e-6),
     "logic": (lambda x, y: jnp.where((x < y) & ~(y > 0.3) | (x != x), x, y), 0),
     "whole": (lambda x, y: x.astype(jnp.int32).astype(x.dtype), 0),
+    "swap": (lambda x, y: x + jax.lax.rev(y.reshape(2, 2, 2), (1,)).reshape(LANES), 0),
     "loop": (lambda x, y: jax.lax.fori_loop(0, 7, lambda i, c: c + i * x, y), 1e-5),
     "while": (
         lambda x, y: jax.lax.while_loop(

@@ -116,6 +116,7 @@ class BoundContacts:
             self.write("normal", normal, item)
             value = lanewise(jar, point, normal, gap, self.friction, motion, velocity)
             self.write("jar", value, item)
+            self.write("step", lanewise(jnp.zeros_like, value), item)
 
         jax.lax.cond(self.touching(item), store, lambda: None)
 
@@ -123,8 +124,8 @@ class BoundContacts:
         gap = self.read("gap", item)
         return self.read("point", item), self.read("normal", item), gap[0]
 
-    def push(self, item: Any) -> tuple[Lanes, Lanes]:
-        """Contact inertia (6, 6) and wrench (6,) of the item, summed over k."""
+    def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+        """Moves jar along the last line; contact inertia (6, 6) and wrench (6,), summed over k."""
 
         def response(point, normal, gap, friction, jar):
             c = Contacts(point, normal, gap, self.set.cone(friction))
@@ -133,7 +134,9 @@ class BoundContacts:
             return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
 
         def compute() -> list[Lanes]:
-            jar = self.read("jar", item)
+            jar, step = self.read("jar", item), self.read("step", item)
+            jar = lanewise(lambda a, j, s: j + a * s, alpha, jar, step)
+            self.write("jar", jar, item)
             matrix, wrench = lanewise(response, *self._contacts(item), self.friction, jar)
             return [upper(matrix), wrench]
 
@@ -172,15 +175,6 @@ class BoundContacts:
             return lanewise(both, gap, self.friction, ray, alpha)
 
         return self.if_touching(item, compute, [(), ()])
-
-    def advance(self, item: Any, alpha: Lanes) -> None:
-        """Moves jar along the line."""
-
-        def store() -> None:
-            jar, step = self.read("jar", item), self.read("step", item)
-            self.write("jar", lanewise(lambda a, j, s: j + a * s, alpha, jar, step), item)
-
-        jax.lax.cond(self.touching(item), store, lambda: None)
 
 
 def sphere_on_object(scene: Scene, size, shape, columns, position, centre, radius):

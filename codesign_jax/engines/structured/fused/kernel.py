@@ -142,7 +142,6 @@ class Program:
             "z": (n, (a,)),
             "step_acc": (n, (a,)),
             "step_motion": (n, (6,)),
-            "sums": (1, (96,)),
             "new_finger": (n, (a,)),
             "new_finger_vel": (n, (a,)),
         }
@@ -281,7 +280,7 @@ class Program:
 
     def _kernel(self, steps: int, *refs: Any) -> None:
         hand, world, fine0, rest0, arm, pressure, fine, rest, scratch, trace = refs
-        block = Block(self.fingers, self.block, barrier=self.backend == "gpu")
+        block = Block(self.fingers, self.block)
         step = Step(self, block, hand, world, fine, rest, scratch)
         own = block.world
         _copy(fine0, fine, self.fine.rows)

@@ -13,7 +13,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.engines.structured.fused.walk import COSINE, SINE, Walker, quarter_turn_parts
+from codesign_jax.engines.structured.fused.walk import (
+    COSINE,
+    SINE,
+    Walker,
+    quarter_turn_parts,
+    swapped_lanes,
+)
 
 _FLOAT = {4: "float", 8: "double"}
 _INT_OPS: dict[str, Callable] = {
@@ -497,6 +503,13 @@ def _iota(w: Writer, equation: Any, *args: Value) -> Value:
     return Value("i", True, None, np.arange(w.lanes, dtype=np.int32))
 
 
+def _reverse(w: Writer, equation: Any, x: Value) -> Value:
+    pattern = swapped_lanes(equation.invars[0].aval.shape, equation.params["dimensions"])
+    if x.text is None:
+        return x._replace(known=np.broadcast_to(np.asarray(x.known), (w.lanes,))[pattern])
+    return Value(x.kind, True, w._shuffle(w.type(x.kind, True), w.operand(w.spread(x)), pattern))
+
+
 def _over_lanes(w: Writer, equation: Any, x: Value) -> Value:
     kind, full = w.type("i", True), f"llvm.vector.reduce.smax.v{w.lanes}i32"
     w.declared.add(f"declare i32 @{full}({kind})")
@@ -529,6 +542,7 @@ Writer.rules = {
     "select_n": _select_n,
     "convert_element_type": _convert,
     "iota": _iota,
+    "rev": _reverse,
     "reduce_max": _over_lanes,
 }
 

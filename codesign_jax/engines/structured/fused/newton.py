@@ -85,6 +85,15 @@ def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
     return {"finger_table": link, "palm_table": palm, "object_table": obj}[name]
 
 
+def along(alpha: jax.Array, value: Any, step: Any) -> Any:
+    """A tree of arrays moved by alpha times another one."""
+    return jax.tree.map(lambda v, s: v + alpha * s, value, step)
+
+
+LINE_TOLERANCE = 0.01
+"""Slope at which a line search ends, over the first one: MuJoCo's default `ls_tolerance`."""
+
+
 class Newton:
     """The solver of one step in a kernel."""
 
@@ -106,20 +115,33 @@ class Newton:
         return found
 
     def write(self, name: str, value: Lanes, item: Any) -> None:
-        """Writes to the scratch table."""
-        self.m.scratch.write(self.m.scratch_ref, name, value, item)
-
-    def sum(self, tree: Any) -> Any:
-        """Sums over the fingers."""
+        """Writes to the table that has the name."""
         m = self.m
-        return self.block.sum(tree, m.scratch_ref, m.scratch.offset["sums"])
+        if name in m.state.groups:
+            m.state.write(m.state_ref, name, value, item)
+        else:
+            m.scratch.write(m.scratch_ref, name, value, item)
+
+    def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
+        """Moves a link's "acc" or "motion" along its step and returns it."""
+        value = lanewise(along, alpha, *self.read(name, f"step_{name}", item=item))
+        self.write(name, value, item)
+        return value
 
     def body_of(self, item: Any) -> list[Lanes]:
         """Arguments of `make_body` for a link."""
         return self.read("mass", "body_centre", "tensor", item=item)
 
-    def backward(self) -> el.Quadratic:
-        """Eliminates the fingers from their tips; returns the sum over the fingers."""
+    def backward(self, alpha: Lanes) -> el.Quadratic:
+        """Eliminates the fingers from their tips.
+
+        Args:
+          alpha: Length of the last step, by which accelerations, motions and jar move first: so
+            they are read once an iteration.
+
+        Returns:
+          The sum over the fingers.
+        """
 
         def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes):
             link = make_body(*body)
@@ -128,11 +150,12 @@ class Newton:
             return el.eliminate(direct, node, axes, arm, tau - arm * acc)
 
         def step(i: Any, node: el.Quadratic) -> el.Quadratic:
-            pushes = {c.set.name: c.push(i) for c in self.fingers}
-            names = ("motion", "smooth", "tau", "axes", "armature", "acc")
+            acc, motion = self.move("acc", i, alpha), self.move("motion", i, alpha)
+            pushes = {c.set.name: c.push(i, alpha) for c in self.fingers}
+            smooth, tau, axes, arm = self.read("smooth", "tau", "axes", "armature", item=i)
             node = node._replace(p=full(node.p), q=full(node.q))
             node, factors = lanewise(
-                eliminate, node, self.body_of(i), *self.read(*names, item=i), pushes
+                eliminate, node, self.body_of(i), motion, smooth, tau, axes, arm, acc, pushes
             )
             for name, value in zip(("w", "g", "z"), factors, strict=True):
                 self.write(name, value, i)
@@ -140,27 +163,27 @@ class Newton:
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         node = loop(self.links, step, el.Quadratic(*empty), self.block.size, reverse=True)
-        node = self.sum(node)
+        node = self.block.sum(node)
         return node._replace(p=full(node.p), q=full(node.q))
 
-    def slot_pushes(self) -> dict[str, tuple[Lanes, Lanes]]:
-        """Contact inertia and wrench of the palm's and the object's contacts."""
+    def slot_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
+        """Contact inertia and wrench of the palm's and the object's contacts; see `backward`."""
         pushes = {}
         for c in self.slots:
 
             def add(i: Any, carry: tuple, c: BoundContacts = c) -> tuple:
-                matrix, wrench = c.push(i)
+                matrix, wrench = c.push(i, alpha)
                 return lanewise(
                     lambda a, b: jax.tree.map(jnp.add, a, b), carry, (upper(matrix), wrench)
                 )
 
             start = (zeros((21,), self.like), zeros((6,), self.like))
-            triangle, wrench = self.sum(loop(c.set.count, add, start, self.block.size))
+            triangle, wrench = self.block.sum(loop(c.set.count, add, start, self.block.size))
             pushes[c.set.name] = (full(triangle), wrench)
         return pushes
 
-    def at_palm(self, now: Iterate, node: el.Quadratic) -> Iterate:
-        """Solves for wrist and object."""
+    def at_palm(self, now: Iterate, node: el.Quadratic, slots: dict) -> Iterate:
+        """Solves for wrist and object; slots: what `slot_pushes` returns."""
 
         def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> Iterate:
             force = Forces(
@@ -182,7 +205,7 @@ class Newton:
             at_centre = spatial(obj[:3], obj[3:] - cross(palm.position, obj[:3]))
             return Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
 
-        return lanewise(solve, now, self.palm, node, self.slot_pushes())
+        return lanewise(solve, now, self.palm, node, slots)
 
     def forward(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
         """Substitutes back and prepares the line search.
@@ -233,7 +256,7 @@ class Newton:
                 return lanewise(jnp.add, sum_, contacts.aim(i, rel))
 
             touch = loop(contacts.set.count, add, touch, self.block.size)
-        slope, curvature, touch = self.sum((slope, curvature, touch))
+        slope, curvature, touch = self.block.sum((slope, curvature, touch))
         slope, curvature = lanewise(self._rest, now, step, self.palm, slope, curvature)
         return slope, curvature, touch
 
@@ -249,8 +272,23 @@ class Newton:
         bent = bent + dot(palm.object.times(step.object_motion), step.object_motion)
         return slope, curvature + bent + dot(palm.armature * step.wrist, step.wrist)
 
-    def line_search(self, slope: Lanes, curvature: Lanes, first: Lanes, evaluations: int) -> Lanes:
-        """Step length, lanes of a world; see `solver.line_search`."""
+    def line_search(
+        self,
+        slope: Lanes,
+        curvature: Lanes,
+        first: Lanes,
+        floor: jax.Array,
+        evaluations: int,
+    ) -> Lanes:
+        """Step length, lanes of a world; see `solver.line_search`.
+
+        Args:
+          slope: Slope of the smooth part at 0.
+          curvature: Its curvature.
+          first: Slope of the contacts at 0.
+          floor: Slope that is small enough, lanes of a world.
+          evaluations: Largest number of evaluations.
+        """
 
         def evaluate(alpha: Lanes) -> tuple[Lanes, Lanes]:
             def add(i: Any, sums: list, sets: list) -> list:
@@ -263,7 +301,7 @@ class Newton:
             sums = loop(self.links, lambda i, s: add(i, s, self.fingers), sums, self.block.size)
             for c in self.slots:
                 sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
-            one, two = self.sum(sums)
+            one, two = self.block.sum(sums)
             return lanewise(
                 lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
             )
@@ -280,33 +318,12 @@ class Newton:
         def going(carry: list) -> jax.Array:
             return (carry[0] < evaluations) & anywhere(jnp.abs(carry[-1]) > goal)
 
-        # Slopes of a thousandth of the first one change the decrease by a millionth.
-        goal = 1e-3 * jnp.abs(lanewise(jnp.add, slope, first).lane)
+        goal = jnp.maximum(floor, LINE_TOLERANCE * jnp.abs(lanewise(jnp.add, slope, first).lane))
         one = lanewise(jnp.ones_like, slope)
         none = lanewise(jnp.zeros_like, slope)
         far = lanewise(lambda x: jnp.full_like(x, solver.FAR), slope)
         start, rebuild = solid((one, none, far, far), self.block.size)
         return rebuild(jax.lax.while_loop(going, body, [jnp.int32(0), *start])[1:])[0]
-
-    def advance(self, now: Iterate, step: Iterate, alpha: Lanes) -> Iterate:
-        """Moves accelerations, motions and jar by alpha times the step."""
-
-        def move(alpha, old, new):
-            return jax.tree.map(lambda a, b: a + alpha * b, old, new)
-
-        def one(i: Any, carry: list) -> list:
-            acc, motion, a, moved = self.read("acc", "motion", "step_acc", "step_motion", item=i)
-            acc, motion = lanewise(move, alpha, (acc, motion), (a, moved))
-            self.m.state.write(self.m.state_ref, "acc", acc, i)
-            self.write("motion", motion, i)
-            for contacts in self.fingers:
-                contacts.advance(i, alpha)
-            return carry
-
-        loop(self.links, one, [], self.block.size)
-        for c in self.slots:
-            jax.lax.fori_loop(0, c.set.count, lambda i, x, c=c: (c.advance(i, alpha), x)[1], 0)
-        return lanewise(move, alpha, now, step)
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -327,22 +344,26 @@ class Newton:
             return jnp.where(going, alpha, 0.0), jnp.where(going, residual, before)
 
         def body(carry: list) -> list:
-            count, (now, before) = carry[0], rebuild(carry[1:])
-            step = self.at_palm(now, self.backward())
+            count, (now, before, last) = carry[0], rebuild(carry[1:])
+            step = self.at_palm(now, self.backward(last), self.slot_pushes(last))
             slope, curvature, first = self.forward(now, step)
-            alpha = self.line_search(slope, curvature, first, evaluations)
-            residual = lanewise(_residual, slope, first, self.palm, now.object_motion)
+            residual, scale = lanewise(_residual, slope, first, self.palm, now.object_motion)
+            floor = LINE_TOLERANCE * tolerance * scale.lane
+            floor = jnp.where(waiting & (before.lane > tolerance), floor, solver.FAR)
+            alpha = self.line_search(slope, curvature, first, floor, evaluations)
             alpha, residual = lanewise(hold, before, alpha, residual)
-            new = self.advance(now, step, alpha)
-            return [count + 1, *solid((new, residual), self.block.size)[0]]
+            now = lanewise(along, alpha, now, step)
+            return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
-            return (carry[0] < iterations) & anywhere(waiting & (carry[-1] > tolerance))
+            return (carry[0] < iterations) & anywhere(waiting & (carry[-2] > tolerance))
 
-        far = lanewise(lambda a: jnp.full_like(a[0], 3e38), now.wrist)
-        start, rebuild = solid((now, far), self.block.size)
+        far = lanewise(lambda a: jnp.full_like(a[0], solver.FAR), now.wrist)
+        none = lanewise(lambda a: jnp.zeros_like(a[0]), now.wrist)
+        start, rebuild = solid((now, far, none), self.block.size)
         count, *arrays = jax.lax.while_loop(going, body, [jnp.int32(0), *start])
-        now, residual = rebuild(arrays)
+        now, residual, last = rebuild(arrays)
+        loop(self.links, lambda i, _: (self.move("acc", i, last), [])[1], [], self.block.size)
         return now, Quality(residual, count)
 
 
@@ -360,4 +381,4 @@ def triangle(tensor: jax.Array) -> jax.Array:
 
 def _residual(slope, first, palm: Palm, motion):
     scale = solver.scale(palm.object.mass, palm.palm.mass, motion)
-    return jnp.maximum(-slope - first, 0.0) / scale
+    return jnp.maximum(-slope - first, 0.0) / scale, scale

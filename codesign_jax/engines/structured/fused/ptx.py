@@ -19,10 +19,13 @@ from codesign_jax.engines.structured.fused.walk import (
     SINE,
     Walker,
     quarter_turn_parts,
+    swapped_lanes,
 )
 
 HEADER = ".version 7.8\n.target sm_80\n.address_size 64\n"
 LANES = 32
+AHEAD = 600
+"""Lines of a loop between asking for a row and reading it, about the time that memory takes."""
 LAUNCH = f".maxntid {LANES}, 1, 1\n"
 
 
@@ -45,6 +48,18 @@ class Ref(NamedTuple):
 
     address: str
     shape: tuple[int, ...]
+
+
+class Ahead(NamedTuple):
+    """Rows that a loop reads at an address, and reads again further on in the next round.
+
+    Attributes:
+      line: Line after which the address is known.
+      offsets: Offsets of the rows from the address [bytes].
+    """
+
+    line: int
+    offsets: list[int]
 
 
 def kind_of(aval: Any) -> str:
@@ -71,6 +86,10 @@ class Assembler(Walker):
         self.lines: list[str] = []
         self.counts: dict[str, int] = {}
         self.known: list[dict[tuple, Value]] = [{}]  # one scope a region: computed already
+        self.spans: set[int] = set()  # numbers of rows that are asked for at once
+        self.growth: dict[str, int] = {}  # of registers, in each round of the loop they are in
+        self.born: dict[str, int] = {}  # line after an address
+        self.ahead: list[dict[str, Ahead]] = []  # one a loop: its reads, by address register
 
     def register(self, kind: str) -> str:
         """A new register."""
@@ -139,6 +158,9 @@ class Assembler(Walker):
                 self.emit(f"mul.wide.s32 {wide}, {name}, {stride};")
                 self.emit(f"add.u64 {found.name}, {address}, {wide};")
                 self.known[-1][key] = found
+                grown = self.growth.get(address, 0) + stride * self.growth.get(name, 0)
+                self.growth[found.name] = grown
+                self.born[found.name] = len(self.lines)
             address = found.name
         return f"[{address}+{offset}]" if offset >= 0 else f"[{address}{offset}]"
 
@@ -199,13 +221,45 @@ class Assembler(Walker):
         label = self.label()
         self.emit(f"{label}:")
         inner = p["jaxpr"]
+        self.ahead.append({})
+        first = len(self.lines)
+        self.growth |= {registers[k].name: 1 for k in counters(inner.jaxpr, split)}  # type: ignore[misc]
         new = self.region(inner.jaxpr, inner.consts, [*consts, *registers])
+        self.prefetch(self.ahead.pop(), first)
         self.update(registers, new)
         self.emit(f"add.s32 {count.name}, {count.name}, 1;")
         going = self.register("pred")
         self.emit(f"setp.lt.s32 {going}, {count.name}, {p['length']};")
         self.emit(f"@{going} bra.uni {label};")
         return registers
+
+    def prefetch(self, reads: dict[str, Ahead], first: int) -> None:
+        """Asks for the rows of later rounds of a loop as soon as their addresses are known.
+
+        Without it every round waits for memory: a kernel of this size leaves room for two warps on
+        a scheduler, which cannot hide it.
+
+        Args:
+          reads: What the loop reads.
+          first: Line where its body begins.
+        """
+        rounds = -(-AHEAD // (len(self.lines) - first))
+        for address, (line, offsets) in sorted(reads.items(), key=lambda r: -r[1].line):
+            before, self.lines = self.lines, []
+            for offset, rows in adjacent(sorted(set(offsets)), 4 * LANES):
+                place = self.spread(address, rows)
+                self.emit(f"prefetch.global.L1 [{place}+{offset + rounds * self.growth[address]}];")
+            before[line:line] = self.lines
+            self.lines = before
+
+    def spread(self, address: str, rows: int) -> str:
+        """Address of a row for each lane, from a lane's place in the first one of them."""
+        if rows == 1:
+            return address
+        self.spans.add(rows)
+        place = self.register("u64")
+        self.emit(f"add.u64 {place}, {address}, %span{rows};")
+        return place
 
     def while_loop(self, equation: Any, args: list) -> list:
         """A while loop; its condition is the same on all lanes."""
@@ -258,19 +312,21 @@ class Assembler(Walker):
         at = self.pointer(ref, self.indices(ref, equation, leaves))
         result = Value("f32", self.register("f32"))
         self.emit(f"ld.global.f32 {result.name}, {at};")
+        if ref.shape[-1] == LANES:
+            self.read_ahead(at)
         return result
+
+    def read_ahead(self, at: str) -> None:
+        """Notes a read that the next round of a loop repeats further on."""
+        address, _, offset = at[1:-1].partition("+")
+        if self.ahead and self.growth.get(address) and offset:
+            here = self.ahead[-1].setdefault(address, Ahead(self.born[address], []))
+            here.offsets.append(int(offset))
 
     def swap(self, equation: Any, ref: Ref, value: Value, leaves: list[Value]) -> None:
         """See `Walker`."""
         at = self.pointer(ref, self.indices(ref, equation, leaves))
         self.emit(f"st.global.f32 {at}, {self.operand(value)};")
-
-    def equation(self, equation: Any, args: list) -> list:
-        """See `Walker`; lanes may have to wait for each other."""
-        if equation.primitive.name in ("debug_barrier", "debug_barrier_p"):
-            self.emit("bar.warp.sync 0xffffffff;")
-            return []
-        return super().equation(equation, args)
 
 
 def _same_kind(name: str) -> Callable:
@@ -290,7 +346,10 @@ def _add(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
 def _sub(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
     if a.kind == "s32" and b.name is None:
         return a._replace(number=int(a.number) - int(b.number))
-    return asm.compute(a.kind, f"sub.{a.kind}", a, b)
+    result = asm.compute(a.kind, f"sub.{a.kind}", a, b)
+    if a.name is None and b.name in asm.growth:
+        asm.growth[result.name] = -asm.growth[b.name]  # type: ignore[index]
+    return result
 
 
 def _mul(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
@@ -300,7 +359,11 @@ def _mul(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
         for x, y in ((a, b), (b, a)):
             if y.name is None and y.number == 1:
                 return x
-        return asm.compute("s32", "mul.lo.s32", a, b)
+        result = asm.compute("s32", "mul.lo.s32", a, b)
+        for x, y in ((a, b), (b, a)):
+            if x.name in asm.growth and y.name is None:
+                asm.growth[result.name] = asm.growth[x.name] * int(y.number)  # type: ignore[index]
+        return result
     return asm.compute("f32", "mul.f32", a, b)
 
 
@@ -416,6 +479,17 @@ def _lane(asm: Assembler, equation: Any, *args: Value) -> Value:
     return Value("s32", "%lane")
 
 
+def _reverse(asm: Assembler, equation: Any, x: Value) -> Value:
+    lanes = swapped_lanes(equation.invars[0].aval.shape, equation.params["dimensions"])
+    mask = int(lanes[0])
+    assert (lanes == np.arange(LANES) ^ mask).all(), "lanes that do not swap in pairs"
+    if x.name is None:
+        return x
+    result = Value(x.kind, asm.register(x.kind))
+    asm.emit(f"shfl.sync.bfly.b32 {result.name}, {x.name}, {mask}, 31, 0xffffffff;")
+    return result
+
+
 def _over_lanes(asm: Assembler, equation: Any, x: Value) -> Value:
     # Never remembered: a loop's condition is computed anew.
     result = Value("s32", asm.register("s32"))
@@ -449,8 +523,31 @@ Assembler.rules = {
     "select_n": _select,
     "convert_element_type": _convert,
     "iota": _lane,
+    "rev": _reverse,
     "reduce_max": _over_lanes,
 }
+
+
+def counters(jaxpr: Any, consts: int) -> list[int]:
+    """Which of a loop's carried values grow by one in every round."""
+    found = []
+    carried = jaxpr.invars[consts:]
+    for k, (before, after) in enumerate(zip(carried, jaxpr.outvars, strict=True)):
+        for e in jaxpr.eqns:
+            if e.primitive.name == "add" and e.outvars[0] is after and e.invars[0] is before:
+                found.append(k)
+    return found
+
+
+def adjacent(offsets: list[int], row: int) -> list[tuple[int, int]]:
+    """Rows that follow each other: first offset and number, at most as many as lanes."""
+    found: list[tuple[int, int]] = []
+    for offset in offsets:
+        if found and offset == found[-1][0] + row * found[-1][1] and found[-1][1] < LANES:
+            found[-1] = (found[-1][0], found[-1][1] + 1)
+        else:
+            found.append((offset, 1))
+    return found
 
 
 def assemble(jaxpr: Any, shapes: list[tuple[int, ...]], name: str) -> str:
@@ -478,10 +575,19 @@ def assemble(jaxpr: Any, shapes: list[tuple[int, ...]], name: str) -> str:
         f".reg {kinds[k]} %{k}<{n + 1}>;\n" for k, n in asm.counts.items() if k in kinds
     )
     params = ", ".join(f".param .u64 arg{k}" for k in range(len(shapes)))
-    start = "mov.u32 %block, %ctaid.x;\nmov.u32 %lane, %tid.x;\n"
-    body = "\n".join(asm.lines)
+    start = ["mov.u32 %block, %ctaid.x;", "mov.u32 %lane, %tid.x;"]
+    for rows in sorted(asm.spans):  # from a lane in the first row to that lane's own row
+        n, step = f"%n{rows}", f"%span{rows}"
+        start += [
+            f".reg .s32 {n}; .reg .s64 {step};",
+            f"min.s32 {n}, %lane, {rows - 1};",
+            f"mul.lo.s32 {n}, {n}, {LANES};",
+            f"sub.s32 {n}, {n}, %lane;",
+            f"mul.wide.s32 {step}, {n}, 4;",
+        ]
+    body = "\n".join([*start, *asm.lines])
     return (
         f"{HEADER}.visible .entry {name}({params})\n{LAUNCH}{{\n"
         f".reg .u32 %block;\n.reg .s32 %lane;\n"
-        f"{registers}{start}{body}\nret;\n}}\n"
+        f"{registers}{body}\nret;\n}}\n"
     )

@@ -162,6 +162,7 @@ class Step:
                 pressure,
             )
             carry, stored = out
+            stored |= {"step_acc": zeros((p.axes,), like), "step_motion": wide}
             for name, value in stored.items():
                 m.scratch.write(self.scratch, name, value, i)
             share = p.hand.read(self.hand, "share", i + 1)
@@ -173,7 +174,7 @@ class Step:
         middle = loop(p.links, link, start, p.size)[-1]
         self._slot_contacts(state, at, m, shape)
         count = p.num_fingers * p.links
-        middle = self.block.sum(middle, self.scratch, p.scratch.offset["sums"])
+        middle = self.block.sum(middle)
         return now, lanewise(lambda c: c / count, middle)
 
     def _finger_contacts(self, i: Any, carry: tuple, at: dict, m: Memory, shape: tuple) -> None:
@@ -273,10 +274,7 @@ class Step:
 
         like = jnp.zeros((p.size,), self.fine.dtype)
         fingers = loop(p.links, link, zeros((), like), p.size).lane
-        largest = size.lane
-        row = p.scratch.offset["sums"]
-        for mine in self.block.share([fingers], self.scratch, row)[0]:
-            largest = _worse(largest, mine)
+        largest = _worse(size.lane, self.block.fold(fingers, _worse))
         limit = p.scene.limits
         good = (speed <= limit.speed) & (largest <= limit.speed)
         good = good & (height >= -limit.penetration)

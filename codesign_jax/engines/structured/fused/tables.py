@@ -1,13 +1,11 @@
 """Named numbers in a kernel's memory, and loops that carry them."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.pallas.triton import debug_barrier
 
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, spread
 
@@ -136,38 +134,34 @@ class Block:
       finger: Finger of each lane, shape (lane,).
     """
 
-    def __init__(self, fingers: int, worlds: int, *, barrier: bool):
-        """Makes the indices, inside a kernel; barrier: whether memory needs one."""
+    def __init__(self, fingers: int, worlds: int):
+        """Makes the indices, inside a kernel."""
         self.fingers, self.worlds, self.size = fingers, worlds, fingers * worlds
         lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
         count = jnp.int32(worlds)
         self.world, self.finger = jax.lax.rem(lane, count), jax.lax.div(lane, count)
-        self._barrier = barrier
 
-    def share(self, arrays: list[jax.Array], ref: Any, row: int) -> list[list[jax.Array]]:
-        """Every finger's value of each array, on all lanes of the world; see `sum`."""
-        for k, array in enumerate(arrays):
-            ref[row + k] = array
-        if self._barrier:
-            debug_barrier()
-        found = [
-            [ref[row + k, self.world + f * self.worlds] for f in range(self.fingers)]
-            for k in range(len(arrays))
-        ]
-        if self._barrier:
-            debug_barrier()
-        return found
+    def fold(self, array: jax.Array, combine: Callable) -> jax.Array:
+        """Every finger's value combined, on all lanes of the world.
 
-    def sum(self, tree: Any, ref: Any, row: int) -> Any:
-        """Sums over the fingers, through memory: lanes do not see each other's registers.
+        Lanes swap their values in pairs of fingers, then in pairs of pairs: combine(a, b) has to
+        equal combine(b, a), so that all lanes of a world get the same bits.
 
         Args:
-          tree: Lanes of a finger each.
-          ref: Memory of enough rows.
-          row: The first of them.
+          array: Numbers of every lane, shape (lane,).
+          combine: Function of two such arrays.
         """
+        distance = self.worlds
+        while distance < self.size:
+            pairs = array.reshape(-1, 2, distance)
+            array = combine(array, jax.lax.rev(pairs, (1,)).reshape(self.size))
+            distance *= 2
+        return array
+
+    def sum(self, tree: Any) -> Any:
+        """Sums over the fingers of a tree of lanes."""
         arrays, rebuild = solid(tree, self.size)
-        sums = [functools.reduce(jnp.add, parts) for parts in self.share(arrays, ref, row)]
+        sums = [self.fold(array, jnp.add) for array in arrays]
 
         def narrow(value: Lanes) -> Lanes:
             return Lanes(value.parts, (*value.shape[:-2], 1, value.shape[-1]), value.dtype)

@@ -39,6 +39,11 @@ def quarter_turn_parts() -> list[float]:
     return parts
 
 
+def swapped_lanes(shape: tuple[int, ...], dimensions: tuple[int, ...]) -> np.ndarray:
+    """Lane that each lane takes its value from when lanes of a shape are reversed."""
+    return np.flip(np.arange(np.prod(shape)).reshape(shape), dimensions).ravel()
+
+
 class Walker:
     """Writes instructions; a language adds values, memory, control flow and rules.
 

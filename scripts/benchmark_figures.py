@@ -157,19 +157,16 @@ Read from these tables:
 Read from these tables:
 
 * MuJoCo Warp, which MJX's documentation recommends on NVIDIA GPUs, does 0.30 and 0.46 million
-  world-steps/s at 1,728 and 16,384 worlds of whole grasps; the structured engine 15 and 23 times
+  world-steps/s at 1,728 and 16,384 worlds of whole grasps; the structured engine 21 and 29 times
   as many, at an error of the accelerations 20 times smaller in the 99 % quantile. Warp agrees with
-  MuJoCo C in 99.7 % of the verdicts: it solves the same problem.
-* Cost grows faster than the number of links: exponent 1.41 from 10 to 40 links at 16,384 worlds,
-  where 1.1 was wanted. Newton iterations grow by a third (contacts of more spheres are harder);
-  an iteration grows with exponent 1.2. The elimination itself is linear; a block's numbers
-  (18 kB a link) outgrow the caches, and a block waits for the slowest of its eight worlds.
-* Growth against fingers and spheres was measured at 4,096 worlds, against links at 16,384. Fingers
+  MuJoCo C in 99.7 % of the verdicts: it solves the same problem. (Warp was measured in an earlier
+  run, in which the structured engine's kernel of then was 15 and 23 times as fast.)
+* Cost is linear in the links: exponent 1.06 from 10 to 40 at 16,384 worlds, of which 0.18 is
+  Newton's iterations, a quarter more at 40 links.
+* What is left: a block waits for the slowest of its eight worlds, 7.6 iterations a step in contact
+  where a world alone needs 4.1 (docs/notes/structured-engine.md).
+* Growth against fingers and spheres was measured with an earlier kernel at 4,096 worlds. Fingers
   fill a warp in powers of two: six cost as much memory as eight.
-* Since this run a world that has found its step length no longer moves with its neighbours' search,
-  so that its numbers do not depend on them. At 1,728, 16,384 and 65,536 worlds in contact the
-  kernel then did 3.32, 6.46 and 6.49 million world-steps/s instead of 3.44, 6.55 and 6.57
-  (commit 8e36a53, same command with --parts window; `data/convergence_h200.json` has its verdicts).
 """.strip(),
 }
 

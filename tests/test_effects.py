@@ -364,10 +364,10 @@ def test_without_contacts_a_step_is_that_of_beams_alone():
 
 
 def test_the_kernel_does_not_run_what_it_lacks(monkeypatch):
-    """The GPU kernel knows the paper's effects; other scenes take the batch form."""
+    """The kernel knows all effects but the hull and contact between fingers."""
 
     def taken(way):
-        def run(self, fields, ctrl, *_):
+        def run(self, fields, ctrl, *_, **__):
             raise RuntimeError(way)
 
         return run
@@ -378,11 +378,10 @@ def test_the_kernel_does_not_run_what_it_lacks(monkeypatch):
     for values, way in (
         ({}, "kernel"),
         ({"gravity": False, "palm_table": False, "pressure_dynamics": True}, "kernel"),
-        ({"friction": "full"}, "batch"),
-        ({"friction": "none"}, "batch"),
-        ({"wrist": False}, "batch"),
-        ({"neo_hookean": True}, "batch"),
-        ({"object_table": False}, "batch"),
+        ({"friction": "full", "neo_hookean": True}, "kernel"),
+        ({"wrist": False, "object_table": False}, "kernel"),
+        ({"surface": "hull"}, "batch"),
+        ({"finger_finger": True}, "batch"),
     ):
         engine = StructuredEngine(effects_scene(values), fused=True, lanes=0)
         with pytest.raises(RuntimeError, match=way):

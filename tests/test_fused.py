@@ -127,6 +127,61 @@ def test_machine_code_equals_the_engine(grasp):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
+EFFECTS = {
+    "no friction": {"effects__friction": "none"},
+    "torsion and rolling": {"effects__friction": "full"},
+    "rigid arm": {"effects__wrist": False},
+    "neo-Hookean": {"effects__neo_hookean": True},
+    "object without a table": {"effects__object_table": False, "effects__gravity": False},
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_machine_code_has_the_effects(name):
+    """The kernel on this CPU and the batch engine in float64, along qpos of every step."""
+    scene = small.pinch("cylinder", links=2, **EFFECTS[name])
+    with jax.enable_x64(True):
+        params, trials = small.random_worlds(scene, 3, 3)
+        fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
+        ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :200]
+        settings = dict(iterations=60, evaluations=30, tolerance=1e-18)
+        got, want = (
+            jax.jit(
+                partial(
+                    StructuredEngine(scene, fused=fused, lanes=0, **settings).rollout,
+                    trajectory=True,
+                )
+            )(fields, ctrl)
+            for fused in (True, False)
+        )
+    assert np.abs(want.qpos[:, -1] - want.qpos[:, 0]).max() > 0.1
+    # Rounding of single steps is 1e-16; contact multiplies it.
+    for field in ("distance", "height", "speed", "qpos", "last"):
+        a, b = getattr(got, field), getattr(want, field)
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=field)
+
+
+def test_a_decided_world_stays(grasp):
+    """A lost object ends a world: its state repeats, whatever its neighbours still do."""
+    scene, fields, ctrl = grasp
+    long = jnp.repeat(ctrl[:, -1:], 700, 1)
+    away = jnp.zeros_like(long).at[1, :, 2].set(jnp.linspace(0, 0.6, 700))  # one hand leaves
+    ctrl = jnp.concatenate([ctrl, long + away], 1)
+    run = jax.jit(partial(StructuredEngine(scene).rollout, trajectory=True))
+    together = run(fields, ctrl)
+    alone = run(jax.tree.map(lambda v: v[1:2], fields), ctrl[1:2])
+    gone = np.asarray(alone.distance[0]) >= scene.cost.lost_distance
+    first = round(scene.window[0] / scene.discretization.timestep)
+    assert gone[first:].any()
+    when = first + int(np.argmax(gone[first:]))
+    for name in ("distance", "height", "speed", "qpos"):
+        values = np.asarray(getattr(together, name))[1]
+        np.testing.assert_array_equal(values, np.asarray(getattr(alone, name))[0], err_msg=name)
+        np.testing.assert_array_equal(
+            values[when:], np.broadcast_to(values[when], values[when:].shape)
+        )
+
+
 def test_neighbours_in_a_block_change_no_bit(grasp):
     """A world's numbers are the same whatever worlds share its vector."""
     scene, fields, ctrl = grasp

@@ -41,7 +41,7 @@ def compile_template(scene: Scene) -> mujoco.MjModel:
     """Compiles the scene's template model, once a scene."""
     space, one = parameters.design_space(scene.hand), np.ones(())
     with _float64():
-        params = jax.tree.map(np.asarray, space.params(space.default()))
+        params = jax.tree.map(np.asarray, jax.jit(lambda: space.params(space.default()))())
     trial = Trial(np.int32(0), np.zeros(2), 0 * one, np.zeros(2), one, one)
     return compile_model(scene, params, trial)
 
@@ -74,6 +74,13 @@ def compile_model(
     return model
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _numbers(scene: Scene, params: Params, trial: Trial) -> tuple:
+    """Beams, mounts, and the object's size and orientation; one program, not one an operation."""
+    beams, place = morphology.finger_beams(scene.hand, params), mounts(scene, params.spread)
+    return beams, place, object_size(scene, trial), object_quat(scene, trial)
+
+
 @_float64()
 def build_spec(
     scene: Scene, params: Params, trial: Trial, *, visual: bool = False
@@ -84,11 +91,12 @@ def build_spec(
     world = spec.worldbody
     world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.05], **_PASSIVE)
     _add_palm(scene, spec, visual)
-    beams = morphology.finger_beams(scene.hand, jax.tree.map(np.asarray, params))
+    concrete = jax.tree.map(np.asarray, (params, trial))
+    beams, place, solid, quat = jax.tree.map(np.asarray, _numbers(scene, *concrete))
     for f in range(scene.num_fingers):
-        beam = Beam(*(float(np.asarray(v)[f]) for v in beams))
-        _add_finger(scene, spec, params, f, beam, visual)
-    _add_object(scene, spec, trial, visual)
+        beam = Beam(*(float(v[f]) for v in beams))
+        _add_finger(scene, spec, params, f, beam, (place[0][f], place[1][f]), visual)
+    _add_object(scene, spec, trial, solid, quat, visual)
     _add_pairs(scene, spec)
     return spec
 
@@ -158,19 +166,24 @@ def _sphere(body: mujoco.MjsBody, name: str, pos, radius: float) -> None:
 
 
 def _add_finger(
-    scene: Scene, spec: mujoco.MjSpec, params: Params, f: int, beam: Beam, visual: bool
+    scene: Scene,
+    spec: mujoco.MjSpec,
+    params: Params,
+    f: int,
+    beam: Beam,
+    mount: tuple[np.ndarray, np.ndarray],
+    visual: bool,
 ) -> None:
     lay, width, h = layout(scene), scene.hand.section.width, scene.discretization.timestep
     length, height = float(params.length[f]), float(params.height[f])
     segment = length / lay.links
-    mount_pos, mount_quat = mounts(scene, np.asarray(params.spread))
     tendon = spec.add_tendon(name=f"chamber_{f}")
     body = spec.body("palm")
     by_axis = {"bend": beam.bending, "lateral": beam.lateral, "twist": beam.torsion}
     for i in range(lay.links + 1):
         body = body.add_body(name=f"finger_{f}_link_{i}")
         if i == 0:
-            body.pos, body.quat = np.asarray(mount_pos)[f], np.asarray(mount_quat)[f]
+            body.pos, body.quat = mount
         else:
             body.pos = [segment / 2 if i == 1 else segment, 0, 0]
         extent = segment / 2 if i in (0, lay.links) else segment
@@ -225,12 +238,17 @@ def _add_skin(scene: Scene, spec: mujoco.MjSpec, f: int, length: float, height: 
     skin.bindquat = np.tile([1.0, 0, 0, 0], len(origins))
 
 
-def _add_object(scene: Scene, spec: mujoco.MjSpec, trial: Trial, visual: bool) -> None:
-    sizes, mass, inertia, rest = (
-        np.asarray(v) for v in object_size(scene, jax.tree.map(np.asarray, trial))
-    )
+def _add_object(
+    scene: Scene,
+    spec: mujoco.MjSpec,
+    trial: Trial,
+    solid: tuple[np.ndarray, ...],
+    quat: np.ndarray,
+    visual: bool,
+) -> None:
+    sizes, mass, inertia, rest = solid
     body = spec.worldbody.add_body(name="object", pos=[*np.asarray(trial.position), float(rest)])
-    body.quat = np.asarray(object_quat(scene, jax.tree.map(np.asarray, trial)))
+    body.quat = quat
     body.explicitinertial, body.mass, body.inertia = True, float(mass), inertia
     body.ipos, body.iquat = [0, 0, 0], [1, 0, 0, 0]
     body.add_freejoint(name="object")

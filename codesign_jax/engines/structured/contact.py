@@ -201,9 +201,9 @@ class Line(NamedTuple):
 
     n0: jax.Array
     n1: jax.Array
-    uu: jax.Array
-    uv: jax.Array
-    vv: jax.Array
+    uu: jax.Array | None
+    uv: jax.Array | None
+    vv: jax.Array | None
 
 
 def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> Line:
@@ -285,7 +285,7 @@ def _full_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
     def row(i: int, columns: range) -> jax.Array:
         return jnp.stack([hessian[place[min(i, j), max(i, j)]] for j in columns])
 
-    top = hessian[jnp.array([place[i, j] for i in range(3) for j in range(i, 3)])]
+    top = jnp.stack([hessian[place[i, j]] for i in range(3) for j in range(i, 3)])
     coulomb = contacts._replace(cone=contacts.cone._replace(spin=None, roll=None))
     matrix, r = contact_inertia(coulomb, top), contacts.point
     e = [contacts.turning(row(i, range(3, 6))) for i in range(3)]

@@ -20,14 +20,14 @@ from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
-from codesign_jax.engines.structured.integration import integrate
+from codesign_jax.engines.structured.integration import integrate, rigid_arm
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
 from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.engines.structured.problem import Matrices, Problem, Spatial
 from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.model.layout import palm_touches
-from codesign_jax.scene import Effects, Scene
+from codesign_jax.scene import Scene
 from codesign_jax.types import Status, Trace
 
 LANES = 60
@@ -82,8 +82,8 @@ class StructuredEngine:
             a tighter tolerance, as the derivative is that of the solution.
           checkpoint: Whether the derivative of a rollout stores only states and accelerations and
             repeats the rest of each step; costs nothing without a derivative.
-          fused: Whether one kernel runs a rollout where it can: primitive shapes, no trajectory,
-            effects of `in_kernel`, on a GPU float32. By default unless `lanes` is given.
+          fused: Whether one kernel runs a rollout where it can: scenes of `in_kernel`, on a GPU in
+            float32. By default unless `lanes` is given.
           lanes: Worlds in flight at once without the kernel, see `stream`; 0 steps all worlds in
             unison. By default `LANES` on a CPU and 0 elsewhere.
           burst: Newton iterations of a round of the stream.
@@ -166,13 +166,10 @@ class StructuredEngine:
         matrix = Matrices(*(run(lambda b: b.matrix(), b) for b in body))
         contacts = self.contacts(run, hand, kin, state.wrist[2])
         velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-        arm = None if self.scene.effects.wrist else self._arm(state, ctrl)
+        h, arm = self.scene.discretization.timestep, None
+        if not self.scene.effects.wrist:
+            arm = rigid_arm(ctrl[:6, None], state.wrist, state.wrist_vel, h)
         return Problem(hand, kin, body, matrix, smooth, contacts, arm), velocity
-
-    def _arm(self, state: State, ctrl: jax.Array) -> jax.Array:
-        """Acceleration of the palm's coordinates that ends the step at the arm frame."""
-        h = self.scene.discretization.timestep
-        return ((ctrl[:6, None] - state.wrist) / h - state.wrist_vel) / h
 
     def contacts(
         self, run: Stages, hand: HandLanes, kin: Kinematics, height: jax.Array
@@ -241,30 +238,23 @@ class StructuredEngine:
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`; where it can, one kernel runs it all, see `fused`."""
-        batched = self._needs_batch()
-        fits = self.fused and not batched and in_kernel(self.scene.effects)
-        if fits and not trajectory and (self.conditional or ctrl.dtype == jnp.float32):
-            return on_all_cores(self._one_kernel, fields, ctrl)
+        fits = in_kernel(self.scene)
+        if fits and self.fused and (self.conditional or ctrl.dtype == jnp.float32):
+            return on_all_cores(partial(self._one_kernel, trajectory=trajectory), fields, ctrl)
         with jax.default_matmul_precision("highest"):
-            if self.lanes and not batched:
+            if self.lanes and fits:
                 return on_all_cores(partial(self._stream, trajectory=trajectory), fields, ctrl)
             return self._rollout(fields, ctrl, trajectory)
 
-    def _needs_batch(self) -> bool:
-        """Whether the scene has what neither the kernel nor the stream knows."""
-        # The stream moves worlds between lanes; a mesh's grid belongs to no world.
-        meshes = any(o.type == "mesh" for o in self.scene.objects.object)
-        e = self.scene.effects
-        return meshes or e.surface == "hull" or e.finger_finger
-
-    def _one_kernel(self, fields: ModelFields, ctrl: jax.Array) -> Trace:
+    def _one_kernel(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
         from codesign_jax.engines.structured.fused import Limits, Program
 
         # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
         limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
         program = Program.here(self.scene, limits, ctrl.dtype)
-        found, end = program.simulate(hand_lanes(self.scene, fields), self.reset(fields), ctrl)
-        qpos = jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
+        hand = hand_lanes(self.scene, fields)
+        found, end = program.simulate(hand, self.reset(fields), ctrl, trajectory=trajectory)
+        qpos = found.get("qpos", jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype))
         status = self._status(found["residual"])
         return Trace(
             found["distance"], found["height"], found["speed"], qpos, status, self._flat(end)
@@ -348,6 +338,8 @@ def _has_kernel() -> bool:
     return backend == "gpu" or (backend == "cpu" and find_spec("llvmlite") is not None)
 
 
-def in_kernel(e: Effects) -> bool:
-    """Whether the fused kernel simulates a scene's effects; the batch form simulates all."""
-    return e.wrist and e.object_table and e.friction == "coulomb" and not e.neo_hookean
+def in_kernel(scene: Scene) -> bool:
+    """Whether the fused kernel and the stream simulate a scene; the batch form simulates all."""
+    # The stream moves worlds between lanes; a mesh's grid belongs to no world.
+    meshes = any(o.type == "mesh" for o in scene.objects.object)
+    return not (meshes or scene.effects.surface == "hull" or scene.effects.finger_finger)

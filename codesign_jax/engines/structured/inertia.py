@@ -142,11 +142,12 @@ def bodies(run: Stages, hand: HandLanes, kin: Kinematics) -> Bodies:
     )
 
 
-def _softening(hand: HandLanes, angle: jax.Array, width: float) -> jax.Array:
-    """As `model.softening_moments`, for angles of shape (link, 1, finger, world)."""
-    assert hand.section is not None
-    height, wall, segment = hand.section
-    return hand.stiffness[:, :1] * angle * softening(angle / segment, height, wall, width=width)
+def softening_moment(
+    section: jax.Array, stiffness: jax.Array, angle: jax.Array, width: float
+) -> jax.Array:
+    """As `model.softening_moments`: of a section (3, finger, world), stiffness and bend angles."""
+    height, wall, segment = section
+    return stiffness * angle * softening(angle / segment, height, wall, width=width)
 
 
 def smooth_forces(
@@ -180,7 +181,8 @@ def smooth_forces(
     finger = -hand.stiffness * state.finger - hand.damping * state.finger_vel
     bend = finger[:, :1] + hand.gain * pressure
     if hand.section is not None:
-        bend = bend + _softening(hand, state.finger[:, :1], scene.hand.section.width)
+        width, angle = scene.hand.section.width, state.finger[:, :1]
+        bend = bend + softening_moment(hand.section, hand.stiffness[:, :1], angle, width)
     finger = jnp.concatenate([bend, finger[:, 1:]], 1)
     links = run(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
     return Smooth(

@@ -45,3 +45,15 @@ def _turn(quat: jax.Array, omega: jax.Array, h: float) -> jax.Array:
         ]
     )
     return turned / jnp.sqrt(total([turned[i] ** 2 for i in range(4)]))
+
+
+def rigid_arm(frame: jax.Array, wrist: jax.Array, velocity: jax.Array, h: float) -> jax.Array:
+    """Acceleration of the palm's coordinates that ends the step at the arm frame.
+
+    Args:
+      frame: Pose of the arm frame, shape (6, ...).
+      wrist: The palm's coordinates, same shape.
+      velocity: Their velocities, same shape.
+      h: Time step.
+    """
+    return ((frame - wrist) / h - velocity) / h

@@ -19,10 +19,8 @@ from codesign_jax.engines.structured.contact import (
 from codesign_jax.engines.structured.kinematics import Acc
 from codesign_jax.engines.structured.lanes import (
     Stages,
-    cross,
     dot,
     scan_links,
-    spatial,
     sum_axis,
     sum_fingers,
     sum_items,
@@ -32,6 +30,7 @@ from codesign_jax.engines.structured.problem import (
     Matrices,
     Problem,
     Spatial,
+    object_acceleration,
     on_links,
     relative,
     work,
@@ -150,8 +149,7 @@ def substitute(run: Stages, problem: Problem, done: Eliminated) -> tuple[Acc, Sp
     _, (fingers, motions) = scan_links(
         next_link, palm + jnp.zeros_like(like), (kin.axes, done.fingers.factors)
     )
-    at_centre = spatial(obj[:3], obj[3:] - cross(kin.object_pos, obj[:3]))
-    acc = Acc(jnp.concatenate(joints), fingers, at_centre)
+    acc = Acc(jnp.concatenate(joints), fingers, object_acceleration(obj, kin.object_pos))
     return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
 
 

@@ -79,6 +79,11 @@ def object_motion(acc: jax.Array, position: jax.Array) -> jax.Array:
     return spatial(acc[:3], acc[3:] + cross(position, acc[:3]))
 
 
+def object_acceleration(motion: jax.Array, position: jax.Array) -> jax.Array:
+    """Inverse of `object_motion`."""
+    return spatial(motion[:3], motion[3:] - cross(position, motion[:3]))
+
+
 def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
     """Spatial accelerations J a of all bodies, without velocity terms."""
     palm = run(palm_motion, acc.wrist, kin.wrist_axes)

@@ -20,8 +20,8 @@ from codesign_jax.engines.structured.lanes import sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
 
-# Numbers of a contact in the scratch table, by name.
-FIELDS = {"point": 3, "normal": 3, "gap": 1, "jar": 3, "step": 3, "ray": 5}
+# Rows of a contact's cone and numbers of its line, by friction model.
+ROWS = {"none": (3, 2), "coulomb": (3, 5), "full": (6, 5)}
 
 
 def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
@@ -50,7 +50,9 @@ class ContactSet:
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """The set's part of the scratch table."""
-        return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in FIELDS.items()}
+        rows, ray = ROWS[self.scene.effects.friction]
+        fields = {"point": 3, "normal": 3, "gap": 1, "jar": rows, "step": rows, "ray": ray}
+        return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in fields.items()}
 
     def bind(self, table: Table, ref: Any, friction: Lanes) -> "BoundContacts":
         """The set in a kernel's memory; friction is that of each world's object."""
@@ -151,7 +153,7 @@ class BoundContacts:
             along = c.relative(step[:, None])
             line = contact.line(c, jar, along)
             first, _ = contact.slopes(c, line, 0.0)
-            return along, jnp.stack(line), sum_axis(first, 0)
+            return along, jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
 
         def compute() -> list[Lanes]:
             jar = self.read("jar", item)
@@ -167,7 +169,8 @@ class BoundContacts:
 
         def both(gap, friction, ray, alpha):
             c = Contacts(gap, gap, gap, self.set.cone(friction))
-            first, second = contact.slopes(c, Line(*(ray[i] for i in range(5))), alpha)
+            line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
+            first, second = contact.slopes(c, line, alpha)
             return [sum_axis(first, 0), sum_axis(second, 0)]
 
         def compute() -> list[Lanes]:

@@ -86,17 +86,20 @@ class Program:
             sets.append(make("finger_table", self.links, k))
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
-        return [*sets, make("object_table", -(-4 // self.fingers), 1)]
+        on_table = [make("object_table", -(-4 // self.fingers), 1)] if e.object_table else []
+        return [*sets, *on_table]
 
     def _tables(self) -> None:
         n, a = self.links, self.axes
         one: tuple[int, ...] = ()
-        spheres = {"sphere": (n, (3, self.k)), "radius": (n, (self.k,))} if self.k else {}
+        more = {"sphere": (n, (3, self.k)), "radius": (n, (self.k,))} if self.k else {}
         if palm_touches(self.scene):
-            spheres |= {
+            more |= {
                 "palm_point": (self.palm_groups, (3, 1)),
                 "palm_radius": (self.palm_groups, (1,)),
             }
+        if self.scene.effects.neo_hookean:
+            more |= {"section": (1, (3,))}
         self.hand = Table(
             True,
             mount=(1, (3, 3)),
@@ -111,7 +114,7 @@ class Program:
             stiffness=(n, (a,)),
             damping=(n, (a,)),
             armature=(n, (a,)),
-            **spheres,
+            **more,
         )
         self.world = Table(
             False,
@@ -163,6 +166,8 @@ class Program:
         arrays["share"] = share.at[jnp.array([0, self.links])].set(0.5)
         if palm_touches(self.scene):
             arrays |= self._palm_slots(worlds, dtype)
+        if hand.section is not None:
+            arrays["section"] = hand.section[None]
         extra = self.fingers - n
         if extra:
             for name in ("share", "mass", "inertia", "gain"):
@@ -224,7 +229,7 @@ class Program:
         return self.simulate(hand, state, ctrl)[0]
 
     def simulate(
-        self, hand: HandLanes, state: State, ctrl: jax.Array
+        self, hand: HandLanes, state: State, ctrl: jax.Array, *, trajectory: bool = False
     ) -> tuple[dict[str, jax.Array], State]:
         """Runs a rollout.
 
@@ -232,9 +237,11 @@ class Program:
           hand: Constants of the worlds.
           state: Their start states.
           ctrl: Controls, shape (world, time, nu).
+          trajectory: Whether to record qpos.
 
         Returns:
-          `TRACE` by name, shape (world, time), and the last states.
+          `TRACE` by name, shape (world, time), with "qpos", shape (world, time, nq), if it is
+          recorded; and the last states.
         """
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         blocks, steps, dtype = inputs[0].shape[0], ctrl.shape[1], ctrl.dtype
@@ -246,6 +253,9 @@ class Program:
             (scratch, self.scratch.rows, self.size),
             (blocks, steps, len(TRACE), self.block),
         ]
+        if trajectory:
+            angles, places = self._path_rows()
+            shapes += [(blocks, steps, angles, self.size), (blocks, steps, places, self.block)]
 
         def spec(shape: tuple[int, ...]) -> pl.BlockSpec:
             own = shape[0] == blocks
@@ -264,12 +274,28 @@ class Program:
         if self.backend == "interpreter":
             out = call(*inputs)
         else:
-            kernel = Kernel(repr((self.scene, self.limits)), self.backend, self.size)
-            out = launch(call, inputs, outputs, kernel)
+            origin = repr((self.scene, self.limits, trajectory))
+            out = launch(call, inputs, outputs, Kernel(origin, self.backend, self.size))
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(TRACE))[: ctrl.shape[0]]
         found = {name: trace[..., k] for k, name in enumerate(TRACE)}
+        if trajectory:
+            found["qpos"] = self._qpos(out[4], out[5])[: ctrl.shape[0]]
         return found, self.unpack_state(out[0], out[1], ctrl.shape[0])
+
+    def _path_rows(self) -> tuple[int, int]:
+        """Rows of the state's tables that are positions, the first of each."""
+        return self.fine.offset["finger_vel"], self.rest.offset["wrist_vel"]
+
+    def _qpos(self, angles: jax.Array, places: jax.Array) -> jax.Array:
+        """MuJoCo's qpos (world, time, nq) of recorded rows (block, time, row, lane or world)."""
+        steps = angles.shape[1]
+        split = (-1, steps, self.links, self.axes, self.fingers, self.block)
+        joints = angles.reshape(split)[..., : self.num_fingers, :]
+        joints = joints.transpose(0, 5, 1, 4, 2, 3)  # (block, world, time, finger, link, axis)
+        joints = joints.reshape(-1, steps, self.num_fingers * self.links * self.axes)
+        rest = jnp.moveaxis(places, 3, 1).reshape(-1, steps, places.shape[2])
+        return jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
 
     def unpack_state(self, fine: jax.Array, rest: jax.Array, worlds: int) -> State:
         """Inverse of `pack_state`."""
@@ -279,7 +305,7 @@ class Program:
         return State(**wide, **narrow, acc=acc)
 
     def _kernel(self, steps: int, *refs: Any) -> None:
-        hand, world, fine0, rest0, arm, pressure, fine, rest, scratch, trace = refs
+        hand, world, fine0, rest0, arm, pressure, fine, rest, scratch, trace, *path = refs
         block = Block(self.fingers, self.block)
         step = Step(self, block, hand, world, fine, rest, scratch)
         own = block.world
@@ -289,17 +315,26 @@ class Program:
         limits, far = self.scene.limits, self.scene.cost.lost_distance
         alive = self.world.read(world, "alive", 0, own).lane
 
+        def record(t: jax.Array) -> None:
+            if path:
+                angles, places = self._path_rows()
+                _copy(fine, path[0], angles, at=(t,))
+                _copy(rest, path[1], places, own, at=(t,))
+
         def body(carry: tuple) -> tuple:
             t, alive, speed = carry
+
+            def judge(distance: jax.Array, height: jax.Array) -> jax.Array:
+                lost = (distance >= far) & (t >= start) & (t < end)
+                return ~lost & (height >= -limits.penetration)
+
+            record(t)
             commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)
             chamber = lanes([pressure[t]], (), wide=True)
-            entry, new_speed, good = step.advance(commands, chamber, alive > 0, speed)
+            entry, new_speed, moved = step.advance(commands, chamber, judge, alive > 0, speed)
             for k, value in enumerate((*entry[:2], speed, *entry[2:])):
                 trace[t, k, own] = value
-            lost = (entry[0] >= far) & (t >= start) & (t < end)
-            failed = ~good | (entry[1] < -limits.penetration)
-            alive = jnp.where(lost | failed, 0.0, alive)
-            return t + 1, alive, jnp.where(speed <= limits.speed, new_speed, speed)
+            return t + 1, jnp.where(moved, alive, 0.0), new_speed
 
         def going(carry: tuple) -> jax.Array:
             return (carry[0] < steps) & anywhere(carry[1] > 0)
@@ -309,6 +344,7 @@ class Program:
         )
 
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
+            record(t)
             for k in range(len(TRACE)):
                 last = trace[jnp.maximum(done - 1, 0), k, own]
                 trace[t, k, own] = speed if k == 2 else last
@@ -317,9 +353,11 @@ class Program:
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))
 
 
-def _copy(source: Any, target: Any, rows: int, *where: jax.Array) -> None:
+def _copy(source: Any, target: Any, rows: int, *where: jax.Array, at: tuple = ()) -> None:
+    """Copies the first rows; `at`: what comes before the row in the target."""
+
     def one(k: jax.Array, x: jax.Array) -> jax.Array:
-        target[(k, *where)] = source[(k, *where)]
+        target[(*at, k, *where)] = source[(k, *where)]
         return x
 
     jax.lax.fori_loop(0, rows, one, jnp.int32(0))

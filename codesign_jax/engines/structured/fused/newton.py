@@ -18,9 +18,9 @@ from codesign_jax.engines.structured.fused.tables import (
     upper,
 )
 from codesign_jax.engines.structured.inertia import Body
-from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
+from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.problem import Forces, Matrices
+from codesign_jax.engines.structured.problem import Forces, Matrices, object_acceleration
 
 
 class Palm(NamedTuple):
@@ -97,9 +97,17 @@ LINE_TOLERANCE = 0.01
 class Newton:
     """The solver of one step in a kernel."""
 
-    def __init__(self, links: int, block: Block, m: Memory, palm: Palm):
-        """Takes the step's memory, in which the forward pass has left its results."""
-        self.links, self.block, self.m, self.palm = links, block, m, palm
+    def __init__(self, links: int, block: Block, m: Memory, palm: Palm, *, rigid: bool = False):
+        """Takes the step's memory, in which the forward pass has left its results.
+
+        Args:
+          links: Moving links of a finger.
+          block: The lanes.
+          m: The memory.
+          palm: Palm, wrist and object.
+          rigid: Whether the wrist's accelerations are known, see `Problem.arm`.
+        """
+        self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
         self.fingers = [c for n, c in m.contacts.items() if n.startswith("finger")]
         self.slots = [c for n, c in m.contacts.items() if not n.startswith("finger")]
         self.like = jnp.zeros((block.size,), palm.armature.dtype)
@@ -195,6 +203,10 @@ class Newton:
             )
             matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
             node = newton.add_palm(node, matrices, force, pushes)
+            if self.rigid:
+                obj = el.solve_object(direct, node.q, node.r_object)
+                none = jnp.zeros_like(obj)
+                return Iterate(none, object_acceleration(obj, palm.position), none, obj)
             arm = palm.armature
             node, hinges = el.eliminate(direct, node, palm.axes, arm[3:], force.wrist[3:])
             slide_axes = newton.wrist_slides(arm)
@@ -202,7 +214,7 @@ class Newton:
             obj = el.solve_object(direct, node.q, node.r_object)
             first, motion = el.substitute(slide_axes, slides, jnp.zeros_like(obj), obj)
             second, motion = el.substitute(palm.axes, hinges, motion, obj)
-            at_centre = spatial(obj[:3], obj[3:] - cross(palm.position, obj[:3]))
+            at_centre = object_acceleration(obj, palm.position)
             return Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
 
         return lanewise(solve, now, self.palm, node, slots)

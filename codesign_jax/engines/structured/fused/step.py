@@ -1,5 +1,6 @@
 """One time step of a block of worlds, inside the kernel."""
 
+from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,7 @@ from codesign_jax.engines.structured.fused.newton import (
 from codesign_jax.engines.structured.fused.tables import Block
 from codesign_jax.engines.structured.hand import apply_columns
 from codesign_jax.engines.structured.inertia import Body
-from codesign_jax.engines.structured.integration import integrate
+from codesign_jax.engines.structured.integration import integrate, rigid_arm
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -59,18 +60,19 @@ class Step:
         """Constants of worlds."""
         return [self.p.world.read(self.world, n, 0, self.block.world) for n in names]
 
-    def advance(self, arm: Lanes, pressure: Lanes, waiting: Any, speed: Any):
+    def advance(self, arm: Lanes, pressure: Lanes, judge: Callable, waiting: Any, speed: Any):
         """Advances the block.
 
         Args:
           arm: Commands of the arm frame, shape (6, 1, world).
           pressure: Chamber pressures, lanes.
+          judge: Whether a world goes on after this step, from distance and height before it.
           waiting: Worlds whose convergence is waited for.
           speed: Largest velocity before the step.
 
         Returns:
-          Trace entries distance, height, residual and iterations; speed after the step; whether
-          the step is good.
+          Trace entries distance, height, residual and iterations; speed after the step; worlds
+          that have moved, and so go on.
         """
         p, scene = self.p, self.p.scene
         state = {n: p.rest.read(self.rest, n, 0, self.block.world) for n in p.rest.groups}
@@ -82,11 +84,13 @@ class Step:
         bound = {c.name: c.bind(p.scratch, self.scratch, friction) for c in p.sets}
         memory = Memory(p.hand, self.hand, p.fine, self.fine, p.scratch, self.scratch, bound)
         now, centre = self._forward(state, geometry, pressure, memory, (size, shape))
-        newton = Newton(p.links, self.block, memory, geometry["palm"])
+        rigid = not scene.effects.wrist
+        newton = Newton(p.links, self.block, memory, geometry["palm"], rigid=rigid)
         now, quality = newton.solve(now, waiting, *p.limits)
         distance = lanewise(_distance, state["position"], state["wrist"], centre).lane
         height = state["position"][2].lane
-        new_speed, good = self._integrate(state, geometry, now, height, speed)
+        goes_on = waiting & judge(distance, height)
+        new_speed, good = self._integrate(state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
         return (distance, height, quality.residual.lane, count), new_speed, good
 
@@ -95,6 +99,7 @@ class Step:
         w, g = self.p.scene.hand.wrist, self.p.scene.gravity_on
         names = ("palm_mass", "palm_centre", "palm_inertia", "wrist_damping", "wrist_armature")
         constants = self.constants(*names, "object_mass", "object_inertia")
+        wrist, h = self.p.scene.effects.wrist, self.p.scene.discretization.timestep
 
         def compute(state: dict, arm, mass, centre, tensor, damping, armature, obj, principal):
             frame, axes, vel, bias = kin._wrist(state["wrist"], state["wrist_vel"])
@@ -107,6 +112,8 @@ class Step:
             error = arm - state["wrist"]
             spring = jnp.stack([stiffness[i] * error[i] for i in range(6)])
             acc = state["acc_wrist"], state["acc_object"]
+            if not wrist:
+                acc = rigid_arm(arm, state["wrist"], state["wrist_vel"], h), acc[1]
             motions = palm_motion(acc[0], axes), object_motion(acc[1], position)
             return {
                 "frame": frame,
@@ -152,6 +159,8 @@ class Step:
             names = ("offset", "mass", "centre", "inertia", "stiffness", "damping")
             constants = [p.hand.read(self.hand, n, i) for n in names]
             gain = p.hand.read(self.hand, "gain")
+            soft = p.scene.effects.neo_hookean
+            section = p.hand.read(self.hand, "section") if soft else None
             joint = [p.fine.read(self.fine, n, i) for n in ("finger", "finger_vel", "acc")]
             out = lanewise(
                 partial(_link, p.scene, self.p.lay.axes),
@@ -160,6 +169,7 @@ class Step:
                 joint,
                 gain,
                 pressure,
+                section,
             )
             carry, stored = out
             stored |= {"step_acc": zeros((p.axes,), like), "step_motion": wide}
@@ -219,8 +229,9 @@ class Step:
             centre = lanewise(lambda f, s: apply_columns(f[:, :, None], s), at["frame"], point)
             for name in palm:
                 create(name, i, self._geometry(name, centre, radius, at, shape))
-        slots = self._table_points(state, at, shape)
-        for i in range(m.contacts["object_table"].set.count):
+        on_table = m.contacts.get("object_table")
+        slots = self._table_points(state, at, shape) if on_table else []
+        for i in range(on_table.set.count if on_table else 0):
             part = [slots[k] for k in range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))]
             create("object_table", i, self._deal(part))
 
@@ -255,11 +266,11 @@ class Step:
             dealt.append(lanes(parts, (len(parts), 1), wide=True))
         return tuple(dealt)  # type: ignore[return-value]
 
-    def _integrate(self, state: dict, at: dict, now: Iterate, height: Any, speed: Any):
-        """Semi-implicit Euler; a step that fails leaves the state as it was.
+    def _integrate(self, state: dict, at: dict, now: Iterate, goes_on: Any, speed: Any):
+        """Semi-implicit Euler; worlds that are decided or whose step fails stay as they were.
 
         Returns:
-          Largest velocity after the step, and whether the step is good, shapes (1, world).
+          Largest velocity after the step, and whether the world has moved, shapes (1, world).
         """
         p, h = self.p, self.p.scene.discretization.timestep
         new = lanewise(partial(_moved, h), state, at["columns"], now.wrist, now.object)
@@ -276,8 +287,7 @@ class Step:
         fingers = loop(p.links, link, zeros((), like), p.size).lane
         largest = _worse(size.lane, self.block.fold(fingers, _worse))
         limit = p.scene.limits
-        good = (speed <= limit.speed) & (largest <= limit.speed)
-        good = good & (height >= -limit.penetration)
+        good = goes_on & (speed <= limit.speed) & (largest <= limit.speed)
         acc = {"acc_wrist": now.wrist, "acc_object": now.object}
         for name, value in {**new, **acc}.items():
             kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
@@ -292,10 +302,10 @@ class Step:
             return x
 
         jax.lax.fori_loop(0, p.links, store, jnp.int32(0))
-        return largest, good
+        return jnp.where(goes_on & (speed <= limit.speed), largest, speed), good
 
 
-def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, pressure):
+def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, pressure, section):
     """A link's kinematics, inertia and forces."""
     origin, frame, vel, bias, motion = parent
     offset, mass, centre, principal, stiffness, damping = constants
@@ -310,7 +320,11 @@ def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, 
         inertia.principal_tensor(frame, principal),
     )
     tau = -stiffness * q - damping * rate
-    tau = jnp.concatenate([tau[:1] + gain * pressure, tau[1:]])
+    bend = tau[:1] + gain * pressure
+    if section is not None:
+        width = scene.hand.section.width
+        bend = bend + inertia.softening_moment(section, stiffness[:1], q[:1], width)
+    tau = jnp.concatenate([bend, tau[1:]])
     stored = {
         "axes": axes,
         "body_centre": body.centre,

@@ -40,10 +40,10 @@ lose their object, and designs around 64 mm and an arm height of 0 mm, which hol
   (C and Warp: MuJoCo's defaults; MJX: one iteration with four of the line search). The structured
   engine's tolerance is a relative Newton decrement: `default` 1e-6, `tight` 1e-8, `loose` 1e-4;
   `unison` steps all worlds together.
-* Compile times are a fresh process's with empty caches, tracing included; in brackets with the
-  program in the persistent cache. Rates are medians of the repeats without it. Warp's do not
-  include the making of the model fields and the costs, the others' do; its kernels are cached on
-  disk, so that only the first of its cases compiles cold.
+* Compile times are a fresh process's with empty caches, tracing included; in brackets those of a
+  second one that finds the program in the persistent cache. Rates are medians of the repeats
+  without it. Warp's do not include the making of the model fields and the costs, the others' do;
+  its kernels are cached on disk, so that only the first of its cases compiles cold.
 * Memory is the device's peak on a GPU and the process's resident set on a CPU.
 """
 
@@ -150,8 +150,7 @@ Read from these tables:
 * Stock MJX steps 64 worlds a second: two thousand times fewer.
 * Linear in links (exponent 0.93 from 10 to 40) and in fingers (1.02).
 * Compiling: most is Python that traces the kernel. A new process that finds its machine code and
-  XLA's program in the cache does neither; the number in brackets still traces, because the case was
-  the first of its process.
+  XLA's program in the cache does neither.
 """.strip(),
     "h200": """
 Read from these tables:

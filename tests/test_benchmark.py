@@ -1,5 +1,7 @@
 """The benchmark's statistics against closed forms and SciPy, its worlds, and its book-keeping."""
 
+import json
+
 import jax
 import numpy as np
 import pytest
@@ -102,3 +104,14 @@ def test_a_second_run_replaces_its_cases():
 
 def test_exponent_of_a_power_law():
     assert report.exponent([10, 20, 40], [1.0, 2.0**1.5, 4.0**1.5]) == pytest.approx(1.5)
+
+
+@pytest.mark.slow
+def test_a_second_process_finds_the_program(tmp_path):
+    """Its start is measured from the cache that the first one filled."""
+    values = {"engine": "structured", "setting": "default", "kind": "window", "worlds": [2]}
+    values |= {"seconds": 60.0, "repeats": 1, "steps": 4, "distinct": 2, "reference": 2}
+    case = cases.Case({**values, "variant": {"links": 3}}, tmp_path / "records.jsonl")
+    case.run()
+    record = json.loads((tmp_path / "records.jsonl").read_text())
+    assert 0 < record["cached_start_s"] < record["trace_s"] + record["compile_s"]

@@ -89,18 +89,24 @@ def test_kernel_equals_the_engine(grasp):
     assert float(got["residual"].max()) < 1e-6
 
 
-def test_kernel_becomes_ptx(grasp):
-    """Every operation of the kernel has its instruction; what has none is named."""
-    scene, fields, ctrl = grasp
-    program = Program(scene, Limits(8, 8, 1e-6))
-    engine = StructuredEngine(scene)
-    lowered = (
-        jax.jit(lambda f, c: program.run(hand_lanes(scene, f), engine.reset(f), c))
-        .trace(fields, ctrl)
-        .lower(lowering_platforms=("cuda",))
-        .as_text()
-    )
-    assert "__gpu$xla.gpu.ptx" in lowered and "fma.rn.f32" in lowered
+@pytest.mark.parametrize("effects", [{}, {"friction": "full", "neo_hookean": True, "wrist": False}])
+def test_kernel_becomes_ptx(effects):
+    """Every operation of the kernel has its instruction, with each effect and a trajectory."""
+    scene = small.pinch("cylinder", links=2, **{f"effects__{k}": v for k, v in effects.items()})
+    params, trials = small.random_worlds(scene, 3, 3)
+    fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
+    ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :20]
+    program, engine = Program(scene, Limits(8, 8, 1e-6)), StructuredEngine(scene)
+
+    def run(f, c):
+        return program.simulate(hand_lanes(scene, f), engine.reset(f), c, trajectory=bool(effects))
+
+    text = jax.jit(run).trace(fields, ctrl).lower(lowering_platforms=("cuda",)).as_text()
+    assert "__gpu$xla.gpu.ptx" in text and "fma.rn.f32" in text
+
+
+def test_what_has_no_ptx_is_named():
+    """Instead of a wrong result."""
     jaxpr = jax.make_jaxpr(jnp.tanh)(1.0)
     with pytest.raises(NotImplementedError, match="tanh"):
         ptx.Assembler().run(jaxpr.jaxpr, [], [ptx.Value("f32", "%f0")])

@@ -93,9 +93,9 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _compile(record: dict[str, Any]) -> str:
-    cached = record.get("cached_compile_s")
     text = f"{record['trace_s'] + record['compile_s']:.1f}"
-    return text if cached is None else f"{text} ({record['trace_s'] + cached:.1f})"
+    cached = record.get("cached_start_s")
+    return text if cached is None else f"{text} ({cached:.1f})"
 
 
 def grasp_table(results: dict[str, Any]) -> list[list[str]]:

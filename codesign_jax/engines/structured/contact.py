@@ -201,9 +201,9 @@ class Line(NamedTuple):
 
     n0: jax.Array
     n1: jax.Array
-    uu: jax.Array | None
-    uv: jax.Array | None
-    vv: jax.Array | None
+    uu: jax.Array
+    uv: jax.Array
+    vv: jax.Array
 
 
 def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> Line:

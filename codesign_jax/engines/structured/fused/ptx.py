@@ -7,40 +7,18 @@ Source of the instructions: NVIDIA, Parallel Thread Execution ISA 8.
 """
 
 import struct
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from codesign_jax.engines.structured.fused.walk import (
-    COMPARE,
-    COSINE,
-    SINE,
-    Walker,
-    quarter_turn_parts,
-    swapped_lanes,
-)
+from codesign_jax.engines.structured.fused.ptx_rules import LANES, RULES, Value, kind_of
+from codesign_jax.engines.structured.fused.walk import Walker
 
 HEADER = ".version 7.8\n.target sm_80\n.address_size 64\n"
-LANES = 32
 AHEAD = 600
 """Lines of a loop between asking for a row and reading it, about the time that memory takes."""
 LAUNCH = f".maxntid {LANES}, 1, 1\n"
-
-
-class Value(NamedTuple):
-    """A register or number of each thread.
-
-    Attributes:
-      kind: "f32", "s32" or "pred".
-      name: Register, or None for a number.
-      number: The number, or what is to be added to the register (s32).
-    """
-
-    kind: str
-    name: str | None
-    number: Any = 0
 
 
 class Ref(NamedTuple):
@@ -62,13 +40,6 @@ class Ahead(NamedTuple):
     offsets: list[int]
 
 
-def kind_of(aval: Any) -> str:
-    """Type of registers for an array."""
-    if aval.dtype == np.bool_:
-        return "pred"
-    return "s32" if np.issubdtype(aval.dtype, np.integer) else "f32"
-
-
 def immediate(kind: str, number: Any) -> str:
     """A number as an operand."""
     if kind == "f32":
@@ -80,6 +51,7 @@ class Assembler(Walker):
     """Writes the instructions of one kernel."""
 
     language = "PTX"
+    rules = RULES
 
     def __init__(self) -> None:
         """Starts empty."""
@@ -143,7 +115,8 @@ class Assembler(Walker):
     def pointer(self, ref: Ref, indices: list[Value]) -> str:
         """Operand [register + offset] of an element, its index in each dimension given."""
         strides = np.cumprod([1, *ref.shape[:0:-1]])[::-1]
-        offset, parts = 0, []
+        offset = 0
+        parts: list[tuple[str, int]] = []
         for index, stride in zip(indices, strides, strict=True):
             offset += 4 * int(stride) * int(index.number)
             if index.name is not None:
@@ -153,14 +126,13 @@ class Assembler(Walker):
             key = ("at", address, name, stride)
             found = next((s[key] for s in self.known if key in s), None)
             if found is None:
-                found = Value("u64", self.register("u64"))
-                wide = self.register("u64")
+                place, wide = self.register("u64"), self.register("u64")
                 self.emit(f"mul.wide.s32 {wide}, {name}, {stride};")
-                self.emit(f"add.u64 {found.name}, {address}, {wide};")
-                self.known[-1][key] = found
+                self.emit(f"add.u64 {place}, {address}, {wide};")
+                self.known[-1][key] = found = Value("u64", place)
                 grown = self.growth.get(address, 0) + stride * self.growth.get(name, 0)
-                self.growth[found.name] = grown
-                self.born[found.name] = len(self.lines)
+                self.growth[place], self.born[place] = grown, len(self.lines)
+            assert found.name is not None
             address = found.name
         return f"[{address}+{offset}]" if offset >= 0 else f"[{address}{offset}]"
 
@@ -327,205 +299,6 @@ class Assembler(Walker):
         """See `Walker`."""
         at = self.pointer(ref, self.indices(ref, equation, leaves))
         self.emit(f"st.global.f32 {at}, {self.operand(value)};")
-
-
-def _same_kind(name: str) -> Callable:
-    def rule(asm: Assembler, equation: Any, *args: Value) -> Value:
-        kind = args[0].kind
-        return asm.compute(kind, f"{name}.{kind}", *args)
-
-    return rule
-
-
-def _add(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
-    if a.kind == "s32" and (a.name is None or b.name is None):
-        return Value("s32", a.name or b.name, int(a.number) + int(b.number))
-    return asm.compute(a.kind, f"add.{a.kind}", a, b)
-
-
-def _sub(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
-    if a.kind == "s32" and b.name is None:
-        return a._replace(number=int(a.number) - int(b.number))
-    result = asm.compute(a.kind, f"sub.{a.kind}", a, b)
-    if a.name is None and b.name in asm.growth:
-        asm.growth[result.name] = -asm.growth[b.name]  # type: ignore[index]
-    return result
-
-
-def _mul(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
-    if a.kind == "s32":
-        if a.name is None and b.name is None:
-            return Value("s32", None, int(a.number) * int(b.number))
-        for x, y in ((a, b), (b, a)):
-            if y.name is None and y.number == 1:
-                return x
-        result = asm.compute("s32", "mul.lo.s32", a, b)
-        for x, y in ((a, b), (b, a)):
-            if x.name in asm.growth and y.name is None:
-                asm.growth[result.name] = asm.growth[x.name] * int(y.number)  # type: ignore[index]
-        return result
-    return asm.compute("f32", "mul.f32", a, b)
-
-
-def _div(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
-    return asm.compute(a.kind, "div.full.f32" if a.kind == "f32" else "div.s32", a, b)
-
-
-def _compare(name: str) -> Callable:
-    def rule(asm: Assembler, equation: Any, a: Value, b: Value) -> Value:
-        if a.kind == "pred":
-            different = asm.compute("pred", "xor.pred", a, b)
-            return different if name == "ne" else asm.compute("pred", "not.pred", different)
-        # A comparison with what is not a number is false, but "not equal" is true.
-        test = "neu" if name == "ne" and a.kind == "f32" else name
-        if a.name is None and b.name is not None:
-            a, b = b, a
-            test = {"lt": "gt", "gt": "lt", "le": "ge", "ge": "le"}.get(test, test)
-        return asm.compute("pred", f"setp.{test}.{a.kind}", a, b)
-
-    return rule
-
-
-def _logic(name: str) -> Callable:
-    def rule(asm: Assembler, equation: Any, *args: Value) -> Value:
-        if args[0].kind != "pred":
-            return asm.compute("s32", f"{name}.b32", *args)
-        return asm.compute("pred", f"{name}.pred", *args)
-
-    return rule
-
-
-def _select(asm: Assembler, equation: Any, which: Value, no: Value, yes: Value) -> Value:
-    if no.kind == "pred":
-        first = asm.compute("pred", "and.pred", which, yes)
-        negated = asm.compute("pred", "not.pred", which)
-        second = asm.compute("pred", "and.pred", negated, no)
-        return asm.compute("pred", "or.pred", first, second)
-    return asm.compute(no.kind, f"selp.{no.kind}", yes, no, which)
-
-
-def _convert(asm: Assembler, equation: Any, x: Value) -> Value:
-    kind = kind_of(equation.outvars[0].aval)
-    if kind == x.kind:
-        return x
-    if x.name is None:
-        return Value(kind, None, x.number)
-    if x.kind == "pred":
-        return asm.compute(kind, f"selp.{kind}", Value(kind, None, 1), Value(kind, None, 0), x)
-    if kind == "pred":
-        return asm.compute("pred", f"setp.ne.{x.kind}", x, Value(x.kind, None, 0))
-    return asm.compute(kind, "cvt.rn.f32.s32" if kind == "f32" else "cvt.rzi.s32.f32", x)
-
-
-def _power(asm: Assembler, equation: Any, x: Value) -> Value:
-    result = x
-    for _ in range(abs(equation.params["y"]) - 1):
-        result = asm.compute("f32", "mul.f32", result, x)
-    if equation.params["y"] < 0:
-        result = asm.compute("f32", "div.full.f32", Value("f32", None, 1.0), result)
-    return result
-
-
-def _number(value: float) -> Value:
-    return Value("f32", None, value)
-
-
-def _turn(asm: Assembler, x: Value) -> tuple[Value, Value]:
-    """Quarter turns of an angle and what is left, within pi / 4 (Cody and Waite's reduction)."""
-    scaled = asm.compute("f32", "mul.f32", x, _number(2 / np.pi))
-    turns = asm.compute("f32", "cvt.rni.f32.f32", scaled)
-    rest = x
-    for part in quarter_turn_parts():
-        rest = asm.compute("f32", "fma.rn.f32", turns, _number(-part), rest)
-    return asm.compute("s32", "cvt.rzi.s32.f32", turns), rest
-
-
-def _polynomial(asm: Assembler, x: Value, coefficients: tuple[float, ...]) -> Value:
-    result = _number(coefficients[0])
-    for c in coefficients[1:]:
-        result = asm.compute("f32", "fma.rn.f32", result, x, _number(c))
-    return result
-
-
-def _sine(shift: int) -> Callable:
-    """Sine, or with a shift of one quarter turn cosine, by Taylor's polynomials to 1e-8."""
-
-    def rule(asm: Assembler, equation: Any, x: Value) -> Value:
-        turns, r = _turn(asm, x)
-        square = asm.compute("f32", "mul.f32", r, r)
-        odd = _polynomial(asm, square, SINE)
-        sine = asm.compute("f32", "mul.f32", odd, r)
-        cosine = _polynomial(asm, square, COSINE)
-        quarter = asm.compute("s32", "add.s32", turns, shift)
-        low = asm.compute("s32", "and.b32", quarter, 1)
-        swapped = asm.compute("pred", "setp.ne.s32", low, 0)
-        value = asm.compute("f32", "selp.f32", cosine, sine, swapped)
-        high = asm.compute("s32", "and.b32", quarter, 2)
-        flipped = asm.compute("pred", "setp.ne.s32", high, 0)
-        negative = asm.compute("f32", "neg.f32", value)
-        return asm.compute("f32", "selp.f32", negative, value, flipped)
-
-    return rule
-
-
-def _sign(asm: Assembler, equation: Any, x: Value) -> Value:
-    below = asm.compute("pred", "setp.lt.f32", x, _number(0))
-    above = asm.compute("pred", "setp.gt.f32", x, _number(0))
-    up = asm.compute("f32", "selp.f32", _number(1), _number(0), above)
-    return asm.compute("f32", "selp.f32", _number(-1), up, below)
-
-
-def _lane(asm: Assembler, equation: Any, *args: Value) -> Value:
-    return Value("s32", "%lane")
-
-
-def _reverse(asm: Assembler, equation: Any, x: Value) -> Value:
-    lanes = swapped_lanes(equation.invars[0].aval.shape, equation.params["dimensions"])
-    mask = int(lanes[0])
-    assert (lanes == np.arange(LANES) ^ mask).all(), "lanes that do not swap in pairs"
-    if x.name is None:
-        return x
-    result = Value(x.kind, asm.register(x.kind))
-    asm.emit(f"shfl.sync.bfly.b32 {result.name}, {x.name}, {mask}, 31, 0xffffffff;")
-    return result
-
-
-def _over_lanes(asm: Assembler, equation: Any, x: Value) -> Value:
-    # Never remembered: a loop's condition is computed anew.
-    result = Value("s32", asm.register("s32"))
-    asm.emit(f"redux.sync.max.s32 {result.name}, {asm.operand(x)}, 0xffffffff;")
-    return result
-
-
-Assembler.rules = {
-    "add": _add,
-    "add_any": _add,
-    "sub": _sub,
-    "mul": _mul,
-    "div": _div,
-    "neg": _same_kind("neg"),
-    "abs": _same_kind("abs"),
-    "max": _same_kind("max"),
-    "min": _same_kind("min"),
-    "rem": _same_kind("rem"),
-    "sqrt": lambda asm, e, x: asm.compute("f32", "sqrt.approx.f32", x),
-    "rsqrt": lambda asm, e, x: asm.compute("f32", "rsqrt.approx.f32", x),
-    "square": lambda asm, e, x: asm.compute("f32", "mul.f32", x, x),
-    "integer_pow": _power,
-    "sin": _sine(0),
-    "cos": _sine(1),
-    "sign": _sign,
-    **{name: _compare(name) for name in COMPARE},
-    "and": _logic("and"),
-    "or": _logic("or"),
-    "xor": _logic("xor"),
-    "not": _logic("not"),
-    "select_n": _select,
-    "convert_element_type": _convert,
-    "iota": _lane,
-    "rev": _reverse,
-    "reduce_max": _over_lanes,
-}
 
 
 def counters(jaxpr: Any, consts: int) -> list[int]:

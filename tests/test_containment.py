@@ -43,9 +43,9 @@ def batches():
 
 @pytest.fixture(scope="module")
 def traces(batches):
-    """Of both batches by the structured engine in two lanes, with trajectories."""
+    """Of both batches by the structured engine, with trajectories."""
     the_scene, *both = batches
-    engine = StructuredEngine(the_scene, lanes=2)
+    engine = StructuredEngine(the_scene)
     run = jax.jit(lambda f, c: engine.rollout(f, c, trajectory=True))
     return [jax.tree.map(np.asarray, run(*batch)) for batch in both]
 

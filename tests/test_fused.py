@@ -81,7 +81,7 @@ def test_kernel_equals_the_engine(grasp):
     run = jax.jit(lambda f, c: program.run(hand_lanes(scene, f), engine.reset(f), c))
     got = run(fields, ctrl)
     with jax.default_matmul_precision("highest"):
-        want = jax.jit(lambda f, c: engine._rollout(f, c, False))(fields, ctrl)
+        want = jax.jit(lambda f, c: engine._rollout(f, c, trajectory=False))(fields, ctrl)
     # Both stop at a decrement of 1e-7; what is left grows over 230 steps in float32.
     np.testing.assert_allclose(got["distance"], want.distance, atol=1e-4)
     np.testing.assert_allclose(got["height"], want.height, atol=1e-4)
@@ -121,7 +121,7 @@ def test_machine_code_equals_the_engine(grasp):
         ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :300]
         settings = dict(iterations=60, evaluations=30, tolerance=1e-18)
         got, want = (
-            jax.jit(StructuredEngine(scene, fused=fused, lanes=0, **settings).rollout)(fields, ctrl)
+            jax.jit(StructuredEngine(scene, fused=fused, **settings).rollout)(fields, ctrl)
             for fused in (True, False)
         )
     moved = np.abs(np.diff(np.asarray(want.height), axis=1)).max()
@@ -154,7 +154,7 @@ def test_machine_code_has_the_effects(name):
         got, want = (
             jax.jit(
                 partial(
-                    StructuredEngine(scene, fused=fused, lanes=0, **settings).rollout,
+                    StructuredEngine(scene, fused=fused, **settings).rollout,
                     trajectory=True,
                 )
             )(fields, ctrl)

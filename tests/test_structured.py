@@ -106,8 +106,8 @@ def test_float32_is_close_to_float64():
     assert error < 1e-4
 
 
-def test_streamed_worlds():
-    """Early ends change no verdict, the lanes' other worlds no bit, and the motion is the same."""
+def test_worlds_that_end_early():
+    """They change no verdict, the block's other worlds no bit, and the motion is the same."""
     with jax.enable_x64(True):
         scene = small.pinch("cylinder")
         # On the way to this distance nothing is ever decided: every world runs to the end.
@@ -123,21 +123,21 @@ def test_streamed_worlds():
         back = jax.tree.map(lambda v: v[::-1], params)
         trials = small.stack(*[trial] * len(lengths))
 
-        def traces(scene, lanes, *batches):
-            engine = StructuredEngine(scene, tolerance=1e-16, iterations=30, lanes=lanes)
+        def traces(scene, fused, *batches):
+            engine = StructuredEngine(scene, tolerance=1e-16, iterations=30, fused=fused)
             run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t)[1])
             return [jax.tree.map(np.asarray, run(p, trials)) for p in batches]
 
-        (unison,) = traces(scene, 0, params)
-        early, reverse = traces(scene, 4, params, back)
-        (full,) = traces(patient, 4, params)
+        (unison,) = traces(scene, False, params)
+        early, reverse = traces(scene, True, params, back)
+        (full,) = traces(patient, True, params)
         read = jax.vmap(lambda t: cost.outcome(scene, t))
         short, long = (jax.tree.map(np.asarray, read(t)) for t in (early, full))
     assert np.ptp(short.cost) > 1.0  # they end at very different times
     for field, whole in zip(short, long, strict=True):
         np.testing.assert_array_equal(field, whole)
     np.testing.assert_array_equal(reverse.distance[::-1], early.distance)
-    # Resumed iterations differ by rounding. From the lift on slipping multiplies a difference by
+    # Sums in another order differ by rounding. From the lift on slipping multiplies a difference by
     # ten every three steps, a change of 1e-14 in the length as well, so the comparison ends there.
     np.testing.assert_allclose(full.distance[:, :380], unison.distance[:, :380], atol=1e-10)
 

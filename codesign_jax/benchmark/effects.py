@@ -169,7 +169,7 @@ def compile_steps(
       new: Whether a program that is not among them is compiled.
       step: From hand, state and controls (nu, world) to the next state; by default the engine's.
     """
-    engine = StructuredEngine(scene, lanes=0, fused=False)
+    engine = StructuredEngine(scene, fused=False)
     fields, ctrl = inputs(scene, worlds)
     hand = hand_lanes(scene, fields)
     q, v = (jnp.asarray(x, fields.start.dtype) for x in (at.qpos, at.qvel))

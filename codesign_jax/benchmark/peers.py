@@ -1,6 +1,5 @@
 """Engines and the settings at which they are measured."""
 
-import inspect
 from typing import Any
 
 import jax
@@ -23,7 +22,7 @@ STRUCTURED: dict[str, dict[str, Any]] = {
     "default": {},
     "tight": {"iterations": 48, "tolerance": 1e-8},
     "loose": {"iterations": 6, "tolerance": 1e-4},
-    "unison": {"lanes": 0},
+    "unison": {"fused": False},
 }
 REFERENCE = {"iterations": 300, "ls_iterations": 100, "tolerance": 1e-15}
 """Solver values at which MuJoCo C finds the solution to rounding."""
@@ -53,14 +52,7 @@ def build(engine: str, setting: str, scene: Scene) -> Engine:
         return make_engine("mujoco", scene)
     if engine != "structured":
         return make_engine(engine, scene)
-    arguments = dict(STRUCTURED[setting])
-    known = inspect.signature(StructuredEngine.__init__).parameters
-    if setting == "unison" and "lanes" not in known:
-        arguments.pop("lanes")
-    built = StructuredEngine(scene, **arguments)
-    if setting == "unison" and hasattr(built, "fused"):
-        built.fused = False  # the batch engine instead of the kernel, whose blocks run on their own
-    return built
+    return StructuredEngine(scene, **STRUCTURED[setting])
 
 
 def how(engine: str, setting: str) -> str:

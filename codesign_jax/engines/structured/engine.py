@@ -24,14 +24,10 @@ from codesign_jax.engines.structured.integration import integrate, rigid_arm
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
 from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.engines.structured.problem import Matrices, Problem, Spatial
-from codesign_jax.engines.structured.stream import Queue, stream
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status, Trace
-
-LANES = 60
-"""Worlds in flight on a core: their arrays fit its L2 cache."""
 
 
 class StepInfo(NamedTuple):
@@ -68,8 +64,6 @@ class StructuredEngine:
         differentiable: bool = False,
         checkpoint: bool = True,
         fused: bool | None = None,
-        lanes: int | None = None,
-        burst: int = 3,
     ):
         """Prepares the engine.
 
@@ -83,10 +77,8 @@ class StructuredEngine:
           checkpoint: Whether the derivative of a rollout stores only states and accelerations and
             repeats the rest of each step; costs nothing without a derivative.
           fused: Whether one kernel runs a rollout where it can: scenes of `in_kernel`, on a GPU in
-            float32. By default unless `lanes` is given.
-          lanes: Worlds in flight at once without the kernel, see `stream`; 0 steps all worlds in
-            unison. By default `LANES` on a CPU and 0 elsewhere.
-          burst: Newton iterations of a round of the stream.
+            float32. Without it all worlds step in unison, to the end of the rollout. By default
+            where kernels can be compiled.
 
         Raises:
           SceneError: If a mesh's distance cannot be put on a grid.
@@ -97,11 +89,8 @@ class StructuredEngine:
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
-        if fused is None:
-            fused = lanes is None and _has_kernel()
-        lanes = (LANES if self.conditional else 0) if lanes is None else lanes
-        self.fused, self.lanes = fused and not differentiable, 0 if differentiable else lanes
-        self.burst = burst
+        fused = _has_kernel() if fused is None else fused
+        self.fused, self.differentiable = fused and not differentiable, differentiable
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -242,9 +231,9 @@ class StructuredEngine:
         if fits and self.fused and (self.conditional or ctrl.dtype == jnp.float32):
             return on_all_cores(partial(self._one_kernel, trajectory=trajectory), fields, ctrl)
         with jax.default_matmul_precision("highest"):
-            if self.lanes and fits:
-                return on_all_cores(partial(self._stream, trajectory=trajectory), fields, ctrl)
-            return self._rollout(fields, ctrl, trajectory)
+            if self.conditional and not self.differentiable:
+                return on_all_cores(partial(self._rollout, trajectory=trajectory), fields, ctrl)
+            return self._rollout(fields, ctrl, trajectory=trajectory)
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
         from codesign_jax.engines.structured.fused import Limits, Program
@@ -260,28 +249,7 @@ class StructuredEngine:
             found["distance"], found["height"], found["speed"], qpos, status, self._flat(end)
         )
 
-    def _stream(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
-        def advance(hand: HandLanes, state: State, u: jax.Array):
-            new, info = self.step(hand, state, u, iterations=self.burst)
-            resumed = state._replace(acc=info.acc)
-            # Not `<=`: a world that is no longer finite must advance, to fail.
-            solved = ~(info.residual[0] > self.tolerance)
-            return new, resumed, solved, info.centre
-
-        queue = Queue(hand_lanes(self.scene, fields), self.reset(fields), ctrl)
-        return stream(
-            self.scene,
-            queue,
-            advance,
-            self._speed,
-            self.qpos,
-            self._flat,
-            lanes=self.lanes,
-            max_rounds=-(-self.iterations // self.burst),
-            trajectory=trajectory,
-        )
-
-    def _rollout(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
+    def _rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
         hand, limits = hand_lanes(self.scene, fields), self.scene.limits
         step = self._checkpointed() if self.checkpoint else self.step
 
@@ -339,7 +307,6 @@ def _has_kernel() -> bool:
 
 
 def in_kernel(scene: Scene) -> bool:
-    """Whether the fused kernel and the stream simulate a scene; the batch form simulates all."""
-    # The stream moves worlds between lanes; a mesh's grid belongs to no world.
+    """Whether the fused kernel simulates a scene; the batch form simulates all."""
     meshes = any(o.type == "mesh" for o in scene.objects.object)
     return not (meshes or scene.effects.surface == "hull" or scene.effects.finger_finger)

@@ -95,5 +95,5 @@ def load(path: Path, settings: dict[str, object]) -> Arrays:
     different = [k for k in {*found, *wanted} if found.get(k) != wanted.get(k)]
     if different:
         text = "; ".join(f"{k}: {found.get(k)} there, {wanted.get(k)} here" for k in different)
-        raise StateError(f"{path} belongs to another experiment ({text}); --fresh starts anew")
+        raise StateError(f"{path} belongs to another experiment ({text}); delete it to start anew")
     return record

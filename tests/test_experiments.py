@@ -420,7 +420,7 @@ def test_the_script_stops_resumes_and_draws(tmp_path):
     drawn = call("figures", "--data", str(tmp_path), "--figures", str(tmp_path / "figures"))
     assert drawn.returncode == 0 and (tmp_path / "figures" / "fig7a_success.png").exists()
     refused = call(*run, "--seed", "7")
-    assert refused.returncode == 1 and "--fresh" in refused.stderr
+    assert refused.returncode == 1 and "delete it" in refused.stderr
 
 
 @pytest.mark.slow

@@ -144,11 +144,12 @@ READ = {
     "cpu": """
 Read from these tables:
 
-* The structured engine's kernel does 19 times the grasps of MuJoCo C on both cores, at 60 and at
-  360 worlds, and 17 times those of its own batch form (`unison`), which it replaced as the default
-  on CPUs. Same verdicts on all 360 grasps.
+* The structured engine's kernel does 16 times the grasps of MuJoCo C on both cores, at 60 and at
+  360 worlds; 19 and 21 times in other runs, as the virtual machine's speed changes by half between
+  hours and not alike for both. Same verdicts on all 360 grasps. Its own batch form (`unison`), in
+  which hull and meshes run, was measured in a faster hour.
 * Stock MJX steps 64 worlds a second: two thousand times fewer.
-* Linear in links (exponent 0.93 from 10 to 40) and in fingers (1.02).
+* Linear in links and in fingers.
 * Compiling: most is Python that traces the kernel. A new process that finds its machine code and
   XLA's program in the cache does neither.
 """.strip(),

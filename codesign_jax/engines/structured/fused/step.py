@@ -92,7 +92,9 @@ class Step:
         goes_on = waiting & judge(distance, height)
         new_speed, good = self._integrate(state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
-        return (distance, height, quality.residual.lane, count), new_speed, good
+        # A decided world is not iterated for: what it is short of says nothing.
+        residual = jnp.where(waiting, quality.residual.lane, 0.0)
+        return (distance, height, residual, count), new_speed, good
 
     def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
         """Kinematics, inertia and smooth forces of palm, wrist and object."""

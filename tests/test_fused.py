@@ -134,10 +134,8 @@ def test_machine_code_equals_the_engine(grasp):
 
 
 EFFECTS = {
-    "no friction": {"effects__friction": "none"},
-    "torsion and rolling": {"effects__friction": "full"},
-    "rigid arm": {"effects__wrist": False},
-    "neo-Hookean": {"effects__neo_hookean": True},
+    "no friction, rigid arm": {"effects__friction": "none", "effects__wrist": False},
+    "full friction, neo-Hookean": {"effects__friction": "full", "effects__neo_hookean": True},
     "object without a table": {"effects__object_table": False, "effects__gravity": False},
 }
 

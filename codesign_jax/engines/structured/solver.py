@@ -5,7 +5,7 @@ implicit terms. A contact acts on a link as a wrench and a 6 x 6 contact inertia
 elimination from the finger tips to the object solves the Newton system.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,11 @@ class Solution(NamedTuple):
     acc: Acc
     residual: jax.Array
     iterations: jax.Array
+
+
+def along(alpha: jax.Array, value: Any, step: Any) -> Any:
+    """A tree of arrays moved by alpha times another one."""
+    return jax.tree.map(lambda v, s: v + alpha * s, value, step)
 
 
 FAR = 3e38
@@ -141,7 +146,7 @@ def solve(
         speed = c.relative(relative(name, velocity, c))
         return c.relative(relative(name, motion, c)) - c.reference(speed)
 
-    def along(name: str, c: Contacts, motion: Spatial) -> jax.Array:
+    def jar_of(name: str, c: Contacts, motion: Spatial) -> jax.Array:
         if c.ends is not None:
             return finger_pairs.jar_of(runs[name], c, motion.link)
         return runs[name](lambda c, m: c.relative(relative(name, m, c)), c, motion)
@@ -161,17 +166,14 @@ def solve(
         step, step_motion = linear_solve(run, problem, force, pushes, pairs, idle)
         slope = -work(run, force, step, step_motion)
         curvature = work(run, inertial_forces(run, problem, step, step_motion), step, step_motion)
-        jar_step = {n: along(n, c, step_motion) for n, c in contacts.items()}
+        jar_step = {n: jar_of(n, c, step_motion) for n, c in contacts.items()}
         alpha = line_search(runs, contacts, jar, jar_step, slope, curvature, evaluations)
         # A world that is done stays as it is, so that its result does not depend on the others.
         done = before <= tolerance
         alpha = jnp.where(done, 0.0, alpha)
         residual = decrement(slope, pushes, step_motion, pairs) / _scale(problem, motion)
 
-        def advance(old, new):
-            return jax.tree.map(lambda a, p: a + alpha * p, old, new)
-
-        acc, motion, jar = advance((acc, motion, jar), (step, step_motion, jar_step))
+        acc, motion, jar = along(alpha, (acc, motion, jar), (step, step_motion, jar_step))
         return acc, motion, jar, jnp.where(done, before, residual), count + 1
 
     def going(carry):

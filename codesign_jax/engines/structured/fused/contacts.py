@@ -18,6 +18,7 @@ from codesign_jax.engines.structured.fused.tables import (
 )
 from codesign_jax.engines.structured.lanes import sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.solver import along
 from codesign_jax.scene import Scene
 
 # Rows of a contact's cone and numbers of its line, by friction model.
@@ -137,7 +138,7 @@ class BoundContacts:
 
         def compute() -> list[Lanes]:
             jar, step = self.read("jar", item), self.read("step", item)
-            jar = lanewise(lambda a, j, s: j + a * s, alpha, jar, step)
+            jar = lanewise(along, alpha, jar, step)
             self.write("jar", jar, item)
             matrix, wrench = lanewise(response, *self._contacts(item), self.friction, jar)
             return [upper(matrix), wrench]
@@ -150,10 +151,10 @@ class BoundContacts:
 
         def ray(point, normal, gap, friction, jar, step):
             c = Contacts(point, normal, gap, self.set.cone(friction))
-            along = c.relative(step[:, None])
-            line = contact.line(c, jar, along)
+            change = c.relative(step[:, None])
+            line = contact.line(c, jar, change)
             first, _ = contact.slopes(c, line, 0.0)
-            return along, jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
+            return change, jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
 
         def compute() -> list[Lanes]:
             jar = self.read("jar", item)

@@ -137,8 +137,17 @@ class Writer(Walker):
         return Value("f", args[0].wide, self.emit(f"call contract {kind} @{full}({operands})"))
 
     def fma(self, a: Value, b: Value, c: Value) -> Value:
-        """The product of a and b plus c, rounded once."""
+        """See `Walker`."""
         return self.intrinsic("fma", a, b, c)
+
+    def nearest(self, x: Value) -> Value:
+        """See `Walker`."""
+        return self.intrinsic("rint", x)
+
+    def whole(self, x: Value) -> Value:
+        """See `Walker`."""
+        text = self.emit(f"fptosi {self.typed(x)} to {self.type('i', x.wide)}")
+        return Value("i", x.wide, text)
 
     def select(self, which: Value, yes: Value, no: Value) -> Value:
         """Lane by lane one of two values."""

@@ -5,12 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from codesign_jax.engines.structured.fused.walk import (
-    COSINE,
-    SINE,
-    quarter_turn_parts,
-    swapped_lanes,
-)
+from codesign_jax.engines.structured.fused.walk import SHARED, swapped_lanes
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.fused.llvm import Writer
@@ -126,64 +121,15 @@ def _convert(w: "Writer", equation: Any, x: Value) -> Value:
     return Value(kind, x.wide, text)
 
 
-def _one(w: "Writer", value: float) -> Value:
-    return Value("f", False, None, value)
+def _rsqrt(w: "Writer", equation: Any, x: Value) -> Value:
+    return w.apply("div", w.constant(np.asarray(1.0)), w.intrinsic("sqrt", x))
 
 
-def _divide(w: "Writer", a: Value, b: Value) -> Value:
-    return w.compute("fdiv contract", a, b)
-
-
-def _power(w: "Writer", equation: Any, x: Value) -> Value:
-    result = x
-    for _ in range(abs(equation.params["y"]) - 1):
-        result = w.compute("fmul contract", result, x)
-    return result if equation.params["y"] > 0 else _divide(w, _one(w, 1.0), result)
-
-
-def _turn(w: "Writer", x: Value) -> tuple[Value, Value]:
-    """Quarter turns of an angle and what is left, within pi / 4 (Cody and Waite's reduction)."""
-    turns = w.intrinsic("rint", w.compute("fmul contract", x, _one(w, 2 / np.pi)))
-    rest = x
-    for part in quarter_turn_parts():
-        rest = w.fma(turns, _one(w, -part), rest)
-    text = w.emit(f"fptosi {w.typed(turns)} to {w.type('i', turns.wide)}")
-    return Value("i", turns.wide, text), rest
-
-
-def _polynomial(w: "Writer", x: Value, coefficients: tuple[float, ...]) -> Value:
-    result = _one(w, coefficients[0])
-    for c in coefficients[1:]:
-        result = w.fma(result, x, _one(w, c))
-    return result
-
-
-def _sine(shift: int) -> Callable:
-    """Sine, or with a shift of one quarter turn cosine, by Taylor's polynomials to 1e-8."""
-
+def _angle(name: str) -> Callable:
     def rule(w: "Writer", equation: Any, x: Value) -> Value:
-        if w.itemsize == 8:
-            return w.intrinsic("cos" if shift else "sin", x)
-        turns, r = _turn(w, x)
-        square = w.compute("fmul contract", r, r)
-        sine = w.compute("fmul contract", _polynomial(w, square, SINE), r)
-        cosine = _polynomial(w, square, COSINE)
-        quarter = w.compute("add", turns, Value("i", False, None, shift))
-
-        def bit(k: int) -> Value:
-            masked = w.compute("and", quarter, Value("i", False, None, k))
-            return w.compute("icmp ne", masked, Value("i", False, None, 0), kind="b")
-
-        value = w.select(bit(1), cosine, sine)
-        return w.select(bit(2), w.compute("fneg", value), value)
+        return w.intrinsic(name, x) if w.itemsize == 8 else SHARED[name](w, equation, x)
 
     return rule
-
-
-def _sign(w: "Writer", equation: Any, x: Value) -> Value:
-    below = w.compute("fcmp olt", x, _one(w, 0), kind="b")
-    above = w.compute("fcmp ogt", x, _one(w, 0), kind="b")
-    return w.select(below, _one(w, -1), w.select(above, _one(w, 1), _one(w, 0)))
 
 
 def _iota(w: "Writer", equation: Any, *args: Value) -> Value:
@@ -204,6 +150,7 @@ def _over_lanes(w: "Writer", equation: Any, x: Value) -> Value:
 
 
 RULES: dict[str, Callable] = {
+    **SHARED,
     "add": _arithmetic("add"),
     "add_any": _arithmetic("add"),
     "sub": _arithmetic("sub"),
@@ -215,12 +162,9 @@ RULES: dict[str, Callable] = {
     "max": _extreme("gt"),
     "min": _extreme("lt"),
     "sqrt": lambda w, e, x: w.intrinsic("sqrt", x),
-    "rsqrt": lambda w, e, x: _divide(w, _one(w, 1.0), w.intrinsic("sqrt", x)),
-    "square": lambda w, e, x: w.compute("fmul contract", x, x),
-    "integer_pow": _power,
-    "sin": _sine(0),
-    "cos": _sine(1),
-    "sign": _sign,
+    "rsqrt": _rsqrt,
+    "sin": _angle("sin"),
+    "cos": _angle("cos"),
     **{name: _compare(name) for name in _COMPARE},
     "and": _logic("and"),
     "or": _logic("or"),

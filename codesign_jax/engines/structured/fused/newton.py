@@ -85,11 +85,6 @@ def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
     return {"finger_table": link, "palm_table": palm, "object_table": obj}[name]
 
 
-def along(alpha: jax.Array, value: Any, step: Any) -> Any:
-    """A tree of arrays moved by alpha times another one."""
-    return jax.tree.map(lambda v, s: v + alpha * s, value, step)
-
-
 LINE_TOLERANCE = 0.01
 """Slope at which a line search ends, over the first one: MuJoCo's default `ls_tolerance`."""
 
@@ -132,7 +127,7 @@ class Newton:
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
         """Moves a link's "acc" or "motion" along its step and returns it."""
-        value = lanewise(along, alpha, *self.read(name, f"step_{name}", item=item))
+        value = lanewise(solver.along, alpha, *self.read(name, f"step_{name}", item=item))
         self.write(name, value, item)
         return value
 
@@ -364,7 +359,7 @@ class Newton:
             floor = jnp.where(waiting & (before.lane > tolerance), floor, solver.FAR)
             alpha = self.line_search(slope, curvature, first, floor, evaluations)
             alpha, residual = lanewise(hold, before, alpha, residual)
-            now = lanewise(along, alpha, now, step)
+            now = lanewise(solver.along, alpha, now, step)
             return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:

@@ -103,6 +103,18 @@ class Assembler(Walker):
         self.known[-1][key] = result
         return result
 
+    def fma(self, a: Value, b: Value, c: Value) -> Value:
+        """See `Walker`."""
+        return self.compute("f32", "fma.rn.f32", a, b, c)
+
+    def nearest(self, x: Value) -> Value:
+        """See `Walker`."""
+        return self.compute("f32", "cvt.rni.f32.f32", x)
+
+    def whole(self, x: Value) -> Value:
+        """See `Walker`."""
+        return self.compute("s32", "cvt.rzi.s32.f32", x)
+
     def move(self, target: str, value: Value) -> None:
         """Copies into a register."""
         if value.kind == "pred":

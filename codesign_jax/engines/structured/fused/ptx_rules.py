@@ -5,13 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from codesign_jax.engines.structured.fused.walk import (
-    COMPARE,
-    COSINE,
-    SINE,
-    quarter_turn_parts,
-    swapped_lanes,
-)
+from codesign_jax.engines.structured.fused.walk import COMPARE, SHARED, swapped_lanes
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.fused.ptx import Assembler
@@ -129,64 +123,6 @@ def _convert(asm: "Assembler", equation: Any, x: Value) -> Value:
     return asm.compute(kind, "cvt.rn.f32.s32" if kind == "f32" else "cvt.rzi.s32.f32", x)
 
 
-def _power(asm: "Assembler", equation: Any, x: Value) -> Value:
-    result = x
-    for _ in range(abs(equation.params["y"]) - 1):
-        result = asm.compute("f32", "mul.f32", result, x)
-    if equation.params["y"] < 0:
-        result = asm.compute("f32", "div.full.f32", Value("f32", None, 1.0), result)
-    return result
-
-
-def _number(value: float) -> Value:
-    return Value("f32", None, value)
-
-
-def _turn(asm: "Assembler", x: Value) -> tuple[Value, Value]:
-    """Quarter turns of an angle and what is left, within pi / 4 (Cody and Waite's reduction)."""
-    scaled = asm.compute("f32", "mul.f32", x, _number(2 / np.pi))
-    turns = asm.compute("f32", "cvt.rni.f32.f32", scaled)
-    rest = x
-    for part in quarter_turn_parts():
-        rest = asm.compute("f32", "fma.rn.f32", turns, _number(-part), rest)
-    return asm.compute("s32", "cvt.rzi.s32.f32", turns), rest
-
-
-def _polynomial(asm: "Assembler", x: Value, coefficients: tuple[float, ...]) -> Value:
-    result = _number(coefficients[0])
-    for c in coefficients[1:]:
-        result = asm.compute("f32", "fma.rn.f32", result, x, _number(c))
-    return result
-
-
-def _sine(shift: int) -> Callable:
-    """Sine, or with a shift of one quarter turn cosine, by Taylor's polynomials to 1e-8."""
-
-    def rule(asm: "Assembler", equation: Any, x: Value) -> Value:
-        turns, r = _turn(asm, x)
-        square = asm.compute("f32", "mul.f32", r, r)
-        odd = _polynomial(asm, square, SINE)
-        sine = asm.compute("f32", "mul.f32", odd, r)
-        cosine = _polynomial(asm, square, COSINE)
-        quarter = asm.compute("s32", "add.s32", turns, shift)
-        low = asm.compute("s32", "and.b32", quarter, 1)
-        swapped = asm.compute("pred", "setp.ne.s32", low, 0)
-        value = asm.compute("f32", "selp.f32", cosine, sine, swapped)
-        high = asm.compute("s32", "and.b32", quarter, 2)
-        flipped = asm.compute("pred", "setp.ne.s32", high, 0)
-        negative = asm.compute("f32", "neg.f32", value)
-        return asm.compute("f32", "selp.f32", negative, value, flipped)
-
-    return rule
-
-
-def _sign(asm: "Assembler", equation: Any, x: Value) -> Value:
-    below = asm.compute("pred", "setp.lt.f32", x, _number(0))
-    above = asm.compute("pred", "setp.gt.f32", x, _number(0))
-    up = asm.compute("f32", "selp.f32", _number(1), _number(0), above)
-    return asm.compute("f32", "selp.f32", _number(-1), up, below)
-
-
 def _lane(asm: "Assembler", equation: Any, *args: Value) -> Value:
     return Value("s32", "%lane")
 
@@ -210,6 +146,7 @@ def _over_lanes(asm: "Assembler", equation: Any, x: Value) -> Value:
 
 
 RULES: dict[str, Callable] = {
+    **SHARED,
     "add": _add,
     "add_any": _add,
     "sub": _sub,
@@ -222,11 +159,6 @@ RULES: dict[str, Callable] = {
     "rem": _same_kind("rem"),
     "sqrt": lambda asm, e, x: asm.compute("f32", "sqrt.approx.f32", x),
     "rsqrt": lambda asm, e, x: asm.compute("f32", "rsqrt.approx.f32", x),
-    "square": lambda asm, e, x: asm.compute("f32", "mul.f32", x, x),
-    "integer_pow": _power,
-    "sin": _sine(0),
-    "cos": _sine(1),
-    "sign": _sign,
     **{name: _compare(name) for name in COMPARE},
     "and": _logic("and"),
     "or": _logic("or"),

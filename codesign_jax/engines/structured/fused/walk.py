@@ -44,6 +44,66 @@ def swapped_lanes(shape: tuple[int, ...], dimensions: tuple[int, ...]) -> np.nda
     return np.flip(np.arange(np.prod(shape)).reshape(shape), dimensions).ravel()
 
 
+def _power(w: "Walker", equation: Any, x: Any) -> Any:
+    result, y = x, equation.params["y"]
+    for _ in range(abs(y) - 1):
+        result = w.apply("mul", result, x)
+    return result if y > 0 else w.apply("div", w.constant(np.asarray(1.0)), result)
+
+
+def _sign(w: "Walker", equation: Any, x: Any) -> Any:
+    none, one, minus = (w.constant(np.asarray(v)) for v in (0.0, 1.0, -1.0))
+    below, above = w.apply("lt", x, none), w.apply("gt", x, none)
+    return w.apply("select_n", below, w.apply("select_n", above, none, one), minus)
+
+
+def _turn(w: "Walker", x: Any) -> tuple[Any, Any]:
+    """Quarter turns of an angle and what is left, within pi / 4 (Cody and Waite's reduction)."""
+    turns = w.nearest(w.apply("mul", x, w.constant(np.asarray(2 / np.pi))))
+    rest = x
+    for part in quarter_turn_parts():
+        rest = w.fma(turns, w.constant(np.asarray(-part)), rest)
+    return w.whole(turns), rest
+
+
+def _polynomial(w: "Walker", x: Any, coefficients: tuple[float, ...]) -> Any:
+    result, *rest = (w.constant(np.asarray(c)) for c in coefficients)
+    for c in rest:
+        result = w.fma(result, x, c)
+    return result
+
+
+def _sine(shift: int) -> Callable:
+    """Sine, or with a shift of one quarter turn cosine, by Taylor's polynomials to 1e-8."""
+
+    def rule(w: "Walker", equation: Any, x: Any) -> Any:
+        turns, r = _turn(w, x)
+        square = w.apply("mul", r, r)
+        sine = w.apply("mul", _polynomial(w, square, SINE), r)
+        cosine = _polynomial(w, square, COSINE)
+        quarter = w.apply("add", turns, w.constant(np.asarray(shift)))
+
+        def bit(k: int) -> Any:
+            masked = w.apply("and", quarter, w.constant(np.asarray(k)))
+            return w.apply("ne", masked, w.constant(np.asarray(0)))
+
+        value = w.apply("select_n", bit(1), sine, cosine)
+        flipped = bit(2)
+        return w.apply("select_n", flipped, value, w.apply("neg", value))
+
+    return rule
+
+
+SHARED: dict[str, Callable] = {
+    "square": lambda w, e, x: w.apply("mul", x, x),
+    "integer_pow": _power,
+    "sign": _sign,
+    "sin": _sine(0),
+    "cos": _sine(1),
+}
+"""Rules of operations that are made of others, in any language."""
+
+
 class Walker:
     """Writes instructions; a language adds values, memory, control flow and rules.
 
@@ -57,6 +117,22 @@ class Walker:
 
     def constant(self, array: np.ndarray) -> Any:
         """The value of a literal or captured array."""
+        raise NotImplementedError
+
+    def apply(self, name: str, *args: Any) -> Any:
+        """The result of an operation that needs no parameters."""
+        return self.rules[name](self, None, *args)
+
+    def fma(self, a: Any, b: Any, c: Any) -> Any:
+        """The product of a and b plus c, rounded once."""
+        raise NotImplementedError
+
+    def nearest(self, x: Any) -> Any:
+        """The nearest whole number, a float."""
+        raise NotImplementedError
+
+    def whole(self, x: Any) -> Any:
+        """A float without its fraction, an integer."""
         raise NotImplementedError
 
     def same(self, equation: Any, value: Any) -> Any:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import optax
 
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import apply_columns, hand_lanes
+from codesign_jax.engines.structured.constants import apply_columns, world_constants
 from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
@@ -67,7 +67,7 @@ def tip_positions(scene: Scene, fields: ModelFields, qpos: jax.Array) -> jax.Arr
       qpos: Generalized positions, shape (time, nq).
     """
     world = jax.tree.map(lambda v: v[None], fields)
-    hand = hand_lanes(scene, world)
+    hand = world_constants(scene, world)
     # Times stand in for worlds: all of them see the same hand.
     times = world._replace(start=qpos)
     state = StructuredEngine(scene).reset(times)

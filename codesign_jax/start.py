@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kinematics import straight
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
@@ -42,7 +42,7 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     are straight.
     """
     engine = StructuredEngine(scene)
-    state, hand = engine.reset(fields), hand_lanes(scene, fields)
+    state, hand = engine.reset(fields), world_constants(scene, fields)
     contacts = engine.contacts(Stages(None), hand, straight(hand, state), state.wrist[2])
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in contacts.values()]
     return jnp.stack(found).max(0)

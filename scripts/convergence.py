@@ -22,8 +22,8 @@ from codesign_jax import control, cost, model, parameters, rollout, scene
 from codesign_jax.benchmark import measure
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.fused import Limits, Program
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.types import Trace, failed
 
 SCENE = scene.load("paper")
@@ -57,7 +57,7 @@ def outcome(trace: Any) -> tuple[np.ndarray, np.ndarray]:
 def kernel(limits: Limits, fields: model.ModelFields, ctrl: jax.Array) -> tuple[Any, dict]:
     """Trace of the kernel, and its time, iterations and share of steps above tolerance."""
     engine, program = StructuredEngine(SCENE), Program.here(SCENE, limits, ctrl.dtype)
-    run = jax.jit(lambda f, c: program.run(hand_lanes(SCENE, f), engine.reset(f), c))
+    run = jax.jit(lambda f, c: program.run(world_constants(SCENE, f), engine.reset(f), c))
     jax.block_until_ready(run(fields, ctrl))
     start = time.perf_counter()
     found = jax.block_until_ready(run(fields, ctrl))

@@ -19,7 +19,7 @@ import tyro
 
 from codesign_jax import control, model, parameters, rollout, scene
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.types import Trial
 
@@ -51,7 +51,7 @@ class Case:
         fields = jax.vmap(lambda p, t: model.model_fields(self.scene, p, Trial(*t)))(*batch)
         self.ctrl = jax.vmap(lambda p, t: control.commands(self.scene, p, Trial(*t)))(*batch)
         self.engine = StructuredEngine(self.scene, tolerance=1e-10, iterations=60, evaluations=12)
-        self.hand, self.state = hand_lanes(self.scene, fields), self.engine.reset(fields)
+        self.hand, self.state = world_constants(self.scene, fields), self.engine.reset(fields)
 
     def settle(self) -> None:
         """Steps to just before the lift."""

@@ -26,7 +26,7 @@ from codesign_jax.accuracy.store import Case, Store
 from codesign_jax.accuracy.timing import name
 from codesign_jax.commands import optimize
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 
 ROOT = Path(__file__).parents[1]
 
@@ -176,7 +176,7 @@ def test_states_and_accelerations_translate_between_the_engines(grasp):
 
         @jax.jit
         def run(batch, state, ctrl):
-            hand = hand_lanes(small, batch)
+            hand = world_constants(small, batch)
             acc = engine.step(hand, state, ctrl)[1].acc
             return acc, impulse.grip(engine, hand, state, ctrl, acc)
 

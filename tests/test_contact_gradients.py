@@ -7,7 +7,7 @@ import pytest
 
 from codesign_jax import model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.lanes import Stages
 from tests import small
 from tests.test_structured import lanes_state
@@ -43,7 +43,7 @@ def test_step_against_central_differences(effect):
         qvel = 0.3 * random.normal(size=len(qpos) - 1)
         along_q, along_v = random.normal(size=len(qpos)), random.normal(size=len(qvel))
         along_q[-4:] = 0.0  # the quaternion stays one
-        weights, lanes = random.normal(size=len(qvel)), hand_lanes(scene, fields)
+        weights, lanes = random.normal(size=len(qvel)), world_constants(scene, fields)
         ctrl = jnp.asarray([*qpos[:6], 6e4, 6e4])[:, None]
         contacts = jax.jit(lambda s: engine.problem(Stages(None), lanes, s, ctrl)[0].contacts)
         name = {"hull": "hull_object"}.get(effect, effect)

@@ -17,8 +17,8 @@ from codesign_jax.benchmark.program_cost import program_size
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.fused import Limits, Program
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import Limits, Program
 from tests import small
 from tests.test_structured import lanes_state
 
@@ -74,7 +74,7 @@ def test_steps_equal_mujocos(name):
     with jax.enable_x64(True):
         scene, oracle, fields, ctrl = setting(SETTINGS[name])
         engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand = hand_lanes(scene, jax.tree.map(lambda x: jnp.asarray(x)[None], fields))
+        hand = world_constants(scene, jax.tree.map(lambda x: jnp.asarray(x)[None], fields))
         step, data, most = jax.jit(engine.step, compiler_options=QUICK), mujoco.MjData(oracle), 0
         data.qpos[:] = fields.start
         for k in range(420):
@@ -145,7 +145,7 @@ def test_gradients_of_a_step(name):
         def end(change):
             u = base.at[2].add(change[0]).at[6].add(1e5 * change[1])
             stiffer = batch._replace(jnt_stiffness=batch.jnt_stiffness * (1 + change[2]))
-            new, _ = engine.step(hand_lanes(scene, stiffer), state, u[:, None])
+            new, _ = engine.step(world_constants(scene, stiffer), state, u[:, None])
             return (engine.qvel(new) ** 2).sum()
 
         # Options are for the outermost program only.
@@ -244,7 +244,7 @@ def program(scene):
     def run(p, t):
         fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(p, t)
         ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(p, t)
-        return engine.step(hand_lanes(scene, fields), engine.reset(fields), ctrl[:, 0].T)
+        return engine.step(world_constants(scene, fields), engine.reset(fields), ctrl[:, 0].T)
 
     return jax.jit(run).lower(world, trial).as_text()
 
@@ -295,7 +295,7 @@ def step_primitives(scene):
         *(small.stack(v) for v in small.hand_world(scene)),
     )
     engine = StructuredEngine(scene)
-    hand = jax.eval_shape(lambda f: hand_lanes(scene, f), fields)
+    hand = jax.eval_shape(lambda f: world_constants(scene, f), fields)
     state = jax.eval_shape(engine.reset, fields)
     ctrl = jax.ShapeDtypeStruct((6 + scene.num_fingers, 1), fields.start.dtype)
     return primitives(jax.make_jaxpr(engine.step)(hand, state, ctrl).jaxpr, {})
@@ -316,7 +316,7 @@ def test_without_contacts_a_step_is_that_of_beams_alone():
     """A separately written simulation of beams and a falling body: its numbers, and its program."""
     scene, _, fields, ctrl = setting(dict.fromkeys(CONTACTS, False))
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-    engine, hand = StructuredEngine(scene), hand_lanes(scene, batch)
+    engine, hand = StructuredEngine(scene), world_constants(scene, batch)
     random, start = np.random.default_rng(0), engine.reset(batch)
     size = len(fields.start)
     qpos = fields.start + 0.1 * random.normal(size=size) * (np.arange(size) < size - 7)
@@ -355,7 +355,7 @@ def test_the_kernel_does_not_run_what_it_lacks(monkeypatch):
         ({"surface": "hull"}, "batch"),
         ({"finger_finger": True}, "batch"),
     ):
-        engine = StructuredEngine(effects_scene(values), fused=True)
+        engine = StructuredEngine(effects_scene(values), kernel=True)
         with pytest.raises(RuntimeError, match=way):
             engine.rollout(None, ctrl)
 

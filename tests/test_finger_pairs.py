@@ -9,7 +9,7 @@ import pytest
 from codesign_jax import model, scene
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.structured import StructuredEngine, finger_pairs
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.schema import SceneError
 from codesign_jax.types import Status
@@ -65,7 +65,7 @@ def test_accelerations_equal_mujoco_on_curled_hands(driven, seed):
         oracle, data, fields = curled(the_scene, seed, bend=0.75 + 0.05 * seed, height=0.07)
         mujoco.mj_forward(oracle, data)
         state = lanes_state(engine, the_scene, fields, data.qpos, data.qvel)
-        new, _ = step(hand_lanes(the_scene, fields), state, jnp.asarray(data.ctrl)[:, None])
+        new, _ = step(world_constants(the_scene, fields), state, jnp.asarray(data.ctrl)[:, None])
         acc = (np.asarray(engine.qvel(new))[0] - data.qvel) / the_scene.discretization.timestep
         error = np.linalg.norm(acc - data.qacc) / np.linalg.norm(data.qacc)
         between, held = kinds(oracle, data)
@@ -83,7 +83,7 @@ def test_without_a_touch_nothing_changes(driven):
         _, _, fields = curled(the_scene, 0, bend=0.1, height=0.12)
         mujoco.mj_forward(oracle, data)
         state = lanes_state(engine, the_scene, fields, data.qpos, data.qvel)
-        new, _ = step(hand_lanes(the_scene, fields), state, jnp.asarray(data.ctrl)[:, None])
+        new, _ = step(world_constants(the_scene, fields), state, jnp.asarray(data.ctrl)[:, None])
         acc = (np.asarray(engine.qvel(new))[0] - data.qvel) / the_scene.discretization.timestep
         assert np.linalg.norm(acc - data.qacc) < 1e-8 * np.linalg.norm(data.qacc)
 

@@ -12,8 +12,8 @@ from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import hull as skin
 from codesign_jax.engines.structured.collision import make_cone
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.contact import Contacts
-from codesign_jax.engines.structured.hand import hand_lanes
 from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.problem import Spatial, relative
@@ -89,7 +89,7 @@ def test_velocities_are_derivatives_of_positions():
         hand, trial = small.hand_world(the_scene, length=LENGTH, height=HEIGHT)
         fields = model.model_fields(the_scene, jax.tree.map(jnp.asarray, hand), trial)
         fields = jax.tree.map(lambda x: x[None], fields)
-        engine, lanes = StructuredEngine(the_scene), hand_lanes(the_scene, fields)
+        engine, lanes = StructuredEngine(the_scene), world_constants(the_scene, fields)
         rate = np.random.default_rng(1).normal(size=data.qvel.shape)
         rate[-6:] = 0.0  # the object's are no differences of its coordinates
 

@@ -10,7 +10,7 @@ import scipy.optimize
 from codesign_jax import control, hull, model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from tests import small
 from tests.test_structured import lanes_state
 
@@ -39,7 +39,7 @@ class Driven:
         self.engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
         self.scene = scene
         self.fields = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-        self.hand, self.step = hand_lanes(scene, self.fields), jax.jit(self.engine.step)
+        self.hand, self.step = world_constants(scene, self.fields), jax.jit(self.engine.step)
 
     def state(self, qpos, qvel):
         return lanes_state(self.engine, self.scene, self.fields, qpos, qvel)

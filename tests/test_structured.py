@@ -13,7 +13,7 @@ import pytest
 from codesign_jax import control, cost, model, rollout
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from tests import small
 
 
@@ -41,7 +41,7 @@ def test_accelerations_equal_mujoco_along_a_grasp(shape):
     with jax.enable_x64(True):
         scene, oracle, start, fields, ctrl = setting(shape)
         engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand, step = hand_lanes(scene, fields), jax.jit(engine.step)
+        hand, step = world_constants(scene, fields), jax.jit(engine.step)
         data, touched = mujoco.MjData(oracle), 0
         data.qpos[:] = start
         for k in range(420):
@@ -68,7 +68,7 @@ def test_free_motion_equals_mujoco_step_by_step():
         scene, oracle, start, fields, ctrl = setting("box")
         oracle.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand, step = hand_lanes(scene, fields), jax.jit(engine.step)
+        hand, step = world_constants(scene, fields), jax.jit(engine.step)
         data = mujoco.MjData(oracle)
         data.qpos[:] = start
         # Lift the object off the table: it falls for 20 steps without reaching it.
@@ -92,7 +92,7 @@ def test_float32_is_close_to_float64():
             dtype = jnp.float64 if wide else jnp.float32
             fields = jax.tree.map(lambda x, t=dtype: x.astype(t), fields)
             engine = StructuredEngine(scene, iterations=60, evaluations=12, tolerance=1e-10)
-            hand = hand_lanes(scene, fields)
+            hand = world_constants(scene, fields)
             # The palm at 60 mm presses the straight fingers onto the table.
             qpos = np.array(start)
             qpos[2] = 0.06
@@ -123,8 +123,8 @@ def test_worlds_that_end_early():
         back = jax.tree.map(lambda v: v[::-1], params)
         trials = small.stack(*[trial] * len(lengths))
 
-        def traces(scene, fused, *batches):
-            engine = StructuredEngine(scene, tolerance=1e-16, iterations=30, fused=fused)
+        def traces(scene, kernel, *batches):
+            engine = StructuredEngine(scene, tolerance=1e-16, iterations=30, kernel=kernel)
             run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t)[1])
             return [jax.tree.map(np.asarray, run(p, trials)) for p in batches]
 

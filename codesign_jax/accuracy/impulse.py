@@ -9,8 +9,8 @@ import numpy as np
 from codesign_jax.accuracy import oracle, worlds
 from codesign_jax.accuracy.settings import Setting
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.constants import WorldConstants, world_constants
 from codesign_jax.engines.structured.contact import respond
-from codesign_jax.engines.structured.hand import HandLanes, hand_lanes
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanes import Stages, dot
 from codesign_jax.engines.structured.problem import propagate, relative
@@ -61,10 +61,10 @@ def forces(setting: Setting, hands: int, seconds: float = SECONDS) -> tuple[np.n
 
 
 def _structured(engine: Any, fields: ModelFields, ctrl: np.ndarray) -> np.ndarray:
-    hand = hand_lanes(engine.scene, jax.tree.map(jnp.asarray, fields))
+    hand = world_constants(engine.scene, jax.tree.map(jnp.asarray, fields))
 
     @jax.jit
-    def run(hand: HandLanes, state: State, ctrl: jax.Array) -> jax.Array:
+    def run(hand: WorldConstants, state: State, ctrl: jax.Array) -> jax.Array:
         def advance(state: State, u: jax.Array):
             new, info = engine.step(hand, state, u)
             return new, grip(engine, hand, state, u, info.acc)
@@ -77,7 +77,7 @@ def _structured(engine: Any, fields: ModelFields, ctrl: np.ndarray) -> np.ndarra
 
 
 def grip(
-    engine: StructuredEngine, hand: HandLanes, state: State, ctrl: jax.Array, acc: Acc
+    engine: StructuredEngine, hand: WorldConstants, state: State, ctrl: jax.Array, acc: Acc
 ) -> jax.Array:
     """Sum of the normal forces of fingers and palm on the object [N], shape (world,).
 

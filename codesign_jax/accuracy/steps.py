@@ -14,7 +14,7 @@ from codesign_jax.accuracy.settings import Setting
 from codesign_jax.benchmark.cases import quantiles
 from codesign_jax.benchmark.peers import REFERENCE
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
@@ -145,7 +145,7 @@ def _structured(setting: Setting, scene: Scene, fields: ModelFields, samples: Sa
 
     @jax.jit
     def step(batch: ModelFields, state: State, ctrl: jax.Array):
-        info = engine.step(hand_lanes(scene, batch), state, ctrl)[1]
+        info = engine.step(world_constants(scene, batch), state, ctrl)[1]
         return info.acc, info.residual[0], info.iterations
 
     state = to_state(engine, scene, batch, worlds.cast(samples, dtype))

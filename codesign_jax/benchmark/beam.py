@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
+from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.engine import integrate
-from codesign_jax.engines.structured.hand import HandLanes
 from codesign_jax.engines.structured.inertia import bodies, smooth_forces
 from codesign_jax.engines.structured.kinematics import Acc, State, kinematics
 from codesign_jax.engines.structured.lanes import (
@@ -27,7 +27,7 @@ from codesign_jax.model import layout
 from codesign_jax.scene import Scene
 
 
-def step(scene: Scene, hand: HandLanes, state: State, ctrl: jax.Array) -> State:
+def step(scene: Scene, hand: WorldConstants, state: State, ctrl: jax.Array) -> State:
     """Advances a batch by one time step.
 
     Args:
@@ -41,7 +41,7 @@ def step(scene: Scene, hand: HandLanes, state: State, ctrl: jax.Array) -> State:
     """
     if not scene.effects.wrist:
         raise ValueError("the beams hang on a compliant wrist")
-    run = Stages(hand.shape[0, 0] >= 0 if jax.default_backend() == "cpu" else None)
+    run = Stages(hand.object_id[0, 0] >= 0 if jax.default_backend() == "cpu" else None)
     kin = kinematics(run, hand, layout(scene).axes, state)
     body = bodies(run, hand, kin)
     smooth = smooth_forces(run, hand, kin, body, state, ctrl, scene)

@@ -245,22 +245,22 @@ def quality(case: Case) -> dict:
     On a GPU those of the kernel; elsewhere those of the batch engine in contact.  A case of growth
     has the short rollouts in contact that its times are of.
     """
-    from codesign_jax.engines.structured import fused
-    from codesign_jax.engines.structured.hand import hand_lanes
+    from codesign_jax.engines.structured import kernel
+    from codesign_jax.engines.structured.constants import world_constants
 
     worlds = case.values["worlds"][0]
     engine: Any = peers.build(case.engine, case.setting, case.scene)
     limits = (engine.iterations, max(engine.evaluations, 14), engine.tolerance)
     short = partial(work.window, case.scene, worlds, case.values["steps"])
-    if engine.fused:
+    if engine.kernel:
         whole = partial(work.make_worlds, case.scene, worlds)
         grown = case.values.get("growth")
         distinct = case.values["distinct"]
         fields, ctrl = short(distinct=distinct) if grown else work.inputs(case.scene, whole())
-        program = fused.Program.here(case.scene, fused.Limits(*limits), ctrl.dtype)
-        found = jax.jit(lambda f, c: program.run(hand_lanes(case.scene, f), engine.reset(f), c))(
-            fields, ctrl
-        )
+        program = kernel.Program.here(case.scene, kernel.Limits(*limits), ctrl.dtype)
+        found = jax.jit(
+            lambda f, c: program.run(world_constants(case.scene, f), engine.reset(f), c)
+        )(fields, ctrl)
         iterations, residual = (np.asarray(found[n]) for n in ("iterations", "residual"))
     else:
         fields, ctrl = short(distinct=worlds)
@@ -270,7 +270,7 @@ def quality(case: Case) -> dict:
             return (carry[0], state), (info.iterations, info.residual[0])
 
         def run(f: Any, c: jax.Array) -> Any:
-            start = hand_lanes(case.scene, f), engine.reset(f)
+            start = world_constants(case.scene, f), engine.reset(f)
             return jax.lax.scan(body, start, jnp.moveaxis(c, 0, -1))[1]
 
         iterations, residual = (np.asarray(v) for v in jax.jit(run)(fields, ctrl))

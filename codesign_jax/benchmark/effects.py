@@ -18,7 +18,7 @@ from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.effects import refusals
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.experiments.statistics import wilson
 from codesign_jax.scene import Scene
@@ -169,9 +169,9 @@ def compile_steps(
       new: Whether a program that is not among them is compiled.
       step: From hand, state and controls (nu, world) to the next state; by default the engine's.
     """
-    engine = StructuredEngine(scene, fused=False)
+    engine = StructuredEngine(scene, kernel=False)
     fields, ctrl = inputs(scene, worlds)
-    hand = hand_lanes(scene, fields)
+    hand = world_constants(scene, fields)
     q, v = (jnp.asarray(x, fields.start.dtype) for x in (at.qpos, at.qvel))
     state = engine.place(engine.reset(fields), q, v)
     rows = jnp.moveaxis(ctrl[:, at.step : at.step + STEPS], 0, -1)
@@ -184,7 +184,7 @@ def compile_steps(
     size = program_size(step or engine.step, hand, state, rows[0])
     lowered = jax.jit(steps).lower(hand, state, rows)
     digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
-    each = hand.shape.shape[1]
+    each = hand.object_id.shape[1]
     record = {"equations": size.equations, "flops": size.flops / each, "program": digest}
     if digest not in compiled and new:
         compiled[digest] = lowered.compile()
@@ -210,7 +210,7 @@ def measure(programs: dict[str, Program], repeats: int) -> dict[str, list[float]
     for _ in range(repeats + 1):
         for name, program in programs.items():
             assert program.run is not None
-            worlds = program.args[0].shape.shape[1]
+            worlds = program.args[0].object_id.shape[1]
             begin = time.perf_counter()
             jax.block_until_ready(program.run(*program.args))
             times[name].append((time.perf_counter() - begin) / STEPS / worlds)

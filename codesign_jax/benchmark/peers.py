@@ -22,7 +22,7 @@ STRUCTURED: dict[str, dict[str, Any]] = {
     "default": {},
     "tight": {"iterations": 48, "tolerance": 1e-8},
     "loose": {"iterations": 6, "tolerance": 1e-4},
-    "unison": {"fused": False},
+    "unison": {"kernel": False},
 }
 REFERENCE = {"iterations": 300, "ls_iterations": 100, "tolerance": 1e-15}
 """Solver values at which MuJoCo C finds the solution to rounding."""

@@ -13,7 +13,7 @@ import numpy as np
 from codesign_jax import control, model, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.scene import Scene
 from tests import small
 
@@ -162,7 +162,7 @@ class Bench:
             engine = StructuredEngine(self.scene, tolerance=self.tolerance)
 
             def start(fields, qvel):
-                return hand_lanes(self.scene, fields), moving(engine, fields, qvel)
+                return world_constants(self.scene, fields), moving(engine, fields, qvel)
 
             def advance(hand, state, ctrl):
                 def one(state, u):

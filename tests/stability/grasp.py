@@ -11,7 +11,7 @@ import numpy as np
 from codesign_jax import hand, model, parameters, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.types import Params, failed
 from tests import small
 from tests.stability.bench import bench, floats, moving, pinch, refined
@@ -130,7 +130,7 @@ def one_step(base, fields, ctrl, qpos, qvel, precision):
 
         def step(fields, ctrl, qvel):
             state = moving(engine, fields, qvel)
-            new, info = engine.step(hand_lanes(base, fields), state, ctrl)
+            new, info = engine.step(world_constants(base, fields), state, ctrl)
             acc = info.acc
             return engine.qvel(new._replace(wrist_vel=acc.wrist, finger_vel=acc.finger)), (
                 engine.qvel(new) - qvel

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured import mesh
+from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
 from codesign_jax.engines.structured.contact import Cone, Contacts
-from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics
 from codesign_jax.engines.structured.lanes import Stages, cross, dot
 from codesign_jax.model import contact_invweight
@@ -57,7 +57,7 @@ def object_friction(scene: Scene, shape: jax.Array) -> jax.Array:
 
 def spheres_on_object(
     scene: Scene,
-    hand: HandLanes,
+    hand: WorldConstants,
     kin: Kinematics,
     run: Stages,
     centre: jax.Array,
@@ -85,7 +85,7 @@ def spheres_on_object(
 
     distance, gradient = run(measure, kin.object, kin.object_pos, centre)
     point, normal, gap = run(place, kin.object, centre, distance, gradient)
-    cone = make_cone(scene, object_friction(scene, hand.shape), bodies=2)
+    cone = make_cone(scene, object_friction(scene, hand.object_id), bodies=2)
     return Contacts(point, normal, gap, cone)
 
 
@@ -102,7 +102,7 @@ def spheres_on_table(
     )
 
 
-def finger_spheres(hand: HandLanes, kin: Kinematics) -> jax.Array:
+def finger_spheres(hand: WorldConstants, kin: Kinematics) -> jax.Array:
     """Centres of the finger spheres in the palm's frame, shape (3, link, k, finger, world)."""
     return kin.origin[:, :, None] + apply_columns(kin.link[:, :, :, None], hand.sphere)
 
@@ -113,7 +113,9 @@ def palm_spheres(scene: Scene, kin: Kinematics) -> jax.Array:
     return apply_columns(kin.palm, points)
 
 
-def signed_distance(scene: Scene, hand: HandLanes, local: jax.Array) -> tuple[jax.Array, jax.Array]:
+def signed_distance(
+    scene: Scene, hand: WorldConstants, local: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Signed distance and its unit gradient in the object's frame, for the shape of each world.
 
     Args:
@@ -134,7 +136,7 @@ def signed_distance(scene: Scene, hand: HandLanes, local: jax.Array) -> tuple[ja
         if result is None:
             result = distance, gradient
             continue
-        mine = jnp.isin(hand.shape, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
+        mine = jnp.isin(hand.object_id, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
         result = jnp.where(mine, distance, result[0]), jnp.where(mine, gradient, result[1])
     assert result is not None
     return result
@@ -176,7 +178,7 @@ def _cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def object_on_table(
-    run: Stages, scene: Scene, hand: HandLanes, kin: Kinematics, height: jax.Array
+    run: Stages, scene: Scene, hand: WorldConstants, kin: Kinematics, height: jax.Array
 ) -> Contacts:
     """Contacts of the object with the table, four slots as in MuJoCo's plane colliders.
 
@@ -195,7 +197,9 @@ def object_on_table(
     def points(size: jax.Array, columns: jax.Array, position: jax.Array, height: jax.Array):
         arms = None
         for kind in dict.fromkeys(kinds):
-            mine = jnp.isin(hand.shape, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
+            mine = jnp.isin(
+                hand.object_id, jnp.array([i for i, k in enumerate(kinds) if k == kind])
+            )
             new = functions[kind](size, columns)
             arms = new if arms is None else jnp.where(mine, new, arms)
         assert arms is not None

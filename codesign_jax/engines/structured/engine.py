@@ -16,9 +16,9 @@ from codesign_jax.engines.structured import (
     implicit,
     mesh,
 )
+from codesign_jax.engines.structured.constants import WorldConstants, apply_columns, world_constants
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.cores import on_all_cores
-from codesign_jax.engines.structured.hand import HandLanes, apply_columns, hand_lanes
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.integration import integrate, rigid_arm
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
@@ -63,7 +63,7 @@ class StructuredEngine:
         tolerance: float = 1e-6,
         differentiable: bool = False,
         checkpoint: bool = True,
-        fused: bool | None = None,
+        kernel: bool | None = None,
     ):
         """Prepares the engine.
 
@@ -76,7 +76,7 @@ class StructuredEngine:
             a tighter tolerance, as the derivative is that of the solution.
           checkpoint: Whether the derivative of a rollout stores only states and accelerations and
             repeats the rest of each step; costs nothing without a derivative.
-          fused: Whether one kernel runs a rollout where it can: scenes of `in_kernel`, on a GPU in
+          kernel: Whether one kernel runs a rollout where it can: scenes of `in_kernel`, on a GPU in
             float32. Without it all worlds step in unison, to the end of the rollout. By default
             where kernels can be compiled.
 
@@ -89,8 +89,8 @@ class StructuredEngine:
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
-        fused = _has_kernel() if fused is None else fused
-        self.fused, self.differentiable = fused and not differentiable, differentiable
+        kernel = _has_kernel() if kernel is None else kernel
+        self.kernel, self.differentiable = kernel and not differentiable, differentiable
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -146,7 +146,7 @@ class StructuredEngine:
         return jnp.concatenate(parts).T
 
     def problem(
-        self, run: Stages, hand: HandLanes, state: State, ctrl: jax.Array
+        self, run: Stages, hand: WorldConstants, state: State, ctrl: jax.Array
     ) -> tuple[Problem, Spatial]:
         """Assembles a step's problem and the bodies' velocities; ctrl has shape (nu, world)."""
         kin = kinematics(run, hand, layout(self.scene).axes, state)
@@ -161,7 +161,7 @@ class StructuredEngine:
         return Problem(hand, kin, body, matrix, smooth, contacts, arm), velocity
 
     def contacts(
-        self, run: Stages, hand: HandLanes, kin: Kinematics, height: jax.Array
+        self, run: Stages, hand: WorldConstants, kin: Kinematics, height: jax.Array
     ) -> dict[str, Contacts]:
         """Contacts that the scene's effects call for, by pair of bodies."""
         scene, e, found = self.scene, self.scene.effects, {}
@@ -192,11 +192,11 @@ class StructuredEngine:
         return found
 
     def step(
-        self, hand: HandLanes, state: State, ctrl: jax.Array, *, iterations: int | None = None
+        self, hand: WorldConstants, state: State, ctrl: jax.Array, *, iterations: int | None = None
     ) -> tuple[State, StepInfo]:
         """Advances a batch by one time step under controls of shape (nu, world)."""
         # The compiler does not know that a shape's index is never negative.
-        run = Stages(hand.shape[0, 0] >= 0 if self.conditional else None)
+        run = Stages(hand.object_id[0, 0] >= 0 if self.conditional else None)
         problem, velocity = self.problem(run, hand, state, ctrl)
         solution = implicit.solve(
             run,
@@ -217,7 +217,7 @@ class StructuredEngine:
         solved = solution.acc, solution.residual, solution.iterations
         return new, StepInfo(*solved, centre, overflow)
 
-    def _centre(self, hand: HandLanes, kin: Kinematics, body: Bodies) -> jax.Array:
+    def _centre(self, hand: WorldConstants, kin: Kinematics, body: Bodies) -> jax.Array:
         """Mean position of the segments in the palm's frame: half weight for the half segments."""
         n, links = hand.mount.shape[2], hand.mass.shape[0]
         weights = [1.0] * (links - 1) + [0.5]
@@ -226,9 +226,9 @@ class StructuredEngine:
         return total([every[:, f : f + 1] for f in range(n)]) / (n * links)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """See `Engine.rollout`; where it can, one kernel runs it all, see `fused`."""
+        """See `Engine.rollout`; where it can, one kernel runs it all, see `kernel`."""
         fits = in_kernel(self.scene)
-        if fits and self.fused and (self.conditional or ctrl.dtype == jnp.float32):
+        if fits and self.kernel and (self.conditional or ctrl.dtype == jnp.float32):
             return on_all_cores(partial(self._one_kernel, trajectory=trajectory), fields, ctrl)
         with jax.default_matmul_precision("highest"):
             if self.conditional and not self.differentiable:
@@ -236,12 +236,12 @@ class StructuredEngine:
             return self._rollout(fields, ctrl, trajectory=trajectory)
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
-        from codesign_jax.engines.structured.fused import Limits, Program
+        from codesign_jax.engines.structured.kernel import Limits, Program
 
         # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
         limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
         program = Program.here(self.scene, limits, ctrl.dtype)
-        hand = hand_lanes(self.scene, fields)
+        hand = world_constants(self.scene, fields)
         found, end = program.simulate(hand, self.reset(fields), ctrl, trajectory=trajectory)
         qpos = found.get("qpos", jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype))
         status = self._status(found["residual"])
@@ -250,7 +250,7 @@ class StructuredEngine:
         )
 
     def _rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
-        hand, limits = hand_lanes(self.scene, fields), self.scene.limits
+        hand, limits = world_constants(self.scene, fields), self.scene.limits
         step = self._checkpointed() if self.checkpoint else self.step
 
         def body(carry, u):
@@ -307,6 +307,6 @@ def _has_kernel() -> bool:
 
 
 def in_kernel(scene: Scene) -> bool:
-    """Whether the fused kernel simulates a scene; the batch form simulates all."""
+    """Whether the kernel simulates a scene; the batch form simulates all."""
     meshes = any(o.type == "mesh" for o in scene.objects.object)
     return not (meshes or scene.effects.surface == "hull" or scene.effects.finger_finger)

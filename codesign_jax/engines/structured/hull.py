@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax import hull
+from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
 from codesign_jax.engines.structured.contact import (
     Contacts,
     Line,
@@ -27,7 +28,6 @@ from codesign_jax.engines.structured.contact import (
     slopes,
 )
 from codesign_jax.engines.structured.elimination import JointTerms
-from codesign_jax.engines.structured.hand import HandLanes, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics
 from codesign_jax.engines.structured.lanes import Stages, contract, sum_items
 from codesign_jax.scene import Scene
@@ -49,7 +49,7 @@ class Vertices(NamedTuple):
     share: jax.Array
 
 
-def vertices(scene: Scene, hand: HandLanes, kin: Kinematics) -> Vertices:
+def vertices(scene: Scene, hand: WorldConstants, kin: Kinematics) -> Vertices:
     """Places the hull's contact points."""
     s, width, dtype = hull.slots(scene), scene.hand.section.width, kin.origin.dtype
     along, across, up, weight, *area = (

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import solver
+from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.contact import Contacts, respond
-from codesign_jax.engines.structured.hand import HandLanes
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, sum_items
 from codesign_jax.engines.structured.newton import linear_solve, respond_all
@@ -163,10 +163,10 @@ def checkpointed(step: Callable, resume: Callable, good: Callable[[State], jax.A
     """
 
     @jax.custom_vjp
-    def light(hand: HandLanes, state: State, ctrl: jax.Array):
+    def light(hand: WorldConstants, state: State, ctrl: jax.Array):
         return step(hand, state, ctrl)
 
-    def forward(hand: HandLanes, state: State, ctrl: jax.Array):
+    def forward(hand: WorldConstants, state: State, ctrl: jax.Array):
         new, info = step(hand, state, ctrl)
         return (new, info), (hand, state._replace(acc=info.acc), ctrl)
 

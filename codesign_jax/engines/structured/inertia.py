@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.hand import HandLanes, apply_columns
+from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics, State
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
 from codesign_jax.morphology import softening
@@ -120,7 +120,7 @@ def object_force(body: Body, vel: jax.Array, gravity: float) -> jax.Array:
     return body.smooth_force(turning, spin, gravity)
 
 
-def bodies(run: Stages, hand: HandLanes, kin: Kinematics) -> Bodies:
+def bodies(run: Stages, hand: WorldConstants, kin: Kinematics) -> Bodies:
     """Inertia of all bodies at the present positions."""
 
     def link(origin: jax.Array, frame: jax.Array):
@@ -152,7 +152,7 @@ def softening_moment(
 
 def smooth_forces(
     run: Stages,
-    hand: HandLanes,
+    hand: WorldConstants,
     kin: Kinematics,
     body: Bodies,
     state: State,

@@ -11,7 +11,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.hand import HandLanes, apply_columns, rotation_columns
+from codesign_jax.engines.structured.constants import (
+    WorldConstants,
+    apply_columns,
+    rotation_columns,
+)
 from codesign_jax.engines.structured.lanes import (
     Stages,
     cross,
@@ -99,7 +103,7 @@ class Kinematics(NamedTuple):
 
 
 def kinematics(
-    run: Stages, hand: HandLanes, axis_names: tuple[str, ...], state: State
+    run: Stages, hand: WorldConstants, axis_names: tuple[str, ...], state: State
 ) -> Kinematics:
     """Computes the kinematics of all bodies."""
     palm, wrist_axes, palm_vel, palm_bias = run(_wrist, state.wrist, state.wrist_vel)
@@ -135,7 +139,7 @@ def kinematics(
     )
 
 
-def straight(hand: HandLanes, state: State) -> Kinematics:
+def straight(hand: WorldConstants, state: State) -> Kinematics:
     """Places of all bodies with straight fingers, nothing moving: no loop along the links."""
     palm, wrist_axes, *_ = _wrist(state.wrist, jnp.zeros_like(state.wrist_vel))
     frame, base = _mount(palm, hand.mount, hand.base)

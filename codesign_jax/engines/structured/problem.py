@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import finger_pairs, hull
+from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.contact import (
     Contacts,
 )
-from codesign_jax.engines.structured.hand import HandLanes
 from codesign_jax.engines.structured.inertia import Bodies, Smooth
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics
 from codesign_jax.engines.structured.lanes import (
@@ -54,7 +54,7 @@ class Problem(NamedTuple):
         compliant wrist, whose accelerations are unknowns.
     """
 
-    hand: HandLanes
+    hand: WorldConstants
     kin: Kinematics
     body: Bodies
     matrix: Matrices

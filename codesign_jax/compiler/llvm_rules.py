@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from codesign_jax.engines.structured.fused.walk import SHARED, swapped_lanes
+from codesign_jax.compiler.walker import SHARED, swapped_lanes
 
 if TYPE_CHECKING:
-    from codesign_jax.engines.structured.fused.llvm import Writer
+    from codesign_jax.compiler.llvm import Writer
 
 _INT_OPS: dict[str, Callable] = {
     "add": np.add,

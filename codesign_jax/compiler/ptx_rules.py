@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from codesign_jax.engines.structured.fused.walk import COMPARE, SHARED, swapped_lanes
+from codesign_jax.compiler.walker import COMPARE, SHARED, swapped_lanes
 
 if TYPE_CHECKING:
-    from codesign_jax.engines.structured.fused.ptx import Assembler
+    from codesign_jax.compiler.ptx import Assembler
 
 LANES = 32
 """Threads of a warp."""

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import collision, contact
 from codesign_jax.engines.structured.contact import Contacts, Line
-from codesign_jax.engines.structured.fused.tables import (
-    Table,
+from codesign_jax.engines.structured.kernel.memory import (
+    MemoryLayout,
     anywhere,
     full,
     solid,
@@ -55,7 +55,7 @@ class ContactSet:
         fields = {"point": 3, "normal": 3, "gap": 1, "jar": rows, "step": rows, "ray": ray}
         return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in fields.items()}
 
-    def bind(self, table: Table, ref: Any, friction: Lanes) -> "BoundContacts":
+    def bind(self, table: MemoryLayout, ref: Any, friction: Lanes) -> "BoundContacts":
         """The set in a kernel's memory; friction is that of each world's object."""
         return BoundContacts(self, table, ref, friction)
 
@@ -73,7 +73,7 @@ class ContactSet:
 class BoundContacts:
     """A contact set with its memory; every method works on one item."""
 
-    def __init__(self, of: ContactSet, table: Table, ref: Any, friction: Lanes):
+    def __init__(self, of: ContactSet, table: MemoryLayout, ref: Any, friction: Lanes):
         """See `ContactSet.bind`."""
         self.set, self.table, self.ref, self.friction = of, table, ref, friction
 
@@ -183,7 +183,7 @@ class BoundContacts:
 
 def sphere_on_object(scene: Scene, size, shape, columns, position, centre, radius):
     """Point, normal and gap of spheres (3, k, ...) against the object."""
-    hand = SimpleNamespace(object_size=size, shape=shape.astype(jnp.int32), mesh=None)
+    hand = SimpleNamespace(object_size=size, object_id=shape.astype(jnp.int32), mesh=None)
     kin = SimpleNamespace(object=columns, object_pos=position)
     c = collision.spheres_on_object(scene, hand, kin, direct, centre, radius)  # type: ignore[arg-type]
     return c.point, c.normal, c.distance[None]

@@ -12,7 +12,7 @@ from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
 
 
-class HandLanes(NamedTuple):
+class WorldConstants(NamedTuple):
     """Hand and object of every world; lanes are (finger, world) or (1, world), all lengths SI.
 
     Attributes:
@@ -39,7 +39,7 @@ class HandLanes(NamedTuple):
       object_mass: Shape (1, world).
       object_inertia: Principal inertia, shape (3, 1, world).
       object_size: Sizes of the object's shape, shape (3, 1, world).
-      shape: Index of the object's shape, shape (1, world).
+      object_id: Index of the object's shape, shape (1, world).
       mesh: Meshes of the worlds; None if the scene has none.
       section: Height, wall and segment length of the fingers, shape (3, finger, world); None
         without the effect `neo_hookean`.
@@ -66,7 +66,7 @@ class HandLanes(NamedTuple):
     object_mass: jax.Array
     object_inertia: jax.Array
     object_size: jax.Array
-    shape: jax.Array
+    object_id: jax.Array
     mesh: MeshLanes | None
     section: jax.Array | None = None
 
@@ -88,7 +88,7 @@ def apply_columns(columns: jax.Array, v: jax.Array) -> jax.Array:
     return jnp.stack([total([columns[k][i] * v[k] for k in range(3)]) for i in range(3)])
 
 
-def hand_lanes(scene: Scene, fields: ModelFields) -> HandLanes:
+def world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
     """Transposes batched model fields, leading axis (world,), into lane layout."""
     lay, template = layout(scene), compile_template(scene)
 
@@ -113,7 +113,7 @@ def hand_lanes(scene: Scene, fields: ModelFields) -> HandLanes:
     picked = jnp.take_along_axis(sizes, shape[:, None, None], axis=1)[:, 0]
     object_size = last(picked)[:, None]
     no_spheres = lay.spheres.size == 0
-    return HandLanes(
+    return WorldConstants(
         mount=mount,
         base=base,
         offset=by_link(fields.body_pos[..., 0], lay.bodies),
@@ -135,7 +135,7 @@ def hand_lanes(scene: Scene, fields: ModelFields) -> HandLanes:
         object_mass=last(fields.body_mass[:, lay.object])[None],
         object_inertia=last(fields.body_inertia[:, lay.object])[:, None],
         object_size=object_size,
-        shape=shape[None],
+        object_id=shape[None],
         mesh=mesh_lanes(scene, shape[None], object_size),
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
     )

@@ -9,10 +9,11 @@ import pytest
 from jax.experimental import pallas as pl
 
 from codesign_jax import control, model
+from codesign_jax.compiler import llvm, native, ptx
+from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.engines.structured import StructuredEngine, elimination
-from codesign_jax.engines.structured.fused import Limits, Program, llvm, native, ptx
-from codesign_jax.engines.structured.fused.launch import Kernel, launch
-from codesign_jax.engines.structured.hand import hand_lanes
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from tests import small
 
@@ -76,9 +77,9 @@ def grasp():
 def test_kernel_equals_the_engine(grasp):
     """The kernel, interpreted, and the batch engine on the way to the object and in contact."""
     scene, fields, ctrl = grasp
-    engine = StructuredEngine(scene, iterations=16, evaluations=10, tolerance=1e-7, fused=False)
+    engine = StructuredEngine(scene, iterations=16, evaluations=10, tolerance=1e-7, kernel=False)
     program = Program(scene, Limits(16, 10, 1e-7), backend="interpreter", width=8)
-    run = jax.jit(lambda f, c: program.run(hand_lanes(scene, f), engine.reset(f), c))
+    run = jax.jit(lambda f, c: program.run(world_constants(scene, f), engine.reset(f), c))
     got = run(fields, ctrl)
     with jax.default_matmul_precision("highest"):
         want = jax.jit(lambda f, c: engine._rollout(f, c, trajectory=False))(fields, ctrl)
@@ -99,7 +100,9 @@ def test_kernel_becomes_ptx(effects):
     program, engine = Program(scene, Limits(8, 8, 1e-6)), StructuredEngine(scene)
 
     def run(f, c):
-        return program.simulate(hand_lanes(scene, f), engine.reset(f), c, trajectory=bool(effects))
+        return program.simulate(
+            world_constants(scene, f), engine.reset(f), c, trajectory=bool(effects)
+        )
 
     text = jax.jit(run).trace(fields, ctrl).lower(lowering_platforms=("cuda",)).as_text()
     assert "__gpu$xla.gpu.ptx" in text and "fma.rn.f32" in text
@@ -121,8 +124,8 @@ def test_machine_code_equals_the_engine(grasp):
         ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :300]
         settings = dict(iterations=60, evaluations=30, tolerance=1e-18)
         got, want = (
-            jax.jit(StructuredEngine(scene, fused=fused, **settings).rollout)(fields, ctrl)
-            for fused in (True, False)
+            jax.jit(StructuredEngine(scene, kernel=kernel, **settings).rollout)(fields, ctrl)
+            for kernel in (True, False)
         )
     moved = np.abs(np.diff(np.asarray(want.height), axis=1)).max()
     assert moved > 1e-4  # something touched the object
@@ -152,11 +155,11 @@ def test_machine_code_has_the_effects(name):
         got, want = (
             jax.jit(
                 partial(
-                    StructuredEngine(scene, fused=fused, **settings).rollout,
+                    StructuredEngine(scene, kernel=kernel, **settings).rollout,
                     trajectory=True,
                 )
             )(fields, ctrl)
-            for fused in (True, False)
+            for kernel in (True, False)
         )
     assert np.abs(want.qpos[:, -1] - want.qpos[:, 0]).max() > 0.1
     # Rounding of single steps is 1e-16; contact multiplies it.

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
 from codesign_jax.engines.structured import newton, solver
-from codesign_jax.engines.structured.fused.contacts import BoundContacts, direct, zeros
-from codesign_jax.engines.structured.fused.tables import (
+from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.kernel.contacts import BoundContacts, direct, zeros
+from codesign_jax.engines.structured.kernel.memory import (
     Block,
-    Table,
+    MemoryLayout,
     anywhere,
     full,
     solid,
     upper,
 )
-from codesign_jax.engines.structured.inertia import Body
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.problem import Forces, Matrices, object_acceleration
@@ -55,11 +55,11 @@ class Quality(NamedTuple):
 class Memory(NamedTuple):
     """A kernel's memory: tables with their refs, and the bound contact sets by name."""
 
-    hand: Table
+    hand: MemoryLayout
     hand_ref: Any
-    state: Table
+    state: MemoryLayout
     state_ref: Any
-    scratch: Table
+    scratch: MemoryLayout
     scratch_ref: Any
     contacts: dict[str, BoundContacts]
 

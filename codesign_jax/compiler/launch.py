@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.engines.structured.fused import ptx
+from codesign_jax.compiler import ptx
 
 
 class Kernel(NamedTuple):
@@ -43,7 +43,7 @@ def launch(
             return _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr).params["jaxpr"]
 
     if kernel.backend == "cpu":
-        from codesign_jax.engines.structured.fused import native
+        from codesign_jax.compiler import native
 
         layout = native.Layout(shapes, len(inputs), kernel.lanes, inputs[0].dtype.itemsize)
         name = native.register(kernel.origin, trace, layout)

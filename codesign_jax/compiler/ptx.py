@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.engines.structured.fused.ptx_rules import LANES, RULES, Value, kind_of
-from codesign_jax.engines.structured.fused.walk import Walker
+from codesign_jax.compiler.ptx_rules import LANES, RULES, Value, kind_of
+from codesign_jax.compiler.walker import Walker
 
 HEADER = ".version 7.8\n.target sm_80\n.address_size 64\n"
 AHEAD = 600

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 
-from codesign_jax.engines.structured.fused.contacts import ContactSet
-from codesign_jax.engines.structured.fused.launch import Kernel, launch
-from codesign_jax.engines.structured.fused.ptx import LANES
-from codesign_jax.engines.structured.fused.step import Step
-from codesign_jax.engines.structured.fused.tables import Block, Table, anywhere
-from codesign_jax.engines.structured.hand import HandLanes
+from codesign_jax.compiler.launch import Kernel, launch
+from codesign_jax.compiler.ptx import LANES
+from codesign_jax.engines.structured.constants import WorldConstants
+from codesign_jax.engines.structured.kernel.contacts import ContactSet
+from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, anywhere
+from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanewise import lanes
 from codesign_jax.model import layout
@@ -71,7 +71,7 @@ class Program:
         """The program for this device and type, whose blocks fill a GPU's warp or CPU's vector."""
         if (backend := jax.default_backend()) != "cpu":
             return cls(scene, limits)
-        from codesign_jax.engines.structured.fused import native
+        from codesign_jax.compiler import native
 
         width = native.vector_bytes() // jnp.dtype(dtype).itemsize
         return cls(scene, limits, backend=backend, width=width)
@@ -100,7 +100,7 @@ class Program:
             }
         if self.scene.effects.neo_hookean:
             more |= {"section": (1, (3,))}
-        self.hand = Table(
+        self.hand = MemoryLayout(
             True,
             mount=(1, (3, 3)),
             base=(1, (3,)),
@@ -116,7 +116,7 @@ class Program:
             armature=(n, (a,)),
             **more,
         )
-        self.world = Table(
+        self.world = MemoryLayout(
             False,
             palm_mass=(1, one),
             palm_centre=(1, (3,)),
@@ -126,13 +126,17 @@ class Program:
             object_mass=(1, one),
             object_inertia=(1, (3,)),
             object_size=(1, (3,)),
-            shape=(1, one),
+            object_id=(1, one),
             alive=(1, one),
         )
-        self.fine = Table(True, finger=(n, (a,)), finger_vel=(n, (a,)), acc=(n, (a,)))
-        rest = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
-        rest |= dict(acc_wrist=6, acc_object=6)
-        self.rest = Table(False, **{name: (1, (size,)) for name, size in rest.items()})
+        self.finger_state = MemoryLayout(
+            True, finger=(n, (a,)), finger_vel=(n, (a,)), acc=(n, (a,))
+        )
+        world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
+        world_state |= dict(acc_wrist=6, acc_object=6)
+        self.world_state = MemoryLayout(
+            False, **{name: (1, (size,)) for name, size in world_state.items()}
+        )
         fields: dict[str, tuple[int, tuple[int, ...]]] = {
             "axes": (n, (a, 6)),
             "body_centre": (n, (3,)),
@@ -150,11 +154,11 @@ class Program:
         }
         for contacts in self.sets:
             fields |= contacts.groups()
-        self.scratch = Table(True, **fields)
+        self.scratch = MemoryLayout(True, **fields)
 
-    def pack_hand(self, hand: HandLanes) -> tuple[jax.Array, jax.Array]:
+    def pack_hand(self, hand: WorldConstants) -> tuple[jax.Array, jax.Array]:
         """The hand's tables; padded worlds are not alive, padded fingers have no mass."""
-        worlds, n = hand.shape.shape[1], self.num_fingers
+        worlds, n = hand.object_id.shape[1], self.num_fingers
         dtype, lane = hand.mass.dtype, (n, worlds)
         links_first = ("centre", "inertia", "sphere")
         arrays = {
@@ -178,7 +182,7 @@ class Program:
                 arrays["radius"] = jnp.pad(hand.radius, pad, constant_values=-1e3)
         wide = {k: self._widen(arrays[k]) for k in self.hand.groups}
         arrays["alive"] = jnp.ones((1, worlds), dtype)
-        arrays["shape"] = hand.shape.astype(dtype)
+        arrays["object_id"] = hand.object_id.astype(dtype)
         narrow = {k: arrays[k] for k in self.world.groups}
         packed = self.world.pack(1, self.block, **narrow)
         ids = jnp.arange(packed.shape[0] * self.block).reshape(-1, self.block)
@@ -208,10 +212,14 @@ class Program:
     def pack_state(self, state: State) -> tuple[jax.Array, jax.Array]:
         """The state's tables."""
         arrays = state._asdict() | {"acc_wrist": state.acc.wrist, "acc_object": state.acc.object}
-        fine = {"finger": state.finger, "finger_vel": state.finger_vel, "acc": state.acc.finger}
-        wide = {k: self._widen(v) for k, v in fine.items()}
-        narrow = {k: arrays[k] for k in self.rest.groups}
-        return self.fine.pack(self.fingers, self.block, **wide), self.rest.pack(
+        finger_state = {
+            "finger": state.finger,
+            "finger_vel": state.finger_vel,
+            "acc": state.acc.finger,
+        }
+        wide = {k: self._widen(v) for k, v in finger_state.items()}
+        narrow = {k: arrays[k] for k in self.world_state.groups}
+        return self.finger_state.pack(self.fingers, self.block, **wide), self.world_state.pack(
             1, self.block, **narrow
         )
 
@@ -224,12 +232,12 @@ class Program:
         pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]
         return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.size)
 
-    def run(self, hand: HandLanes, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
+    def run(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
         """Runs a rollout; returns `TRACE` by name, shape (world, time)."""
         return self.simulate(hand, state, ctrl)[0]
 
     def simulate(
-        self, hand: HandLanes, state: State, ctrl: jax.Array, *, trajectory: bool = False
+        self, hand: WorldConstants, state: State, ctrl: jax.Array, *, trajectory: bool = False
     ) -> tuple[dict[str, jax.Array], State]:
         """Runs a rollout.
 
@@ -248,8 +256,8 @@ class Program:
         # A core runs block after block: they share what no block leaves to another.
         scratch = 1 if self.backend == "cpu" else blocks
         shapes = [
-            (blocks, self.fine.rows, self.size),
-            (blocks, self.rest.rows, self.block),
+            (blocks, self.finger_state.rows, self.size),
+            (blocks, self.world_state.rows, self.block),
             (scratch, self.scratch.rows, self.size),
             (blocks, steps, len(TRACE), self.block),
         ]
@@ -285,7 +293,7 @@ class Program:
 
     def _path_rows(self) -> tuple[int, int]:
         """Rows of the state's tables that are positions, the first of each."""
-        return self.fine.offset["finger_vel"], self.rest.offset["wrist_vel"]
+        return self.finger_state.offset["finger_vel"], self.world_state.offset["wrist_vel"]
 
     def _qpos(self, angles: jax.Array, places: jax.Array) -> jax.Array:
         """MuJoCo's qpos (world, time, nq) of recorded rows (block, time, row, lane or world)."""
@@ -294,23 +302,35 @@ class Program:
         joints = angles.reshape(split)[..., : self.num_fingers, :]
         joints = joints.transpose(0, 5, 1, 4, 2, 3)  # (block, world, time, finger, link, axis)
         joints = joints.reshape(-1, steps, self.num_fingers * self.links * self.axes)
-        rest = jnp.moveaxis(places, 3, 1).reshape(-1, steps, places.shape[2])
-        return jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
+        world_state = jnp.moveaxis(places, 3, 1).reshape(-1, steps, places.shape[2])
+        return jnp.concatenate([world_state[..., :6], joints, world_state[..., 6:]], -1)
 
-    def unpack_state(self, fine: jax.Array, rest: jax.Array, worlds: int) -> State:
+    def unpack_state(self, finger_state: jax.Array, world_state: jax.Array, worlds: int) -> State:
         """Inverse of `pack_state`."""
-        wide = self.fine.unpack(fine, self.fingers, self.num_fingers, worlds)
-        narrow = self.rest.unpack(rest, 1, 1, worlds)
+        wide = self.finger_state.unpack(finger_state, self.fingers, self.num_fingers, worlds)
+        narrow = self.world_state.unpack(world_state, 1, 1, worlds)
         acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
         return State(**wide, **narrow, acc=acc)
 
     def _kernel(self, steps: int, *refs: Any) -> None:
-        hand, world, fine0, rest0, arm, pressure, fine, rest, scratch, trace, *path = refs
+        (
+            hand,
+            world,
+            finger_state0,
+            world_state0,
+            arm,
+            pressure,
+            finger_state,
+            world_state,
+            scratch,
+            trace,
+            *path,
+        ) = refs
         block = Block(self.fingers, self.block)
-        step = Step(self, block, hand, world, fine, rest, scratch)
+        step = Step(self, block, hand, world, finger_state, world_state, scratch)
         own = block.world
-        _copy(fine0, fine, self.fine.rows)
-        _copy(rest0, rest, self.rest.rows, own)
+        _copy(finger_state0, finger_state, self.finger_state.rows)
+        _copy(world_state0, world_state, self.world_state.rows, own)
         start, end = (round(t / self.scene.discretization.timestep) for t in self.scene.window)
         limits, far = self.scene.limits, self.scene.cost.lost_distance
         alive = self.world.read(world, "alive", 0, own).lane
@@ -318,8 +338,8 @@ class Program:
         def record(t: jax.Array) -> None:
             if path:
                 angles, places = self._path_rows()
-                _copy(fine, path[0], angles, at=(t,))
-                _copy(rest, path[1], places, own, at=(t,))
+                _copy(finger_state, path[0], angles, at=(t,))
+                _copy(world_state, path[1], places, own, at=(t,))
 
         def body(carry: tuple) -> tuple:
             t, alive, speed = carry

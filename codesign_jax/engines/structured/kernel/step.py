@@ -10,13 +10,17 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import collision, inertia
 from codesign_jax.engines.structured import kinematics as kin
-from codesign_jax.engines.structured.fused.contacts import (
+from codesign_jax.engines.structured.constants import apply_columns
+from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.integration import integrate, rigid_arm
+from codesign_jax.engines.structured.kernel.contacts import (
     direct,
     sphere_on_object,
     sphere_on_table,
     zeros,
 )
-from codesign_jax.engines.structured.fused.newton import (
+from codesign_jax.engines.structured.kernel.memory import Block
+from codesign_jax.engines.structured.kernel.newton import (
     Iterate,
     Memory,
     Newton,
@@ -25,10 +29,6 @@ from codesign_jax.engines.structured.fused.newton import (
     relative,
     triangle,
 )
-from codesign_jax.engines.structured.fused.tables import Block
-from codesign_jax.engines.structured.hand import apply_columns
-from codesign_jax.engines.structured.inertia import Body
-from codesign_jax.engines.structured.integration import integrate, rigid_arm
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -36,7 +36,7 @@ from codesign_jax.engines.structured.problem import next_motion, object_motion, 
 from codesign_jax.scene import Scene
 
 if TYPE_CHECKING:
-    from codesign_jax.engines.structured.fused.kernel import Program
+    from codesign_jax.engines.structured.kernel.program import Program
 
 
 class Step:
@@ -48,13 +48,13 @@ class Step:
         block: Block,
         hand: Any,
         world: Any,
-        fine: Any,
-        rest: Any,
+        finger_state: Any,
+        world_state: Any,
         scratch: Any,
     ):
         """Takes the kernel's lanes and memory."""
         self.p, self.block, self.hand, self.world = program, block, hand, world
-        self.fine, self.rest, self.scratch = fine, rest, scratch
+        self.finger_state, self.world_state, self.scratch = finger_state, world_state, scratch
 
     def constants(self, *names: str) -> list[Lanes]:
         """Constants of worlds."""
@@ -75,14 +75,19 @@ class Step:
           that have moved, and so go on.
         """
         p, scene = self.p, self.p.scene
-        state = {n: p.rest.read(self.rest, n, 0, self.block.world) for n in p.rest.groups}
+        state = {
+            n: p.world_state.read(self.world_state, n, 0, self.block.world)
+            for n in p.world_state.groups
+        }
         geometry = self._palm(state, arm)
-        size, shape = self.constants("object_size", "shape")
+        size, shape = self.constants("object_size", "object_id")
         friction = lanewise(
             lambda s: collision.object_friction(scene, s.astype(jnp.int32)).astype(s.dtype), shape
         )
         bound = {c.name: c.bind(p.scratch, self.scratch, friction) for c in p.sets}
-        memory = Memory(p.hand, self.hand, p.fine, self.fine, p.scratch, self.scratch, bound)
+        memory = Memory(
+            p.hand, self.hand, p.finger_state, self.finger_state, p.scratch, self.scratch, bound
+        )
         now, centre = self._forward(state, geometry, pressure, memory, (size, shape))
         rigid = not scene.effects.wrist
         newton = Newton(p.links, self.block, memory, geometry["palm"], rigid=rigid)
@@ -145,7 +150,7 @@ class Step:
           The warm start and the hand's centre in the palm's frame.
         """
         p, now = self.p, at["now"]
-        like = jnp.zeros((p.size,), self.fine.dtype)
+        like = jnp.zeros((p.size,), self.finger_state.dtype)
         mount, base, share, stub = (
             p.hand.read(self.hand, n) for n in ("mount", "base", "share", "stub_centre")
         )
@@ -163,7 +168,10 @@ class Step:
             gain = p.hand.read(self.hand, "gain")
             soft = p.scene.effects.neo_hookean
             section = p.hand.read(self.hand, "section") if soft else None
-            joint = [p.fine.read(self.fine, n, i) for n in ("finger", "finger_vel", "acc")]
+            joint = [
+                p.finger_state.read(self.finger_state, n, i)
+                for n in ("finger", "finger_vel", "acc")
+            ]
             out = lanewise(
                 partial(_link, p.scene, self.p.lay.axes),
                 (origin, frame, vel, bias, motion),
@@ -212,7 +220,7 @@ class Step:
         if name.endswith("_object"):
             function = partial(sphere_on_object, scene)
             return lanewise(function, *shape, at["columns"], at["palm"].position, centre, radius)
-        height = self.p.rest.read(self.rest, "wrist", 0, self.block.world)[2]
+        height = self.p.world_state.read(self.world_state, "wrist", 0, self.block.world)[2]
         return lanewise(partial(sphere_on_table, scene), height, centre, radius)
 
     def _slot_contacts(self, state: dict, at: dict, m: Memory, shape: tuple) -> None:
@@ -241,7 +249,7 @@ class Step:
         """Point, normal and gap of each slot of the object on the table, lanes of a world."""
 
         def compute(size, kind, columns, position, height):
-            hand = SimpleNamespace(object_size=size, shape=kind.astype(jnp.int32), mesh=None)
+            hand = SimpleNamespace(object_size=size, object_id=kind.astype(jnp.int32), mesh=None)
             frame = SimpleNamespace(object=columns, object_pos=position)
             c = collision.object_on_table(direct, self.p.scene, hand, frame, height)  # type: ignore[arg-type]
             return [
@@ -255,7 +263,7 @@ class Step:
     def _deal(self, slots: list[tuple]) -> tuple[Lanes, Lanes, Lanes]:
         """Deals the slots (component, 1, world) out to the finger lanes."""
         p = self.p
-        away = jnp.full((p.size,), 1e3, self.fine.dtype)
+        away = jnp.full((p.size,), 1e3, self.finger_state.dtype)
         dealt = []
         for field in range(3):
             values = [s[field] for s in slots]
@@ -279,13 +287,16 @@ class Step:
         size = lanewise(_largest, new)
 
         def link(i: Any, largest: Lanes) -> Lanes:
-            q, rate, acc = (p.fine.read(self.fine, n, i) for n in ("finger", "finger_vel", "acc"))
+            q, rate, acc = (
+                p.finger_state.read(self.finger_state, n, i)
+                for n in ("finger", "finger_vel", "acc")
+            )
             rate, q, top = lanewise(partial(_turned, h), q, rate, acc)
             p.scratch.write(self.scratch, "new_finger", q, i)
             p.scratch.write(self.scratch, "new_finger_vel", rate, i)
             return lanewise(_worse, largest, top)
 
-        like = jnp.zeros((p.size,), self.fine.dtype)
+        like = jnp.zeros((p.size,), self.finger_state.dtype)
         fingers = loop(p.links, link, zeros((), like), p.size).lane
         largest = _worse(size.lane, self.block.fold(fingers, _worse))
         limit = p.scene.limits
@@ -293,14 +304,14 @@ class Step:
         acc = {"acc_wrist": now.wrist, "acc_object": now.object}
         for name, value in {**new, **acc}.items():
             kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
-            p.rest.write(self.rest, name, kept, 0, self.block.world)
+            p.world_state.write(self.world_state, name, kept, 0, self.block.world)
 
         def store(i: Any, x: Any) -> Any:
             for name in ("finger", "finger_vel"):
                 value = p.scratch.read(self.scratch, f"new_{name}", i)
-                old = p.fine.read(self.fine, name, i)
+                old = p.finger_state.read(self.finger_state, name, i)
                 kept = lanewise(jnp.where, lanes([good], (), wide=False), value, old)
-                p.fine.write(self.fine, name, kept, i)
+                p.finger_state.write(self.finger_state, name, kept, i)
             return x
 
         jax.lax.fori_loop(0, p.links, store, jnp.int32(0))

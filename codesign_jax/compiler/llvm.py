@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.engines.structured.fused.llvm_rules import RULES, Value, kind_of
-from codesign_jax.engines.structured.fused.walk import Walker
+from codesign_jax.compiler.llvm_rules import RULES, Value, kind_of
+from codesign_jax.compiler.walker import Walker
 
 _FLOAT = {4: "float", 8: "double"}
 

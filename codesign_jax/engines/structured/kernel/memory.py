@@ -10,7 +10,7 @@ import numpy as np
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, spread
 
 
-class Table:
+class MemoryLayout:
     """Names of the rows of an array (block, row, lane or world of the block).
 
     A block's numbers lie together in memory; one row is a number of every lane or world.

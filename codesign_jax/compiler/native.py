@@ -20,7 +20,7 @@ import llvmlite.binding as binding
 import numpy as np
 
 import codesign_jax
-from codesign_jax.engines.structured.fused import llvm
+from codesign_jax.compiler import llvm
 
 # Offsets in bytes in the structures of XLA's foreign function interface, 64 bit.
 _EXTENSION, _ARGS, _RETS = 8, 72, 112  # in XLA_FFI_CallFrame

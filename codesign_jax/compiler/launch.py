@@ -45,7 +45,8 @@ def launch(
     if kernel.backend == "cpu":
         from codesign_jax.compiler import native
 
-        layout = native.Layout(shapes, len(inputs), kernel.lanes, inputs[0].dtype.itemsize)
+        sizes = [x.dtype.itemsize for x in (*avals, *outputs)]
+        layout = native.Layout(shapes, len(inputs), kernel.lanes, sizes[0], sizes)
         name = native.register(kernel.origin, trace, layout)
         return list(jax.ffi.ffi_call(name, outputs)(*inputs))
     number = np.int32

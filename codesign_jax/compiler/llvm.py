@@ -7,22 +7,16 @@ additions.  Source of the instructions: LLVM Language Reference Manual.
 """
 
 import struct
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 
+from codesign_jax.compiler import llvm_memory
+from codesign_jax.compiler.llvm_memory import Ref
 from codesign_jax.compiler.llvm_rules import RULES, Value, kind_of
 from codesign_jax.compiler.walker import Walker
 
 _FLOAT = {4: "float", 8: "double"}
-
-
-class Ref(NamedTuple):
-    """Memory of a block: name of its address, and its shape."""
-
-    address: str
-    shape: tuple[int, ...]
 
 
 class Writer(Walker):
@@ -157,74 +151,6 @@ class Writer(Walker):
         text = self.emit(f"select {self.typed(which)}, {self.typed(yes)}, {self.typed(no)}")
         return Value(yes.kind, yes.wide, text)
 
-    # Memory
-
-    def _address(self, ref: Ref, indices: list[Value]) -> str:
-        """Address of an element, of the first lane where an index has one for each."""
-        strides = np.cumprod([1, *ref.shape[:0:-1]])[::-1]
-        offset, address = 0, ref.address
-        for index, stride in zip(indices, strides, strict=True):
-            if index.text is None:
-                offset += int(stride) * int(np.min(index.known))
-                continue
-            assert not index.wide, "an index that is not known and differs between the lanes"
-            wide = self.emit(f"sext i32 {index.text} to i64")
-            step = self.emit(f"mul nsw i64 {wide}, {int(stride)}")
-            kind = self.scalars["f"]
-            address = self.emit(f"getelementptr inbounds {kind}, ptr {address}, i64 {step}")
-        if offset:
-            address = self.emit(
-                f"getelementptr inbounds {self.scalars['f']}, ptr {address}, i64 {offset}"
-            )
-        return address
-
-    def _indices(self, ref: Ref, equation: Any, leaves: list[Value]) -> list[Value]:
-        """Index in each dimension; a whole slice is the lane."""
-        (indexer,) = jax.tree.unflatten(equation.params["tree"], leaves)
-        found = []
-        for index, size in zip(indexer.indices, ref.shape, strict=True):
-            if isinstance(index, Value):
-                found.append(index if len(found) == len(ref.shape) - 1 else self.narrow(index))
-            elif isinstance(index, int | np.integer):
-                found.append(Value("i", False, None, int(index)))
-            else:  # a slice
-                assert index.size == size == self.lanes, (index, size)
-                found.append(Value("i", True, None, np.arange(size)))
-        assert not any(i.wide for i in found[:-1])
-        return found
-
-    def load(self, ref: Ref, indices: list[Value]) -> Value:
-        """Reads an element, or one for each lane, all within one row."""
-        address, align = self._address(ref, indices), self.itemsize
-        lane = indices[-1]
-        if not lane.wide:
-            return Value(
-                "f", False, self.emit(f"load {self.type('f', False)}, ptr {address}, align {align}")
-            )
-        pattern = np.asarray(lane.known) - np.min(lane.known)
-        count = int(pattern.max()) + 1
-        row = self.type("f", True, count)
-        value = self.emit(f"load {row}, ptr {address}, align {align}")
-        if count != self.lanes or (pattern != np.arange(self.lanes)).any():
-            value = self.shuffle(row, value, pattern)
-        return Value("f", True, value)
-
-    def store(self, ref: Ref, indices: list[Value], value: Value) -> None:
-        """Writes an element, or one for each lane; lanes with one index have one value."""
-        address, align = self._address(ref, indices), self.itemsize
-        lane = indices[-1]
-        if not lane.wide:
-            self.lines.append(f"store {self.typed(value)}, ptr {address}, align {align}")
-            return
-        value = self.spread(value)
-        pattern = np.asarray(lane.known) - np.min(lane.known)
-        places, first = np.unique(pattern, return_index=True)
-        assert (places == np.arange(places.size)).all(), "a row with holes"
-        row, text = self.type("f", True, places.size), self.operand(value)
-        if places.size != self.lanes or (pattern != np.arange(self.lanes)).any():
-            text = self.shuffle(self.type("f", True), text, first)
-        self.lines.append(f"store {row} {text}, ptr {address}, align {align}")
-
     def shuffle(self, kind: str, value: str, pattern: np.ndarray) -> str:
         """A vector whose lane i is the value's lane pattern[i]."""
         mask = ", ".join(f"i32 {int(p)}" for p in pattern)
@@ -328,11 +254,12 @@ class Writer(Walker):
 
     def get(self, equation: Any, ref: Ref, leaves: list[Value]) -> Value:
         """See `Walker`."""
-        return self.load(ref, self._indices(ref, equation, leaves))
+        value = llvm_memory.load(self, ref, llvm_memory.indices(self, ref, equation, leaves))
+        return self.same(equation, value)
 
     def swap(self, equation: Any, ref: Ref, value: Value, leaves: list[Value]) -> None:
         """See `Walker`."""
-        self.store(ref, self._indices(ref, equation, leaves), value)
+        llvm_memory.store(self, ref, llvm_memory.indices(self, ref, equation, leaves), value)
 
 
 def write(jaxpr: Any, shapes: list[tuple[int, ...]], lanes: int, itemsize: int = 4) -> str:
@@ -342,13 +269,15 @@ def write(jaxpr: Any, shapes: list[tuple[int, ...]], lanes: int, itemsize: int =
       jaxpr: The kernel's jaxpr; its arguments are references to a block of each array.
       shapes: Shapes of the blocks.
       lanes: Lanes of a block.
-      itemsize: Bytes of a float.
+      itemsize: Bytes of a computed float; arrays have the types of the jaxpr's references.
 
     Raises:
       NotImplementedError: If the kernel does something that has no rule here.
     """
     writer = Writer(lanes, itemsize)
-    writer.run(jaxpr, [], [Ref(f"%a{k}", shape) for k, shape in enumerate(shapes)])
+    types = [np.dtype(v.aval.dtype) for v in jaxpr.invars]
+    arrays = [Ref(f"%a{k}", *of) for k, of in enumerate(zip(shapes, types, strict=True))]
+    writer.run(jaxpr, [], arrays)
     params = ", ".join(f"ptr noalias %a{k}" for k in range(len(shapes)))
     body = "\n".join(writer.lines)
     declarations = "\n".join(sorted(writer.declared))

@@ -38,13 +38,15 @@ class Layout(NamedTuple):
       shapes: Shape of a block of each.
       inputs: How many of them, the first ones, are inputs.
       lanes: Lanes of a block.
-      itemsize: Bytes of a float.
+      itemsize: Bytes of a computed float.
+      bytes: Bytes of an element of each array.
     """
 
     shapes: list[tuple[int, ...]]
     inputs: int
     lanes: int
     itemsize: int
+    bytes: list[int]
 
 
 @functools.cache
@@ -73,7 +75,8 @@ def _handler(name: str, layout: Layout) -> str:
     An array of one block belongs to all of them.
     """
     major, minor = _api_version()
-    sizes = [layout.itemsize * int(np.prod(s)) for s in layout.shapes]
+    arrays = zip(layout.bytes, layout.shapes, strict=True)
+    sizes = [size * int(np.prod(shape)) for size, shape in arrays]
     lines = [
         f"define ptr @{name}(ptr %frame) nounwind {{",
         "entry:",

@@ -7,12 +7,16 @@ from typing import Annotated, Literal
 
 import tyro
 
+# A flag given twice adds to what was given before.
 Overrides = Annotated[
-    tuple[str, ...],
+    tuple[tuple[str, ...], ...],
+    tyro.conf.UseAppendAction,
     tyro.conf.arg(
         name="set",
         metavar="KEY=VALUE ...",
-        help="Values that replace the scene file's, e.g. discretization.links=5 gravity=3.7",
+        help="Values that replace those of the scene, hand and objects files, by key path: "
+        "gravity=3.7 discretization.links=5 hand.material.shear_modulus=60e3 "
+        "objects.object.sphere.mass=0.2",
         help_behavior_hint="",
     ),
 ]
@@ -78,7 +82,9 @@ class Evaluate:
     """Evaluate one design: costs of each object, success, and an animation if asked for."""
 
     design: Annotated[
-        tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint="")
+        tuple[tuple[str, ...], ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint=""),
     ] = ()
     """The design in the hand file's units, e.g. length=148 arm_z=-59; the rest is the default."""
     run_folder: Annotated[

@@ -2,10 +2,11 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from codesign_jax import files, schema
+from codesign_jax import files, keypaths, schema
 from codesign_jax.schema import choice, quantity
 
 # Unit of a file -> (SI unit, factor).
@@ -150,18 +151,21 @@ class Hand:
     preset: tuple[Preset, ...] = ()
 
 
-def load(name: str | Path) -> Hand:
+def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Hand:
     """Reads and checks a hand.
 
     Args:
       name: Name of a built-in hand, or a path ending in .toml.
+      overrides: Values by key path that replace the file's; see `keypaths`.
 
     Raises:
       SceneError: with every problem in the file.
     """
     path = files.find("hands", name)
     problems: list[str] = []
-    hand = schema.parse(Hand, files.read(path), path.name, problems)
+    table = files.read(path)
+    keypaths.apply(table, keypaths.flatten(overrides or {}), path.name, problems)
+    hand = schema.parse(Hand, table, path.name, problems)
     if hand is not None:
         _check_table(hand, path.name, problems)
         _check_presets(hand, path.name, problems)

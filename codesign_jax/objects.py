@@ -1,10 +1,11 @@
 """Object sets as data: shapes, masses, friction and the noise of a trial (paper Sec. VI.2)."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from codesign_jax import files, schema
+from codesign_jax import files, keypaths, schema
 from codesign_jax.schema import choice, quantity
 
 if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitives need neither
@@ -105,18 +106,21 @@ class ObjectSet:
     object: tuple[Shape, ...]
 
 
-def load(name: str | Path) -> ObjectSet:
+def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> ObjectSet:
     """Reads and checks an object set and its meshes.
 
     Args:
       name: Name of a built-in set, or a path ending in .toml.
+      overrides: Values by key path that replace the file's; see `keypaths`.
 
     Raises:
       SceneError: with every problem in the file and in its meshes.
     """
     path = files.find("objects", name)
     problems: list[str] = []
-    parsed = schema.parse(_ObjectSetFile, files.read(path), path.name, problems)
+    table = files.read(path)
+    keypaths.apply(table, keypaths.flatten(overrides or {}), path.name, problems)
+    parsed = schema.parse(_ObjectSetFile, table, path.name, problems)
     if parsed is None:
         raise schema.SceneError(problems)
     if not parsed.object:

@@ -5,10 +5,11 @@ none.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax import files, hand, objects, schema
+from codesign_jax import files, hand, keypaths, objects, schema
 from codesign_jax.schema import choice, quantity
 
 
@@ -215,7 +216,7 @@ def load(
     hand_name: str | Path | None = None,
     object_set: str | Path | None = None,
     accuracy: str | Path | None = None,
-    overrides: dict[str, dict[str, Any]] | None = None,
+    overrides: Mapping[Any, Any] | None = None,
 ) -> Scene:
     """Reads a scene with its hand and objects.
 
@@ -225,8 +226,8 @@ def load(
       object_set: Object set to use instead of the scene's.
       accuracy: Preset of discretization and solver to use instead of the scene's: "fast",
         "standard", "reference", or a path ending in .toml; see `load_accuracy`.
-      overrides: Values by table and key that replace the file's and the preset's, e.g.
-        {"discretization": {"links": 5}}.
+      overrides: Values by key path that replace the files' and the preset's, nested or dotted,
+        e.g. {"discretization": {"links": 5}, "hand.material.shear_modulus": 60e3}; see `keypaths`.
 
     Raises:
       SceneError: with every problem of the scene, the hand and the objects.
@@ -234,12 +235,10 @@ def load(
     path = files.find("scenes", name)
     table = files.read(path)
     problems: list[str] = []
-    changes = [_preset(accuracy, problems), overrides or {}]
-    for group, values in (item for change in changes for item in change.items()):
-        if isinstance(values, dict):
-            table[group] = {**table.get(group, {}), **values}
-        else:
-            table[group] = values
+    changes = keypaths.flatten(_preset(accuracy, problems)) | keypaths.flatten(overrides or {})
+    inside = {key: keypaths.below(changes, key) for key in ("hand", "objects")}
+    own = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
+    keypaths.apply(table, own, path.name, problems)
     parsed = schema.parse(_SceneFile, table, path.name, problems)
     parts = {}
     for key, loader, chosen in (
@@ -250,7 +249,8 @@ def load(
         if chosen is None and not isinstance(named, str):
             continue  # missing or of the wrong type: `parse` has said so
         try:
-            parts[key] = loader(_beside(path, named) if chosen is None else chosen)
+            source = _beside(path, named) if chosen is None else chosen
+            parts[key] = loader(source, overrides=inside[key])
         except schema.SceneError as error:
             problems += error.problems
     if parsed is not None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import jax
 
-from codesign_jax import codesign, parameters, scene
+from codesign_jax import codesign, keypaths, parameters, scene
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
 from codesign_jax.experiments import (
@@ -63,7 +63,7 @@ def parse() -> argparse.Namespace:
 def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], int]:
     """Returns the experiment, the settings its state must belong to, and its grasps."""
     the_plan = plan.experiment(args.experiment, args.size)
-    overrides = common.parse_overrides([*plan.OVERRIDES[args.size], *args.set])
+    overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
     the_scene = scene.load("paper", overrides=overrides)
     space = parameters.design_space(the_scene.hand, the_plan.preset)
     devices = args.devices or jax.device_count()
@@ -117,7 +117,7 @@ def find_types(args: argparse.Namespace) -> int:
     grid = statistics.load(args.data, "landscape")
     if grid is None:
         sys.exit(f"error: {args.data} holds no landscape.npz")
-    overrides = common.parse_overrides([*plan.OVERRIDES[args.size], *args.set])
+    overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
     the_scene = scene.load("paper", overrides=overrides)
     space = parameters.design_space(the_scene.hand, "2d")
     engine = make_engine(args.engine, the_scene)

@@ -262,6 +262,11 @@ WRONG = {
         ["discretization.links = 3.5 must be of type int", "gravity = 'low' must be of type float"],
     ),
     "not a number": (["--set", "gravity=nan"], ["gravity = nan is outside [0, 100] m/s^2"]),
+    "key of a value": (["--set", "name.x=1"], ["name = 'paper' is no table: it has no key 'x'"]),
+    "key of another file": (
+        ["--set", "hand.section.width=18", "--set", "objects.nois.position=0.01"],
+        ["width = 18 is outside [0.005, 0.1] m", "did you mean 'noise'?"],
+    ),
     "no value": (["--set", "gravity"], ["--set 'gravity' must be KEY=VALUE"]),
     "all at once": (
         [

@@ -9,8 +9,20 @@ import numpy as np
 import pytest
 from small import DATA, nth, stack
 
-from codesign_jax import control, files, hand, model, objects, parameters, rollout, scene, schema
+from codesign_jax import (
+    control,
+    files,
+    hand,
+    keypaths,
+    model,
+    objects,
+    parameters,
+    rollout,
+    scene,
+    schema,
+)
 from codesign_jax.engines import make_engine
+from codesign_jax.runs.scene_files import write_scene
 
 HANDS, OBJECTS = sorted(files.available("hands")), sorted(files.available("objects"))
 
@@ -61,6 +73,59 @@ def test_unknown_key_names_the_nearest(tmp_path):
 def test_unknown_key_in_a_scene_override():
     (problem,) = scene_problems(solver={"iteration": 3})
     assert "paper.toml.solver.iteration is not a known key; did you mean 'iterations'?" in problem
+
+
+BY_PATH = {
+    "gravity=3.7": lambda s: s.gravity == 3.7,
+    "discretization.links=5": lambda s: s.discretization.links == 5,
+    "pneumatics.lag=0.2": lambda s: s.pneumatics.lag == 0.2,
+    "hand=tripod3": lambda s: s.hand.name == "tripod3",
+    "hand.material.shear_modulus=60e3": lambda s: s.hand.material.shear_modulus == 60e3,
+    "hand.finger[1].tilt=75": lambda s: [f.tilt for f in s.hand.finger[:2]] == [70.0, 75.0],
+    "hand.parameter.length.high=150": lambda s: s.hand.parameter[0].high == 150.0,
+    "hand.preset.2d.fixed.pressure=110": lambda s: s.hand.preset[0].fixed["pressure"] == 110,
+    "objects.noise.position=0.01": lambda s: s.objects.noise.position == 0.01,
+    "objects.object.sphere.mass=0.2": lambda s: s.objects.object[2].mass == 0.2,
+    "objects.object.0.size.2=0.02": lambda s: s.objects.object[0].size == (0.03, 0.03, 0.02),
+}
+
+
+@pytest.mark.parametrize("pair", BY_PATH)
+def test_a_key_path_changes_its_value_and_the_resolved_scene_has_it(pair, tmp_path):
+    changed = scene.load("paper", overrides=keypaths.parse([pair]))
+    assert BY_PATH[pair](changed) and changed != scene.load("paper")
+    write_scene(changed, tmp_path)
+    assert scene.load(tmp_path / "scene.toml") == changed
+
+
+def test_key_paths_may_be_nested_or_dotted_and_the_last_of_a_key_holds():
+    nested = {"hand": {"material": {"shear_modulus": 60e3}}, "solver.iterations": 7}
+    pairs = ["solver.iterations=9", "hand.material={shear_modulus=60e3}", "solver.iterations=7"]
+    one = scene.load(overrides=nested)
+    assert one.solver.iterations == 7 and one.hand.material.shear_modulus == 60e3
+    assert scene.load(overrides=keypaths.parse(pairs)) == one
+
+
+@pytest.mark.parametrize(
+    ("pair", "expected"),
+    [
+        ("name.x=1", "paper.toml.name = 'paper' is no table: it has no key 'x'"),
+        ("gravity.earth.x=1", "paper.toml.gravity = 9.81 is no table: it has no key 'earth'"),
+        ("solver=3", "paper.toml.solver must be a table, not int"),
+        ("hand.materiel.density=1", "materiel is not a known key; did you mean 'material'?"),
+        ("hand.material.densty=1", "material.densty is not a known key; did you mean 'density'?"),
+        (
+            "hand.section.width=18",
+            "pneuflex4.toml.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018?",
+        ),
+        ("hand.finger[7].tilt=1", "pneuflex4.toml.finger has no entry '7'"),
+        ("objects.object.spher.mass=1", "object has no entry 'spher'; did you mean 'sphere'?"),
+        ("objects.object.sphere.mass=light", "object[2].mass = 'light' must be of type float"),
+    ],
+)
+def test_a_wrong_key_path_is_told_in_words(pair, expected):
+    problems = problems_of(lambda name: scene.load(name, overrides=keypaths.parse([pair])), "paper")
+    assert any(expected in p for p in problems), problems
 
 
 def test_missing_table(tmp_path):

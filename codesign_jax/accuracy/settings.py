@@ -1,16 +1,18 @@
 """Settings whose error and cost are measured: time step, links, axes, surface, solver, floats."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from codesign_jax import keypaths
 from codesign_jax import scene as scenes
 from codesign_jax.benchmark import peers
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import Scene
 
-Overrides = dict[str, dict[str, Any]]
+Overrides = Mapping[Any, Any]
+"""Values by key path, nested or flat; see `keypaths`."""
 
 # A relative Newton decrement is a square: these are the smallest that rounding lets a step reach.
 EXACT = {
@@ -65,9 +67,7 @@ class Setting:
 
     def overrides(self) -> Overrides:
         """What the setting changes in a scene."""
-        from codesign_jax.commands import common
-
-        tables: Overrides = {
+        tables: dict[str, dict[str, Any]] = {
             "discretization": {
                 "timestep": self.timestep * 1e-3,
                 "links": self.links,
@@ -83,7 +83,7 @@ class Setting:
             # MuJoCo's contacts need two steps a time constant. The normal stiffness stays: it is
             # declared apart from the time constant, see `model.contact_invweight`.
             tables["contact"] = {"time_constant": 2e-3 * self.timestep}
-        return merge(tables, common.parse_overrides(self.extra))
+        return merge(tables, keypaths.parse(self.extra))
 
     def scene(self, more: Overrides | None = None, **names: Any) -> Scene:
         """The paper's scene at this setting.
@@ -107,11 +107,10 @@ class Setting:
 
 
 def merge(*tables: Overrides) -> Overrides:
-    """Overrides one after the other, later ones last."""
-    merged: Overrides = {}
+    """Overrides one after the other: the last value of a key holds."""
+    merged: dict[keypaths.Path, Any] = {}
     for table in tables:
-        for group, values in table.items():
-            merged[group] = {**merged.get(group, {}), **values}
+        merged |= keypaths.flatten(table)
     return merged
 
 

@@ -1,12 +1,10 @@
-"""What the commands share: overrides, designs and JAX's compilation cache."""
+"""What the commands share: designs, notes and JAX's compilation cache."""
 
 import contextlib
 import math
 import os
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -34,30 +32,6 @@ def use_compilation_cache() -> None:
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         jax.config.update("jax_compilation_cache_dir", str(Path(root) / "codesign-jax" / "jax"))
-
-
-def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
-    """Turns "discretization.links=5" into {"discretization": {"links": 5}}.
-
-    Raises:
-      SceneError: If a pair is not KEY=VALUE, or a key has more than two parts.
-    """
-    tables: dict[str, Any] = {}
-    problems = []
-    for pair in pairs:
-        key, equals, text = pair.partition("=")
-        parts = key.strip().split(".")
-        if not equals or len(parts) > 2 or not all(parts):
-            problems.append(f"--set {pair!r} must be KEY=VALUE, such as discretization.links=5")
-        elif len(parts) == 1:
-            tables[parts[0]] = _toml_value(text)
-        else:
-            group = tables.setdefault(parts[0], {})
-            if isinstance(group, dict):
-                group[parts[1]] = _toml_value(text)
-    if problems:
-        raise SceneError(problems)
-    return tables
 
 
 def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
@@ -133,11 +107,3 @@ def _number(text: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
-
-
-def _toml_value(text: str) -> Any:
-    """Reads a TOML value; what is none, such as a bare word, is a string."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text

@@ -1,5 +1,6 @@
 """`codesign evaluate`."""
 
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, rollout, runs, schema, types
+from codesign_jax import codesign, engines, keypaths, rollout, runs, schema, types
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common
 from codesign_jax.cost import particle_cost
@@ -76,10 +77,10 @@ def _from_flags(options: "Evaluate") -> _Case:
         hand_name=options.hand,
         object_set=options.objects,
         accuracy=options.accuracy,
-        overrides=common.parse_overrides(options.overrides),
+        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
     )
     space = design_space(scene.hand, options.preset)
-    design = common.parse_design(space, options.design)
+    design = common.parse_design(space, [*chain.from_iterable(options.design)])
     return _Case(scene, space, design, options.engine or engines.DEFAULT)
 
 

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, runs
+from codesign_jax import codesign, engines, keypaths, runs
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
@@ -67,7 +68,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
             hand_name=options.hand,
             object_set=options.objects,
             accuracy=options.accuracy,
-            overrides=common.parse_overrides(options.overrides),
+            overrides=keypaths.parse(chain.from_iterable(options.overrides)),
         )
     except SceneError as error:
         problems += error.problems

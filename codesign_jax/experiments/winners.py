@@ -9,10 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from codesign_jax import parameters, rollout
+from codesign_jax import keypaths, parameters, rollout
 from codesign_jax import scene as scenes
 from codesign_jax.codesign import SUCCESS_COST, stream_key
-from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.experiments import record as records
 from codesign_jax.experiments.record import Arrays
@@ -57,7 +56,7 @@ class Variant:
         Args:
           more: Further overrides, which come first.
         """
-        table = common.parse_overrides([*more, *self.overrides])
+        table = keypaths.parse([*more, *self.overrides])
         base = scenes.load("paper", object_set=self.objects, overrides=table)
         return scaled(base, self.friction, self.stiffness)
 

@@ -336,7 +336,7 @@ def test_without_contacts_a_step_is_that_of_beams_alone():
 
 
 def test_the_kernel_does_not_run_what_it_lacks(monkeypatch):
-    """The kernel knows all effects but the hull and contact between fingers."""
+    """The kernel knows all effects but contact between fingers."""
 
     def taken(way):
         def run(self, fields, ctrl, *_, **__):
@@ -352,7 +352,7 @@ def test_the_kernel_does_not_run_what_it_lacks(monkeypatch):
         ({"gravity": False, "palm_table": False, "pressure_dynamics": True}, "kernel"),
         ({"friction": "full", "neo_hookean": True}, "kernel"),
         ({"wrist": False, "object_table": False}, "kernel"),
-        ({"surface": "hull"}, "batch"),
+        ({"surface": "hull"}, "kernel"),
         ({"finger_finger": True}, "batch"),
     ):
         engine = StructuredEngine(effects_scene(values), kernel=True)

@@ -244,7 +244,8 @@ class StructuredEngine:
         hand = world_constants(self.scene, fields)
         found, end = program.simulate(hand, self.reset(fields), ctrl, trajectory=trajectory)
         qpos = found.get("qpos", jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype))
-        status = self._status(found["residual"])
+        overflow = found["overflow"][None] > 0 if "overflow" in found else None
+        status = self._status(found["residual"], overflow)
         return Trace(
             found["distance"], found["height"], found["speed"], qpos, status, self._flat(end)
         )
@@ -309,4 +310,4 @@ def _has_kernel() -> bool:
 def in_kernel(scene: Scene) -> bool:
     """Whether the kernel simulates a scene; the batch form simulates all."""
     meshes = any(o.type == "mesh" for o in scene.objects.object)
-    return not (meshes or scene.effects.surface == "hull" or scene.effects.finger_finger)
+    return not (meshes or scene.effects.finger_finger)

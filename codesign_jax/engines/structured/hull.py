@@ -49,23 +49,39 @@ class Vertices(NamedTuple):
     share: jax.Array
 
 
-def vertices(scene: Scene, hand: WorldConstants, kin: Kinematics) -> Vertices:
-    """Places the hull's contact points."""
-    s, width, dtype = hull.slots(scene), scene.hand.section.width, kin.origin.dtype
+def places(scene: Scene, hand: WorldConstants) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The vertices on their links, which do not change with the hand's pose.
+
+    Args:
+      scene: The scene.
+      hand: The hand.
+
+    Returns:
+      Places in the frame of the row's link, or, with the same numbers, of the link before it if
+      that is shifted to the row's joint [m], shape (3, row, k, finger, world); and `Vertices`'
+      weight and share.
+    """
+    s, width, dtype = hull.slots(scene), scene.hand.section.width, hand.offset.dtype
     along, across, up, weight, *area = (
         jnp.asarray(v[..., None, None], dtype) for v in (s.along, s.across, s.up, s.weight, *s.area)
     )
     # The first joint stands half a segment from the base; centres lie at half the height.
     segment, height = 2.0 * hand.offset[0], 2.0 * hand.centre[2, 0]
     local = jnp.stack([along * segment, across * width + 0.0 * segment + 0.0 * along, up * height])
+    surface = area[0] * segment * width + area[1] * segment * height + area[2] * width * height
+    return local, weight, surface / width**2
+
+
+def vertices(scene: Scene, hand: WorldConstants, kin: Kinematics) -> Vertices:
+    """Places the hull's contact points."""
+    local, weight, share = places(scene, hand)
     base = jnp.stack([apply_columns(kin.palm, hand.mount[k]) for k in range(3)])
     before = jnp.concatenate([base[:, :, None], kin.link], 2)[:, :, :, None]
     after = jnp.concatenate([kin.link, kin.link[:, :, -1:]], 2)[:, :, :, None]
     joint = jnp.concatenate([kin.origin, kin.origin[:, -1:]], 1)[:, :, None]
     image = apply_columns(after, local)
     blend = (1.0 - weight) * apply_columns(before, local) + weight * image
-    surface = area[0] * segment * width + area[1] * segment * height + area[2] * width * height
-    return Vertices(joint + blend, image, weight, surface / width**2)
+    return Vertices(joint + blend, image, weight, share)
 
 
 def attach(run: Stages, contacts: Contacts, skin: Vertices) -> Contacts:

@@ -49,6 +49,11 @@ class ContactSet:
         self.scene, self.name, self.count, self.k, self.size = scene, name, count, k, size
         self.on_object = name.endswith("_object")
 
+    places: tuple[str, ...] = ("point", "normal", "gap")
+    """Fields that say where contacts are, in the order of `contacts`' argument."""
+    of_lines: tuple[str, ...] = ("gap",)
+    """Fields that a line search needs."""
+
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """The set's part of the scratch table."""
         rows, ray = ROWS[self.scene.effects.friction]
@@ -68,6 +73,16 @@ class ContactSet:
         if self.name != "object_table":
             table = self.scene.contact.finger_table_friction
         return make(self.scene, table, bodies=1)
+
+    def contacts(self, place: tuple, friction: jax.Array) -> Contacts:
+        """Contacts of (point, normal, gap), and what else the set keeps of them."""
+        point, normal, gap = place
+        return Contacts(point, normal, gap[0], self.cone(friction))
+
+    def of_line(self, gap: tuple, friction: jax.Array) -> Contacts:
+        """What a line search needs of contacts: their gaps and cones."""
+        (gap,) = gap
+        return Contacts(gap, gap, gap[0], self.cone(friction))
 
 
 class BoundContacts:
@@ -106,79 +121,80 @@ class BoundContacts:
 
     def create(self, item: Any, geometry: Any, motion: Lanes, velocity: Lanes) -> None:
         """Stores contacts (point, normal, gap) and their jar for relative motions (6, ...)."""
-        point, normal, gap = geometry
-        self.write("gap", gap, item)
-
-        def jar(point, normal, gap, friction, motion, velocity):
-            c = Contacts(point, normal, gap[0], self.set.cone(friction))
-            reference = c.reference(c.relative(velocity[:, None]))
-            return c.relative(motion[:, None]) - reference
+        self.write("gap", geometry[2], item)
 
         def store() -> None:
-            self.write("point", point, item)
-            self.write("normal", normal, item)
-            value = lanewise(jar, point, normal, gap, self.friction, motion, velocity)
-            self.write("jar", value, item)
-            self.write("step", lanewise(jnp.zeros_like, value), item)
+            for field, value in self.begin(geometry, motion, velocity).items():
+                self.write(field, value, item)
 
         jax.lax.cond(self.touching(item), store, lambda: None)
 
-    def _contacts(self, item: Any) -> tuple[Lanes, Lanes, Lanes]:
-        gap = self.read("gap", item)
-        return self.read("point", item), self.read("normal", item), gap[0]
+    def begin(self, place: tuple, motion: Lanes, velocity: Lanes) -> dict[str, Lanes]:
+        """What is kept of new contacts, by field, for relative motions of their bodies."""
+
+        def jar(place, friction, motion, velocity):
+            c = self.set.contacts(place, friction)
+            reference = c.reference(c.relative(velocity[:, None]))
+            return c.relative(motion[:, None]) - reference
+
+        value = lanewise(jar, place, self.friction, motion, velocity)
+        fields = dict(zip(self.set.places, place, strict=True))
+        return {**fields, "jar": value, "step": lanewise(jnp.zeros_like, value)}
+
+    def place(self, item: Any) -> tuple[Lanes, ...]:
+        """Where the contacts are, see `ContactSet.places`."""
+        return tuple(self.read(field, item) for field in self.set.places)
 
     def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Moves jar along the last line; contact inertia (6, 6) and wrench (6,), summed over k."""
+        shapes: list[tuple] = [(21,), (6,)]
+        triangle, wrench = self.if_touching(item, lambda: self._push(item, alpha), shapes)
+        return full(triangle), wrench
 
-        def response(point, normal, gap, friction, jar):
-            c = Contacts(point, normal, gap, self.set.cone(friction))
+    def _push(self, item: Any, alpha: Lanes) -> list[Lanes]:
+        def response(place, friction, jar):
+            c = self.set.contacts(place, friction)
             r = contact.respond(c, jar)
             matrix = contact.contact_inertia(c, r.hessian)
             return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
 
-        def compute() -> list[Lanes]:
-            jar, step = self.read("jar", item), self.read("step", item)
-            jar = lanewise(along, alpha, jar, step)
-            self.write("jar", jar, item)
-            matrix, wrench = lanewise(response, *self._contacts(item), self.friction, jar)
-            return [upper(matrix), wrench]
-
-        triangle, wrench = self.if_touching(item, compute, [(21,), (6,)])
-        return full(triangle), wrench
+        jar, step = self.read("jar", item), self.read("step", item)
+        jar = lanewise(along, alpha, jar, step)
+        self.write("jar", jar, item)
+        matrix, wrench = lanewise(response, self.place(item), self.friction, jar)
+        return [upper(matrix), wrench]
 
     def aim(self, item: Any, step: Lanes) -> Lanes:
         """Stores the line along a relative motion (6, ...); returns the cost's slope at 0."""
+        return self.if_touching(item, lambda: [self._aim(item, step)], [()])[0]
 
-        def ray(point, normal, gap, friction, jar, step):
-            c = Contacts(point, normal, gap, self.set.cone(friction))
+    def _aim(self, item: Any, step: Lanes) -> Lanes:
+        def ray(place, friction, jar, step):
+            c = self.set.contacts(place, friction)
             change = c.relative(step[:, None])
             line = contact.line(c, jar, change)
             first, _ = contact.slopes(c, line, 0.0)
             return change, jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
 
-        def compute() -> list[Lanes]:
-            jar = self.read("jar", item)
-            out = lanewise(ray, *self._contacts(item), self.friction, jar, step)
-            self.write("step", out[0], item)
-            self.write("ray", out[1], item)
-            return [out[2]]
-
-        return self.if_touching(item, compute, [()])[0]
+        jar = self.read("jar", item)
+        change, line, slope = lanewise(ray, self.place(item), self.friction, jar, step)
+        self.write("step", change, item)
+        self.write("ray", line, item)
+        return slope
 
     def slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
         """First and second derivative of the item's cost along the line."""
+        return self.if_touching(item, lambda: self._slopes(item, alpha), [(), ()])
 
+    def _slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
         def both(gap, friction, ray, alpha):
-            c = Contacts(gap, gap, gap, self.set.cone(friction))
+            c = self.set.of_line(gap, friction)
             line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             first, second = contact.slopes(c, line, alpha)
             return [sum_axis(first, 0), sum_axis(second, 0)]
 
-        def compute() -> list[Lanes]:
-            gap, ray = self.read("gap", item)[0], self.read("ray", item)
-            return lanewise(both, gap, self.friction, ray, alpha)
-
-        return self.if_touching(item, compute, [(), ()])
+        gap = tuple(self.read(field, item) for field in self.set.of_lines)
+        return lanewise(both, gap, self.friction, self.read("ray", item), alpha)
 
 
 def sphere_on_object(scene: Scene, size, shape, columns, position, centre, radius):

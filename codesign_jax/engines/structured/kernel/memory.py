@@ -1,5 +1,6 @@
 """Named numbers in a kernel's memory, and loops that carry them."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -79,6 +80,24 @@ class MemoryLayout:
         values = [ref[(row + k, *where)] for k in range(int(np.prod(shape)))]
         return lanes(values, shape, wide=self.wide)
 
+    def gather(self, ref: Any, name: str, item: jax.Array, lane: jax.Array) -> Lanes:
+        """Lanes of items that differ from lane to lane, of a table of fingers.
+
+        Args:
+          ref: The memory.
+          name: Name of the rows.
+          item: Item that each lane reads, int32, shape (lane,).
+          lane: Lane whose item it reads, same shape.
+        """
+        row, shape = self._row(name, item)
+        return lanes([ref[row + k, lane] for k in range(int(np.prod(shape)))], shape, wide=True)
+
+    def scatter(self, ref: Any, name: str, value: Lanes, item: jax.Array, lane: jax.Array) -> None:
+        """Stores items that differ from lane to lane; arguments as in `gather`."""
+        row, _ = self._row(name, item)
+        for k, part in enumerate(value.parts.ravel()):
+            ref[row + k, lane] = spread(part, lane.shape, value.dtype)
+
     def write(self, ref: Any, name: str, value: Lanes, item: Any = 0, world: Any = None) -> None:
         """Stores an item; the lanes of a world store the same number."""
         row, _ = self._row(name, item)
@@ -86,6 +105,13 @@ class MemoryLayout:
         size = ref.shape[-1:] if self.wide else world.shape
         for k, part in enumerate(value.parts.ravel()):
             ref[(row + k, *where)] = spread(part, size, value.dtype)
+
+
+def choose(which: jax.Array, compute: Callable, otherwise: Any, size: int) -> Any:
+    """compute() where a scalar is true, else a tree of lanes of the same structure, as it is."""
+    arrays, rebuild = solid(otherwise, size)
+    some = lambda: solid(compute(), size)[0]  # noqa: E731
+    return rebuild(jax.lax.cond(which, some, lambda: arrays))
 
 
 def solid(tree: Any, size: int) -> tuple[list[jax.Array], Callable]:
@@ -107,20 +133,21 @@ def solid(tree: Any, size: int) -> tuple[list[jax.Array], Callable]:
     return arrays, rebuild
 
 
-_UPPER = np.triu_indices(6)
-
-
 def upper(matrix: Lanes) -> Lanes:
-    """Upper triangle of a symmetric (6, 6) matrix, 21 components."""
-    return Lanes(matrix.parts[_UPPER], (21, *matrix.shape[2:]), matrix.dtype)
+    """Upper triangle of a symmetric (n, n) matrix, n (n + 1) / 2 components."""
+    n = matrix.shape[0]
+    return Lanes(
+        matrix.parts[np.triu_indices(n)], (n * (n + 1) // 2, *matrix.shape[2:]), matrix.dtype
+    )
 
 
 def full(triangle: Lanes) -> Lanes:
-    """Symmetric (6, 6) matrix of its upper triangle."""
-    parts = np.empty((6, 6, 1, 1), object)
-    for value, i, j in zip(triangle.parts.ravel(), *_UPPER, strict=True):
+    """Symmetric (n, n) matrix of its upper triangle."""
+    n = (math.isqrt(8 * triangle.shape[0] + 1) - 1) // 2
+    parts = np.empty((n, n, 1, 1), object)
+    for value, i, j in zip(triangle.parts.ravel(), *np.triu_indices(n), strict=True):
         parts[i, j, 0, 0] = parts[j, i, 0, 0] = value
-    return Lanes(parts, (6, 6, *triangle.shape[1:]), triangle.dtype)
+    return Lanes(parts, (n, n, *triangle.shape[1:]), triangle.dtype)
 
 
 class Block:
@@ -130,6 +157,7 @@ class Block:
       fingers: Number of fingers, a power of two.
       worlds: Number of worlds.
       size: Number of lanes.
+      lane: The lanes, shape (lane,).
       world: World of each lane, shape (lane,).
       finger: Finger of each lane, shape (lane,).
     """
@@ -137,7 +165,7 @@ class Block:
     def __init__(self, fingers: int, worlds: int):
         """Makes the indices, inside a kernel."""
         self.fingers, self.worlds, self.size = fingers, worlds, fingers * worlds
-        lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
+        self.lane = lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
         count = jnp.int32(worlds)
         self.world, self.finger = jax.lax.rem(lane, count), jax.lax.div(lane, count)
 

@@ -1,6 +1,7 @@
 """Newton's method of `solver`, inside a kernel: links in loops, numbers in registers."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,15 +10,18 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured import elimination as el
 from codesign_jax.engines.structured import newton, solver
 from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.kernel import hull
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, direct, zeros
 from codesign_jax.engines.structured.kernel.memory import (
     Block,
     MemoryLayout,
     anywhere,
+    choose,
     full,
     solid,
     upper,
 )
+from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.problem import Forces, Matrices, object_acceleration
@@ -52,6 +56,24 @@ class Quality(NamedTuple):
     count: jax.Array
 
 
+class Row(NamedTuple):
+    """What a row of the hull adds to the elimination.
+
+    Attributes:
+      held: Whether its contacts are with the object.
+      used: Whether there are any, a scalar.
+      terms: What they add to the row's joint.
+      matrix: Contact inertia of the link before it, upper triangle (21,).
+      force: Its wrench.
+    """
+
+    held: bool
+    used: jax.Array
+    terms: el.JointTerms
+    matrix: Lanes
+    force: Lanes
+
+
 class Memory(NamedTuple):
     """A kernel's memory: tables with their refs, and the bound contact sets by name."""
 
@@ -82,7 +104,10 @@ def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
         return lanewise(difference, link, obj)
     if name == "palm_object":
         return lanewise(difference, palm, obj)
-    return {"finger_table": link, "palm_table": palm, "object_table": obj}[name]
+    if name == "hull_object":
+        return lanewise(lambda m, o: jnp.concatenate([m[:6] - o, m[6:]]), link, obj)
+    alone = {"finger_table": link, "hull_table": link, "palm_table": palm, "object_table": obj}
+    return alone[name]
 
 
 LINE_TOLERANCE = 0.01
@@ -104,7 +129,8 @@ class Newton:
         """
         self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
         self.fingers = [c for n, c in m.contacts.items() if n.startswith("finger")]
-        self.slots = [c for n, c in m.contacts.items() if not n.startswith("finger")]
+        self.skin = [c for n, c in m.contacts.items() if n.startswith("hull_")]
+        self.slots = [c for n, c in m.contacts.items() if not n.startswith(("finger", "hull_"))]
         self.like = jnp.zeros((block.size,), palm.armature.dtype)
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
@@ -146,28 +172,68 @@ class Newton:
           The sum over the fingers.
         """
 
-        def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes):
+        def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes, terms):
             link = make_body(*body)
             push = smooth - link.times(motion)
             node = newton.add_link(node, newton.link_terms(link.matrix(), push, pushes))
-            return el.eliminate(direct, node, axes, arm, tau - arm * acc)
+            return el.eliminate(direct, node, axes, arm, tau - arm * acc, terms)
 
         def step(i: Any, node: el.Quadratic) -> el.Quadratic:
             acc, motion = self.move("acc", i, alpha), self.move("motion", i, alpha)
             pushes = {c.set.name: c.push(i, alpha) for c in self.fingers}
             smooth, tau, axes, arm = self.read("smooth", "tau", "axes", "armature", item=i)
             node = node._replace(p=full(node.p), q=full(node.q))
+            rows = [self.row(c, i, axes, alpha) for c in self.skin]
+            terms = add_terms([r.terms for r in rows]) if rows else None
             node, factors = lanewise(
-                eliminate, node, self.body_of(i), motion, smooth, tau, axes, arm, acc, pushes
+                eliminate, node, self.body_of(i), motion, smooth, tau, axes, arm, acc, pushes, terms
             )
             for name, value in zip(("w", "g", "z"), factors, strict=True):
                 self.write(name, value, i)
-            return node._replace(p=upper(node.p), q=upper(node.q))
+            return self.add_rows(node._replace(p=upper(node.p), q=upper(node.q)), rows)
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
-        node = loop(self.links, step, el.Quadratic(*empty), self.block.size, reverse=True)
+        tip = [self.row(c, self.links, None, alpha) for c in self.skin]
+        node = self.add_rows(el.Quadratic(*empty), tip)
+        node = loop(self.links, step, node, self.block.size, reverse=True)
         node = self.block.sum(node)
         return node._replace(p=full(node.p), q=full(node.q))
+
+    def row(self, slots: BoundSlots, row: Any, axes: Lanes | None, alpha: Lanes) -> "Row":
+        """What a row of the hull adds to the elimination, see `hull.row_terms`.
+
+        Args:
+          slots: The row's contacts with the object or the table.
+          row: The row.
+          axes: Motion subspace of its joint; None for the tip, which has none.
+          alpha: Length of the last step.
+        """
+        number = 1 if axes is None else axes.shape[0]
+        shapes = ((number, number), (number, 6), (number, 6), (number,), (21,), (6,))
+        empty = [zeros(s, self.like) for s in shapes]
+        used = slots.used(row) > 0
+
+        def compute() -> list[Lanes]:
+            inertia, wrench = slots.push(row, alpha)
+            if axes is None:
+                return [*empty[:4], upper(inertia[:6, :6]), wrench[:6]]
+            terms, matrix, force = lanewise(hull.row_terms, axes, inertia, wrench)
+            return [*terms, upper(matrix), force]
+
+        *terms, matrix, force = choose(used, compute, empty, self.block.size)
+        if not slots.set.on_object:
+            terms[2] = zeros(shapes[2], self.like)
+        return Row(slots.set.on_object, used, el.JointTerms(*terms), matrix, force)
+
+    def add_rows(self, node: el.Quadratic, rows: list["Row"]) -> el.Quadratic:
+        """Adds the rows' contacts to the links before them; p and q as triangles."""
+        for row in rows:
+
+            def add(row: Row = row, node: el.Quadratic = node) -> el.Quadratic:
+                return lanewise(_add_row, node, row.matrix, full(row.matrix), row.force, row.held)
+
+            node = choose(row.used, add, node, self.block.size)
+        return node
 
     def slot_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
         """Contact inertia and wrench of the palm's and the object's contacts; see `backward`."""
@@ -247,15 +313,18 @@ class Newton:
             for contacts in self.fingers:
                 rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
                 terms.append(contacts.aim(i, rel))
+            terms += self.aim_row(i, parent, moved, step)
             touch = lanewise(lambda t: total(t), terms)
             slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
             return moved, slope, curvature, touch
 
         none = zeros((), self.like)
         parent = lanewise(jnp.add, step.palm_motion, zeros((6,), self.like))
-        _, slope, curvature, touch = loop(
+        last, slope, curvature, touch = loop(
             self.links, one, (parent, none, none, none), self.block.size
         )
+        tip = self.aim_row(self.links, last, last, step)
+        touch = lanewise(lambda t: total(t), [touch, *tip])
         for contacts in self.slots:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
@@ -266,6 +335,17 @@ class Newton:
         slope, curvature, touch = self.block.sum((slope, curvature, touch))
         slope, curvature = lanewise(self._rest, now, step, self.palm, slope, curvature)
         return slope, curvature, touch
+
+    def aim_row(self, row: Any, before: Lanes, after: Lanes, step: Iterate) -> list[Lanes]:
+        """Slopes of a row's contacts along the step of the links before and behind it."""
+        if not self.skin:
+            return []
+        moved = lanewise(partial(hull.across, obj=None), before, after)
+        names = [
+            (c, relative(c.set.name, moved, step.palm_motion, step.object_motion))
+            for c in self.skin
+        ]
+        return [c.aim(row, motion) for c, motion in names]
 
     @staticmethod
     def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
@@ -305,7 +385,9 @@ class Newton:
                 return sums
 
             sums = [zeros((), self.like)] * 2
-            sums = loop(self.links, lambda i, s: add(i, s, self.fingers), sums, self.block.size)
+            for count, sets in ((self.links, self.fingers), (self.links + 1, self.skin)):
+                if sets:
+                    sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
             for c in self.slots:
                 sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
             one, two = self.block.sum(sums)
@@ -372,6 +454,21 @@ class Newton:
         now, residual, last = rebuild(arrays)
         loop(self.links, lambda i, _: (self.move("acc", i, last), [])[1], [], self.block.size)
         return now, Quality(residual, count)
+
+
+def add_terms(terms: list[el.JointTerms]) -> el.JointTerms:
+    """Sums what the rows of several pairs of bodies add to a joint."""
+    if len(terms) == 1:
+        return terms[0]
+    return lanewise(lambda *t: jax.tree.map(lambda *v: total(v), *t), *terms)
+
+
+def _add_row(node: el.Quadratic, matrix, square, force, held: bool) -> el.Quadratic:
+    p, c, q, r, ro = node
+    p, r = p + matrix, r + force
+    if held:
+        c, q, ro = c + square, q + matrix, ro - force
+    return el.Quadratic(p, c, q, r, ro)
 
 
 def make_body(mass: jax.Array, centre: jax.Array, tensor: jax.Array) -> Body:

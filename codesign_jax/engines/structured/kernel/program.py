@@ -16,8 +16,10 @@ from jax.experimental import pallas as pl
 from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.compiler.ptx import LANES
 from codesign_jax.engines.structured.constants import WorldConstants
+from codesign_jax.engines.structured.kernel import hull
 from codesign_jax.engines.structured.kernel.contacts import ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, anywhere
+from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_slots
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanewise import lanes
@@ -64,6 +66,8 @@ class Program:
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
         self.palm_groups = -(-len(palm_points(scene)) // self.fingers)
         self.sets = self._sets()
+        self.slotted = any(isinstance(s, SlotSet) for s in self.sets)
+        self.trace = (*TRACE, "overflow") if self.slotted else TRACE
         self._tables()
 
     @classmethod
@@ -84,10 +88,17 @@ class Program:
             sets.append(make("finger_object", self.links, k))
         if k and e.finger_table:
             sets.append(make("finger_table", self.links, k))
+        on = {"hull_object": e.finger_object, "hull_table": e.finger_table}
+        if e.surface == "hull":
+            sets += [self._skin(name) for name in on if on[name]]
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
         on_table = [make("object_table", -(-4 // self.fingers), 1)] if e.object_table else []
         return [*sets, *on_table]
+
+    def _skin(self, name: str) -> HullSet:
+        slots = hull_slots(self.scene)
+        return HullSet(self.scene, name, rows=self.links + 1, slots=slots, size=self.size)
 
     def _tables(self) -> None:
         n, a = self.links, self.axes
@@ -100,6 +111,8 @@ class Program:
             }
         if self.scene.effects.neo_hookean:
             more |= {"section": (1, (3,))}
+        if self.slotted:
+            more |= hull.fields(self.scene)
         self.hand = MemoryLayout(
             True,
             mount=(1, (3, 3)),
@@ -172,6 +185,8 @@ class Program:
             arrays |= self._palm_slots(worlds, dtype)
         if hand.section is not None:
             arrays["section"] = hand.section[None]
+        if self.slotted:
+            arrays |= hull.pack(self.scene, hand)
         extra = self.fingers - n
         if extra:
             for name in ("share", "mass", "inertia", "gain"):
@@ -233,7 +248,7 @@ class Program:
         return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.size)
 
     def run(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
-        """Runs a rollout; returns `TRACE` by name, shape (world, time)."""
+        """Runs a rollout; returns `trace` by name, shape (world, time)."""
         return self.simulate(hand, state, ctrl)[0]
 
     def simulate(
@@ -248,7 +263,7 @@ class Program:
           trajectory: Whether to record qpos.
 
         Returns:
-          `TRACE` by name, shape (world, time), with "qpos", shape (world, time, nq), if it is
+          `trace` by name, shape (world, time), with "qpos", shape (world, time, nq), if it is
           recorded; and the last states.
         """
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
@@ -259,7 +274,7 @@ class Program:
             (blocks, self.finger_state.rows, self.size),
             (blocks, self.world_state.rows, self.block),
             (scratch, self.scratch.rows, self.size),
-            (blocks, steps, len(TRACE), self.block),
+            (blocks, steps, len(self.trace), self.block),
         ]
         if trajectory:
             angles, places = self._path_rows()
@@ -285,8 +300,8 @@ class Program:
             origin = repr((self.scene, self.limits, trajectory))
             out = launch(call, inputs, outputs, Kernel(origin, self.backend, self.size))
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
-        trace = trace.reshape(-1, steps, len(TRACE))[: ctrl.shape[0]]
-        found = {name: trace[..., k] for k, name in enumerate(TRACE)}
+        trace = trace.reshape(-1, steps, len(self.trace))[: ctrl.shape[0]]
+        found = {name: trace[..., k] for k, name in enumerate(self.trace)}
         if trajectory:
             found["qpos"] = self._qpos(out[4], out[5])[: ctrl.shape[0]]
         return found, self.unpack_state(out[0], out[1], ctrl.shape[0])
@@ -365,7 +380,7 @@ class Program:
 
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
             record(t)
-            for k in range(len(TRACE)):
+            for k in range(len(self.trace)):
                 last = trace[jnp.maximum(done - 1, 0), k, own]
                 trace[t, k, own] = speed if k == 2 else last
             return x

@@ -19,6 +19,7 @@ from codesign_jax.engines.structured.kernel.contacts import (
     sphere_on_table,
     zeros,
 )
+from codesign_jax.engines.structured.kernel.hull import Side, Skin
 from codesign_jax.engines.structured.kernel.memory import Block
 from codesign_jax.engines.structured.kernel.newton import (
     Iterate,
@@ -29,6 +30,7 @@ from codesign_jax.engines.structured.kernel.newton import (
     relative,
     triangle,
 )
+from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -71,8 +73,8 @@ class Step:
           speed: Largest velocity before the step.
 
         Returns:
-          Trace entries distance, height, residual and iterations; speed after the step; worlds
-          that have moved, and so go on.
+          Trace entries distance, height, residual, iterations and, with slots, overflow; speed
+          after the step; worlds that have moved, and so go on.
         """
         p, scene = self.p, self.p.scene
         state = {
@@ -99,7 +101,16 @@ class Step:
         count = jnp.full_like(height, quality.count)
         # A decided world is not iterated for: what it is short of says nothing.
         residual = jnp.where(waiting, quality.residual.lane, 0.0)
-        return (distance, height, residual, count), new_speed, good
+        entry = [distance, height, residual, count]
+        if p.slotted:
+            entry.append(self._overflow(bound, waiting))
+        return tuple(entry), new_speed, good
+
+    def _overflow(self, bound: dict[str, Any], waiting: jax.Array) -> jax.Array:
+        """One for worlds that had too few slots for their contacts in this step, else zero."""
+        lists = [c.overflow() for c in bound.values() if isinstance(c, BoundSlots)]
+        most = self.block.fold(total(lists), jnp.maximum)
+        return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
 
     def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
         """Kinematics, inertia and smooth forces of palm, wrist and object."""
@@ -161,8 +172,11 @@ class Step:
             lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
         )
 
+        skin = Skin(self, at, m, shape) if any(n.startswith("hull_") for n in m.contacts) else None
+
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, motion, middle = carry
+            before = Side(frame, motion, vel)
             names = ("offset", "mass", "centre", "inertia", "stiffness", "damping")
             constants = [p.hand.read(self.hand, n, i) for n in names]
             gain = p.hand.read(self.hand, "gain")
@@ -188,10 +202,15 @@ class Step:
             share = p.hand.read(self.hand, "share", i + 1)
             middle = lanewise(lambda m, c, s: m + s * c, middle, stored["body_centre"], share)
             self._finger_contacts(i, carry, at, m, shape)
+            if skin:
+                skin.row(i, carry[0], before, Side(carry[1], carry[4], carry[2]))
             return (*carry, middle)
 
         start = (origin, frame, vel, bias, motion, weight)
-        middle = loop(p.links, link, start, p.size)[-1]
+        origin, frame, vel, _, motion, middle = loop(p.links, link, start, p.size)
+        if skin:
+            tip = Side(frame, motion, vel)
+            skin.row(p.links, origin, tip, tip)
         self._slot_contacts(state, at, m, shape)
         count = p.num_fingers * p.links
         middle = self.block.sum(middle)
@@ -208,14 +227,15 @@ class Step:
         )
         for name in ("finger_object", "finger_table"):
             if name in m.contacts:
-                geometry = self._geometry(name, centre, radius, at, shape)
+                geometry = self.geometry(name, centre, radius, at, shape)
                 moves = (
                     relative(name, motion, now.palm_motion, now.object_motion),
                     relative(name, vel, at["vel"], at["object_vel"]),
                 )
                 m.contacts[name].create(i, geometry, *moves)
 
-    def _geometry(self, name: str, centre: Lanes, radius: Lanes, at: dict, shape: tuple):
+    def geometry(self, name: str, centre: Lanes, radius: Any, at: dict, shape: tuple):
+        """Point, normal and gap of spheres of the hand against the object or the table."""
         scene = self.p.scene
         if name.endswith("_object"):
             function = partial(sphere_on_object, scene)
@@ -238,7 +258,7 @@ class Step:
             point, radius = (p.hand.read(self.hand, n, i) for n in ("palm_point", "palm_radius"))
             centre = lanewise(lambda f, s: apply_columns(f[:, :, None], s), at["frame"], point)
             for name in palm:
-                create(name, i, self._geometry(name, centre, radius, at, shape))
+                create(name, i, self.geometry(name, centre, radius, at, shape))
         on_table = m.contacts.get("object_table")
         slots = self._table_points(state, at, shape) if on_table else []
         for i in range(on_table.set.count if on_table else 0):

@@ -1,0 +1,179 @@
+"""The skinned hull in a kernel: which vertices touch, and how they enter the joints' elimination.
+
+The algebra is that of `codesign_jax.engines.structured.hull`, one row at a time.
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.engines.structured import hull
+from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
+from codesign_jax.engines.structured.elimination import JointTerms
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, any_of
+from codesign_jax.engines.structured.lanes import contract, dot
+from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.scene import Scene
+
+if TYPE_CHECKING:
+    from codesign_jax.engines.structured.kernel.newton import Memory
+    from codesign_jax.engines.structured.kernel.step import Step
+
+KINDS = 3
+"""Rows differ in their vertices: most have the same, the last joint's and the tip's their own."""
+
+
+class Side(NamedTuple):
+    """A link as a row's vertices follow it; lanes.
+
+    Attributes:
+      frame: Columns of its orientation, shape (3, 3, finger, world).
+      motion: Its spatial acceleration, shape (6, finger, world).
+      vel: Its spatial velocity, same shape.
+    """
+
+    frame: Lanes
+    motion: Lanes
+    vel: Lanes
+
+
+def fields(scene: Scene) -> dict[str, tuple[int, tuple[int, ...]]]:
+    """The hull's part of the hand's table: vertices (place, weight, share) and balls."""
+    k = scene.discretization.hull_rings * scene.discretization.hull_points
+    return {"vertex": (KINDS * k, (5,)), "ball": (KINDS, (2,))}
+
+
+def pack(scene: Scene, hand: WorldConstants) -> dict[str, jax.Array]:
+    """Arrays of `fields`, (item, component, finger, world).
+
+    A ball is a radius and a height: around the point of that height above the joint, on the link
+    behind it, all vertices of a straight row are within the radius.
+    """
+    local, weight, share = hull.places(scene, hand)
+    rows = np.array([max(local.shape[1] - KINDS, 0), local.shape[1] - 2, local.shape[1] - 1])
+    weight = jnp.broadcast_to(weight, share.shape)
+    vertex = jnp.concatenate([local, weight[None], share[None]])[:, rows]
+    up = hand.centre[2, 0]
+    away = local[:, rows] - jnp.stack([0 * up, 0 * up, up])[:, None, None]
+    radius = jnp.sqrt(dot(away, away)).max(1)
+    ball = jnp.stack([radius, jnp.broadcast_to(up, radius.shape)], 1)
+    return {"vertex": jnp.moveaxis(vertex, 0, 2).reshape(-1, 5, *up.shape), "ball": ball}
+
+
+def kind_of(row: Any, links: int) -> Any:
+    """Which of the kinds a row is."""
+    return jnp.maximum(row - (links - 2), 0)
+
+
+class Skin:
+    """Finds the vertices that touch the object or the table, row by row."""
+
+    def __init__(self, step: "Step", at: dict[str, Any], m: "Memory", shape: tuple):
+        """Takes a step's memory and geometry, see `Step`."""
+        self.step, self.at, self.m, self.shape = step, at, m, shape
+        d = step.p.scene.discretization
+        self.k, self.links = d.hull_rings * d.hull_points, step.p.links
+        self.sets = [c for n, c in m.contacts.items() if n.startswith("hull_")]
+
+    def row(self, row: Any, joint: Lanes, before: Side, after: Side) -> None:
+        """Gives a slot to each vertex of a row that touches.
+
+        Args:
+          row: The row.
+          joint: Place of its joint.
+          before: The link before it.
+          after: The link behind it.
+        """
+        kind = kind_of(row, self.links)
+        moves = {c.set.name: self._moves(c.set.name, before, after) for c in self.sets}
+        ball = self.step.p.hand.read(self.step.hand, "ball", kind)
+        centre, reach = lanewise(_ball, joint, before.frame, after.frame, ball)
+        for slots in self.sets:
+            slots.clear(row)
+            _, _, gap = self.step.geometry(slots.set.name, centre, reach, self.at, self.shape)
+
+            def vertices(slots: BoundSlots = slots) -> None:
+                def one(v: jax.Array, x: jax.Array) -> jax.Array:
+                    self._vertex(row, kind * self.k + v, slots, joint, before, after, moves)
+                    return x
+
+                jax.lax.fori_loop(0, self.k, one, jnp.int32(0))
+
+            any_of(gap.lane < 0, vertices)
+
+    def _vertex(self, row, item, slots, joint, before, after, moves) -> None:
+        vertex = self.step.p.hand.read(self.step.hand, "vertex", item)
+        place = lanewise(_place, vertex, joint, before.frame, after.frame)
+        point, image, weight, share = place
+        name = slots.set.name
+        where, normal, gap = self.step.geometry(name, point, 0.0, self.at, self.shape)
+
+        which = gap.lane < 0
+        if self.step.p.fingers > self.step.p.num_fingers:  # the others fill up
+            which = which & (self.step.block.finger < self.step.p.num_fingers)
+
+        def store() -> None:
+            lever = lanewise(lambda w, i, c, x: w * (i + c - x), weight, image, where, point)
+            contact = where, normal, gap, lever, share
+            kept = slots.begin(contact, *moves[name])
+            slots.add(row, which, kept, self.step.block.lane)
+
+        any_of(which, store)
+
+    def _moves(self, name: str, before: Side, after: Side) -> tuple[Lanes, Lanes]:
+        """Relative acceleration and velocity of a row, (9, ...)."""
+        obj = (self.at["now"].object_motion, self.at["object_vel"])
+        one, two = (before.motion, before.vel), (after.motion, after.vel)
+        return tuple(  # type: ignore[return-value]
+            lanewise(across, a, b, o if name.endswith("object") else None)
+            for a, b, o in zip(one, two, obj, strict=True)
+        )
+
+
+def across(before: jax.Array, after: jax.Array, obj: jax.Array | None) -> jax.Array:
+    """Motion of a row, of nine components, relative to the object or to what is at rest."""
+    first = before if obj is None else before - obj
+    return jnp.concatenate([first, after[:3] - before[:3]])
+
+
+def _ball(joint, before, after, ball):
+    """Centre (3, 1, ...) and radius (1, ...) of a ball around a row's vertices.
+
+    The link before the joint holds the straight row's centre somewhere else: the radius grows by
+    that distance.
+    """
+    radius, up = ball[0], ball[1]
+    apart = up * (after[2] - before[2])
+    centre = joint + up * after[2]
+    return centre[:, None], radius + jnp.sqrt(dot(apart, apart))[None]
+
+
+def _place(vertex, joint, before, after):
+    """Place (3, 1, ...), image (3, 1, ...), weight (1, ...) and share (1, 1, ...) of a vertex."""
+    local, weight, share = vertex[:3], vertex[3], vertex[4]
+    image = apply_columns(after, local)
+    point = joint + (1.0 - weight) * apply_columns(before, local) + weight * image
+    return point[:, None], image[:, None], weight[None], share[None, None]
+
+
+def row_terms(
+    axes: jax.Array, inertia: jax.Array, wrench: jax.Array
+) -> tuple[JointTerms, jax.Array, jax.Array]:
+    """What a row adds to its joint, as if it touched the object, and to the link before it.
+
+    Args:
+      axes: Motion subspace of the joint, shape (axis, 6, finger, world).
+      inertia: Contact inertia of the row, shape (9, 9, finger, world).
+      wrench: Its wrench, shape (9, finger, world).
+
+    Returns:
+      The terms of the joint, and the contact inertia (6, 6) and wrench (6,) of the link.
+    """
+    turn = axes[:, :3]
+    mixed = contract(turn[:, :, None], inertia[None, 6:], 1)  # (axis, 9, ...)
+    parent = mixed[:, :6]
+    own = contract(turn[:, None], mixed[None, :, 6:], 2)
+    force = contract(turn, wrench[None, 6:], 1)
+    return JointTerms(own, parent, parent, force), inertia[:6, :6], wrench[:6]

@@ -1,0 +1,114 @@
+"""The skinned hull inside the rollout kernel: a dense solve, neighbours, too few slots."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import Limits, Program, program
+from codesign_jax.types import Status
+from tests import test_hull_contact as oracle
+
+STEPS = 420
+
+
+class Runs(NamedTuple):
+    """One compiled rollout of a scene, of as many worlds as `states` below, and its grasp."""
+
+    scene: object
+    engine: StructuredEngine
+    fields: object
+    ctrl: np.ndarray
+    run: Callable
+
+    def along(self, count, start=None, ctrl=None):
+        """The trace and qpos of worlds that repeat the fields."""
+        fields = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[None], count, 0), self.fields)
+        start = self.engine.reset(fields) if start is None else start(fields)
+        ctrl = np.repeat(self.ctrl[None], count, 0) if ctrl is None else ctrl
+        return jax.tree.map(np.asarray, self.run(fields, start, jnp.asarray(ctrl)))
+
+
+def compiled(scene, fields, ctrl):
+    limits = Limits(100, 40, 1e-24)
+    with jax.enable_x64(True):
+        kernel = Program.here(scene, limits, np.float64)
+
+        def run(fields, start, ctrl):
+            hand = world_constants(scene, fields)
+            return kernel.simulate(hand, start, ctrl, trajectory=True)[0]
+
+        return Runs(scene, StructuredEngine(scene), fields, ctrl[:STEPS], jax.jit(run))
+
+
+def velocity(first, second, h):
+    """qvel of the step between two qpos: semi-implicit Euler's, the object turning as MuJoCo's."""
+    found = (second[:-4] - first[:-4]) / h
+    turned, back = np.zeros(4), first[-4:] * [1, -1, -1, -1]
+    mujoco.mju_mulQuat(turned, back, second[-4:])
+    omega = np.zeros(3)
+    mujoco.mju_quat2Vel(omega, turned, h)
+    return np.concatenate([found, omega])
+
+
+@pytest.mark.parametrize("shape", ["box", pytest.param("sphere", marks=oracle.SLOW)])
+def test_accelerations_equal_a_dense_solve(shape):
+    """States of a grasp, one world each: one step of each against dense Jacobians and SciPy."""
+    with jax.enable_x64(True):
+        scene = oracle.hull_scene(shape, hull_rings=2, hull_points=8)
+        hand, _, fields, model, ctrl = oracle.world(scene)
+        runs, h = compiled(scene, fields, ctrl), scene.discretization.timestep
+        when, data, most = np.arange(20, STEPS, 35), mujoco.MjData(model), 0
+        trace = runs.along(len(when))
+        path = trace["qpos"][0]
+        assert not trace["overflow"].any()
+        qpos = path[when]
+        qvel = np.stack([velocity(path[k - 1], path[k], h) for k in when])
+        start = partial(place, runs.engine, qpos, qvel)
+        ctrl = np.stack([np.concatenate([ctrl[k:STEPS], ctrl[:k]]) for k in when])
+        new = runs.along(len(when), start, ctrl)["qpos"]
+        for w, k in enumerate(when):
+            data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[w], qvel[w], ctrl[w, 0]
+            mujoco.mj_forward(model, data)
+            dense = oracle.Dense(scene, model, data, hand)
+            expected = dense.solve()
+            acc = (velocity(qpos[w], new[w, 1], h) - qvel[w]) / h
+            error = np.linalg.norm(acc - expected) / max(np.linalg.norm(expected), 100.0)
+            assert error < 1e-8, (k, dense.num_hull, error)  # as the batch form
+            most = max(most, dense.num_hull)
+        assert most > 8
+        neighbours_change_no_bit(runs, qpos, qvel, ctrl)
+
+
+def place(engine, qpos, qvel, fields):
+    return engine.place(engine.reset(fields), jnp.asarray(qpos), jnp.asarray(qvel))
+
+
+def neighbours_change_no_bit(runs, qpos, qvel, ctrl):
+    """The same worlds in other blocks of a vector, in the program that is compiled already."""
+    order = np.random.default_rng(0).permutation(len(qpos))
+    a = runs.along(len(qpos), partial(place, runs.engine, qpos, qvel), ctrl)
+    b = runs.along(len(qpos), partial(place, runs.engine, qpos[order], qvel[order]), ctrl[order])
+    for name in ("qpos", "distance", "height"):
+        np.testing.assert_array_equal(a[name][order], b[name], err_msg=name)
+
+
+def test_too_few_slots_are_an_overflow(monkeypatch):
+    """With one slot a row a grasp needs more as it touches, and its status tells from then on."""
+    scene = oracle.hull_scene("box", links=2, hull_rings=1, hull_points=4)
+    with jax.enable_x64(True):
+        _, _, fields, _, ctrl = oracle.world(scene)
+    fields = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32)[None], fields)
+    monkeypatch.setattr(program, "hull_slots", lambda _: 1)
+    # A tolerance of its own: a kernel is known by its scene and limits.
+    rollout = jax.jit(StructuredEngine(scene, tolerance=1.1e-6).rollout)
+    status = np.asarray(rollout(fields, jnp.asarray(ctrl, jnp.float32)[None, :STEPS]).status)
+    overflow = (status & int(Status.CONTACT_OVERFLOW)) > 0
+    assert overflow.any() and not overflow[0, 0]

@@ -1,4 +1,6 @@
-"""Checkpoints: orbax in, orbax out; the only module that imports it.
+"""Checkpoints: orbax in, orbax out; the only module that imports it, and where it is used only.
+
+It takes half a second to import, for which commands without a run folder need not wait.
 
 Orbax 0.12 restores a flipped byte as a wrong number and keeps calling a truncated step its latest.
 So every step has a file of SHA-256 digests beside it: of its files, as `sha256sum -c` reads them,
@@ -14,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import orbax.checkpoint as ocp
 
 Arrays = dict[str, Any]
 """Nested dictionaries of NumPy arrays; orbax stores none of size zero."""
@@ -44,11 +45,14 @@ class Checkpoints:
           folder: Folder of the steps.
           keep: Newest steps to keep.
         """
+        import orbax.checkpoint as ocp
+
         self.folder = folder.resolve()  # orbax takes absolute paths only
         # Synchronous: an episode counts as saved when the command says so.
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
         )
+        self._args = ocp.args
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def __enter__(self) -> "Checkpoints":
@@ -70,7 +74,7 @@ class Checkpoints:
           OSError: If it cannot be written, for example on a full disk; older steps stay intact.
         """
         try:
-            saved = self._manager.save(step, args=ocp.args.StandardSave(arrays))
+            saved = self._manager.save(step, args=self._args.StandardSave(arrays))
         except ValueError as error:  # how tensorstore says that the disk is full
             raise OSError(f"checkpoint {step} could not be written: {error}") from error
         if not saved:
@@ -109,7 +113,7 @@ class Checkpoints:
             for expected_file, name in (line.split("  ", 1) for line in lines[1:]):
                 if _file_digest(self.folder / name) != expected_file:
                     return {}, f"the SHA-256 digest of {name} differs"
-            arrays: Any = self._manager.restore(step, args=ocp.args.StandardRestore())
+            arrays: Any = self._manager.restore(step, args=self._args.StandardRestore())
         except FileNotFoundError as error:
             return {}, f"{Path(error.filename or '').name or 'a file'} is missing"
         except Exception as error:  # damaged files raise whatever the parser at that byte raises

@@ -1,6 +1,9 @@
-"""Finds and reads hand, object and scene files: the user's, the checkout's or the wheel's."""
+"""Finds and reads hands, objects and scenes; writes files as a whole or not at all."""
 
+import contextlib
+import os
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,3 +57,33 @@ def read(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise schema.SceneError([f"{path.name}: not valid TOML: {error}"]) from error
+
+
+@contextlib.contextmanager
+def atomically(path: Path) -> Iterator[Path]:
+    """Replaces a file as a whole: whoever reads it, and whenever, finds the old one or the new one.
+
+    Args:
+      path: The file; its folder is made if it is missing.
+
+    Yields:
+      The path to write to, beside the file. It takes the file's place, on disk, when the block ends
+      and is removed if the block raises; a killed process leaves it behind, with a name in .tmp.
+
+    Raises:
+      OSError: If the file cannot be written; the old one stays.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def cache_folder() -> Path:
+    """Folder for what can be computed again, such as compiled programs; it may not exist yet."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "codesign-jax"

@@ -5,14 +5,10 @@ The scene's own checks look at one number at a time; these look at what a design
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy import linalg
 
-from codesign_jax import model, morphology, rollout
+from codesign_jax import clearance, morphology
 from codesign_jax.scene import Scene
-from codesign_jax.start import depth
 from codesign_jax.types import Params
 
 SHAKE_STEPS = 20
@@ -100,7 +96,7 @@ def _blocks(inertia: np.ndarray) -> np.ndarray:
 
 def _ends(matrix: np.ndarray) -> np.ndarray:
     """Largest and smallest eigenvalue: the lowest and the highest frequency."""
-    values = linalg.eigvalsh(matrix)
+    values = np.linalg.eigvalsh(matrix)
     return np.array([values[-1], values[0]])
 
 
@@ -203,12 +199,9 @@ def _reach(scene: Scene, one: Params, name: str) -> list[str]:
 def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     """Refuses designs that start deep inside the table or an object, without noise."""
     found, limit = [], scene.limits.penetration
-    for k, shape in enumerate(scene.objects.object):
-        trial = rollout.nominal_trial(scene, k)
-        fields = jax.vmap(lambda p, t=trial: model.model_fields(scene, p, t))(
-            jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), designs)
-        )
-        for name, deep in zip(names, np.asarray(depth(scene, fields)), strict=True):
+    depths = clearance.overlaps(scene, designs)
+    for shape, row in zip(scene.objects.object, depths, strict=True):
+        for name, deep in zip(names, row, strict=True):
             if not deep <= limit:
                 found.append(
                     f"{name}: starts {1e3 * deep:.0f} mm inside the table or object {shape.name!r} "

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 from toy import TINY
 
-from codesign_jax import cli, runs
+from codesign_jax import cli, preflight, runs
 from codesign_jax.checkpoint import Checkpoints, digest
+from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs.record import to_arrays
 
 EPISODES = 40
@@ -307,8 +308,37 @@ def test_dry_run_writes_nothing(workplace, capsys):
     assert command(*RUN, "--out", "run", "--dry-run") == 0
     output = capsys.readouterr().out
     assert "timestep = 0.02  # s" in output and f"grasps: {EPISODES * 8 + 16}" in output
-    assert "grasps/s" in output and "MB" in output
+    assert "MB" in output and "time: about" in output
+    assert "grasps/s (measured on another machine, docs/performance.md" in output
     assert list(workplace.iterdir()) == []
+
+
+def test_dry_run_estimates_from_earlier_runs_and_simulates_nothing(workplace, monkeypatch, capsys):
+    short = [*RUN, "--episodes", "2", "--test-trials", "0"]
+    assert command(*short, "--out", "run") == 0
+
+    def never(*arguments):
+        raise AssertionError("something was simulated")
+
+    monkeypatch.setattr(MujocoEngine, "rollout", never)
+    capsys.readouterr()
+    assert command(*RUN, "--out", "other", "--dry-run") == 0
+    output = capsys.readouterr().out
+    assert "grasps/s (measured on this machine on" in output and "scaled" not in output
+    assert "60 steps, 6 links, 8 grasps at once" in output
+
+
+def test_conflicts_are_told_before_the_preflight(finished, monkeypatch, capsys):
+    def never(*arguments):
+        raise AssertionError("the preflight ran")
+
+    monkeypatch.setattr(preflight, "check", never)
+    assert command(*RUN, "--out", finished, "--particles", "5", "--dry-run") == 2
+    assert "particles: the run has 4, asked for is 5" in capsys.readouterr().err
+    hull = ["--set", "effects.surface=hull"]
+    for arguments in ([*RUN, *hull], ["evaluate", "--scene", TINY, "--engine", "mujoco", *hull]):
+        assert command(*arguments) == 2
+        assert "not supported by engine mujoco" in capsys.readouterr().err
 
 
 def test_evaluate_prints_costs_of_each_object(capsys):

@@ -1,6 +1,7 @@
 """Run folders: scene files, settings, tables and the signals that stop a run."""
 
 import csv
+import dataclasses
 import os
 import signal
 import threading
@@ -14,9 +15,9 @@ from toy import tiny
 
 from codesign_jax import codesign, files, parameters, scene
 from codesign_jax.checkpoint import digest
+from codesign_jax.runs import rates, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
-from codesign_jax.runs import tables
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Progress, duration
 from codesign_jax.runs.record import Record
@@ -211,6 +212,54 @@ def test_error_in_a_step_is_passed_on():
 
     with Interrupts(lambda _: None) as interrupts, pytest.raises(ValueError, match="broken"):
         interrupts.call(step)
+
+
+def test_estimates_scale_the_most_similar_measurement(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    the_scene = tiny()[0]
+    asked = rates.work(the_scene, settings())
+    shipped = rates.estimate(asked)
+    assert "another machine" in shipped.basis and "scaled" in shipped.basis
+    rates.record(dataclasses.replace(asked, grasps=800, scene="another"), 10.0, 60.0)
+    rates.record(asked, 50.0, 3.0)
+    found = rates.estimate(asked)
+    assert (found.grasps_per_second, found.compile_seconds) == (50.0, 3.0)
+    assert "50 grasps/s (measured on this machine" in found.basis and "scaled" not in found.basis
+    longer = rates.work(tiny(discretization={"timestep": 0.01, "links": 6})[0], settings())
+    found = rates.estimate(longer)  # twice the steps, twice the links, a program not seen before
+    assert (found.grasps_per_second, found.compile_seconds) == (12.5, 60.0)
+    assert "scaled to this run's" in found.basis
+    assert rates.estimate(dataclasses.replace(asked, engine="mjx", device="tpu x1")) is None
+
+
+@pytest.mark.parametrize("content", ["", "[{}]", '[{"work": {}}]', "7"])
+def test_a_damaged_file_of_rates_counts_as_none(content, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = tmp_path / "codesign-jax" / "rates.json"
+    path.parent.mkdir()
+    path.write_text(content)
+    assert rates.measured() == []
+    work = rates.work(tiny()[0], settings())
+    rates.record(work, 5.0, 1.0)
+    assert [r.work for r in rates.measured()] == [work]
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
+    (tmp_path / "codesign-jax").write_text("a file, not a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    rates.record(rates.work(tiny()[0], settings()), 5.0, 1.0)
+    assert rates.measured() == []
+
+
+def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "new" / "file.txt"
+    with files.atomically(path) as part:
+        part.write_text("old")
+        assert not path.exists()
+    with pytest.raises(RuntimeError), files.atomically(path) as part:
+        part.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old" and list(path.parent.iterdir()) == [path]
 
 
 def test_progress_line(capsys):

@@ -2,18 +2,15 @@
 
 import contextlib
 import math
-import os
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
 
-from codesign_jax import preflight, schema
+from codesign_jax import files, preflight, schema
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
-from codesign_jax.types import Params
 
 
 def use_all_cores(engine: str | None) -> None:
@@ -30,8 +27,9 @@ def use_all_cores(engine: str | None) -> None:
 def use_compilation_cache() -> None:
     """Keeps compiled programs between processes, unless the user has chosen a place already."""
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(Path(root) / "codesign-jax" / "jax"))
+        jax.config.update("jax_compilation_cache_dir", str(files.cache_folder() / "jax"))
+        # Small programs too, of which a command has dozens: JAX keeps those that take a second.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
@@ -89,13 +87,22 @@ def mesh_notes(scene: Scene) -> list[str]:
     return notes
 
 
-def preflight_notes(scene: Scene, designs: Params, names: list[str]) -> list[str]:
+def preflight_notes(
+    scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]
+) -> list[str]:
     """Warnings and notes about designs that are about to be simulated.
+
+    Args:
+      scene: The scene.
+      space: The design space.
+      designs: Designs [SI units], each of shape (parameter,), by what to call them.
 
     Raises:
       SceneError: If a design must not be simulated.
     """
-    report = preflight.check(scene, designs, names)
+    stacked = np.array([*designs.values()], np.float32)
+    params = jax.jit(jax.vmap(space.params))(stacked)
+    report = preflight.check(scene, params, [*designs])
     if report.refusals:
         raise SceneError(report.refusals)
     return [f"warning: {text}" for text in report.warnings] + report.notes

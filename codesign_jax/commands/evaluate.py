@@ -39,9 +39,8 @@ def main(options: "Evaluate") -> int:
     common.use_all_cores(options.engine)
     case = _from_run(options) if options.run_folder else _from_flags(options)
     _check(options, case.engine)
-    designs = jax.vmap(case.space.params)(jnp.asarray(case.design)[None])
-    notes = common.preflight_notes(case.scene, designs, ["the design"])
     engine = make_engine(case.engine, case.scene)
+    notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
     for note in [*notes, *common.mesh_notes(case.scene)]:

@@ -1,23 +1,19 @@
 """`codesign optimize`."""
 
 import sys
-import time
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, keypaths, runs
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common
-from codesign_jax.engines import make_engine
-from codesign_jax.optimize import candidates
 from codesign_jax.parameters import design_space
-from codesign_jax.runs import AllFailed, Plan, RunResult, Settings
+from codesign_jax.runs import AllFailed, Plan, RunResult, Settings, rates
 from codesign_jax.runs.progress import duration
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
@@ -36,19 +32,24 @@ def main(options: "Optimize") -> int:
     common.use_compilation_cache()
     common.use_all_cores(options.engine)
     scene, settings = resolve(options)
-    notes = _preflight(scene, settings)
+    # Everything that speaks against the run, before anything that takes time.
+    plan = runs.prepare(scene, settings)
+    folder = options.out or _default_folder(scene, settings)
+    runs.check_folder(folder, scene, settings, fresh=options.fresh)
+    notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
+    print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
-        print("".join(f"{note}\n" for note in notes), end="")
         _dry_run(scene, settings)
         return 0
-    plan = runs.prepare(scene, settings)
-    print("".join(f"{note}\n" for note in [*notes, *common.mesh_notes(scene)]), end="")
-    folder = options.out or _default_folder(scene, settings)
     try:
         result = runs.optimize(plan, folder, sys.argv, fresh=options.fresh)
     except (AllFailed, OSError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    timing = result.timing
+    if timing.grasps:
+        rate = timing.grasps / timing.seconds
+        rates.record(rates.work(scene, settings), rate, timing.compile_seconds)
     if result.signum:
         return 128 + result.signum
     _summarize(plan, result, folder)
@@ -104,13 +105,14 @@ def _preflight(scene: Scene, settings: Settings) -> list[str]:
     """
     space = design_space(scene.hand, settings.preset)
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}
-    designs = jnp.stack([jnp.asarray(v, jnp.float32) for v in ends.values()])
-    params = jax.vmap(lambda d: space.params(space.project(d)))(designs)
-    return common.preflight_notes(scene, params, [f"design of the space's {n}" for n in ends])
+    stacked = np.array([*ends.values()], np.float32)
+    projected = np.asarray(jax.jit(jax.vmap(space.project))(stacked))
+    names = [f"design of the space's {n}" for n in ends]
+    return common.preflight_notes(scene, space, dict(zip(names, projected, strict=True)))
 
 
 def _dry_run(scene: Scene, settings: Settings) -> None:
-    """Prints scene, settings, grasps and what they will take, measured on a few random designs."""
+    """Prints scene, settings, grasps and what they will take; see `runs.rates`."""
     for name, text in scene_texts(scene).items():
         print(f"# ---- {name}\n{text}")
     print(f"# ---- settings\n{settings}\n")
@@ -120,17 +122,18 @@ def _dry_run(scene: Scene, settings: Settings) -> None:
     row = 40 + 12 * space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
-    engine, optimizer = make_engine(settings.engine, scene), codesign.make_filter(space)
-    print("".join(f"{note}\n" for note in common.mesh_notes(scene)), end="")
-    evaluate = codesign.make_evaluate(scene, engine, space, 3)
-    population = candidates(jax.random.key(settings.seed), optimizer.space, jnp.arange(4))
-    compiled = evaluate.lower(population, jax.random.key(0)).compile()  # type: ignore[attr-defined]
-    start = time.perf_counter()
-    jax.block_until_ready(compiled(population, jax.random.key(0)))
-    rate = 12 / (time.perf_counter() - start)
-    total = duration(settings.grasps / rate)
-    print(f"time: about {total} at {rate:.1f} grasps/s (12 grasps of random designs; good ones")
-    print("take longer, as lost trials end early; larger batches may be faster)")
+    found = rates.estimate(rates.work(scene, settings))
+    if found is None:
+        print("time: unknown, as no run was measured on such a device with this engine yet")
+        return
+    grasping = (settings.grasps + batch) / found.grasps_per_second
+    compiling = found.compile_seconds
+    if compiling is None:
+        print(f"time: about {duration(grasping)}, and compiling")
+    else:
+        total = duration(grasping + compiling)
+        print(f"time: about {total}, of which {compiling:.0f} s to compile or load the program")
+    print(f"based on {found.basis}")
 
 
 def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:

@@ -3,7 +3,7 @@
 The numerical modules know nothing of files; this package knows nothing of physics.
 """
 
-from codesign_jax.runs.directory import read_run
+from codesign_jax.runs.directory import check_folder, read_run
 from codesign_jax.runs.loop import AllFailed, Plan, RunResult, load_record, optimize, prepare
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, check, make_settings
@@ -17,6 +17,7 @@ __all__ = [
     "RunResult",
     "Settings",
     "check",
+    "check_folder",
     "describe",
     "load_record",
     "make_settings",

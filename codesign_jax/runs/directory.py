@@ -78,7 +78,7 @@ def open_run(
         if fresh:
             _clear(path)
         if (path / _PROVENANCE).exists():
-            stored = json.loads((path / _PROVENANCE).read_text(encoding="utf-8"))
+            stored = _read_provenance(path)
             _refuse_other(path, scene, settings, stored)
             notes = _differences(stored["environment"], environment())
             stored["resumed"] = [*stored.get("resumed", []), _start(command)]
@@ -93,18 +93,40 @@ def open_run(
         yield run, notes
 
 
+def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = False) -> None:
+    """Checks that a run could start or go on in a folder; changes nothing.
+
+    Args:
+      path: The folder.
+      scene: The scene of the run.
+      settings: Its settings.
+      fresh: Whether an earlier run's files will be deleted.
+
+    Raises:
+      SceneError: See `open_run`.
+    """
+    _refuse_foreign(path)
+    if (path / _PROVENANCE).exists() and not fresh:
+        _refuse_other(path, scene, settings, _read_provenance(path))
+
+
 def read_run(path: Path) -> tuple[Scene, Settings]:
     """Reads scene and settings of a run folder.
 
     Raises:
       SceneError: If it is not a run folder.
     """
+    stored = _read_provenance(path)
+    return scenes.load(path / "scene.toml"), Settings(**stored["settings"])
+
+
+def _read_provenance(path: Path) -> dict[str, Any]:
     try:
         stored = json.loads((path / _PROVENANCE).read_text(encoding="utf-8"))
-        settings = Settings(**stored["settings"])
+        Settings(**stored["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SceneError([f"{path} is not a run folder: {_PROVENANCE} cannot be read"]) from error
-    return scenes.load(path / "scene.toml"), settings
+    return stored
 
 
 def _refuse_foreign(path: Path) -> None:

@@ -1,5 +1,6 @@
 """The optimisation of one run: seed, episodes, final test; saved after every step and resumable."""
 
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +40,20 @@ class Plan(NamedTuple):
     key: jax.Array
 
 
+class Timing(NamedTuple):
+    """What one process's part of a run took.
+
+    Attributes:
+      compile_seconds: Compiling the episode.
+      seconds: Episodes with their saving.
+      grasps: Grasps of these episodes.
+    """
+
+    compile_seconds: float = 0.0
+    seconds: float = 0.0
+    grasps: int = 0
+
+
 class RunResult(NamedTuple):
     """How a run ended.
 
@@ -46,11 +61,13 @@ class RunResult(NamedTuple):
       record: State and history, or None if the run was stopped before it had a seed.
       test: The final test, or None if there was none.
       signum: Signal that stopped the run early, or 0.
+      timing: What this process's episodes took.
     """
 
     record: Record | None
     test: FinalTest | None
     signum: int
+    timing: Timing = Timing()
 
 
 def prepare(scene: Scene, settings: Settings) -> Plan:
@@ -109,6 +126,7 @@ class _Loop:
     ):
         self.plan, self.run_directory, self.store = plan, run, store
         self.progress, self.interrupts = progress, interrupts
+        self.timing = Timing()
 
     def run(self) -> RunResult:
         """Runs what is left of the run."""
@@ -124,7 +142,7 @@ class _Loop:
         except Stopped:
             self._say(f"stopped by signal {self.interrupts.signum}; the same command resumes")
         test = None if record is None else _final_test(self.plan, record)
-        return RunResult(record, test, self.interrupts.signum)
+        return RunResult(record, test, self.interrupts.signum, self.timing)
 
     def _tested(self, record: Record) -> bool:
         return record.test is not None or self.plan.settings.test_trials == 0
@@ -165,7 +183,7 @@ class _Loop:
 
     def _episodes(self, record: Record, episode: EpisodeFunction) -> None:
         for e in range(record.done, self.plan.settings.episodes):
-            key = record.state.key
+            key, start = record.state.key, time.perf_counter()
             with self.progress.busy("simulating") as watch:
                 record.state, info = self.interrupts.call(episode, record.state, self.plan.mask[e])
             records.report(record.history, e, info)
@@ -173,6 +191,9 @@ class _Loop:
             self._save(e + 1, record)
             self._write_tables(record, e)
             self._report(record.history, e, watch.seconds)
+            spent = self.timing.seconds + time.perf_counter() - start
+            done = self.timing.grasps + info.trials.cost.size
+            self.timing = self.timing._replace(seconds=spent, grasps=done)
             _check_failures(record.history.trials.status[e], self.run_directory.path)
 
     def _save_failures(self, key: jax.Array, e: int, info: EpisodeInfo) -> None:
@@ -193,6 +214,7 @@ class _Loop:
         state = plan.optimizer.init(plan.key, np.array(plan.space.low), n)  # for its shapes
         with self.progress.busy("compiling") as watch:
             compiled = self.interrupts.call(lambda: episode.lower(state, plan.mask[0]).compile())  # type: ignore[attr-defined]
+        self.timing = Timing(watch.seconds)
         self._say(f"compiled in {watch.seconds:.1f} s (engine {plan.engine.name})")
         return compiled
 

@@ -1,0 +1,93 @@
+"""Which designs start deep inside the table or an object, told before anything is simulated."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import model, rollout
+from codesign_jax.model.layout import palm_points
+from codesign_jax.objects import Shape
+from codesign_jax.scene import Scene
+from codesign_jax.start import depth
+from codesign_jax.types import Params
+
+
+def overlaps(scene: Scene, designs: Params) -> np.ndarray:
+    """Deepest overlap of each design's start without noise [m], shape (object, design).
+
+    If all hands start above all objects (see `lowest_point`) it is 0, or else measured by the
+    engine's contacts, for which a program is compiled.
+
+    Args:
+      scene: The scene.
+      designs: Parameters with leading axis (design,), NumPy arrays.
+    """
+    shapes = scene.objects.object
+    top = max(_height(shape) for shape in shapes)
+    low = [lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
+    # Fingers that touch one another may overlap at any height.
+    if min(low) >= top and not scene.effects.finger_finger:
+        return np.zeros((len(shapes), len(low)))
+    return np.asarray(_depths(scene, Params(*(v.astype(np.float32) for v in designs))))
+
+
+def lowest_point(scene: Scene, params: Params) -> float:
+    """Lower bound on the height above the table of any point of the hand at its start [m].
+
+    Fingers are straight at the start: boxes around segments that leave the palm. The palm is turned
+    by roll about x, yaw about z and pitch against y, in this order, each about the axis as turned
+    by those before.
+
+    Args:
+      scene: The scene.
+      params: One design, NumPy arrays.
+    """
+    fingers, section, palm = scene.hand.finger, scene.hand.section, scene.hand.palm
+    roll, pitch, yaw = (float(v) for v in params.arm[3:])
+    # Heights only: the last row of the palm's orientation.
+    up = (_about(0, roll) @ _about(2, yaw) @ _about(1, -pitch))[2]
+    azimuth = np.deg2rad([f.azimuth for f in fingers])
+    azimuth = azimuth + np.array([f.spread for f in fingers]) * float(params.spread)
+    tilt = np.deg2rad([f.tilt for f in fingers])
+    outwards = np.cos(azimuth) * up[0] + np.sin(azimuth) * up[1]
+    across = -np.sin(azimuth) * up[0] + np.cos(azimuth) * up[1]
+    along = np.cos(tilt) * outwards - np.sin(tilt) * up[2]
+    back = np.sin(tilt) * outwards + np.cos(tilt) * up[2]
+    base = np.array([f.radius for f in fingers]) * outwards
+    ends = np.minimum(base, base + params.length * along)
+    # The skin is a box between the layer that bends and the back; contact spheres fill its height.
+    skin = np.minimum(params.height * back, 0.0) - section.width / 2 * np.abs(across)
+    spheres = params.height / 2 * (back - 1.0)
+    palm_low = (palm_points(scene) @ up).min() - palm.contact_radius
+    lowest = min(float((ends + np.minimum(skin, spheres)).min()), float(palm_low))
+    return scene.arm.start_height + lowest
+
+
+def _height(shape: Shape) -> float:
+    """Height of an object on the table [m]."""
+    if shape.mesh:
+        w, x, y, z = shape.mesh.upright
+        up = [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)]
+        return shape.mesh.rest_height + float((shape.mesh.vertices @ up).max())
+    return 2 * shape.half_sizes[{"box": 2, "cylinder": 1, "sphere": 0}[shape.type]]
+
+
+def _about(axis: int, angle: float) -> np.ndarray:
+    """Rotation about a coordinate axis, shape (3, 3)."""
+    matrix, (i, j) = np.eye(3), ((1, 2), (2, 0), (0, 1))[axis]
+    matrix[[i, j], [i, j]] = np.cos(angle)
+    matrix[i, j], matrix[j, i] = -np.sin(angle), np.sin(angle)
+    return matrix
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _depths(scene: Scene, designs: Params) -> jax.Array:
+    """`start.depth` of designs with every object, shape (object, design); one program for all."""
+
+    def of_shape(index: jax.Array) -> jax.Array:
+        trial = rollout.nominal_trial(scene)._replace(shape=index)
+        return depth(scene, jax.vmap(lambda p: model.model_fields(scene, p, trial))(designs))
+
+    return jax.lax.map(of_shape, jnp.arange(len(scene.objects.object)))

@@ -1,0 +1,196 @@
+"""How long a run will take, from rates that earlier runs measured; nothing is simulated for it.
+
+Every run of `codesign optimize` adds its rate and compile time to a file in the user's cache. Where
+none fits, rates measured for docs/performance.md stand in.
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import hashlib
+import json
+import math
+import os
+
+import jax
+
+from codesign_jax import files
+from codesign_jax.engines.structured.engine import in_kernel
+from codesign_jax.runs.scene_files import scene_texts
+from codesign_jax.runs.settings import Settings
+from codesign_jax.scene import Scene
+
+_KEPT = 200
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """What a rate depends on.
+
+    Attributes:
+      engine: Engine.
+      device: What it computes on, e.g. "cpu x2".
+      form: "kernel", or "batch" for scenes that the structured engine runs without its kernel.
+      steps: Time steps of a grasp.
+      links: Links of all fingers.
+      grasps: Grasps simulated at once.
+      scene: Digest of the scene.
+    """
+
+    engine: str
+    device: str
+    form: str
+    steps: int
+    links: int
+    grasps: int
+    scene: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rate:
+    """A measurement.
+
+    Attributes:
+      work: What was simulated.
+      grasps_per_second: Wall time of whole episodes, saving included.
+      compile_seconds: Tracing and compiling, or loading what had been compiled before; None if it
+        was not measured.
+      source: When or where it was measured.
+    """
+
+    work: Work
+    grasps_per_second: float
+    compile_seconds: float | None
+    source: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """An estimate of a run and what it is based on.
+
+    Attributes:
+      grasps_per_second: Expected rate.
+      compile_seconds: Expected time before the first grasp, None if it is not known.
+      basis: The measurement that it comes from, in words.
+    """
+
+    grasps_per_second: float
+    compile_seconds: float | None
+    basis: str
+
+
+_ELSEWHERE = "measured on another machine, docs/performance.md"
+
+
+def _shipped(
+    engine: str, device: str, form: str, grasps: int, rate: float, seconds: float | None
+) -> Rate:
+    return Rate(Work(engine, device, form, 900, 40, grasps), rate, seconds, _ELSEWHERE)
+
+
+# Two cores of an AMD EPYC and one H200: docs/performance.md has the same numbers and how they were
+# measured.
+_REFERENCE = (
+    _shipped("structured", "cpu x2", "kernel", 60, 129.3, 10.0),
+    _shipped("structured", "cpu x2", "batch", 60, 10.5, 17.2),
+    _shipped("mujoco", "cpu x2", "batch", 60, 7.9, 2.7),
+    _shipped("mjx", "cpu x2", "batch", 12, 0.07, None),
+    _shipped("structured", "gpu x1", "kernel", 1728, 7154.0, 10.3),
+)
+
+
+def work(scene: Scene, settings: Settings) -> Work:
+    """What an episode of a run is, on this machine."""
+    texts = "".join(scene_texts(scene).values())
+    kernel = settings.engine == "structured" and in_kernel(scene)
+    return Work(
+        settings.engine,
+        _device(settings.engine),
+        "kernel" if kernel else "batch",
+        scene.num_steps,
+        scene.num_fingers * scene.discretization.links,
+        settings.particles * settings.trials,
+        hashlib.sha256(texts.encode()).hexdigest()[:16],
+    )
+
+
+def _device(engine: str) -> str:
+    platform = "cpu" if engine == "mujoco" else jax.default_backend()
+    if platform != "cpu":
+        return f"{platform} x1"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"cpu x{cores or 1}"
+
+
+def record(work: Work, grasps_per_second: float, compile_seconds: float) -> None:
+    """Keeps a measurement in the user's cache; one that cannot be written is left out."""
+    today = datetime.date.today().isoformat()
+    entry = Rate(work, grasps_per_second, compile_seconds, f"measured on this machine on {today}")
+    kept = [r for r in measured() if r.work != work][-_KEPT + 1 :]
+    with contextlib.suppress(OSError), files.atomically(_path()) as part:
+        content = [dataclasses.asdict(r) for r in [*kept, entry]]
+        part.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def measured() -> list[Rate]:
+    """The user's measurements, oldest first; a damaged file counts as none."""
+    try:
+        stored = json.loads(_path().read_text(encoding="utf-8"))
+        return [Rate(**(entry | {"work": Work(**entry["work"])})) for entry in stored]
+    except (OSError, ValueError, TypeError, KeyError):
+        return []
+
+
+def estimate(work: Work) -> Estimate | None:
+    """Scales the most similar measurement; None if the engine was never measured in this form.
+
+    Rates go with the steps and the links of a grasp (docs/performance.md has exponents near one),
+    on CPUs with the cores, and on a GPU with the grasps at once up to the measured number.
+    """
+    same = [r for r in measured() if _alike(r.work, work) and r.work.device == work.device]
+    kind = work.device.split(" ")[0]
+    shipped = [r for r in _REFERENCE if _alike(r.work, work) and r.work.device.startswith(kind)]
+    if not same and not shipped:
+        return None
+    best = min(same or shipped, key=lambda r: _distance(r.work, work))
+    rate = best.grasps_per_second * (best.work.steps * best.work.links) / (work.steps * work.links)
+    if kind == "cpu":
+        rate *= _count(work.device) / _count(best.work.device)
+    elif work.grasps < best.work.grasps:
+        rate *= work.grasps / best.work.grasps
+    # What was compiled before is loaded; for another scene the slowest compile is the honest guess.
+    exact = [r.compile_seconds for r in same if _program(r.work) == _program(work)]
+    slowest = max((r.compile_seconds or 0.0 for r in same + shipped), default=0.0) or None
+    compile_seconds = exact[-1] if exact else slowest
+    basis = f"{best.grasps_per_second:.3g} grasps/s {_at(best)}"
+    if dataclasses.replace(best.work, scene=work.scene) != work:
+        basis += ", scaled to this run's steps, links and batch"
+    return Estimate(rate, compile_seconds, basis)
+
+
+def _at(rate: Rate) -> str:
+    w = rate.work
+    sizes = f"{w.steps} steps, {w.links} links, {w.grasps} grasps at once, {w.device}"
+    return f"({rate.source}: {sizes})"
+
+
+def _alike(a: Work, b: Work) -> bool:
+    return (a.engine, a.form) == (b.engine, b.form)
+
+
+def _program(work: Work) -> tuple:
+    return work.scene, work.grasps, work.engine, work.device
+
+
+def _distance(a: Work, b: Work) -> float:
+    """How far apart two pieces of work are, in octaves of size; another scene counts as one."""
+    pairs = ((a.steps, b.steps), (a.links, b.links), (a.grasps, b.grasps))
+    return sum(abs(math.log2(x / y)) for x, y in pairs) + (a.scene != b.scene)
+
+
+def _count(device: str) -> int:
+    return int(device.rsplit("x", 1)[1])
+
+
+def _path():
+    return files.cache_folder() / "rates.json"

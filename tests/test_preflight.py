@@ -1,0 +1,90 @@
+"""Preflight: what it refuses without simulating, and that an ordinary start costs no program."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from small import pinch, random_worlds, still
+
+from codesign_jax import clearance, model, parameters, preflight
+from codesign_jax.types import Params
+
+
+def low_start():
+    """The pinch scene with an arm that starts so low that long fingers reach table or box."""
+    return pinch(links=2, arm__start_height=0.15)
+
+
+def hands(scene, count):
+    """Random hands of the whole table, NumPy arrays in float64 with leading axis (world,)."""
+    params, _ = random_worlds(scene, 0, count)
+    return Params(*(np.asarray(v, float) for v in params))
+
+
+def single(designs):
+    """The designs in float32."""
+    return Params(*(v.astype(np.float32) for v in designs))
+
+
+def test_lowest_point_bounds_mujocos_geoms():
+    """MuJoCo C places the same hand: spheres lie above the bound, and not far above it."""
+    scene = low_start()
+    designs, gaps = hands(scene, 4), []
+    starts = jax.jit(jax.vmap(lambda p: model.model_fields(scene, p, still()).start))
+    for one, qpos in zip(zip(*designs, strict=True), starts(single(designs)), strict=True):
+        one = Params(*one)
+        compiled = model.compile_model(scene, one, still())
+        data = mujoco.MjData(compiled)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(compiled, data)
+        names = [compiled.geom(g).name for g in range(compiled.ngeom)]
+        spheres = [g for g, name in enumerate(names) if name.startswith(("finger", "palm"))]
+        lowest = (data.geom_xpos[spheres, 2] - compiled.geom_size[spheres, 0]).min()
+        gaps.append(lowest - clearance.lowest_point(scene, one))
+    # Rounding of float32; half the section's width of 20 mm and half a link of 180 / 2 mm.
+    assert -1e-6 < min(gaps) and max(gaps) < 0.010 + 0.045
+
+
+def test_starts_inside_table_or_object_are_refused_and_those_called_clear_are_clear():
+    scene = low_start()
+    designs = hands(scene, 64)
+    exact = np.asarray(clearance._depths(scene, single(designs)))[0]
+    low = [clearance.lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
+    clear = np.array(low) >= 0.06  # the box's height
+    assert clear.any() and (exact[clear] <= 0).all()
+    deep = np.flatnonzero(exact > scene.limits.penetration)
+    assert 0 < len(deep) < 64
+    refusals = preflight.check(scene, designs).refusals
+    assert [text.split(":")[0] for text in refusals] == [f"design {i}" for i in deep]
+    for part in (f"starts {1e3 * exact[deep[0]]:.0f} mm", "'box'", "raise arm.start_height = 0.15"):
+        assert part in refusals[0]
+
+
+def test_an_ordinary_start_needs_no_program(monkeypatch):
+    def never(*arguments):
+        raise AssertionError("a program was compiled")
+
+    monkeypatch.setattr(clearance, "_depths", never)
+    for preset in ("2d", "full"):
+        scene = pinch()
+        space = parameters.design_space(scene.hand, preset)
+        ends = jax.vmap(space.params)(np.array([space.default(), space.low, space.high]))
+        report = preflight.check(scene, ends._replace(pressure=0 * ends.pressure))
+        assert report.refusals == []
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({"wall": 0.015}, "leave no air chamber"),
+        ({"length": -0.1}, "must be positive"),
+        ({"length": np.nan}, "not a finite number"),
+        ({"pressure": 5e5}, "above the limit of"),
+    ],
+)
+def test_numbers_that_are_no_hand_are_refused(change, part):
+    scene = pinch()
+    space = parameters.design_space(scene.hand, "2d")
+    designs = jax.vmap(space.params)(space.default()[None])
+    wrong = designs._replace(**{k: 0 * getattr(designs, k) + v for k, v in change.items()})
+    assert any(part in problem for problem in preflight.check(scene, wrong).refusals)

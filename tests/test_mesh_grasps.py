@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,10 @@ from scipy.spatial.transform import Rotation
 from small import DATA, hand_world, nth, stack, still
 from solids import box, object_file
 
-from codesign_jax import model, objects, parameters, rollout, scene, schema
+from codesign_jax import control, model, objects, parameters, rollout, scene, schema
 from codesign_jax.engines import make_engine
+from codesign_jax.engines import mujoco as mujoco_engine
+from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import mesh as mesh_lanes
 from codesign_jax.meshes import surface
 from codesign_jax.report import sketch
@@ -156,13 +159,33 @@ HURRIED = {
 }
 
 
+class Grasps(NamedTuple):
+    """Grasps of a batch, in float64 and solved to rounding.
+
+    Attributes:
+      scene: The scene.
+      params: Params of all worlds.
+      trials: The trial of each world.
+      names: Name of the object of each world.
+      kernel: Trace of the kernel.
+      reverse: Trace of the kernel for the same worlds in reverse.
+      batch: Trace of the batch form.
+      compiled: How many programs the kernel's two traces took.
+    """
+
+    scene: Any
+    params: Any
+    trials: list
+    names: list[str]
+    kernel: Any
+    reverse: Any
+    batch: Any
+    compiled: int
+
+
 @pytest.fixture(scope="module")
 def grasps(tmp_path_factory, household):
-    """Two fingers grasp primitives, their meshed twins and the household's shapes, in one batch.
-
-    Returns:
-      Names; the trace of the batch and of the same worlds in reverse; how often it compiled.
-    """
+    """Two fingers grasp primitives, their meshed twins and the household's shapes, in one batch."""
     folder = tmp_path_factory.mktemp("objects")
     box(60, 60, 60).export(folder / "box.stl")
     trimesh.creation.icosphere(4, 30).export(folder / "ball.stl")
@@ -179,32 +202,92 @@ def grasps(tmp_path_factory, household):
     the_scene = scene.load(
         "paper", hand_name=DATA / "pinch.toml", object_set=path, overrides=HURRIED
     )
-    space = parameters.design_space(the_scene.hand, "2d")
-    params = space.params(jnp.asarray((0.09, 0.05)))
-    params = params._replace(pressure=params.pressure * 0 + 190e3)
+    # No world is decided before the end: the kernel goes on as the batch form does.
+    patient = dataclasses.replace(the_scene.cost, lost_distance=1e3)
+    the_scene = dataclasses.replace(the_scene, cost=patient)
     names = [shape.name for shape in the_scene.objects.object]
-    size = {"size": np.float32(1.04), "yaw": np.float32(0.1)}
-    trials = [still(i)._replace(**size) for i in range(len(names))]
-    engine = make_engine("structured", the_scene)
-    run = jax.jit(
-        lambda p, t: rollout.simulate(the_scene, engine, p, t, trajectory=True)[1],
-        # Compiling takes longer than all that is done with it here.
-        compiler_options={"xla_backend_optimization_level": 0},
-    )
-    worlds = stack(*([params] * len(names)))
-    traces = [nth(run(worlds, stack(*order)), ...) for order in (trials, trials[::-1])]
-    return names, *traces, run._cache_size()
+    with jax.enable_x64(True):
+        params = nth(
+            parameters.design_space(the_scene.hand, "2d").params(jnp.array((0.09, 0.05))), ...
+        )
+    params = params._replace(pressure=params.pressure * 0 + 190e3)
+    yaws = [(i, 0.1) for i in range(len(names))]
+    # Once more with the mug's handle between the fingers.
+    yaws.append((names.index("mug"), 0.1 + np.pi / 2))
+    trials = [still(i)._replace(size=np.array(1.04), yaw=np.array(yaw)) for i, yaw in yaws]
+
+    def runner(*, kernel):
+        engine = StructuredEngine(
+            the_scene, iterations=60, evaluations=30, tolerance=1e-18, kernel=kernel
+        )
+        return jax.jit(
+            lambda p, t: rollout.simulate(the_scene, engine, p, t, trajectory=True)[1],
+            # Compiling the batch form takes longer than all that is done with it here.
+            compiler_options={"xla_backend_optimization_level": 0},
+        )
+
+    with jax.enable_x64(True):
+        worlds, kernel = stack(*[params] * len(trials)), runner(kernel=True)
+        ways = [stack(*trials), stack(*trials[::-1])]
+        traces = [nth(kernel(worlds, way), ...) for way in ways]
+        traces.append(nth(runner(kernel=False)(worlds, ways[0]), ...))
+    names.append("turned mug")
+    return Grasps(the_scene, params, trials, names, *traces, kernel._cache_size())
 
 
 def test_primitives_and_meshes_share_a_batch_and_a_program(grasps):
-    _, trace, other, compiled = grasps
-    assert compiled == 1
-    for a, b in zip(trace, other, strict=True):
-        np.testing.assert_array_equal(a[::-1], b)  # worlds do not mix
+    """In the kernel's blocks of a few worlds, whose other worlds change no bit of a world."""
+    assert grasps.compiled == 1
+    for a, b in zip(grasps.kernel, grasps.reverse, strict=True):
+        np.testing.assert_array_equal(a[::-1], b)
+
+
+def test_meshes_in_the_kernel_equal_the_batch_form(grasps):
+    """Along all positions of a grasp of primitives and meshes, one of them by its handle."""
+    got, want = grasps.kernel, grasps.batch
+    assert got.qpos.dtype == np.float64
+    upright, turned = (grasps.names.index(name) for name in ("mug", "turned mug"))
+    touched = np.abs(want.qpos[upright] - want.qpos[turned])[:, 6:-7].max()
+    assert touched > 0.05  # the handle made a difference to the fingers, radians
+    # Rounding of single steps is 1e-16; contact multiplies it.
+    for field in ("distance", "height", "speed", "qpos", "last"):
+        a, b = getattr(got, field), getattr(want, field)
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=field)
+
+
+def test_accelerations_of_a_meshed_box_equal_mujoco(grasps, tmp_path):
+    """MuJoCo C has no meshes that are not convex: it gets the box as a primitive of the same size.
+
+    At the states that the kernel went through; its accelerations are differences of them.
+    """
+    common = "mass = 0.1; friction = 0.8"
+    path = object_file(tmp_path, f'name = "box"; type = "box"; size = [0.03, 0.03, 0.03]; {common}')
+    twin = scene.load("paper", hand_name=DATA / "pinch.toml", object_set=path, overrides=HURRIED)
+    world = grasps.names.index("mesh box")
+    trial = grasps.trials[world]._replace(shape=np.int32(0))
+    with jax.enable_x64(True):
+        params = jax.tree.map(jnp.asarray, grasps.params)
+        fields = jax.jit(lambda p, t: model.model_fields(twin, p, t))(params, trial)
+        ctrl = jax.jit(lambda p, t: control.commands(twin, p, t))(params, trial)
+        oracle = mujoco_engine.world_model(twin, fields)
+    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
+    data, h, qpos = mujoco.MjData(oracle), oracle.opt.timestep, grasps.kernel.qpos[world]
+    speed, contacts = np.zeros((len(qpos) - 1, oracle.nv)), set()
+    for k in range(len(speed)):
+        mujoco.mj_differentiatePos(oracle, speed[k], h, qpos[k], qpos[k + 1])
+    for k in range(1, len(speed)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[k], speed[k - 1], ctrl[k]
+        mujoco.mj_forward(oracle, data)
+        error = np.linalg.norm((speed[k] - speed[k - 1]) / h - data.qacc)
+        # The grid's distances are float32: 2e-9 m at 30 mm, of the 1e-3 m that the fingers press
+        # in; 1e-7 measured.
+        assert error < 1e-6 * max(np.linalg.norm(data.qacc), 100.0), k
+        contacts.add(data.ncon)
+    assert contacts >= {4, 6}  # on the table, and there between two fingers
 
 
 def test_a_meshed_primitive_behaves_like_the_primitive(grasps):
-    names, trace, *_ = grasps
+    names, trace = grasps.names, grasps.kernel
     at, height, rest = names.index, trace.height, slice(0, 50)
     # On the table the same four corners carry both boxes: float32 rounding of 31 mm.
     np.testing.assert_allclose(height[at("mesh box"), rest], height[at("box"), rest], atol=1e-7)
@@ -218,7 +301,7 @@ def test_a_meshed_primitive_behaves_like_the_primitive(grasps):
 
 def test_every_shape_stands_where_it_was_put(grasps):
     """Upright and still on the table, and finite while a hand that may not hold it grasps at it."""
-    names, trace, *_ = grasps
+    names, trace = grasps.names, grasps.kernel
     assert np.isfinite(trace.distance).all() and (trace.speed < 60).all()
     for i, name in enumerate(names):
         sunk = trace.height[i, 0] - trace.height[i, 45]

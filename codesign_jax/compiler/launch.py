@@ -16,11 +16,13 @@ class Kernel(NamedTuple):
       origin: What determines its code besides the package's own.
       backend: "gpu" or "cpu".
       lanes: Lanes of a block.
+      shared: Places of inputs of one block that all blocks read; their leading axis is 1.
     """
 
     origin: str
     backend: str
     lanes: int
+    shared: tuple[int, ...] = ()
 
 
 def launch(
@@ -54,7 +56,7 @@ def launch(
         *inputs,
         name="grasp",
         kernel_type="ptx",
-        kernel_data=ptx.assemble(trace(), shapes, "grasp"),
+        kernel_data=ptx.assemble(trace(), shapes, "grasp", kernel.shared),
         grid_x=number(outputs[0].shape[0]),
         grid_y=number(1),
         grid_z=number(1),

@@ -7,6 +7,7 @@ Source of the instructions: NVIDIA, Parallel Thread Execution ISA 8.
 """
 
 import struct
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import jax
@@ -335,24 +336,29 @@ def adjacent(offsets: list[int], row: int) -> list[tuple[int, int]]:
     return found
 
 
-def assemble(jaxpr: Any, shapes: list[tuple[int, ...]], name: str) -> str:
+def assemble(
+    jaxpr: Any, shapes: list[tuple[int, ...]], name: str, shared: Collection[int] = ()
+) -> str:
     """PTX of a kernel whose block b works on entry b of every array.
 
     Args:
       jaxpr: The kernel's jaxpr; its arguments are references to a block of each array.
       shapes: Shapes of the blocks.
       name: Name of the kernel.
+      shared: Places of arrays of one block, which all blocks read.
 
     Raises:
       NotImplementedError: If the kernel does something that has no rule here.
     """
     asm, refs = Assembler(), []
     for k, shape in enumerate(shapes):
-        address, offset = asm.register("u64"), asm.register("u64")
+        address = asm.register("u64")
         asm.emit(f"ld.param.u64 {address}, [arg{k}];")
         asm.emit(f"cvta.to.global.u64 {address}, {address};")
-        asm.emit(f"mul.wide.u32 {offset}, %block, {4 * int(np.prod(shape))};")
-        asm.emit(f"add.u64 {address}, {address}, {offset};")
+        if k not in shared:
+            offset = asm.register("u64")
+            asm.emit(f"mul.wide.u32 {offset}, %block, {4 * int(np.prod(shape))};")
+            asm.emit(f"add.u64 {address}, {address}, {offset};")
         refs.append(Ref(address, shape))
     asm.run(jaxpr, [], refs)
     kinds = {"f": ".f32", "r": ".s32", "p": ".pred", "d": ".u64"}

@@ -1,6 +1,8 @@
 """Contact geometry: spheres against the object and the table, the object on the table."""
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -75,18 +77,41 @@ def spheres_on_object(
     """
 
     def measure(columns: jax.Array, position: jax.Array, centre: jax.Array):
-        away = jnp.stack([centre[i] - position[i] for i in range(3)])
-        local = jnp.stack([dot(columns[k], away) for k in range(3)])
-        return signed_distance(scene, hand, local)
+        return signed_distance(scene, hand, in_object(columns, position, centre))
 
     def place(columns: jax.Array, centre: jax.Array, distance: jax.Array, gradient: jax.Array):
-        normal, gap = apply_columns(columns, gradient), distance - radius
-        return centre - normal * (radius + 0.5 * gap), normal, gap
+        return on_surface(columns, centre, radius, distance, gradient)
 
     distance, gradient = run(measure, kin.object, kin.object_pos, centre)
     point, normal, gap = run(place, kin.object, centre, distance, gradient)
     cone = make_cone(scene, object_friction(scene, hand.object_id), bodies=2)
     return Contacts(point, normal, gap, cone)
+
+
+def in_object(columns: jax.Array, position: jax.Array, point: jax.Array) -> jax.Array:
+    """Points (3, ...) of the palm's frame in the object's frame."""
+    away = jnp.stack([point[i] - position[i] for i in range(3)])
+    return jnp.stack([dot(columns[k], away) for k in range(3)])
+
+
+def on_surface(
+    columns: jax.Array,
+    centre: jax.Array,
+    radius: jax.Array | float,
+    distance: jax.Array,
+    gradient: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Contacts of spheres with the object: point (3, ...), normal (3, ...) and gap (...).
+
+    Args:
+      columns: Columns of the object's orientation.
+      centre: Sphere centres in the palm's frame, shape (3, ...).
+      radius: Sphere radii.
+      distance: Signed distance of the centres from the object, shape (...).
+      gradient: Its unit gradient in the object's frame, shape (3, ...).
+    """
+    normal, gap = apply_columns(columns, gradient), distance - radius
+    return centre - normal * (radius + 0.5 * gap), normal, gap
 
 
 def spheres_on_table(
@@ -123,21 +148,47 @@ def signed_distance(
       hand: Sizes and shape index of the objects.
       local: Points, shape (3, ...).
     """
-    functions: dict[str, Callable] = {
-        "box": _box,
-        "cylinder": _cylinder,
-        "sphere": _sphere,
-        "mesh": lambda size, p: mesh.signed_distance(hand.mesh, p),
-    }
-    kinds = [s.type for s in scene.objects.object]
-    result = None
-    for kind in dict.fromkeys(kinds):
-        distance, gradient = functions[kind](hand.object_size, local)
+    meshes = mesh_indices(scene)
+    if len(meshes) == len(scene.objects.object):
+        return mesh.signed_distance(hand.mesh, local)  # type: ignore[arg-type]
+    distance, gradient = primitive_distance(scene, hand.object_size, hand.object_id, local)
+    if not meshes:
+        return distance, gradient
+    mine = jnp.isin(hand.object_id, jnp.array(meshes))
+    other = mesh.signed_distance(hand.mesh, local)  # type: ignore[arg-type]
+    return jnp.where(mine, other[0], distance), jnp.where(mine, other[1], gradient)
+
+
+def mesh_indices(scene: Scene) -> list[int]:
+    """Indices of the scene's objects that are meshes."""
+    return [i for i, s in enumerate(scene.objects.object) if s.type == "mesh"]
+
+
+def primitive_distance(
+    scene: Scene, size: jax.Array, shape: jax.Array, local: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """As `signed_distance`, for a scene's primitives; worlds with a mesh get any primitive's.
+
+    Args:
+      scene: The scene, with a primitive at least.
+      size: Sizes of the objects, shape (3, 1, world).
+      shape: Index of each world's object, shape (1, world).
+      local: Points, shape (3, ...).
+    """
+    functions: dict[str, Callable] = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
+    return _by_kind(scene, shape, {k: partial(f, size, local) for k, f in functions.items()})
+
+
+def _by_kind(scene: Scene, shape: jax.Array, functions: dict[str, Callable]) -> Any:
+    """What the function for the kind of each world's object returns, a tree of arrays."""
+    kinds, result = [s.type for s in scene.objects.object], None
+    for kind in dict.fromkeys(k for k in kinds if k in functions):
+        new = functions[kind]()
         if result is None:
-            result = distance, gradient
+            result = new
             continue
-        mine = jnp.isin(hand.object_id, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
-        result = jnp.where(mine, distance, result[0]), jnp.where(mine, gradient, result[1])
+        mine = jnp.isin(shape, jnp.array([i for i, k in enumerate(kinds) if k == kind]))
+        result = jax.tree.map(partial(jnp.where, mine), new, result)
     assert result is not None
     return result
 
@@ -186,34 +237,54 @@ def object_on_table(
     counterpart and two more on the lower rim, 120 degrees apart, of a cylinder; the lowest point of
     a sphere (one slot); four spread-out ones among the lowest support points of a mesh.
     """
-    functions: dict[str, Callable] = {
-        "box": _box_corners,
-        "cylinder": _rim_points,
-        "sphere": _lowest_point,
-        "mesh": lambda size, columns: mesh.table_points(hand.mesh, columns),
-    }
-    kinds = [s.type for s in scene.objects.object]
 
     def points(size: jax.Array, columns: jax.Array, position: jax.Array, height: jax.Array):
-        arms = None
-        for kind in dict.fromkeys(kinds):
-            mine = jnp.isin(
-                hand.object_id, jnp.array([i for i, k in enumerate(kinds) if k == kind])
-            )
-            new = functions[kind](size, columns)
+        meshes, arms = mesh_indices(scene), None
+        if len(meshes) < len(scene.objects.object):
+            arms = primitive_points(scene, size, hand.object_id, columns)
+        if meshes:
+            new = mesh.table_points(hand.mesh, columns)  # type: ignore[arg-type]
+            mine = jnp.isin(hand.object_id, jnp.array(meshes))
             arms = new if arms is None else jnp.where(mine, new, arms)
-        assert arms is not None
-        point = position + arms
-        gap = point[2] + height
-        zero = jnp.zeros_like(gap)
-        normal = jnp.stack([zero, zero, zero + 1.0])
-        return point - 0.5 * gap * normal, normal, gap
+        return on_table(position, arms, height)
 
     cone = make_cone(scene, scene.objects.table.friction, bodies=1)
     point, normal, gap = run(
         points, hand.object_size[:, 0], kin.object[:, :, 0], kin.object_pos, height
     )
     return Contacts(point, normal, gap, cone)
+
+
+def primitive_points(
+    scene: Scene, size: jax.Array, shape: jax.Array, columns: jax.Array
+) -> jax.Array:
+    """Points of a scene's primitives that may touch the table, from the centre, (3, 4, world).
+
+    Args:
+      scene: The scene, with a primitive at least.
+      size: Sizes of the objects, shape (3, world).
+      shape: Index of each world's object, shape (1, world).
+      columns: Columns of the object's orientation, shape (3, 3, world).
+    """
+    functions = {"box": _box_corners, "cylinder": _rim_points, "sphere": _lowest_point}
+    return _by_kind(scene, shape, {k: partial(f, size, columns) for k, f in functions.items()})
+
+
+def on_table(
+    position: jax.Array, arms: jax.Array, height: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Contacts of an object's points with the table: point, normal (3, slot, world) and gap.
+
+    Args:
+      position: Centre of the object in the palm's frame, shape (3, 1, world).
+      arms: Points from the centre, shape (3, slot, world).
+      height: Height of the palm above the table, shape (1, world).
+    """
+    point = position + arms
+    gap = point[2] + height
+    zero = jnp.zeros_like(gap)
+    normal = jnp.stack([zero, zero, zero + 1.0])
+    return point - 0.5 * gap * normal, normal, gap
 
 
 _AWAY = 1e3  # an unused slot hangs this far above the table

@@ -309,5 +309,4 @@ def _has_kernel() -> bool:
 
 def in_kernel(scene: Scene) -> bool:
     """Whether the kernel simulates a scene; the batch form simulates all."""
-    meshes = any(o.type == "mesh" for o in scene.objects.object)
-    return not (meshes or scene.effects.finger_finger)
+    return not scene.effects.finger_finger

@@ -3,6 +3,10 @@
 The grids of all meshes of a scene lie one after the other in one array, each with its own shape and
 cell: worlds with different meshes read different parts of it, in one program, and no mesh pays for
 the resolution or the size of another.
+
+A distance has three parts, because a kernel evaluates arithmetic component by component and reads
+memory by itself: `locate` finds a point's cell, the caller reads the distances at the indices of
+`corners`, and `interpolate` makes distance and gradient of them.
 """
 
 import functools
@@ -16,17 +20,22 @@ from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
 
+# Grids begin at multiples of this index, which a float32 holds exactly up to 2^31.
+_ALIGNED = 128
 _FAR = 1e-12  # added under square roots: keeps their derivative finite
 # A support point counts as one metre lower for this many metres that it lies farther out: on a face
 # that is level to 1/20 the four contacts spread, on a steeper one they stay at its lowest edge.
 _STEEPEST = 20.0
+# Of points that are level, as those of a round foot, the earlier one counts as lower: a few times
+# the rounding of a float32, so that which ones are taken does not depend on it.
+_ORDER = 2e-7  # m of score for each point
 
 
 class Tables(NamedTuple):
     """Constants of a scene's meshes, a row for each shape of the set; those of primitives are void.
 
     Attributes:
-      values: Grid values of all meshes [m], flat, z fastest.
+      values: Grid values of all meshes [m], flat, z fastest, float32.
       first: Index of each grid's first value, shape (shape,).
       nodes: Nodes along each axis, shape (shape, 3).
       origin: Position of the first node [m], shape (shape, 3).
@@ -66,8 +75,12 @@ def tables(scene: Scene) -> Tables | None:
         return None
     count = len(scene.objects.object)
     points = 1 << (max(len(s) for s in supports.values()) - 1).bit_length()
+    flat = [np.pad(g.values.ravel(), (0, -g.values.size % _ALIGNED)) for g in grids.values()]
+    total = sum(v.size for v in flat)
+    # Sizes in powers of two: scenes of other meshes find the programs of this one.
+    filled = np.zeros((1 << (total - 1).bit_length()) - total, np.float32)
     result = Tables(
-        np.concatenate([g.values.ravel() for g in grids.values()]),
+        np.concatenate([*flat, filled]),
         np.zeros(count, np.int32),
         np.full((count, 3), 2, np.int32),
         np.zeros((count, 3)),
@@ -76,34 +89,60 @@ def tables(scene: Scene) -> Tables | None:
         np.zeros((count, points, 3)),
     )
     start = 0
-    for i, grid in grids.items():
+    for (i, grid), values in zip(grids.items(), flat, strict=True):
         result.first[i], result.nodes[i], result.cell[i] = start, grid.values.shape, grid.cell
         result.origin[i], result.half[i] = grid.origin, scene.objects.object[i].half_sizes[0]
         result.support[i] = np.resize(supports[i], (points, 3))  # repeats the points
-        start += grid.values.size
+        start += values.size
     return result
+
+
+class GridLanes(NamedTuple):
+    """The grid of each world's mesh.
+
+    Attributes:
+      first: Index of its first value, shape (1, world), int32 or a float that holds it exactly.
+      nodes: Nodes along each axis, shape (3, 1, world), like `first`.
+      origin: Position of the first node [m], shape (3, 1, world).
+      cell: Distance of the nodes [m], shape (1, world).
+      factor: Factor on the mesh's size, shape (1, world).
+    """
+
+    first: jax.Array
+    nodes: jax.Array
+    origin: jax.Array
+    cell: jax.Array
+    factor: jax.Array
 
 
 class MeshLanes(NamedTuple):
     """The tables on the device, and each world's rows of them.
 
     Attributes:
-      values: Grid values of all meshes [m], flat: of the scene, not of a world.
-      first: Index of the first value of the world's grid, shape (1, world).
-      nodes: Nodes along each axis, shape (3, 1, world).
-      origin: Position of the first node [m], shape (3, 1, world).
-      cell: Distance of the nodes [m], shape (1, world).
-      factor: Factor on the mesh's size, shape (1, world).
-      support: Support points of the mesh as large as it is [m], shape (3, point, world).
+      values: Grid values of all meshes [m], flat, float32: of the scene, not of a world.
+      grid: Where and how large the grid of each world's mesh is.
+      support: Support points of the mesh as large as it is [m], shape (3, point, world); their
+        number is a power of two.
     """
 
     values: jax.Array
-    first: jax.Array
-    nodes: jax.Array
-    origin: jax.Array
-    cell: jax.Array
-    factor: jax.Array
+    grid: GridLanes
     support: jax.Array
+
+
+class Cell(NamedTuple):
+    """The cells of a grid in which points lie.
+
+    Attributes:
+      corner: Index of the cell's first corner in the values, int32, shape (...).
+      part: Position in the cell, 0 to 1 on each axis, shape (3, ...).
+      beyond: Way from the nearest point of the grid to the point, in the mesh's size as it is in
+        its file [m], shape (3, ...).
+    """
+
+    corner: jax.Array
+    part: jax.Array
+    beyond: jax.Array
 
 
 def mesh_lanes(scene: Scene, shape: jax.Array, size: jax.Array) -> MeshLanes | None:
@@ -124,15 +163,15 @@ def mesh_lanes(scene: Scene, shape: jax.Array, size: jax.Array) -> MeshLanes | N
         return jnp.moveaxis(picked, 0, -1)
 
     factor = size[0] / row(t.half)
-    return MeshLanes(
-        values=jnp.asarray(t.values, size.dtype),
+    grid = GridLanes(
         first=row(t.first)[None],
         nodes=row(t.nodes)[:, None],
         origin=row(t.origin)[:, None],
         cell=row(t.cell)[None],
         factor=factor,
-        support=factor * jnp.moveaxis(row(t.support), 1, 0),
     )
+    support = factor * jnp.moveaxis(row(t.support), 1, 0)
+    return MeshLanes(jnp.asarray(t.values), grid, support)
 
 
 def signed_distance(lanes: MeshLanes, p: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -144,38 +183,49 @@ def signed_distance(lanes: MeshLanes, p: jax.Array) -> tuple[jax.Array, jax.Arra
       lanes: The worlds' meshes.
       p: Points, shape (3, ..., world).
     """
-    axes, nodes = range(3), lanes.nodes
-    scaled = [(p[k] / lanes.factor - lanes.origin[k]) / lanes.cell for k in axes]
+    cell = locate(lanes.grid, p)
+    values = lanes.values[corners(lanes.grid, cell)].astype(p.dtype)
+    return interpolate(lanes.grid, cell, values)
+
+
+def locate(grid: GridLanes, p: jax.Array) -> Cell:
+    """Finds the cells of points (3, ..., world) in the object's frame."""
+    axes, nodes = range(3), grid.nodes.astype(jnp.int32)
+    scaled = [(p[k] / grid.factor - grid.origin[k]) / grid.cell for k in axes]
     inside = [jnp.clip(scaled[k], 0.0, (nodes[k] - 1).astype(p.dtype)) for k in axes]
-    index = [jnp.minimum(inside[k].astype(jnp.int32), nodes[k] - 2) for k in axes]
-    part = [inside[k] - index[k].astype(p.dtype) for k in axes]
-    corner = lanes.first + (index[0] * nodes[1] + index[1]) * nodes[2] + index[2]
-    value, slope = _interpolate(lanes.values, corner, (nodes[1] * nodes[2], nodes[2]), part)
-    beyond = jnp.stack([scaled[k] - inside[k] for k in axes]) * lanes.cell
-    back = jnp.sqrt(dot(beyond, beyond) + _FAR**2)
-    gradient = slope / lanes.cell + beyond / back
-    length = jnp.sqrt(dot(gradient, gradient) + _FAR**2)
-    return lanes.factor * (value + back - _FAR), gradient / length
+    # A place that is not a number has to lead to a cell too: kernels do not check indices.
+    index = [jnp.clip(inside[k].astype(jnp.int32), 0, nodes[k] - 2) for k in axes]
+    part = jnp.stack([inside[k] - index[k].astype(p.dtype) for k in axes])
+    beyond = jnp.stack([scaled[k] - inside[k] for k in axes]) * grid.cell
+    first = grid.first.astype(jnp.int32)
+    return Cell(first + (index[0] * nodes[1] + index[1]) * nodes[2] + index[2], part, beyond)
 
 
-def _interpolate(
-    values: jax.Array, corner: jax.Array, strides: tuple, part: list[jax.Array]
-) -> tuple[jax.Array, jax.Array]:
-    """Value and gradient per cell at fractions `part` of the cells with the given first corners."""
-    x, y, z = part
+def corners(grid: GridLanes, cell: Cell) -> jax.Array:
+    """Indices of the values at a cell's corners, z fastest, int32 of shape (8, ...)."""
+    nodes = grid.nodes.astype(jnp.int32)
+    offsets = [i * nodes[1] * nodes[2] + j * nodes[2] + k for i, j, k in np.ndindex(2, 2, 2)]
+    return jnp.stack([cell.corner + offset for offset in offsets])
 
-    def edge(i: int, j: int) -> tuple[jax.Array, jax.Array]:
-        """Interpolates along z on the cell's edge (i, j)."""
-        at = corner + i * strides[0] + j * strides[1]
-        low, high = values[at], values[at + 1]
+
+def interpolate(grid: GridLanes, cell: Cell, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Signed distance (...) and its unit gradient (3, ...) from the values at `corners`."""
+    x, y, z = (cell.part[k] for k in range(3))
+
+    def edge(k: int) -> tuple[jax.Array, jax.Array]:
+        """Interpolates along z on an edge of the cell."""
+        low, high = values[2 * k], values[2 * k + 1]
         return low + z * (high - low), high - low
 
-    (a, az), (b, bz), (c, cz), (d, dz) = edge(0, 0), edge(0, 1), edge(1, 0), edge(1, 1)
+    (a, az), (b, bz), (c, cz), (d, dz) = (edge(k) for k in range(4))
     low, high = a + y * (b - a), c + y * (d - c)
     low_z, high_z = az + y * (bz - az), cz + y * (dz - cz)
     slope_y = (b - a) + x * ((d - c) - (b - a))
     slope = jnp.stack([high - low, slope_y, low_z + x * (high_z - low_z)])
-    return low + x * (high - low), slope
+    back = jnp.sqrt(dot(cell.beyond, cell.beyond) + _FAR**2)
+    gradient = slope / grid.cell + cell.beyond / back
+    length = jnp.sqrt(dot(gradient, gradient) + _FAR**2)
+    return grid.factor * (low + x * (high - low) + back - _FAR), gradient / length
 
 
 def table_points(lanes: MeshLanes, columns: jax.Array) -> jax.Array:
@@ -188,16 +238,41 @@ def table_points(lanes: MeshLanes, columns: jax.Array) -> jax.Array:
       lanes: The worlds' meshes.
       columns: Columns of the object's orientation, shape (3, 3, world).
     """
-    point = jnp.stack([dot(columns[:, i], lanes.support) for i in range(3)])
-    height = _STEEPEST * point[2]
-    first = _best(-height, point)
-    away = point - first[:, None]
-    second = _best(jnp.sqrt(away[0] ** 2 + away[1] ** 2 + _FAR**2) - height, point)
-    line = second - first
-    line = line / jnp.sqrt(line[0] ** 2 + line[1] ** 2 + _FAR**2)
-    side = line[0] * away[1] - line[1] * away[0]
-    third, fourth = _best(side - height, point), _best(-side - height, point)
+    point = turned(columns, lanes.support)
+    index = jnp.arange(point.shape[1], dtype=point.dtype)[:, None]
+    first = _best(lowest(point, index), point)
+    second = _best(farthest(point, index, first[:, None]), point)
+    third, fourth = (
+        _best(score, point) for score in beside(point, index, first[:, None], second[:, None])
+    )
     return jnp.stack([first, second, third, fourth], 1)
+
+
+def turned(columns: jax.Array, point: jax.Array) -> jax.Array:
+    """Points (3, point, world) of the object's frame, from its centre in the palm's frame."""
+    return jnp.stack([dot(columns[:, i], point) for i in range(3)])
+
+
+def lowest(point: jax.Array, index: jax.Array) -> jax.Array:
+    """Score of support points (3, point, world) by their height alone; index: (point, 1)."""
+    return -(_STEEPEST * point[2] + _ORDER * index)
+
+
+def farthest(point: jax.Array, index: jax.Array, first: jax.Array) -> jax.Array:
+    """Score by the distance from the first point, (3, 1, world)."""
+    away = point - first
+    return jnp.sqrt(away[0] ** 2 + away[1] ** 2 + _FAR**2) + lowest(point, index)
+
+
+def beside(
+    point: jax.Array, index: jax.Array, first: jax.Array, second: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Scores by the distance on either side of the line through two points, (3, 1, world)."""
+    line, away = second - first, point - first
+    length = jnp.sqrt(line[0] ** 2 + line[1] ** 2 + _FAR**2)
+    side = (line[0] * away[1] - line[1] * away[0]) / length
+    low = lowest(point, index)
+    return side + low, low - side
 
 
 def _best(score: jax.Array, point: jax.Array) -> jax.Array:

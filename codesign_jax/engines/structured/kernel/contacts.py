@@ -1,7 +1,6 @@
 """Contacts of a kernel: one item at a time, and nothing computed where no lane touches."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import collision, contact
 from codesign_jax.engines.structured.contact import Contacts, Line
+from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.memory import (
     MemoryLayout,
     anywhere,
@@ -16,6 +16,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     solid,
     upper,
 )
+from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.lanes import sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.solver import along
@@ -197,12 +198,39 @@ class BoundContacts:
         return lanewise(both, gap, self.friction, self.read("ray", item), alpha)
 
 
-def sphere_on_object(scene: Scene, size, shape, columns, position, centre, radius):
-    """Point, normal and gap of spheres (3, k, ...) against the object."""
-    hand = SimpleNamespace(object_size=size, object_id=shape.astype(jnp.int32), mesh=None)
-    kin = SimpleNamespace(object=columns, object_pos=position)
-    c = collision.spheres_on_object(scene, hand, kin, direct, centre, radius)  # type: ignore[arg-type]
-    return c.point, c.normal, c.distance[None]
+def sphere_on_object(
+    scene: Scene,
+    thing: WorldObject,
+    columns: Lanes,
+    position: Lanes,
+    centre: Lanes,
+    radius: Lanes | float,
+) -> tuple[Lanes, Lanes, Lanes]:
+    """Contacts of spheres with the objects: the one way to them for all that may touch.
+
+    It reads the kernel's memory where an object is a mesh, so that it is called on lanes and not
+    from within `lanewise`.  Points without a size, such as a hull's vertices, have radius 0.
+
+    Args:
+      scene: The scene.
+      thing: The block's objects, see `objects.read`.
+      columns: Columns of their orientation in the palm's frame, shape (3, 3).
+      position: Their centres in the palm's frame [m], shape (3,).
+      centre: Sphere centres in the palm's frame [m], shape (3, k).
+      radius: Sphere radii [m], shape (k,).
+
+    Returns:
+      Contact points [m] and unit normals from object to hand, shape (3, k), and gaps [m], negative
+      in contact, shape (1, k).
+    """
+    local = lanewise(collision.in_object, columns, position, centre)
+    distance, gradient = objects.signed_distance(scene, thing, local)
+
+    def place(*args):
+        point, normal, gap = collision.on_surface(*args)
+        return point, normal, gap[None]
+
+    return lanewise(place, columns, centre, radius, distance, gradient)
 
 
 def sphere_on_table(scene: Scene, height, centre, radius):

@@ -12,6 +12,7 @@ import numpy as np
 from codesign_jax.engines.structured import hull
 from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
 from codesign_jax.engines.structured.elimination import JointTerms
+from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, any_of
 from codesign_jax.engines.structured.lanes import contract, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
@@ -70,9 +71,9 @@ def kind_of(row: Any, links: int) -> Any:
 class Skin:
     """Finds the vertices that touch the object or the table, row by row."""
 
-    def __init__(self, step: "Step", at: dict[str, Any], m: "Memory", shape: tuple):
+    def __init__(self, step: "Step", at: dict[str, Any], m: "Memory", thing: WorldObject):
         """Takes a step's memory and geometry, see `Step`."""
-        self.step, self.at, self.m, self.shape = step, at, m, shape
+        self.step, self.at, self.m, self.thing = step, at, m, thing
         d = step.p.scene.discretization
         self.k, self.links = d.hull_rings * d.hull_points, step.p.links
         self.sets = [c for n, c in m.contacts.items() if n.startswith("hull_")]
@@ -92,7 +93,7 @@ class Skin:
         centre, reach = lanewise(_ball, joint, before.frame, after.frame, ball)
         for slots in self.sets:
             slots.clear(row)
-            _, _, gap = self.step.geometry(slots.set.name, centre, reach, self.at, self.shape)
+            _, _, gap = self.step.geometry(slots.set.name, centre, reach, self.at, self.thing)
 
             def vertices(slots: BoundSlots = slots) -> None:
                 def one(v: jax.Array, x: jax.Array) -> jax.Array:
@@ -108,7 +109,7 @@ class Skin:
         place = lanewise(_place, vertex, joint, before.frame, after.frame)
         point, image, weight, share = place
         name = slots.set.name
-        where, normal, gap = self.step.geometry(name, point, 0.0, self.at, self.shape)
+        where, normal, gap = self.step.geometry(name, point, 0.0, self.at, self.thing)
 
         which = gap.lane < 0
         if self.step.p.fingers > self.step.p.num_fingers:  # the others fill up

@@ -133,6 +133,17 @@ def solid(tree: Any, size: int) -> tuple[list[jax.Array], Callable]:
     return arrays, rebuild
 
 
+def loop(count: int, body: Callable, start: Any, size: int, *, reverse: bool = False):
+    """Folds body(item, tree of lanes) over the items."""
+    first, rebuild = solid(start, size)
+
+    def step(k: jax.Array, arrays: list) -> list:
+        item = count - 1 - k if reverse else k
+        return solid(body(item, rebuild(arrays)), size)[0]
+
+    return rebuild(jax.lax.fori_loop(0, count, step, first))
+
+
 def upper(matrix: Lanes) -> Lanes:
     """Upper triangle of a symmetric (n, n) matrix, n (n + 1) / 2 components."""
     n = matrix.shape[0]

@@ -1,6 +1,5 @@
 """Newton's method of `solver`, inside a kernel: links in loops, numbers in registers."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     anywhere,
     choose,
     full,
+    loop,
     solid,
     upper,
 )
@@ -84,17 +84,6 @@ class Memory(NamedTuple):
     scratch: MemoryLayout
     scratch_ref: Any
     contacts: dict[str, BoundContacts]
-
-
-def loop(count: int, body: Callable, start: Any, size: int, *, reverse: bool = False):
-    """Folds body(item, tree of lanes) over the items."""
-    first, rebuild = solid(start, size)
-
-    def step(k: jax.Array, arrays: list) -> list:
-        item = count - 1 - k if reverse else k
-        return solid(body(item, rebuild(arrays)), size)[0]
-
-    return rebuild(jax.lax.fori_loop(0, count, step, first))
 
 
 def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:

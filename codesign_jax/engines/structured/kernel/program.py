@@ -15,8 +15,9 @@ from jax.experimental import pallas as pl
 
 from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.compiler.ptx import LANES
+from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured.constants import WorldConstants
-from codesign_jax.engines.structured.kernel import hull
+from codesign_jax.engines.structured.kernel import hull, objects
 from codesign_jax.engines.structured.kernel.contacts import ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, anywhere
 from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_slots
@@ -65,6 +66,7 @@ class Program:
         self.size = self.fingers * self.block
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
         self.palm_groups = -(-len(palm_points(scene)) // self.fingers)
+        self.meshes = bool(collision.mesh_indices(scene))
         self.sets = self._sets()
         self.slotted = any(isinstance(s, SlotSet) for s in self.sets)
         self.trace = (*TRACE, "overflow") if self.slotted else TRACE
@@ -113,6 +115,7 @@ class Program:
             more |= {"section": (1, (3,))}
         if self.slotted:
             more |= hull.fields(self.scene)
+        support, grid = objects.tables(self.scene, self.fingers)
         self.hand = MemoryLayout(
             True,
             mount=(1, (3, 3)),
@@ -128,6 +131,7 @@ class Program:
             damping=(n, (a,)),
             armature=(n, (a,)),
             **more,
+            **support,
         )
         self.world = MemoryLayout(
             False,
@@ -141,6 +145,7 @@ class Program:
             object_size=(1, (3,)),
             object_id=(1, one),
             alive=(1, one),
+            **grid,
         )
         self.finger_state = MemoryLayout(
             True, finger=(n, (a,)), finger_vel=(n, (a,)), acc=(n, (a,))
@@ -187,6 +192,8 @@ class Program:
             arrays["section"] = hand.section[None]
         if self.slotted:
             arrays |= hull.pack(self.scene, hand)
+        if hand.mesh is not None:
+            arrays |= objects.rows(hand.mesh, self.fingers, dtype)
         extra = self.fingers - n
         if extra:
             for name in ("share", "mass", "inertia", "gain"):
@@ -267,6 +274,9 @@ class Program:
           recorded; and the last states.
         """
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
+        shared = (len(inputs),) if self.meshes else ()
+        if hand.mesh is not None:
+            inputs += (hand.mesh.values[None],)
         blocks, steps, dtype = inputs[0].shape[0], ctrl.shape[1], ctrl.dtype
         # A core runs block after block: they share what no block leaves to another.
         scratch = 1 if self.backend == "cpu" else blocks
@@ -298,7 +308,8 @@ class Program:
             out = call(*inputs)
         else:
             origin = repr((self.scene, self.limits, trajectory))
-            out = launch(call, inputs, outputs, Kernel(origin, self.backend, self.size))
+            kernel = Kernel(origin, self.backend, self.size, shared)
+            out = launch(call, inputs, outputs, kernel)
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(self.trace))[: ctrl.shape[0]]
         found = {name: trace[..., k] for k, name in enumerate(self.trace)}
@@ -335,14 +346,18 @@ class Program:
             world_state0,
             arm,
             pressure,
+            *rest,
+        ) = refs
+        grid = rest.pop(0) if self.meshes else None
+        (
             finger_state,
             world_state,
             scratch,
             trace,
             *path,
-        ) = refs
+        ) = rest
         block = Block(self.fingers, self.block)
-        step = Step(self, block, hand, world, finger_state, world_state, scratch)
+        step = Step(self, block, hand, world, finger_state, world_state, scratch, grid)
         own = block.world
         _copy(finger_state0, finger_state, self.finger_state.rows)
         _copy(world_state0, world_state, self.world_state.rows, own)

@@ -13,23 +13,23 @@ from codesign_jax.engines.structured import kinematics as kin
 from codesign_jax.engines.structured.constants import apply_columns
 from codesign_jax.engines.structured.inertia import Body
 from codesign_jax.engines.structured.integration import integrate, rigid_arm
+from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.contacts import (
-    direct,
     sphere_on_object,
     sphere_on_table,
     zeros,
 )
 from codesign_jax.engines.structured.kernel.hull import Side, Skin
-from codesign_jax.engines.structured.kernel.memory import Block
+from codesign_jax.engines.structured.kernel.memory import Block, loop
 from codesign_jax.engines.structured.kernel.newton import (
     Iterate,
     Memory,
     Newton,
     Palm,
-    loop,
     relative,
     triangle,
 )
+from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
@@ -53,10 +53,12 @@ class Step:
         finger_state: Any,
         world_state: Any,
         scratch: Any,
+        grid: Any = None,
     ):
-        """Takes the kernel's lanes and memory."""
+        """Takes the kernel's lanes and memory; grid: distances of all meshes, if there are any."""
         self.p, self.block, self.hand, self.world = program, block, hand, world
         self.finger_state, self.world_state, self.scratch = finger_state, world_state, scratch
+        self.grid = grid
 
     def constants(self, *names: str) -> list[Lanes]:
         """Constants of worlds."""
@@ -82,15 +84,17 @@ class Step:
             for n in p.world_state.groups
         }
         geometry = self._palm(state, arm)
-        size, shape = self.constants("object_size", "object_id")
+        hand, world = (p.hand, self.hand), (p.world, self.world)
+        thing = objects.read(scene, self.block, world, hand, self.grid)
         friction = lanewise(
-            lambda s: collision.object_friction(scene, s.astype(jnp.int32)).astype(s.dtype), shape
+            lambda s: collision.object_friction(scene, s.astype(jnp.int32)).astype(s.dtype),
+            thing.shape,
         )
         bound = {c.name: c.bind(p.scratch, self.scratch, friction) for c in p.sets}
         memory = Memory(
             p.hand, self.hand, p.finger_state, self.finger_state, p.scratch, self.scratch, bound
         )
-        now, centre = self._forward(state, geometry, pressure, memory, (size, shape))
+        now, centre = self._forward(state, geometry, pressure, memory, thing)
         rigid = not scene.effects.wrist
         newton = Newton(p.links, self.block, memory, geometry["palm"], rigid=rigid)
         now, quality = newton.solve(now, waiting, *p.limits)
@@ -154,7 +158,7 @@ class Step:
 
         return lanewise(compute, state, arm, *constants)
 
-    def _forward(self, state: dict, at: dict, pressure: Lanes, m: Memory, shape: tuple):
+    def _forward(self, state: dict, at: dict, pressure: Lanes, m: Memory, thing: WorldObject):
         """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
 
         Returns:
@@ -172,7 +176,7 @@ class Step:
             lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
         )
 
-        skin = Skin(self, at, m, shape) if any(n.startswith("hull_") for n in m.contacts) else None
+        skin = Skin(self, at, m, thing) if any(n.startswith("hull_") for n in m.contacts) else None
 
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, motion, middle = carry
@@ -201,7 +205,7 @@ class Step:
                 m.scratch.write(self.scratch, name, value, i)
             share = p.hand.read(self.hand, "share", i + 1)
             middle = lanewise(lambda m, c, s: m + s * c, middle, stored["body_centre"], share)
-            self._finger_contacts(i, carry, at, m, shape)
+            self._finger_contacts(i, carry, at, m, thing)
             if skin:
                 skin.row(i, carry[0], before, Side(carry[1], carry[4], carry[2]))
             return (*carry, middle)
@@ -211,12 +215,14 @@ class Step:
         if skin:
             tip = Side(frame, motion, vel)
             skin.row(p.links, origin, tip, tip)
-        self._slot_contacts(state, at, m, shape)
+        self._slot_contacts(state, at, m, thing)
         count = p.num_fingers * p.links
         middle = self.block.sum(middle)
         return now, lanewise(lambda c: c / count, middle)
 
-    def _finger_contacts(self, i: Any, carry: tuple, at: dict, m: Memory, shape: tuple) -> None:
+    def _finger_contacts(
+        self, i: Any, carry: tuple, at: dict, m: Memory, thing: WorldObject
+    ) -> None:
         p, now = self.p, at["now"]
         if not p.k:
             return
@@ -227,23 +233,23 @@ class Step:
         )
         for name in ("finger_object", "finger_table"):
             if name in m.contacts:
-                geometry = self.geometry(name, centre, radius, at, shape)
+                geometry = self.geometry(name, centre, radius, at, thing)
                 moves = (
                     relative(name, motion, now.palm_motion, now.object_motion),
                     relative(name, vel, at["vel"], at["object_vel"]),
                 )
                 m.contacts[name].create(i, geometry, *moves)
 
-    def geometry(self, name: str, centre: Lanes, radius: Any, at: dict, shape: tuple):
+    def geometry(self, name: str, centre: Lanes, radius: Any, at: dict, thing: WorldObject):
         """Point, normal and gap of spheres of the hand against the object or the table."""
         scene = self.p.scene
         if name.endswith("_object"):
-            function = partial(sphere_on_object, scene)
-            return lanewise(function, *shape, at["columns"], at["palm"].position, centre, radius)
+            place = at["columns"], at["palm"].position
+            return sphere_on_object(scene, thing, *place, centre, radius)
         height = self.p.world_state.read(self.world_state, "wrist", 0, self.block.world)[2]
         return lanewise(partial(sphere_on_table, scene), height, centre, radius)
 
-    def _slot_contacts(self, state: dict, at: dict, m: Memory, shape: tuple) -> None:
+    def _slot_contacts(self, state: dict, at: dict, m: Memory, thing: WorldObject) -> None:
         p, now = self.p, at["now"]
 
         def create(name: str, i: Any, geometry: Any) -> None:
@@ -258,27 +264,26 @@ class Step:
             point, radius = (p.hand.read(self.hand, n, i) for n in ("palm_point", "palm_radius"))
             centre = lanewise(lambda f, s: apply_columns(f[:, :, None], s), at["frame"], point)
             for name in palm:
-                create(name, i, self.geometry(name, centre, radius, at, shape))
+                create(name, i, self.geometry(name, centre, radius, at, thing))
         on_table = m.contacts.get("object_table")
-        slots = self._table_points(state, at, shape) if on_table else []
+        slots = self._table_points(state, at, thing) if on_table else []
         for i in range(on_table.set.count if on_table else 0):
             part = [slots[k] for k in range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))]
             create("object_table", i, self._deal(part))
 
-    def _table_points(self, state: dict, at: dict, shape: tuple) -> list[tuple]:
+    def _table_points(self, state: dict, at: dict, thing: WorldObject) -> list[tuple]:
         """Point, normal and gap of each slot of the object on the table, lanes of a world."""
+        height, position = state["wrist"][2], at["palm"].position
+        arms = objects.table_points(self.p.scene, thing, at["columns"], position, height)
 
-        def compute(size, kind, columns, position, height):
-            hand = SimpleNamespace(object_size=size, object_id=kind.astype(jnp.int32), mesh=None)
-            frame = SimpleNamespace(object=columns, object_pos=position)
-            c = collision.object_on_table(direct, self.p.scene, hand, frame, height)  # type: ignore[arg-type]
+        def compute(position, arms, height):
+            point, normal, gap = collision.on_table(position, arms, height)
             return [
-                (c.point[:, k : k + 1], c.normal[:, k : k + 1], c.distance[None, k : k + 1])
-                for k in range(c.distance.shape[0])
+                (point[:, k : k + 1], normal[:, k : k + 1], gap[None, k : k + 1])
+                for k in range(gap.shape[0])
             ]
 
-        height = state["wrist"][2]
-        return lanewise(compute, *shape, at["columns"], at["palm"].position, height)
+        return lanewise(compute, position, arms, height)
 
     def _deal(self, slots: list[tuple]) -> tuple[Lanes, Lanes, Lanes]:
         """Deals the slots (component, 1, world) out to the finger lanes."""

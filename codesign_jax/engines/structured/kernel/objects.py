@@ -1,0 +1,266 @@
+"""The grasped object of each world inside a kernel: primitives and meshes, side by side.
+
+What no lane of a block has is skipped: a block of primitives reads no grid, and one of meshes
+computes no primitive.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.engines.structured import collision, mesh
+from codesign_jax.engines.structured.kernel.memory import (
+    Block,
+    MemoryLayout,
+    anywhere,
+    choose,
+    loop,
+)
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.mesh import GridLanes, MeshLanes
+from codesign_jax.scene import Scene
+
+_LAST = 1e9  # beyond any index of a support point
+
+
+class MeshMemory(NamedTuple):
+    """A block's memory of meshes.
+
+    Attributes:
+      values: Grid values of all meshes of the scene, a reference to a flat array.
+      support: Reads the support points of a row, one for each finger's lane, shape (3,).
+      rows: Number of these rows.
+      grid: The grid of each world's mesh.
+      reach: Distance of the farthest support point from the centre [m], lanes of a world.
+      meshed: Which worlds have a mesh, lanes of a world.
+    """
+
+    values: Any
+    support: Callable[[Any], Lanes]
+    rows: int
+    grid: GridLanes
+    reach: Lanes
+    meshed: Lanes
+
+
+class WorldObject(NamedTuple):
+    """Objects of a block's worlds.
+
+    Attributes:
+      size: Sizes of the primitives, shape (3,), lanes of a world.
+      shape: Index of each world's object in the scene, a float, lanes of a world.
+      block: The lanes.
+      mesh: Meshes; None if the scene has none.
+    """
+
+    size: Lanes
+    shape: Lanes
+    block: Block
+    mesh: MeshMemory | None
+
+
+def tables(scene: Scene, fingers: int) -> tuple[dict, dict]:
+    """Groups that meshes add to the table of the hand and to the table of the worlds."""
+    if not (found := mesh.tables(scene)):
+        return {}, {}
+    one: tuple[int, ...] = ()
+    rows = max(1, found.support.shape[1] // fingers)
+    world = {"first": one, "nodes": (3,), "origin": (3,), "cell": one, "factor": one, "reach": one}
+    return {"support": (rows, (3,))}, {f"grid_{k}": (1, shape) for k, shape in world.items()}
+
+
+def rows(found: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
+    """Arrays for the groups of `tables`: support points are dealt to the lanes of the fingers."""
+    support = found.support
+    if support.shape[1] < fingers:
+        support = jnp.tile(support, (1, fingers // support.shape[1], 1))
+    dealt = support.reshape(3, -1, fingers, support.shape[2])
+    reach = jnp.sqrt((support**2).sum(0).max(0))[None]
+    grid = {k: v.astype(dtype) for k, v in found.grid._asdict().items()}
+    return {"support": dealt.swapaxes(0, 1)} | {
+        f"grid_{k}": v for k, v in (grid | {"reach": reach}).items()
+    }
+
+
+def read(
+    scene: Scene,
+    block: Block,
+    world: tuple[MemoryLayout, Any],
+    hand: tuple[MemoryLayout, Any],
+    values: Any,
+) -> WorldObject:
+    """The objects of a block.
+
+    Args:
+      scene: The scene.
+      block: The lanes.
+      world: Table of the worlds' constants and its reference.
+      hand: Table of the hand's constants and its reference.
+      values: Reference to the grid values of all meshes; None without meshes.
+    """
+
+    def constant(name: str) -> Lanes:
+        return world[0].read(world[1], name, 0, block.world)
+
+    size, shape = constant("object_size"), constant("object_id")
+    if values is None:
+        return WorldObject(size, shape, block, None)
+    meshes = np.array(collision.mesh_indices(scene), np.int32)
+    meshed = lanewise(lambda s: jnp.isin(s.astype(jnp.int32), meshes), shape)
+    found = MeshMemory(
+        values,
+        partial(hand[0].read, hand[1], "support"),
+        hand[0].groups["support"][0],
+        GridLanes(*(constant(f"grid_{name}") for name in GridLanes._fields)),
+        constant("grid_reach"),
+        meshed,
+    )
+    return WorldObject(size, shape, block, found)
+
+
+def _for_both(
+    scene: Scene,
+    thing: WorldObject,
+    primitive: Callable,
+    meshed: Callable,
+    like: Any,
+    near: jax.Array | None = None,
+) -> Any:
+    """Results of primitive() and meshed() on the lanes that have such an object.
+
+    Args:
+      scene: The scene.
+      thing: The objects.
+      primitive: Computes a tree of lanes for primitives.
+      meshed: Computes one of the same structure for meshes.
+      like: Lanes of the same structure.
+      near: Lanes whose mesh is asked for; the others may get zeros.  By default all with a mesh.
+    """
+    if thing.mesh is None:
+        return primitive()
+    mine, size = thing.mesh.meshed.lane, thing.block.size
+    if len(collision.mesh_indices(scene)) == len(scene.objects.object):
+        return meshed() if near is None else choose(anywhere(near), meshed, like, size)
+    plain = choose(anywhere(~mine), primitive, like, size)
+    other = choose(anywhere(mine if near is None else near & mine), meshed, like, size)
+
+    def pick(mine: jax.Array, mesh: Any, primitive: Any) -> Any:
+        return jax.tree.map(partial(jnp.where, mine), mesh, primitive)
+
+    return lanewise(pick, thing.mesh.meshed, other, plain)
+
+
+def signed_distance(scene: Scene, thing: WorldObject, local: Lanes) -> tuple[Lanes, Lanes]:
+    """Signed distance (...) and unit gradient (3, ...) at points (3, ...) of the object's frame."""
+
+    def primitive() -> tuple[Lanes, Lanes]:
+        def compute(size, shape, local):
+            return collision.primitive_distance(scene, size, shape.astype(jnp.int32), local)
+
+        return lanewise(compute, thing.size, thing.shape, local)
+
+    def meshed() -> tuple[Lanes, Lanes]:
+        assert thing.mesh is not None
+        grid = thing.mesh.grid
+        cell = lanewise(mesh.locate, grid, local)
+        values = _gather(thing.mesh.values, lanewise(mesh.corners, grid, cell), local.dtype)
+        return lanewise(mesh.interpolate, grid, cell, values)
+
+    none = lanewise(lambda p: (jnp.zeros_like(p[0]), jnp.zeros_like(p)), local)
+    return _for_both(scene, thing, primitive, meshed, none)
+
+
+def _gather(ref: Any, index: Lanes, dtype: Any) -> Lanes:
+    """Elements of a flat array at the indices of each lane."""
+    parts = np.empty(index.parts.shape, object)
+    for at, where in np.ndenumerate(index.parts):
+        parts[at] = ref[(where,)].astype(dtype)
+    return Lanes(parts, index.shape, dtype)
+
+
+def table_points(
+    scene: Scene, thing: WorldObject, columns: Lanes, position: Lanes, height: Lanes
+) -> Lanes:
+    """Four points that may touch the table, from the centre, shape (3, 4, world).
+
+    Args:
+      scene: The scene.
+      thing: The objects.
+      columns: Columns of their orientation, shape (3, 3).
+      position: Their centres in the palm's frame, shape (3,).
+      height: Height of the palm above the table.
+    """
+
+    def primitive() -> Lanes:
+        def compute(size, shape, columns):
+            shape = shape.astype(jnp.int32)
+            return collision.primitive_points(scene, size[:, 0], shape, columns[:, :, 0])
+
+        return lanewise(compute, thing.size, thing.shape, columns)
+
+    def meshed() -> Lanes:
+        search = partial(_search, thing, columns)
+        (first,) = search(lambda *a: (mesh.lowest(*a),))
+        (second,) = search(lambda *a: (mesh.farthest(*a),), first)
+        found = [first, second, *search(mesh.beside, first, second)]
+        return lanewise(lambda points: jnp.concatenate(points, 1), found)
+
+    near = None
+    if thing.mesh is not None:
+        # A mesh whose centre is higher than its farthest point touches nothing: the search for
+        # its points is left out, and zeros, its centre, touch nothing either.
+        clear = lanewise(lambda p, h, r: p[2] + h - r, position, height, thing.mesh.reach)
+        near = clear.lane < 0
+    none = lanewise(lambda c: jnp.zeros((3, 4, c.shape[-1]), c.dtype), columns)
+    return _for_both(scene, thing, primitive, meshed, none, near)
+
+
+def _search(thing: WorldObject, columns: Lanes, scores: Callable, *known: Lanes) -> list[Lanes]:
+    """The support points with the largest scores, from the centre, shape (3,), lanes of a world.
+
+    Each finger's lane goes through its part of the points; then the lanes of a world compare.
+
+    Args:
+      thing: The objects.
+      columns: Columns of their orientation, shape (3, 3).
+      scores: Function of points (3, finger, world), their indices and the known points to a tuple
+        of scores, see `mesh.lowest`.
+      *known: Points that were found before.
+    """
+    assert thing.mesh is not None
+    block, support = thing.block, thing.mesh.support
+    dtype = columns.dtype
+    finger = block.finger.astype(dtype)
+
+    def compare(columns, point, index, known, best):
+        point = mesh.turned(columns[:, :, 0], point)
+        new = scores(point, index, *known)
+        if best is None:
+            return [(score, index, point) for score in new]
+        better = [score > old[0] for score, old in zip(new, best, strict=True)]
+        now = [(score, index, point) for score in new]
+        return [
+            jax.tree.map(partial(jnp.where, b), n, o)
+            for b, n, o in zip(better, now, best, strict=True)
+        ]
+
+    def row(k: Any, best: Any) -> Any:
+        place = finger + block.fingers * jnp.asarray(k).astype(dtype)
+        index = lanes([place], (), wide=True)
+        return lanewise(compare, columns, support(k), index, known, best)
+
+    best = loop(thing.mesh.rows - 1, lambda k, best: row(k + 1, best), row(0, None), block.size)
+    return [_among_fingers(block, *b) for b in best]
+
+
+def _among_fingers(block: Block, score: Lanes, index: Lanes, point: Lanes) -> Lanes:
+    """The point of the finger's lane with the largest score, of equal ones the first."""
+    mine = score.lane == block.fold(score.lane, jnp.maximum)
+    chosen = block.fold(jnp.where(mine, index.lane, _LAST), jnp.minimum)
+    mine = mine & (index.lane == chosen)
+    parts = [block.fold(jnp.where(mine, p, 0.0), jnp.add) for p in point.parts.ravel()]
+    return lanes(parts, (3,), wide=False)

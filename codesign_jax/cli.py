@@ -32,7 +32,8 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior
 class Optimize:
     """Co-design morphology and control of a hand.
 
-    The same command again resumes the run in its folder.  Sizes that are not given are the paper's.
+    The same command again resumes the run in its folder, and more --episodes extend it.  Sizes that
+    are not given are the paper's.
     """
 
     preset: str = "2d"
@@ -79,7 +80,7 @@ class Optimize:
 
 @dataclasses.dataclass
 class Evaluate:
-    """Evaluate one design: costs of each object, success, and an animation if asked for."""
+    """Evaluate one design: costs of each object, how sure they are, an animation if asked for."""
 
     design: Annotated[
         tuple[tuple[str, ...], ...],
@@ -90,7 +91,8 @@ class Evaluate:
     run_folder: Annotated[
         Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
     ] = None
-    """Take scene, design space and best particle from this run folder."""
+    """Take scene, design space and best particle from this run folder; --accuracy, --objects, --set
+    and --engine then replace the run's."""
     preset: str = "2d"
     """Design space that the names belong to."""
     hand: Text = None

@@ -84,7 +84,7 @@ def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) 
 def make_evaluate(
     scene: Scene, engine: Engine, space: DesignSpace, num_trials: int
 ) -> EvaluateFunction:
-    """Returns a jitted function (population, key) -> outcomes of shape (particle, trial).
+    """Returns a function (population, key) -> outcomes of shape (particle, trial); one program.
 
     All particles meet the same trials: common random numbers compare designs, not luck.
 
@@ -96,9 +96,13 @@ def make_evaluate(
     """
 
     @jax.jit
-    def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
+    def simulate(population: jax.Array, key: jax.Array) -> Outcome:
         trials = rollout.sample_trials(scene, key, num_trials)
         return rollout.evaluate(scene, engine, jax.vmap(space.params)(population), trials)
+
+    def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
+        space.refuse_unit_slips(population)
+        return simulate(population, key)
 
     return evaluate
 

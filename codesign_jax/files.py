@@ -42,9 +42,12 @@ def find(kind: str, name: str | Path) -> Path:
     built_in = available(kind)
     if str(name) in built_in:
         return built_in[str(name)]
-    raise schema.SceneError(
-        [f"{kind}: {str(name)!r} unknown; {schema.nearest(str(name), built_in)}"]
-    )
+    beside = path.with_name(path.name + ".toml") if path.name else path
+    if beside.is_file():
+        hint = f"did you mean the file {str(beside)!r}?"
+    else:
+        hint = schema.nearest(str(name), built_in)
+    raise schema.SceneError([f"{kind}: {str(name)!r} unknown; {hint}"])
 
 
 def read(path: Path) -> dict[str, Any]:

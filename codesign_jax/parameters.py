@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import schema
-from codesign_jax.hand import UNITS, Hand, Parameter, Preset
+from codesign_jax.hand import PARAMETERS, UNITS, Hand, Parameter, Preset
 from codesign_jax.types import Params
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
@@ -52,7 +52,12 @@ class DesignSpace:
         return len(self.names)
 
     def expand(self, design: jax.Array) -> jax.Array:
-        """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,)."""
+        """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,).
+
+        Raises:
+          SceneError: See `refuse_unit_slips`.
+        """
+        self.refuse_unit_slips(design)
         design = jnp.asarray(design)
         source = np.asarray(self.source)
         filled = design[np.maximum(source, 0)]
@@ -82,6 +87,27 @@ class DesignSpace:
             if j >= 0:
                 design = design.at[j].min(caps[i])
         return design
+
+    def refuse_unit_slips(self, designs: np.typing.ArrayLike) -> None:
+        """Refuses designs that were given in other units than SI; see `from_units` for those.
+
+        Only numbers that a factor between units would bring into the range that makes sense for
+        their parameter are refused, and only outside of programs that are being traced.
+
+        Args:
+          designs: Design vectors [SI], shape (..., parameter).
+
+        Raises:
+          SceneError: With every such number and its suggested value.
+        """
+        if isinstance(designs, jax.core.Tracer):
+            return
+        columns = np.moveaxis(np.asarray(designs, float), -1, 0)
+        found = []
+        for name, column in zip(self.names, columns, strict=True):
+            found += _slips(name, name.split("[")[0], column)
+        if found:
+            raise schema.SceneError(found)
 
     def default(self) -> np.ndarray:
         """Returns the table's default design, shape (parameter,), inside the bounds [SI]."""
@@ -165,6 +191,36 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
     return DesignSpace(
         hand, names, units, scale, low, high, domain, tuple(base), tuple(source.tolist())
     )
+
+
+def refuse_unit_slips(params: Params) -> None:
+    """Refuses parameters that were given in other units than SI and radians.
+
+    As `DesignSpace.refuse_unit_slips`, for parameters with any leading axes.
+
+    Raises:
+      SceneError: With every such number and its suggested value.
+    """
+    if any(isinstance(v, jax.core.Tracer) for v in params):
+        return
+    arm = [f"arm_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
+    values = {name: getattr(params, name) for name in Params._fields if name != "arm"}
+    values |= {name: np.asarray(params.arm)[..., i] for i, name in enumerate(arm)}
+    found = [slip for name, v in values.items() for slip in _slips(name, name, np.asarray(v))]
+    if found:
+        raise schema.SceneError(found)
+
+
+def _slips(name: str, row: str, values: np.ndarray) -> list[str]:
+    """What is wrong with the first value, if any, that looks like one of another unit."""
+    kind = PARAMETERS[row]
+    slack = 1e-6 * abs(kind.high)  # a float32 of a bound
+    outside = values[(values < kind.low - slack) | (values > kind.high + slack)]
+    for value in outside.ravel()[:1]:
+        if schema.unit_slip(float(value), kind.unit, kind.low, kind.high):
+            problem = schema.range_problem(name, float(value), kind.unit, kind.low, kind.high)
+            return [f"{problem}; Python takes SI units and radians"]
+    return []
 
 
 def _width(hand: Hand, row: Parameter) -> int:

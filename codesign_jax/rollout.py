@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import control, cost, model
+from codesign_jax import control, cost, model, parameters, schema
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Scene
 from codesign_jax.start import invalid_start
@@ -42,8 +42,15 @@ def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
 
 
 def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
-    """Returns a trial without noise for an object of the set, by index or name."""
+    """Returns a trial without noise for an object of the set, by index or name.
+
+    Raises:
+      SceneError: If the set has no such object.
+    """
     names = [s.name for s in scene.objects.object]
+    if shape not in names and shape not in range(len(names)):
+        hint = schema.nearest(str(shape), names)
+        raise schema.SceneError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
     index = names.index(shape) if isinstance(shape, str) else shape
     zero, one = jnp.zeros(()), jnp.ones(())
     return Trial(jnp.int32(index), jnp.zeros(2), zero, jnp.zeros(2), one, one)
@@ -63,7 +70,12 @@ def simulate(
 
     Returns:
       Outcome and trace with leading axis (world,).
+
+    Raises:
+      SceneError: If a parameter is out of its range by a factor between units, such as
+        millimetres given for metres; not inside a program that is being traced.
     """
+    parameters.refuse_unit_slips(params)
     fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
     ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)
     trace = engine.rollout(fields, ctrl, trajectory=trajectory)

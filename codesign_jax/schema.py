@@ -22,6 +22,7 @@ _UNIT_SLIPS = (
     (1e-6, "mega-scale slip"),
     (1e6, "micro-scale slip"),
 )
+_ANGLE_SLIPS = ((math.pi / 180.0, "degrees given where radians are expected"),)
 
 
 class SceneError(ValueError):
@@ -54,6 +55,14 @@ def nearest(name: str, names: typing.Iterable[str]) -> str:
     return f"did you mean {close[0]!r}?" if close else "valid: " + ", ".join(sorted(names))
 
 
+def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, str] | None:
+    """The factor between units, and what was mixed up, that would bring a value into its range."""
+    if low <= value <= high or value == 0 or not math.isfinite(value):
+        return None
+    slips = _ANGLE_SLIPS if unit == "rad" else _UNIT_SLIPS
+    return next(((f, why) for f, why in slips if low <= value * f <= high), None)
+
+
 def range_problem(path: str, value: float, unit: str, low: float, high: float) -> str | None:
     """Returns why a value lies outside its range, or None.
 
@@ -67,10 +76,8 @@ def range_problem(path: str, value: float, unit: str, low: float, high: float) -
     if low <= value <= high:
         return None
     message = f"{path} = {value!r} is outside [{low:g}, {high:g}] {unit}".rstrip()
-    for factor, reason in _UNIT_SLIPS:
-        if value != 0 and math.isfinite(value) and low <= value * factor <= high:
-            return f"{message}; did you mean {value * factor:g}? ({reason})"
-    return message
+    slip = unit_slip(value, unit, low, high)
+    return f"{message}; did you mean {value * slip[0]:g}? ({slip[1]})" if slip else message
 
 
 def parse(cls: type[T], table: Any, path: str, problems: list[str]) -> T | None:

@@ -10,13 +10,16 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from toy import TINY
 
 from codesign_jax import cli, preflight, runs
 from codesign_jax.checkpoint import Checkpoints, digest
+from codesign_jax.commands import common
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs.record import to_arrays
+from codesign_jax.types import Status
 
 EPISODES = 40
 RUN = [
@@ -353,7 +356,57 @@ def test_evaluate_takes_the_best_of_a_run(finished, capsys):
     rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
     best = min(rows, key=lambda row: float(row[1]))
     assert command("evaluate", "--run", finished, "--trials", "2") == 0
-    assert f"length={float(best[-2]):.4g} mm" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert f"length={float(best[-2]):.4g} mm" in output
+    assert "over 2 trials" in output and "% of grasps (95 % interval)" in output
+
+
+def test_evaluate_judges_a_run_on_other_objects_and_settings(finished, tmp_path, capsys):
+    box = TINY.parent / "box.toml"
+    changes = ["--objects", box, "--accuracy", "fast", "--set", "objects.object.box.mass=0.2"]
+    again = tmp_path / "again.gif"
+    assert command("evaluate", "--run", finished, *changes, "--trials", "3") == 0
+    output = capsys.readouterr().out
+    assert "best final design of" in output and "box: mean cost" in output
+    assert "sphere" not in output and not again.exists()
+    wrong = ["--accuracy", "fats", "--set", "hand.sectoin.width=1"]
+    assert command("evaluate", "--run", finished, *wrong) == 2
+    error = capsys.readouterr().err
+    assert "did you mean 'fast'?" in error and "did you mean 'section'?" in error
+
+
+def test_a_verdict_comes_with_its_interval():
+    """Wilson's interval of n out of n begins at n / (n + 1.96^2): three of three says little."""
+    ok = np.zeros(3, int)
+    assert "keeps it in 44 to 100 % of grasps" in common.verdict(0.0, np.zeros(3), ok)
+    some = common.verdict(0.5, np.array([0.0, 0.0, 1.5]), np.array([0, 0, 0]))
+    assert "not below the limit" in some and "2 of 3 trials kept" in some
+    broken = common.verdict(3.0, np.zeros(3), ok + int(Status.NONFINITE))
+    assert "every trial failed" in broken and "%" not in broken
+
+
+def test_more_episodes_extend_a_run_bit_for_bit(tmp_path, capsys):
+    long, grown = tmp_path / "long", tmp_path / "grown"
+    assert command(*RUN, "--episodes", "5", "--out", long) == 0
+    assert command(*RUN, "--episodes", "3", "--out", grown) == 0
+    assert command(*RUN, "--episodes", "5", "--out", grown) == 0
+    assert "extended from 3 to 5 episodes" in capsys.readouterr().out
+    assert_same_run(grown, long)
+    provenance = json.loads((grown / "provenance.json").read_text())
+    assert provenance["settings"]["episodes"] == 5
+    ((step, command_line),) = [(e, e.pop("command")) for e in provenance["extended"]]
+    assert (step["from"], step["to"]) == (3, 5) and command_line
+    before = snapshot(grown)
+    assert command(*RUN, "--episodes", "4", "--out", grown) == 2
+    assert "a run can be extended, not shortened" in capsys.readouterr().err
+    assert snapshot(grown) == before
+
+
+def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsys):
+    switching = [*RUN, "--schedule", "switch-1", "--out", tmp_path / "run", "--test-trials", "0"]
+    assert command(*switching, "--episodes", "2") == 0
+    assert command(*switching, "--episodes", "4") == 2
+    assert "switch-1 divides its episodes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -369,7 +422,8 @@ def test_evaluate_takes_the_best_of_a_run(finished, capsys):
         (["--engine", "c"], "--engine"),
         (["--render", "grasp.mp4"], "must end in .gif"),
         (["--run", "nowhere"], "nowhere is not a run folder"),
-        (["--run", "nowhere", "--design", "length=100"], "leave out the flags"),
+        (["--run", "nowhere", "--design", "length=100"], "own; leave out --design"),
+        (["--run", "nowhere", "--hand", "tripod3", "--preset", "23d"], "out --hand and --preset"),
     ],
 )
 def test_evaluate_refuses_wrong_input(arguments, part, workplace, capsys):

@@ -44,6 +44,39 @@ def test_params_are_named_and_in_si_units():
     np.testing.assert_allclose(params.pressure, np.arange(20, 24) * 1e3, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("length[1]", 97.0, "length[1] = 97.0 is outside [0.001, 1] m; did you mean 0.097? (milli"),
+        ("wall[0]", 3.0, "did you mean 0.003?"),
+        ("arm_z", -30.0, "did you mean -0.03?"),
+        ("arm_pitch", 15.0, "did you mean 0.261799? (degrees given where radians are expected)"),
+        ("pressure[3]", 120e6, "did you mean 120000? (milli-unit"),
+    ],
+)
+def test_other_units_than_si_are_refused_in_words(name, value, expected):
+    design = FULL.default()
+    design[FULL.names.index(name)] = value
+    for call in (FULL.params, FULL.project, FULL.refuse_unit_slips):
+        with pytest.raises(schema.SceneError) as caught:
+            call(jnp.asarray(design))
+        assert expected in str(caught.value) and "Python takes SI units" in str(caught.value)
+    full = parameters.unflatten(HAND, design)
+    with pytest.raises(schema.SceneError, match=r"did you mean"):
+        parameters.refuse_unit_slips(full)
+
+
+def test_what_no_unit_explains_and_what_is_traced_is_left_to_the_status():
+    design = FULL.default()
+    parameters.refuse_unit_slips(FULL.params(design)._replace(length=-np.ones(4)))
+    jax.eval_shape(FULL.params, 97 + design)
+
+
+def test_bounds_are_no_slip_of_units():
+    for space in (FULL, PLANAR):
+        space.refuse_unit_slips(np.array([space.low, space.high], np.float32))
+
+
 def test_units_round_trip():
     design = np.random.default_rng(0).uniform(FULL.low, FULL.high, (5, 23))
     np.testing.assert_allclose(FULL.from_units(FULL.in_units(design)), design, rtol=1e-14)

@@ -98,6 +98,15 @@ def test_a_key_path_changes_its_value_and_the_resolved_scene_has_it(pair, tmp_pa
     assert scene.load(tmp_path / "scene.toml") == changed
 
 
+def test_a_trial_of_an_unknown_object_names_the_nearest():
+    the_scene = scene.load("paper")
+    assert int(rollout.nominal_trial(the_scene, "cylinder").shape) == 1
+    with pytest.raises(schema.SceneError, match="'cubiod' unknown in paper; did you mean 'cuboid'"):
+        rollout.nominal_trial(the_scene, "cubiod")
+    with pytest.raises(schema.SceneError, match="object 3 unknown"):
+        rollout.nominal_trial(the_scene, 3)
+
+
 def test_key_paths_may_be_nested_or_dotted_and_the_last_of_a_key_holds():
     nested = {"hand": {"material": {"shear_modulus": 60e3}}, "solver.iterations": 7}
     pairs = ["solver.iterations=9", "hand.material={shear_modulus=60e3}", "solver.iterations=7"]
@@ -260,6 +269,9 @@ def test_names_of_objects_must_differ(tmp_path):
 def test_unknown_names_and_files(tmp_path):
     assert "did you mean 'pneuflex4'?" in problems_of(hand.load, "pneuflex")[0]
     assert "no file" in problems_of(hand.load, "nowhere/hand.toml")[0]
+    (tmp_path / "myhand.toml").write_text("")
+    (problem,) = problems_of(hand.load, tmp_path / "myhand")
+    assert "did you mean the file" in problem and "myhand.toml'?" in problem
     (tmp_path / "broken.toml").write_text("a = = 1")
     assert "not valid TOML" in problems_of(hand.load, tmp_path / "broken.toml")[0]
     (tmp_path / "latin.toml").write_bytes(b'name = "\xe9"')

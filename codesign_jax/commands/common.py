@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 
-from codesign_jax import files, preflight, schema
+from codesign_jax import codesign, files, preflight, schema, statistics, types
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
@@ -106,6 +106,28 @@ def preflight_notes(
     if report.refusals:
         raise SceneError(report.refusals)
     return [f"warning: {text}" for text in report.warnings] + report.notes
+
+
+def verdict(mean: float, cost: np.ndarray, status: np.ndarray) -> str:
+    """Says how a design did, with how sure that is.
+
+    Args:
+      mean: Its mean cost by the scene's rule for failed trials.
+      cost: Costs of its trials, shape (trial,).
+      status: Bits of `Status` of its trials, shape (trial,).
+    """
+    limit = codesign.SUCCESS_COST
+    side = "below" if mean < limit else "not below"
+    text = f"mean cost {mean:.4f} over {cost.size} trials, {side} the limit of success, {limit}"
+    counted = ~types.failed(status)
+    if not counted.any():
+        return f"{text}; every trial failed, which says nothing about the grasp"
+    kept, total = int((cost[counted] < limit).sum()), int(counted.sum())
+    share = statistics.proportion(kept, total)
+    return (
+        f"{text}; {kept} of {total} trials kept the object: the design keeps it in "
+        f"{100 * share.low:.0f} to {100 * share.high:.0f} % of grasps (95 % interval)"
+    )
 
 
 def _number(text: str) -> float | None:

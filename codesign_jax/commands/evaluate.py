@@ -42,6 +42,8 @@ def main(options: "Evaluate") -> int:
     engine = make_engine(case.engine, case.scene)
     notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
     console = Console(highlight=False, soft_wrap=True)
+    if options.run_folder:
+        console.print(f"best final design of {options.run_folder}", markup=False)
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
     for note in [*notes, *common.mesh_notes(case.scene)]:
         console.print(note, markup=False)
@@ -84,21 +86,40 @@ def _from_flags(options: "Evaluate") -> _Case:
 
 
 def _from_run(options: "Evaluate") -> _Case:
-    """The final particle of a run that tested best, or the last episode's best without a test."""
-    if any((options.design, options.hand, options.objects, options.accuracy, options.overrides)):
-        raise SceneError(["--run brings its own design and scene; leave out the flags for them"])
+    """The final particle of a run that tested best, or the last episode's best without a test.
+
+    Objects, accuracy and single values may differ from the run's.
+    """
+    own = {"--design": bool(options.design), "--hand": options.hand is not None}
+    own |= {"--scene": options.scene != "paper", "--preset": options.preset != "2d"}
+    given = [flag for flag, is_given in own.items() if is_given]
+    if given:
+        flags = " and ".join(given)
+        raise SceneError([f"--run brings design, hand and scene of its own; leave out {flags}"])
     folder: Path = options.run_folder  # type: ignore[assignment]
-    scene, settings = runs.read_run(folder)
+    scene, settings = runs.read_run(
+        folder,
+        object_set=options.objects,
+        accuracy=options.accuracy,
+        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
+    )
     record = runs.load_record(folder)
     if record is None or record.done == 0:
         raise SceneError([f"--run {folder} has no finished episode yet"])
     if record.test is not None:
-        best = int(particle_cost(scene, record.test).argmin())
+        best = int(np.asarray(particle_cost(runs.read_run(folder)[0], record.test)).argmin())
         design = np.asarray(record.state.particles)[best]
     else:
         best = int(record.history.cost[record.done - 1].argmin())
         design = record.history.population[record.done - 1][best]
     space = design_space(scene.hand, settings.preset)
+    if len(design) != space.num_parameters:
+        raise SceneError(
+            [
+                f"--set leaves {space.num_parameters} parameters free in preset "
+                f"{settings.preset!r}; the run's designs have {len(design)}"
+            ]
+        )
     return _Case(scene, space, design, options.engine or settings.engine)
 
 
@@ -119,9 +140,7 @@ def _evaluate(case: _Case, engine: engines.Engine, options: "Evaluate", console:
             f"{types.failed(status).sum()} failed" + (f" ({counts})" if counts else "")
         )
     total = float(particle_cost(case.scene, outcomes)[0])
-    verdict = "success" if total < codesign.SUCCESS_COST else "no success"
-    limit = codesign.SUCCESS_COST
-    console.print(f"{'all':>12}: mean cost {total:.4f} ({verdict}: limit {limit})")
+    console.print(f"{'all':>12}: {common.verdict(total, outcomes.cost[0], outcomes.status[0])}")
 
 
 def _render(case: _Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:

@@ -150,12 +150,13 @@ def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:
         console.print(f"converged from episode {converged + 1} on, after {grasps} grasps")
     if result.test is not None:
         cost = np.asarray(result.test.cost)
-        best, count = int(cost.argmin()), result.test.trials.cost.shape[1]
+        best = int(cost.argmin())
         console.print(f"best final particle: {runs.describe(plan.space, particles[best])}")
-        verdict = "success" if bool(result.test.success[best]) else "no success"
-        limit = codesign.SUCCESS_COST
+        trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.trials)
+        console.print(f"its test: {common.verdict(float(cost[best]), trials.cost, trials.status)}")
+        again = f"codesign evaluate --run {folder} --trials 150 --accuracy reference"
         console.print(
-            f"its mean cost over {count} trials: {cost[best]:.4f} ({verdict}: limit {limit})"
+            f"chosen as the best of {cost.size} by these trials; on new ones: {again}", markup=False
         )
     _figures(plan, result, folder, console)
     console.print(f"results: {folder}", markup=False)

@@ -1,10 +1,16 @@
 """Stock MJX: the same model and equations in JAX, on any platform, in the caller's float type."""
 
+import contextlib
+import io
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
+
+# MJX prints that it lacks NVIDIA Warp, an optional backend that is not used here. A warning or an
+# error on its way is no print and passes.
+with contextlib.redirect_stdout(io.StringIO()):
+    from mujoco import mjx
 
 from codesign_jax import effects
 from codesign_jax.engines.base import refuse_meshes

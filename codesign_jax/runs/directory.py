@@ -16,14 +16,14 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs import scene_files
-from codesign_jax.runs.settings import Settings
+from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
 
@@ -68,7 +68,7 @@ def open_run(
 
     Raises:
       SceneError: If the folder holds other files, belongs to another scene or other settings
-        (with a diff), or is in use; nothing is changed then.
+        (with a diff; more episodes extend the run), or is in use; nothing is changed then.
     """
     _refuse_foreign(path)
     made = not path.exists()
@@ -82,6 +82,12 @@ def open_run(
             _refuse_other(path, scene, settings, stored)
             notes = _differences(stored["environment"], environment())
             stored["resumed"] = [*stored.get("resumed", []), _start(command)]
+            before = stored["settings"]["episodes"]
+            if before != settings.episodes:
+                step = {"from": before, "to": settings.episodes}
+                stored["extended"] = [*stored.get("extended", []), _start(command) | step]
+                stored["settings"]["episodes"] = settings.episodes
+                notes.append(f"extended from {before} to {settings.episodes} episodes")
             _write_provenance(path, stored)
         else:
             _clear(path)  # remains of a start that was cut short
@@ -110,14 +116,29 @@ def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = 
         _refuse_other(path, scene, settings, _read_provenance(path))
 
 
-def read_run(path: Path) -> tuple[Scene, Settings]:
+def read_run(
+    path: Path,
+    *,
+    object_set: str | Path | None = None,
+    accuracy: str | Path | None = None,
+    overrides: Mapping[Any, Any] | None = None,
+) -> tuple[Scene, Settings]:
     """Reads scene and settings of a run folder.
+
+    Args:
+      path: The folder.
+      object_set: Object set instead of the run's.
+      accuracy: Preset of discretization and solver instead of the run's.
+      overrides: Values by key path that replace the run's; see `scene.load`.
 
     Raises:
       SceneError: If it is not a run folder.
     """
     stored = _read_provenance(path)
-    return scenes.load(path / "scene.toml"), Settings(**stored["settings"])
+    scene = scenes.load(
+        path / "scene.toml", object_set=object_set, accuracy=accuracy, overrides=overrides
+    )
+    return scene, Settings(**stored["settings"])
 
 
 def _read_provenance(path: Path) -> dict[str, Any]:
@@ -196,7 +217,9 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
     problems = []
     for name, value in dataclasses.asdict(settings).items():
         before = stored["settings"].get(name)
-        if before != value:
+        if name == "episodes":
+            problems += _extension_problems(scene, settings, before)
+        elif before != value:
             problems.append(f"{name}: the run has {before!r}, asked for is {value!r}")
     if scenes.load(path / "scene.toml") != scene:
         for name, text in scene_files.scene_texts(scene).items():
@@ -206,6 +229,23 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
     if problems:
         head = f"--out {path} holds another run; choose another folder, or --fresh to delete it"
         raise SceneError([head, *(p.rstrip() for p in problems)])
+
+
+def _extension_problems(scene: Scene, settings: Settings, before: int) -> list[str]:
+    """Why a run cannot have another number of episodes than it had."""
+    asked = settings.episodes
+    if asked < before:
+        return [
+            f"episodes: the run has {before}, asked for is {asked}: "
+            "a run can be extended, not shortened"
+        ]
+    masks = [masks_of(scene, dataclasses.replace(settings, episodes=n)) for n in (before, asked)]
+    if (masks[0] != masks[1][:before]).any():
+        return [
+            f"episodes: the run has {before}, asked for is {asked}: schedule "
+            f"{settings.schedule} divides its episodes and would have switched at others"
+        ]
+    return []
 
 
 def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:

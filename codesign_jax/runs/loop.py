@@ -11,7 +11,7 @@ from codesign_jax import codesign, types
 from codesign_jax.checkpoint import Checkpoints
 from codesign_jax.codesign import EpisodeFunction, EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import ParticleFilter, schedule
+from codesign_jax.optimize import ParticleFilter
 from codesign_jax.parameters import DesignSpace, design_space
 from codesign_jax.runs import failures, tables
 from codesign_jax.runs import record as records
@@ -19,7 +19,7 @@ from codesign_jax.runs.directory import RunDirectory, open_run
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Progress
 from codesign_jax.runs.record import History, Record
-from codesign_jax.runs.settings import Settings
+from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status
 
@@ -77,13 +77,7 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
       scene: The scene.
       settings: Settings without `settings.problems`.
     """
-    space = design_space(scene.hand, settings.preset)
-    mask = schedule(
-        settings.schedule,
-        np.array(space.is_morphology),
-        settings.episodes,
-        settings.first,  # type: ignore[arg-type]
-    )
+    space, mask = design_space(scene.hand, settings.preset), masks_of(scene, settings)
     engine, optimizer = make_engine(settings.engine, scene), codesign.make_filter(space)
     return Plan(scene, settings, engine, space, optimizer, mask, jax.random.key(settings.seed))
 
@@ -156,6 +150,13 @@ class _Loop:
             return None
         record = records.from_arrays(found.arrays)
         done, total = record.done, self.plan.settings.episodes
+        if done < total and record.test is not None:
+            # The run was extended: its test was of particles that are no longer final, and the next
+            # episode takes the step of that test.
+            record.test = None
+            self.store.discard([found.step])
+            (self.run_directory.path / tables.TESTS).unlink(missing_ok=True)
+        record.history = records.with_room(record.history, total)
         if done < total:
             self._say(f"resuming episode {done + 1}/{total} from {self.run_directory.path}")
         else:

@@ -48,6 +48,12 @@ def empty_history(settings: Settings, num_parameters: int) -> History:
     )
 
 
+def with_room(history: History, episodes: int) -> History:
+    """A history with room for this many episodes, at least those it has room for."""
+    more = episodes - len(history.cost)
+    return jax.tree.map(lambda v: np.pad(v, [(0, more)] + [(0, 0)] * (v.ndim - 1)), history)
+
+
 def report(history: History, episode: int, info: EpisodeInfo) -> None:
     """Writes the report of an episode into the history's arrays."""
     s = info.selection

@@ -1,11 +1,15 @@
 """What a run does with a scene: design space, schedule, sizes and seed."""
 
 import dataclasses
+from typing import Any
+
+import numpy as np
 
 from codesign_jax import engines, schema
 from codesign_jax.hand import Hand
 from codesign_jax.optimize import MAX_PARTICLES, schedule
 from codesign_jax.parameters import DesignSpace, design_space
+from codesign_jax.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +80,18 @@ def make_settings(
     chosen = (s if a is None else a for a, s in zip(asked, sizes, strict=True))
     n, t, e, test = chosen
     return Settings(preset, schedule, first, engine, n, t, e, seed, test)
+
+
+def masks_of(scene: Scene, settings: Settings) -> np.ndarray:
+    """Mask of the parameters that may move in each episode, shape (episode, parameter).
+
+    Args:
+      scene: The scene.
+      settings: Settings without `check`'s problems.
+    """
+    space = design_space(scene.hand, settings.preset)
+    first: Any = settings.first
+    return schedule(settings.schedule, np.array(space.is_morphology), settings.episodes, first)
 
 
 def check(settings: Settings, hand: Hand | None) -> list[str]:

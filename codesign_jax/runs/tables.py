@@ -18,6 +18,8 @@ from codesign_jax.runs.record import History
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status
 
+TESTS = "tests.csv"
+
 
 def design_columns(space: DesignSpace) -> list[str]:
     """Names of the parameters with their units, e.g. length_mm and pressure_0_kPa."""
@@ -64,7 +66,7 @@ def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: F
         [i, _number(test.cost[i]), failed.shape[1], failed[i].sum(), int(test.success[i]), *design]
         for i, design in enumerate(_designs(space, particles))
     )
-    _write(folder / "tests.csv", head, rows, 0)
+    _write(folder / TESTS, head, rows, 0)
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:

@@ -6,11 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental import pallas as pl
 
 from codesign_jax import control, model
-from codesign_jax.compiler import llvm, native, ptx
-from codesign_jax.compiler.launch import Kernel, launch
+from codesign_jax.compiler import native
 from codesign_jax.engines.structured import StructuredEngine, elimination
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
@@ -106,13 +104,6 @@ def test_kernel_becomes_ptx(effects):
 
     text = jax.jit(run).trace(fields, ctrl).lower(lowering_platforms=("cuda",)).as_text()
     assert "__gpu$xla.gpu.ptx" in text and "fma.rn.f32" in text
-
-
-def test_what_has_no_ptx_is_named():
-    """Instead of a wrong result."""
-    jaxpr = jax.make_jaxpr(jnp.tanh)(1.0)
-    with pytest.raises(NotImplementedError, match="tanh"):
-        ptx.Assembler().run(jaxpr.jaxpr, [], [ptx.Value("f32", "%f0")])
 
 
 def test_machine_code_equals_the_engine(grasp):
@@ -228,110 +219,11 @@ def test_a_kernel_is_traced_once(grasp, monkeypatch):
     """The second program of a scene finds its machine code; other limits are another kernel."""
     scene, fields, ctrl = grasp
     first = jax.jit(StructuredEngine(scene).rollout)(fields, ctrl)
-    monkeypatch.setattr(native.llvm, "write", lambda *_: pytest.fail("written again"))
+    monkeypatch.setattr(native.vector, "write", lambda *_: pytest.fail("written again"))
     again = jax.jit(StructuredEngine(scene).rollout)(fields, ctrl)
     np.testing.assert_array_equal(first.distance, again.distance)
     with pytest.raises(pytest.fail.Exception, match="written again"):
         jax.jit(StructuredEngine(scene, tolerance=1e-5).rollout)(fields, ctrl)
-
-
-def test_what_has_no_instruction_is_named():
-    """Instead of a wrong result."""
-    jaxpr = jax.make_jaxpr(jnp.tanh)(1.0)
-    with pytest.raises(NotImplementedError, match="tanh"):
-        llvm.Writer(8).run(jaxpr.jaxpr, [], [llvm.Value("f", True, "%x")])
-
-
-def ptx_of(kernel, rows):
-    """A kernel's PTX; it has one array of rows."""
-    spec = pl.BlockSpec((None, rows, ptx.LANES), lambda i: (i, 0, 0))
-    shape = jax.ShapeDtypeStruct((1, rows, ptx.LANES), jnp.float32)
-    call = pl.pallas_call(kernel, grid=(1,), in_specs=[spec], out_specs=spec, out_shape=shape)
-    (equation,) = jax.make_jaxpr(call)(shape).eqns
-    return ptx.assemble(equation.params["jaxpr"], [(rows, ptx.LANES)] * 2, "test")
-
-
-@pytest.mark.parametrize("reverse", [False, True])
-def test_a_loop_asks_for_what_it_reads_later(reverse):
-    """Rows 2 k + 3 and 2 k + 4 of round k: as many rounds on as memory takes, in their order."""
-    count = 8
-
-    def kernel(x, out):
-        def body(k, total):
-            at = 2 * (count - 1 - k if reverse else k)
-            return total + x[at + 3, :] * x[at + 4, :]
-
-        out[0, :] = jax.lax.fori_loop(0, count, body, x[0, :])
-
-    lines = ptx_of(kernel, 32).splitlines()
-    (asked,) = [line for line in lines if line.startswith("prefetch.global.L1")]
-    offset = int(asked.split("+")[1].rstrip("];"))
-    row, reads = 4 * ptx.LANES, [line for line in lines if line.startswith("ld.global")]
-    begin = next(k for k, line in enumerate(lines) if line.startswith("L0"))
-    body = [k for k, line in enumerate(lines) if k > begin and line.startswith("ld.global")]
-    rounds = (offset / row - 3) / (-2 if reverse else 2)
-    assert len(reads) == 3 and rounds == int(rounds) >= 1
-    length = next(k for k, line in enumerate(lines) if "bra.uni L0" in line) - begin
-    assert rounds * length >= ptx.AHEAD > (rounds - 1) * (length - 10)
-    # Two rows: lane 0 asks for the first one, all others for the second one.
-    assert "min.s32 %n2, %lane, 1;" in lines and lines.index(asked) < body[0]
-
-
-@pytest.mark.parametrize(("width", "mask"), [((2, 8), 8), ((2, 16), 16), ((32,), 31)])
-def test_lanes_swap_by_a_mask(width, mask):
-    """PTX exchanges registers between the lanes that a reversed axis exchanges."""
-
-    def kernel(x, out):
-        out[0, :] = jax.lax.rev(x[0, :].reshape(-1, *width), (1,)).reshape(ptx.LANES)
-
-    assert f"shfl.sync.bfly.b32 %f1, %f0, {mask}, 31" in ptx_of(kernel, 1)
-
-
-OPERATIONS = {
-    "sine": (lambda x, y: jnp.sin(40 * x), 2e-7),
-    "cosine": (lambda x, y: jnp.cos(40 * x), 2e-7),
-    "sign": (lambda x, y: jnp.sign(x) + jnp.sign(0 * x), 0),
-    "power": (lambda x, y: x**3 - (1 + y * y) ** -2, 2e-6),
-    "root": (lambda x, y: jnp.sqrt(jnp.abs(x)) + jax.lax.rsqrt(1 + jnp.abs(y)), 1e-6),
-    "extremes": (lambda x, y: jnp.maximum(x, y) * jnp.minimum(x, y), 2e-6),
-    "logic": (lambda x, y: jnp.where((x < y) & ~(y > 0.3) | (x != x), x, y), 0),
-    "whole": (lambda x, y: x.astype(jnp.int32).astype(x.dtype), 0),
-    "swap": (lambda x, y: x + jax.lax.rev(y.reshape(2, 2, 2), (1,)).reshape(LANES), 0),
-    "loop": (lambda x, y: jax.lax.fori_loop(0, 7, lambda i, c: c + i * x, y), 1e-5),
-    "while": (
-        lambda x, y: jax.lax.while_loop(
-            lambda c: jnp.max((c < 9).astype(int)) > 0, lambda c: c + 1, y
-        ),
-        1e-5,
-    ),
-    "branch": (
-        lambda x, y: jax.lax.cond(jnp.max((x > 9).astype(jnp.int32)) > 0, lambda: x, lambda: y - x),
-        0,
-    ),
-}
-
-
-@pytest.mark.parametrize("name", OPERATIONS)
-def test_operations(name):
-    """Each instruction on a vector against NumPy's result through JAX."""
-    function, tolerance = OPERATIONS[name]
-    rng = np.random.default_rng(0)
-    x, y = 3 * rng.standard_normal((2, 5, LANES)).astype(np.float32)
-
-    def kernel(a, b, out):
-        out[0, :] = function(a[0, :], b[0, :])
-
-    def run(a, b):
-        spec = pl.BlockSpec((None, 1, LANES), lambda i: (i, 0, 0))
-        shape = jax.ShapeDtypeStruct((5, 1, LANES), jnp.float32)
-        call = pl.pallas_call(
-            kernel, grid=(5,), in_specs=[spec] * 2, out_specs=spec, out_shape=shape
-        )
-        return launch(call, (a, b), [shape], Kernel(f"test {name}", "cpu", LANES))[0][:, 0]
-
-    got = jax.jit(run)(x[:, None], y[:, None])
-    want = jnp.stack([jax.jit(function)(a, b) for a, b in zip(x, y, strict=True)])
-    np.testing.assert_allclose(got, want, rtol=tolerance, atol=tolerance)
 
 
 def test_state_tables_give_the_states_back(grasp):

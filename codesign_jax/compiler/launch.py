@@ -1,4 +1,4 @@
-"""Runs a Pallas kernel, on a GPU through `ptx` or on a CPU through `llvm`."""
+"""Runs a Pallas kernel, on a GPU through `thread` and `nvptx`, or on a CPU through `vector`."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.compiler import ptx
+from codesign_jax.compiler import thread
 
 
 class Kernel(NamedTuple):
@@ -51,16 +51,20 @@ def launch(
         layout = native.Layout(shapes, len(inputs), kernel.lanes, sizes[0], sizes)
         name = native.register(kernel.origin, trace, layout)
         return list(jax.ffi.ffi_call(name, outputs)(*inputs))
-    number = np.int32
+    from codesign_jax.compiler import nvptx
+
+    jaxpr, number = trace(), np.int32
+    blocks = [(shape, v.aval.dtype) for shape, v in zip(shapes, jaxpr.invars, strict=True)]
+    text = thread.write(jaxpr, blocks, [k in kernel.shared for k in range(len(blocks))], "grasp")
     results = jax.ffi.ffi_call("__gpu$xla.gpu.ptx", outputs)(
         *inputs,
         name="grasp",
         kernel_type="ptx",
-        kernel_data=ptx.assemble(trace(), shapes, "grasp", kernel.shared),
+        kernel_data=nvptx.assembly(text),
         grid_x=number(outputs[0].shape[0]),
         grid_y=number(1),
         grid_z=number(1),
-        block_x=number(ptx.LANES),
+        block_x=number(thread.LANES),
         block_y=number(1),
         block_z=number(1),
         shared_mem_bytes=number(0),

@@ -20,7 +20,7 @@ import llvmlite.binding as binding
 import numpy as np
 
 import codesign_jax
-from codesign_jax.compiler import llvm
+from codesign_jax.compiler import vector
 
 # Offsets in bytes in the structures of XLA's foreign function interface, 64 bit.
 _EXTENSION, _ARGS, _RETS = 8, 72, 112  # in XLA_FFI_CallFrame
@@ -220,7 +220,9 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout) -> str:
     machine = _machine()
 
     def build() -> bytes:
-        code = llvm.write(trace(), layout.shapes, layout.lanes, layout.itemsize)
+        jaxpr = trace()
+        types = [v.aval.dtype for v in jaxpr.invars]
+        code = vector.write(jaxpr, list(zip(layout.shapes, types, strict=True)), layout.lanes)
         return _compile(code + _handler(name, layout), machine)
 
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)

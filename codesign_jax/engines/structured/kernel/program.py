@@ -14,7 +14,7 @@ import numpy as np
 from jax.experimental import pallas as pl
 
 from codesign_jax.compiler.launch import Kernel, launch
-from codesign_jax.compiler.ptx import LANES
+from codesign_jax.compiler.thread import LANES
 from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.kernel import hull, objects

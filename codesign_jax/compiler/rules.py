@@ -1,0 +1,260 @@
+"""Instructions for the operations of a kernel: from operands to the result, by JAX's primitive.
+
+Results are those of JAX for every input, also for infinities and what is not a number: a rule that
+is cheaper but wrong there would hide a simulation's failure.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from codesign_jax.compiler import trigonometry
+from codesign_jax.compiler.values import Value, is_float, kind_of, numpy_type
+
+if TYPE_CHECKING:
+    from codesign_jax.compiler.writer import Writer
+
+Rule = Callable[..., Value]
+
+_NUMPY: dict[str, Callable] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "max": np.maximum,
+    "min": np.minimum,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+}
+
+
+def _folded(name: str, kind: str, *args: Value) -> Value | None:
+    """The result on integers or truth values that are known when the kernel is written."""
+    if is_float(args[0].kind) or not all(a.is_known for a in args):
+        return None
+    with np.errstate(over="ignore"):
+        known = _NUMPY[name](*(np.asarray(a.known, numpy_type(a.kind)) for a in args))
+    return Value(kind, any(a.wide for a in args), None, np.asarray(known, numpy_type(kind))[()])
+
+
+def _arithmetic(name: str) -> Rule:
+    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+        if is_float(a.kind):
+            return w.compute(f"f{name} contract", a, b)
+        known = _folded(name, a.kind, a, b) or _offset(name, a, b)
+        return w.grown(name, a, b, known or w.compute(name, a, b))
+
+    return rule
+
+
+def _offset(name: str, a: Value, b: Value) -> Value | None:
+    """A named integer and a number to be added to it; see `Value.known`."""
+    if name == "mul":
+        for x, y in ((a, b), (b, a)):
+            if y.is_known and np.ndim(y.known) == 0 and y.known == 1 and x.wide >= y.wide:
+                return x
+        return None
+    if name == "add" and a.is_known:
+        a, b = b, a
+    small = b.is_known and np.ndim(b.known) == 0 and a.kind == "i32" and a.wide >= b.wide
+    if not small or a.is_known or abs(int(a.known)) + abs(int(b.known)) > 2**24:
+        return None
+    return a._replace(known=int(a.known) + (int(b.known) if name == "add" else -int(b.known)))
+
+
+def _divide(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+    if is_float(a.kind):
+        return w.divide(a, b)
+    return _whole_division(w, "sdiv", a, b)
+
+
+def _remainder(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+    return w.compute("frem", a, b) if is_float(a.kind) else _whole_division(w, "srem", a, b)
+
+
+def _whole_division(w: "Writer", operation: str, a: Value, b: Value) -> Value:
+    """Quotient or remainder of integers; those that processors trap at have XLA's results.
+
+    x / 0 is -1, x rem 0 is x, and the smallest integer over -1 is itself, with remainder 0.
+    """
+    quotient = operation == "sdiv"
+    if a.is_known and b.is_known and np.all(np.asarray(b.known) > 0):
+        x, y = np.asarray(a.known), np.asarray(b.known)
+        exact = np.asarray(np.sign(x) * (np.abs(x) // y) if quotient else np.fmod(x, y))
+        return Value(a.kind, a.wide or b.wide, None, exact.astype(numpy_type(a.kind))[()])
+    if b.is_known and np.all(np.asarray(b.known) > 0):
+        return w.compute(operation, a, b)
+    zero, minus = w.like(b, 0), w.like(b, -1)
+    nothing = w.compute("icmp eq", b, zero, kind="b")
+    negated = w.compute("icmp eq", b, minus, kind="b")
+    trap = w.compute("or", nothing, negated)
+    result = w.compute(operation, a, w.select(trap, w.like(b, 1), b))
+    opposite = w.compute("sub", zero, a) if quotient else zero
+    result = w.select(negated, opposite, result)
+    return w.select(nothing, minus if quotient else a, result)
+
+
+def _compare(name: str) -> Rule:
+    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+        known = _folded(name, "b", a, b)
+        if known is not None:
+            return known
+        if is_float(a.kind):
+            # A comparison with what is not a number is false, but "not equal" is true.
+            test = "fcmp une" if name == "ne" else f"fcmp o{name}"
+        else:
+            sign = "u" if a.kind == "b" else "s"  # of truth values false is the smaller one
+            test = f"icmp {name}" if name in ("eq", "ne") else f"icmp {sign}{name}"
+        return w.compute(test, a, b, kind="b")
+
+    return rule
+
+
+def _extreme(name: str) -> Rule:
+    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+        if a.kind == "b":
+            return w.compute("or" if name == "max" else "and", a, b)
+        if not is_float(a.kind):
+            return _folded(name, a.kind, a, b) or w.intrinsic(f"s{name}", a, b)
+        return w.intrinsic({"max": "maximum", "min": "minimum"}[name], a, b, flags="nsz ")
+
+    return rule
+
+
+def _logic(name: str) -> Rule:
+    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+        return _folded(name, a.kind, a, b) or w.compute(name, a, b)
+
+    return rule
+
+
+def _not(w: "Writer", equation: Any, a: Value) -> Value:
+    return w.compute("xor", a, Value(a.kind, a.wide, None, 1 if a.kind == "b" else -1))
+
+
+def _negate(w: "Writer", equation: Any, x: Value) -> Value:
+    if is_float(x.kind):
+        return w.compute("fneg", x)
+    return RULES["sub"](w, None, w.like(x, 0), x)
+
+
+def _magnitude(w: "Writer", equation: Any, x: Value) -> Value:
+    if is_float(x.kind):
+        return w.intrinsic("fabs", x, flags="")
+    return w.select(w.compute("icmp slt", x, w.like(x, 0), kind="b"), _negate(w, None, x), x)
+
+
+def _sign(w: "Writer", equation: Any, x: Value) -> Value:
+    """-1, 0 or 1; zeros and what is not a number stay as they are."""
+    below, above = (RULES[test](w, None, x, w.like(x, 0)) for test in ("lt", "gt"))
+    return w.select(below, w.like(x, -1), w.select(above, w.like(x, 1), x))
+
+
+def _power(w: "Writer", equation: Any, x: Value) -> Value:
+    result, y = w.like(x, 1), equation.params["y"]
+    square = x
+    for bit in reversed(bin(abs(y))[2:]):
+        if bit == "1":
+            result = square if result.is_known else RULES["mul"](w, None, result, square)
+        square = RULES["mul"](w, None, square, square)
+    return result if y >= 0 else w.divide(w.like(x, 1), result)
+
+
+def _select_n(w: "Writer", equation: Any, which: Value, *cases: Value) -> Value:
+    if which.kind == "b":
+        return w.select(which, cases[1], cases[0])
+    result = cases[-1]
+    for k in reversed(range(len(cases) - 1)):
+        chosen = RULES["eq"](w, None, which, w.like(which, k))
+        result = w.select(chosen, cases[k], result)
+    return result
+
+
+def _convert(w: "Writer", equation: Any, x: Value) -> Value:
+    kind = kind_of(equation.outvars[0].aval.dtype)
+    if kind == x.kind:
+        return x
+    if x.is_known and (not is_float(x.kind) or kind == "b" or is_float(kind)):
+        known = np.asarray(x.known, numpy_type(x.kind)).astype(numpy_type(kind))
+        return Value(kind, x.wide, None, known[()])
+    if kind == "b":
+        return RULES["ne"](w, None, x, w.like(x, 0))
+    if is_float(x.kind) and is_float(kind):
+        return w.convert("fpext" if kind == "f64" else "fptrunc", x, kind)
+    if is_float(x.kind):
+        return w.whole(x, kind)
+    if is_float(kind):
+        return w.convert("uitofp" if x.kind == "b" else "sitofp", x, kind)
+    if x.kind == "b":
+        return w.convert("zext", x, kind)
+    return w.convert("sext" if kind == "i64" else "trunc", x, kind)
+
+
+def _reverse(w: "Writer", equation: Any, x: Value) -> Value:
+    shape, dimensions = equation.invars[0].aval.shape, equation.params["dimensions"]
+    source = np.flip(np.arange(np.prod(shape)).reshape(shape), dimensions).ravel()
+    if x.is_known:
+        known = np.broadcast_to(np.asarray(x.known), (w.lanes,))[source]
+        return x._replace(known=known if np.ndim(x.known) else x.known)
+    return w.swap_lanes(w.spread(x), source)
+
+
+def _over_lanes(name: str) -> Rule:
+    def rule(w: "Writer", equation: Any, x: Value) -> Value:
+        if x.kind != "i32":
+            raise NotImplementedError(
+                f"a kernel reduces int32 over its lanes, not {equation.invars[0].aval.dtype}"
+            )
+        return w.over_lanes(name, w.spread(x))
+
+    return rule
+
+
+def _is_finite(w: "Writer", equation: Any, x: Value) -> Value:
+    size = _magnitude(w, None, x)
+    return w.compute("fcmp olt", size, w.like(x, np.inf), kind="b")
+
+
+def _clamp(w: "Writer", equation: Any, low: Value, x: Value, high: Value) -> Value:
+    return RULES["min"](w, None, RULES["max"](w, None, x, low), high)
+
+
+RULES: dict[str, Rule] = {
+    "add": _arithmetic("add"),
+    "add_any": _arithmetic("add"),
+    "sub": _arithmetic("sub"),
+    "mul": _arithmetic("mul"),
+    "div": _divide,
+    "rem": _remainder,
+    "neg": _negate,
+    "abs": _magnitude,
+    "max": _extreme("max"),
+    "min": _extreme("min"),
+    "clamp": _clamp,
+    "sign": _sign,
+    "square": lambda w, e, x: RULES["mul"](w, None, x, x),
+    "integer_pow": _power,
+    "sqrt": lambda w, e, x: w.square_root(x),
+    "rsqrt": lambda w, e, x: w.inverse_square_root(x),
+    "sin": trigonometry.sine,
+    "cos": trigonometry.cosine,
+    "floor": lambda w, e, x: w.intrinsic("floor", x, flags=""),
+    "ceil": lambda w, e, x: w.intrinsic("ceil", x, flags=""),
+    "is_finite": _is_finite,
+    **{name: _compare(name) for name in ("lt", "le", "gt", "ge", "eq", "ne")},
+    **{name: _logic(name) for name in ("and", "or", "xor")},
+    "not": _not,
+    "select_n": _select_n,
+    "convert_element_type": _convert,
+    "iota": lambda w, e: w.lane_index(),
+    "rev": _reverse,
+    "reduce_max": _over_lanes("max"),
+    "reduce_min": _over_lanes("min"),
+}

@@ -1,0 +1,318 @@
+"""A block as one warp of an NVIDIA GPU: a value over the lanes is a scalar of each thread.
+
+Source of the instructions: NVIDIA, Parallel Thread Execution ISA 8; LLVM, User Guide for NVPTX.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codesign_jax.compiler.values import LLVM_TYPES, SIZES, Ref, Value, kind_of
+from codesign_jax.compiler.writer import Writer
+
+LANES = 32
+"""Threads of a warp."""
+
+AHEAD = 300
+"""Lines of a loop between asking for a row and reading it, about the time that memory takes."""
+
+_ALL = "i32 -1"  # the mask of a warp's threads that take part
+
+
+class Ahead(NamedTuple):
+    """Rows that a loop reads at an address, and reads again further on in the next round.
+
+    Attributes:
+      line: Line behind which the address is known.
+      offsets: Offsets of the rows from the address [bytes].
+    """
+
+    line: int
+    offsets: list[int]
+
+
+class ThreadWriter(Writer):
+    """Writes the instructions of a thread."""
+
+    def __init__(self, lanes: int = LANES):
+        """Starts empty; the lane is in `%lane`."""
+        super().__init__(lanes)
+        self.lane = Value("i32", True, "%lane")
+        self.growth: dict[str, int] = {}  # of integers [1] and addresses [bytes], in each round
+        self.born: dict[str, int] = {}  # line behind an address
+        self.found: list[dict[tuple, Any]] = [{}]  # computed already, one scope a region
+        self.ahead: list[dict[str, Ahead]] = []  # one a loop: its reads, by address
+        self.spans: set[int] = set()  # numbers of rows that are asked for at once
+
+    def type(self, kind: str, wide: bool) -> str:
+        """See `Writer`."""
+        return LLVM_TYPES[kind]
+
+    def lane_index(self) -> Value:
+        """See `Writer`."""
+        return self.lane
+
+    def spread(self, value: Value) -> Value:
+        """See `Writer`; the register stays."""
+        if not value.wide and value.text is not None:
+            self.scalar_of[value.text] = value._replace(known=0)
+        return value._replace(wide=True)
+
+    def swap_lanes(self, value: Value, source: np.ndarray) -> Value:
+        """See `Writer`; lanes swap in pairs."""
+        mask = int(source[0])
+        if len(source) != LANES or (source != np.arange(LANES) ^ mask).any():
+            raise NotImplementedError("a kernel's lanes swap in pairs whose indices differ by bits")
+        if value.kind in ("f32", "i32"):
+            return self._swap(value, mask)
+        if value.kind == "b":
+            whole = self._swap(self.convert("zext", value, "i32"), mask)
+            return self.compute("icmp ne", whole, self.like(whole, 0), kind="b")
+        bits = self.emit(f"bitcast {self.typed(value)} to i64")
+        halves = []
+        for shift in (0, 32):
+            half = self.emit(f"trunc i64 {self.emit(f'lshr i64 {bits}, {shift}')} to i32")
+            half = self._swap(Value("i32", True, half), mask)
+            half = self.emit(f"zext {self.typed(half)} to i64")
+            halves.append(self.emit(f"shl i64 {half}, {shift}"))
+        both = self.emit(f"or i64 {halves[0]}, {halves[1]}")
+        kind = self.type(value.kind, True)
+        return Value(value.kind, True, self.emit(f"bitcast i64 {both} to {kind}"))
+
+    def _swap(self, value: Value, mask: int) -> Value:
+        one = LLVM_TYPES[value.kind]
+        full = f"llvm.nvvm.shfl.sync.bfly.{value.kind}"
+        self.declared.add(f"declare {one} @{full}(i32, {one}, i32, i32)")
+        call = f"call {one} @{full}({_ALL}, {self.typed(value)}, i32 {mask}, i32 31)"
+        return Value(value.kind, True, self.emit(call))
+
+    def over_lanes(self, name: str, value: Value) -> Value:
+        """See `Writer`."""
+        full = f"llvm.nvvm.redux.sync.{name}"
+        self.declared.add(f"declare i32 @{full}(i32, i32)")
+        return Value("i32", False, self.emit(f"call i32 @{full}({self.typed(value)}, {_ALL})"))
+
+    def compute(self, operation: str, *args: Value, kind: str | None = None) -> Value:
+        """See `Writer`; no integer is computed twice, so that addresses are known again."""
+        if args[0].kind != "i32":
+            return super().compute(operation, *args, kind=kind)
+        key = (operation, *args)
+        return self._once(
+            key, lambda: super(ThreadWriter, self).compute(operation, *args, kind=kind)
+        )
+
+    def _once(self, key: tuple, make: Any) -> Any:
+        """What was made for a key where control has come from, or is made now."""
+        for scope in self.found:
+            if key in scope:
+                return scope[key]
+        self.found[-1][key] = result = make()
+        return result
+
+    # Arithmetic: in float32 what the kernel's tolerance is far above, two units in the last place
+
+    def divide(self, a: Value, b: Value) -> Value:
+        """See `Writer`."""
+        if a.kind == "f64":
+            return super().divide(a, b)
+        self.declared.add("declare float @llvm.nvvm.div.full(float, float)")
+        parts = f"{self.typed(a)}, {self.typed(b)}"
+        return Value("f32", a.wide or b.wide, self.emit(f"call float @llvm.nvvm.div.full({parts})"))
+
+    def square_root(self, x: Value) -> Value:
+        """See `Writer`."""
+        return super().square_root(x) if x.kind == "f64" else self._approximate("sqrt", x)
+
+    def inverse_square_root(self, x: Value) -> Value:
+        """See `Writer`."""
+        if x.kind == "f64":
+            return super().inverse_square_root(x)
+        return self._approximate("rsqrt", x)
+
+    def _approximate(self, name: str, x: Value) -> Value:
+        full = f"llvm.nvvm.{name}.approx.f"
+        self.declared.add(f"declare float @{full}(float)")
+        return Value("f32", x.wide, self.emit(f"call float @{full}({self.typed(x)})"))
+
+    # Memory
+
+    def load(self, ref: Ref, indices: list[Value]) -> Value:
+        """See `Writer`."""
+        base, offset, place = self._address(ref, indices)
+        wide, kind = any(i.wide for i in indices), LLVM_TYPES[ref.kind]
+        text = self.emit(f"load {kind}, ptr addrspace(1) {place}, align {SIZES[ref.kind]}")
+        if ref.shape[-1] == self.lanes and self.ahead and self.growth.get(base):
+            here = self.ahead[-1].setdefault(base, Ahead(self.born[base], []))
+            here.offsets.append(offset)
+        return Value(ref.kind, wide, text)
+
+    def store(self, ref: Ref, indices: list[Value], value: Value) -> None:
+        """See `Writer`."""
+        _, _, place = self._address(ref, indices)
+        align = SIZES[ref.kind]
+        self.lines.append(f"store {self.typed(value)}, ptr addrspace(1) {place}, align {align}")
+
+    def _address(self, ref: Ref, indices: list[Value]) -> tuple[str, int, str]:
+        """An element's address: a base, the offset from it in bytes, and both together."""
+        strides = np.cumprod([1, *ref.shape[:0:-1]])[::-1] * SIZES[ref.kind]
+        offset, base = 0, ref.address
+        for index, stride in zip(indices, strides, strict=True):
+            offset += int(stride) * int(index.known)
+            if not index.is_known:
+                base = self._step(base, index, int(stride))
+        if not offset:
+            return base, 0, base
+        place = self.emit(f"getelementptr inbounds i8, ptr addrspace(1) {base}, i64 {offset}")
+        return base, offset, place
+
+    def _step(self, base: str, index: Value, stride: int) -> str:
+        """Address `index` times `stride` bytes behind another one."""
+        return self._once((base, index.text, stride), lambda: self._behind(base, index, stride))
+
+    def _behind(self, base: str, index: Value, stride: int) -> str:
+        assert index.text is not None
+        wide = index.text
+        if index.kind != "i64":
+            wide = self.emit(f"sext i32 {index.text} to i64")
+        step = self.emit(f"mul nsw i64 {wide}, {stride}")
+        place = self.emit(f"getelementptr inbounds i8, ptr addrspace(1) {base}, i64 {step}")
+        self.growth[place] = self.growth.get(base, 0) + stride * self.growth.get(index.text, 0)
+        self.born[place] = len(self.lines)
+        return place
+
+    def branch(self, equation: Any, args: list) -> list:
+        """See `Writer`; addresses of a branch are unknown behind it."""
+        return self._scoped(super().branch, equation, args)
+
+    def while_loop(self, equation: Any, args: list) -> list:
+        """See `Writer`; addresses of a loop are unknown behind it."""
+        return self._scoped(super().while_loop, equation, args)
+
+    def loop(self, equation: Any, args: list) -> list:
+        """See `Writer`; addresses of a loop are unknown behind it."""
+        return self._scoped(super().loop, equation, args)
+
+    def _scoped(self, write: Any, equation: Any, args: list) -> list:
+        self.found.append({})
+        results = write(equation, args)
+        self.found.pop()
+        return results
+
+    def start(self, label: str) -> None:
+        """See `Writer`; the two branches of a conditional know nothing of each other."""
+        super().start(label)
+        if len(self.found) > 1:
+            self.found[-1] = {}
+
+    # Asking for memory ahead
+
+    def grown(self, name: str, a: Value, b: Value, result: Value) -> Value:
+        """See `Writer`; notes how integers grow from round to round."""
+        if result.text is None:
+            return result
+        grow = [0 if v.text is None else self.growth.get(v.text, 0) for v in (a, b)]
+        if name == "mul":
+            factors = [int(v.known) if v.is_known and np.ndim(v.known) == 0 else 0 for v in (b, a)]
+            total = grow[0] * factors[0] + grow[1] * factors[1]
+        else:
+            total = grow[0] + (grow[1] if name == "add" else -grow[1])
+        if total:
+            self.growth[result.text] = total
+        return result
+
+    def begin_loop(self, counters: list[str]) -> None:
+        """See `Writer`."""
+        self.ahead.append({})
+        self.first = len(self.lines)
+        self.growth |= {name: 1 for name in counters}
+
+    def end_loop(self) -> None:
+        """Asks for the rows of later rounds of a loop as soon as their addresses are known.
+
+        Without it every round waits for memory: a kernel of this size leaves room for two warps on
+        a scheduler, which cannot hide it.
+        """
+        reads = self.ahead.pop()
+        rounds = -(-AHEAD // max(1, len(self.lines) - self.first))
+        for address, (line, offsets) in sorted(reads.items(), key=lambda r: -r[1].line):
+            behind, self.lines = self.lines[line:], self.lines[:line]
+            for offset, rows in adjacent(sorted(set(offsets)), 4 * LANES):
+                self._prefetch(address, offset + rounds * self.growth[address], rows)
+            self.lines += behind
+
+    def _prefetch(self, address: str, offset: int, rows: int) -> None:
+        """Asks for rows: lane k for the k-th of them, lanes behind the last one for the last."""
+        if rows > 1:
+            self.spans.add(rows)
+            address = self.emit(f"getelementptr i8, ptr addrspace(1) {address}, i64 %span{rows}")
+        place = self.emit(f"getelementptr i8, ptr addrspace(1) {address}, i64 {offset}")
+        # LLVM's own prefetch has no instruction on NVPTX.
+        self.lines.append(
+            f'call void asm sideeffect "prefetch.global.L1 [$0];", "l"(ptr addrspace(1) {place}) #1'
+        )
+
+
+def adjacent(offsets: list[int], row: int) -> list[tuple[int, int]]:
+    """Rows that follow each other: first offset and number, at most as many as lanes."""
+    found: list[tuple[int, int]] = []
+    for offset in offsets:
+        if found and offset == found[-1][0] + row * found[-1][1] and found[-1][1] < LANES:
+            found[-1] = (found[-1][0], found[-1][1] + 1)
+        else:
+            found.append((offset, 1))
+    return found
+
+
+def write(
+    jaxpr: Any, blocks: list[tuple[tuple[int, ...], Any]], shared: list[bool], name: str
+) -> str:
+    """A kernel of LLVM's language whose block b works on entry b of every array.
+
+    Args:
+      jaxpr: The kernel's jaxpr; its arguments are references to a block of each array.
+      blocks: Shape and dtype of a block of each array.
+      shared: Whether an array has one block, which all blocks read.
+      name: Name of the kernel.
+
+    Raises:
+      NotImplementedError: If the kernel does something that has no rule here.
+    """
+    writer = ThreadWriter()
+    refs, start = [], []
+    for k, ((shape, dtype), one) in enumerate(zip(blocks, shared, strict=True)):
+        kind = kind_of(dtype)
+        size = 0 if one else SIZES[kind] * int(np.prod(shape))
+        start += [
+            f"%o{k} = mul i64 %block, {size}",
+            f"%a{k} = getelementptr inbounds i8, ptr addrspace(1) %p{k}, i64 %o{k}",
+        ]
+        refs.append(Ref(f"%a{k}", shape, kind))
+    writer.run(jaxpr, [], refs)
+    for rows in sorted(writer.spans):  # from a lane in the first row to that lane's own row
+        start += [
+            f"%last{rows} = call i32 @llvm.umin.i32(i32 %lane, i32 {rows - 1})",
+            f"%row{rows} = mul i32 %last{rows}, {LANES}",
+            f"%from{rows} = sub i32 %row{rows}, %lane",
+            f"%elements{rows} = sext i32 %from{rows} to i64",
+            f"%span{rows} = mul i64 %elements{rows}, 4",
+        ]
+    params = ", ".join(f"ptr addrspace(1) noalias align 16 %p{k}" for k in range(len(blocks)))
+    head = [
+        "entry:",
+        f"%lane = call range(i32 0, {LANES}) i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
+        "%index = call i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
+        "%block = zext i32 %index to i64",
+    ]
+    declared = writer.declared | {
+        "declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
+        "declare i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
+        "declare i32 @llvm.umin.i32(i32, i32)",
+    }
+    body = "\n".join([*head, *start, *writer.lines, "ret void"])
+    return (
+        'target triple = "nvptx64-nvidia-cuda"\n'
+        f"define ptx_kernel void @{name}({params}) #0 {{\n{body}\n}}\n"
+        + "\n".join(sorted(declared))
+        + f'\nattributes #0 = {{ nounwind "nvvm.maxntid"="{LANES},1,1" }}\n'
+        "attributes #1 = { nounwind memory(inaccessiblemem: readwrite) }\n"
+    )

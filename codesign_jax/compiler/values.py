@@ -1,0 +1,73 @@
+"""Operands of the instructions that a kernel is written as."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+LLVM_TYPES = {"f32": "float", "f64": "double", "i32": "i32", "i64": "i64", "b": "i1"}
+"""LLVM's scalar types by kind."""
+
+_KINDS = {"float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "bool": "b"}
+SIZES = {"f32": 4, "f64": 8, "i32": 4, "i64": 8}
+"""Bytes of an element in memory, by kind; truth values are not stored."""
+
+
+class Value(NamedTuple):
+    """An operand of an instruction.
+
+    Attributes:
+      kind: "f32", "f64", "i32", "i64", or "b" for a truth value.
+      wide: Whether it may differ between the lanes.
+      text: Its LLVM name; None if its value is known when the kernel is written.
+      known: Without a name its value: a number, or an array over the lanes. With a name a number
+        that is to be added to what the name holds (i32 only), so that addresses get constant
+        offsets.
+    """
+
+    kind: str
+    wide: bool
+    text: str | None
+    known: Any = 0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the value is a number or an array of numbers."""
+        return self.text is None
+
+
+class Ref(NamedTuple):
+    """A block's part of an array in memory.
+
+    Attributes:
+      address: LLVM name of its address.
+      shape: Its shape.
+      kind: Kind of its elements.
+    """
+
+    address: str
+    shape: tuple[int, ...]
+    kind: str
+
+
+def kind_of(dtype: Any) -> str:
+    """Kind of a dtype's elements.
+
+    Raises:
+      NotImplementedError: If kernels have no such dtype.
+    """
+    name = np.dtype(dtype).name
+    if name not in _KINDS:
+        raise NotImplementedError(
+            f"kernels have no dtype {name}; convert to one of {', '.join(_KINDS)}"
+        )
+    return _KINDS[name]
+
+
+def numpy_type(kind: str) -> Any:
+    """NumPy's scalar type of a kind."""
+    return next(np.dtype(name).type for name, k in _KINDS.items() if k == kind)
+
+
+def is_float(kind: str) -> bool:
+    """Whether a kind is a floating-point one."""
+    return kind[0] == "f"

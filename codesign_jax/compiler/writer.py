@@ -1,0 +1,430 @@
+"""Writes a Pallas kernel in LLVM's assembly language, one operation of its jaxpr after the other.
+
+A value over the lanes of a block is either one vector (`vector`, for CPUs) or a scalar of each
+thread (`thread`, for GPUs); what is the same on all lanes, such as indices and conditions, is a
+scalar on both.  This module has what both have in common: text, arithmetic and control flow.
+Source of the instructions: LLVM Language Reference Manual.
+"""
+
+import struct
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from codesign_jax.compiler.rules import RULES
+from codesign_jax.compiler.values import Ref, Value, is_float, kind_of, numpy_type
+
+_INLINE = ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint")
+_SAME = (
+    "broadcast_in_dim",
+    "broadcast_to",
+    "reshape",
+    "squeeze",
+    "stop_gradient",
+    "copy",
+    "optimization_barrier",
+    "reshard",
+)
+
+
+class Writer:
+    """Writes the instructions of one block.
+
+    Attributes:
+      lanes: Number of lanes of a block.
+      lines: The instructions written so far.
+      declared: Declarations of the functions that they call.
+    """
+
+    def __init__(self, lanes: int):
+        """Starts empty."""
+        self.lanes = lanes
+        self.lines: list[str] = []
+        self.declared: set[str] = set()
+        self.count, self.here = 0, "entry"
+        self.read: set[Any] = set()  # variables that some operation needs
+        self.scalar_of: dict[str, Value] = {}  # what was spread over the lanes, by its new name
+
+    # What vectors and threads do differently
+
+    def type(self, kind: str, wide: bool) -> str:
+        """Name of the LLVM type of a value."""
+        raise NotImplementedError
+
+    def lane_index(self) -> Value:
+        """The index of each lane."""
+        raise NotImplementedError
+
+    def spread(self, value: Value) -> Value:
+        """A scalar on all lanes."""
+        raise NotImplementedError
+
+    def swap_lanes(self, value: Value, source: np.ndarray) -> Value:
+        """The value that lane source[i] has, on lane i."""
+        raise NotImplementedError
+
+    def over_lanes(self, name: str, value: Value) -> Value:
+        """The largest ("max") or smallest ("min") value of all lanes, a scalar."""
+        raise NotImplementedError
+
+    def load(self, ref: Ref, indices: list[Value]) -> Value:
+        """Reads an element, or one for each lane."""
+        raise NotImplementedError
+
+    def store(self, ref: Ref, indices: list[Value], value: Value) -> None:
+        """Writes an element, or one for each lane; where lanes share one they write the same."""
+        raise NotImplementedError
+
+    def divide(self, a: Value, b: Value) -> Value:
+        """Quotient of floats."""
+        return self.compute("fdiv contract", a, b)
+
+    def square_root(self, x: Value) -> Value:
+        """Square root of floats."""
+        return self.intrinsic("sqrt", x)
+
+    def inverse_square_root(self, x: Value) -> Value:
+        """1 / sqrt(x) of floats."""
+        return self.divide(self.constant(numpy_type(x.kind)(1)), self.square_root(x))
+
+    def grown(self, name: str, a: Value, b: Value, result: Value) -> Value:
+        """Called with each sum, difference or product of integers; returns the result."""
+        return result
+
+    def begin_loop(self, counters: list[str]) -> None:
+        """Called before the body of a loop, with the names of what grows by one in every round."""
+
+    def end_loop(self) -> None:
+        """Called behind the body of a loop."""
+
+    # Text
+
+    def name(self, prefix: str = "v") -> str:
+        """A new name."""
+        self.count += 1
+        return f"{prefix}{self.count}"
+
+    def emit(self, text: str) -> str:
+        """Adds an instruction; returns the name of its result."""
+        name = "%" + self.name()
+        self.lines.append(f"{name} = {text}")
+        return name
+
+    def start(self, label: str) -> None:
+        """Begins a basic block."""
+        self.lines.append(f"{label}:")
+        self.here = label
+
+    def number(self, kind: str, value: Any) -> str:
+        """A number as an operand."""
+        if is_float(kind):  # the bits of a double, also for a float
+            return "0x" + struct.pack(">d", float(numpy_type(kind)(value))).hex().upper()
+        return str(int(value))
+
+    def operand(self, value: Value) -> str:
+        """A value as an operand, without its type."""
+        if value.text is None:
+            return self.number(value.kind, value.known)
+        if isinstance(value.known, np.ndarray) or value.known:
+            return self._plain(value).text  # type: ignore[return-value]
+        return value.text
+
+    def _plain(self, value: Value) -> Value:
+        """A value whose number to be added is added."""
+        base = value._replace(known=0)
+        text = self.emit(
+            f"add {self.typed(base)}, {self._known(value.kind, value.wide, value.known)}"
+        )
+        return Value(value.kind, value.wide, text)
+
+    def _known(self, kind: str, wide: bool, number: Any) -> str:
+        """A number as an operand of an instruction on wide or scalar values."""
+        return self.operand(Value(kind, wide, None, number))
+
+    def typed(self, value: Value) -> str:
+        """A value as an operand with its type."""
+        operand = self.operand(value)  # may add an instruction
+        return f"{self.type(value.kind, value.wide)} {operand}"
+
+    def narrow(self, value: Value) -> Value:
+        """The scalar of a value that is known to be the same on all lanes."""
+        if value.text is not None:
+            found = self.scalar_of.get(value.text)
+            return value if found is None else found._replace(known=found.known + value.known)
+        if value.wide and np.min(value.known) == np.max(value.known):
+            return Value(value.kind, False, None, np.min(value.known))
+        return value
+
+    def alike(self, *values: Value) -> list[Value]:
+        """The values, all wide if one is."""
+        if any(v.wide for v in values):
+            return [self.spread(v) for v in values]
+        return list(values)
+
+    # Arithmetic
+
+    def constant(self, array: Any) -> Value:
+        """The value of a literal or captured array."""
+        array = np.asarray(array)
+        return Value(kind_of(array.dtype), bool(array.shape), None, array[()])
+
+    def like(self, value: Value, number: float) -> Value:
+        """A number of a value's kind."""
+        return Value(value.kind, False, None, numpy_type(value.kind)(number))
+
+    def compute(self, operation: str, *args: Value, kind: str | None = None) -> Value:
+        """The result of an instruction whose operands have one type."""
+        args = tuple(self.alike(*args))
+        first, wide = args[0], args[0].wide
+        operands = ", ".join([self.operand(a) for a in args])
+        text = self.emit(f"{operation} {self.type(first.kind, wide)} {operands}")
+        return Value(kind or first.kind, wide, text)
+
+    def intrinsic(
+        self, name: str, *args: Value, flags: str = "contract ", extra: str = ""
+    ) -> Value:
+        """The result of one of LLVM's overloaded functions on floats or integers."""
+        args = tuple(self.alike(*args))
+        kind, wide = args[0].kind, args[0].wide
+        full = f"llvm.{name}.{self.suffix(kind, wide)}"
+        one = self.type(kind, wide)
+        more = [part.rsplit(" ", 1)[0] for part in extra.split(", ") if part]
+        self.declared.add(f"declare {one} @{full}({', '.join([one] * len(args) + more)})")
+        operands = ", ".join([self.typed(a) for a in args] + ([extra] if extra else []))
+        flags = flags if is_float(kind) else ""
+        return Value(kind, wide, self.emit(f"call {flags}{one} @{full}({operands})"))
+
+    def suffix(self, kind: str, wide: bool) -> str:
+        """How LLVM names a type in its functions' names."""
+        scalar = {"b": "i1"}.get(kind, kind)
+        vector = self.type(kind, wide).startswith("<")
+        return f"v{self.lanes}{scalar}" if vector else scalar
+
+    def fma(self, a: Value, b: Value, c: Value) -> Value:
+        """The product of a and b plus c, rounded once."""
+        return self.intrinsic("fma", a, b, c)
+
+    def convert(self, operation: str, value: Value, kind: str) -> Value:
+        """The result of one of LLVM's conversions."""
+        text = self.emit(f"{operation} {self.typed(value)} to {self.type(kind, value.wide)}")
+        return Value(kind, value.wide, text)
+
+    def whole(self, x: Value, kind: str = "i32") -> Value:
+        """A float without its fraction; 0 for what is not a number, the nearest integer beyond."""
+        source, target = self.suffix(x.kind, x.wide), self.suffix(kind, x.wide)
+        full, result = f"llvm.fptosi.sat.{target}.{source}", self.type(kind, x.wide)
+        self.declared.add(f"declare {result} @{full}({self.type(x.kind, x.wide)})")
+        return Value(kind, x.wide, self.emit(f"call {result} @{full}({self.typed(x)})"))
+
+    def select(self, which: Value, yes: Value, no: Value) -> Value:
+        """One of two values, lane by lane if `which` differs between the lanes."""
+        if which.is_known and not which.wide:
+            return yes if which.known else no
+        yes, no = self.alike(yes, no)
+        if which.wide:
+            yes, no = self.spread(yes), self.spread(no)
+        parts = [self.typed(v) for v in (which, yes, no)]
+        return Value(yes.kind, yes.wide, self.emit(f"select {', '.join(parts)}"))
+
+    # Control
+
+    def _phis(self, values: list[Value], source: str) -> tuple[list[Value], list[int]]:
+        """Values that depend on where control comes from, and their lines, which `_close` ends."""
+        found, lines = [], []
+        for value in values:
+            name = "%" + self.name()
+            lines.append(len(self.lines))
+            kind = self.type(value.kind, value.wide)
+            self.lines.append(f"{name} = phi {kind} [ {self.operand(value)}, %{source} ]")
+            found.append(Value(value.kind, value.wide, name))
+        return found, lines
+
+    def _close(self, lines: list[int], values: list[str], source: str) -> None:
+        for line, value in zip(lines, values, strict=True):
+            self.lines[line] += f", [ {value}, %{source} ]"
+
+    def _carried(self, variables: Any, values: list[Value]) -> list[Value]:
+        """Values as wide as the variables that hold them, each with a name or known."""
+        wide = [
+            self.spread(v) if var.aval.shape else v
+            for var, v in zip(variables, values, strict=True)
+        ]
+        return [v if v.text is None or not v.known else self._plain(v) for v in wide]
+
+    def _condition(self, value: Value) -> str:
+        value = self.narrow(value)
+        if value.wide:
+            raise NotImplementedError(
+                "a kernel's condition differs between its lanes: reduce it over the lanes first"
+            )
+        return self.typed(value)
+
+    def loop(self, equation: Any, args: list) -> list:
+        """A scan without inputs and outputs: a loop of fixed length."""
+        p = equation.params
+        split = p["num_consts"]
+        if split + p["num_carry"] != len(args) or len(equation.outvars) != p["num_carry"]:
+            raise NotImplementedError(
+                "a kernel's scan has no inputs or outputs of each round: use memory instead"
+            )
+        variables = p["jaxpr"].jaxpr.invars[split:]
+        consts, start = args[:split], self._carried(variables, args[split:])
+        if not p["length"]:
+            return start
+        label, end, source = self.name("L"), self.name("L"), self.here
+        self.lines.append(f"br label %{label}")
+        self.start(label)
+        values, lines = self._phis([Value("i32", False, None, 0), *start], source)
+        inner = p["jaxpr"]
+        grown = [values[1 + k].text for k in counters(inner.jaxpr, split)]
+        self.begin_loop(grown)  # type: ignore[arg-type]
+        new = self._carried(variables, self.run(inner.jaxpr, inner.consts, [*consts, *values[1:]]))
+        operands = [self.operand(v) for v in new]
+        self.end_loop()
+        following = self.emit(f"add nsw i32 {values[0].text}, 1")
+        going = self.emit(f"icmp slt i32 {following}, {p['length']}")
+        self._close(lines, [following, *operands], self.here)
+        self.lines.append(f"br i1 {going}, label %{label}, label %{end}")
+        self.start(end)
+        return new
+
+    def while_loop(self, equation: Any, args: list) -> list:
+        """A while loop; its condition is the same on all lanes."""
+        p = equation.params
+        a, b = p["cond_nconsts"], p["body_nconsts"]
+        cond_consts, body_consts = args[:a], args[a : a + b]
+        start = self._carried(equation.outvars, args[a + b :])
+        top, inside, end, source = self.name("L"), self.name("L"), self.name("L"), self.here
+        self.lines.append(f"br label %{top}")
+        self.start(top)
+        values, lines = self._phis(start, source)
+        cond, body = p["cond_jaxpr"], p["body_jaxpr"]
+        (going,) = self.run(cond.jaxpr, cond.consts, [*cond_consts, *values])
+        going = self._condition(going)
+        self.lines.append(f"br {going}, label %{inside}, label %{end}")
+        self.start(inside)
+        new = self.run(body.jaxpr, body.consts, [*body_consts, *values])
+        operands = [self.operand(v) for v in self._carried(equation.outvars, new)]
+        self._close(lines, operands, self.here)
+        self.lines.append(f"br label %{top}")
+        self.start(end)
+        return values
+
+    def branch(self, equation: Any, args: list) -> list:
+        """A conditional of two branches; its predicate is the same on all lanes."""
+        which, operands = args[0], args[1:]
+        if len(equation.params["branches"]) != 2:
+            raise NotImplementedError("a kernel's conditional has two branches: nest them")
+        no, yes = equation.params["branches"]
+        if which.kind != "b":
+            which = self.compute("icmp ne", which, self.like(which, 0), kind="b")
+        labels, end = (self.name("L"), self.name("L")), self.name("L")
+        which = self._condition(which)
+        self.lines.append(f"br {which}, label %{labels[0]}, label %{labels[1]}")
+        found, sources = [], []
+        for branch, label in zip((yes, no), labels, strict=True):
+            self.start(label)
+            values = self.run(branch.jaxpr, branch.consts, operands)
+            found.append(self._carried(equation.outvars, values))
+            sources.append(self.here)
+            self.lines.append(f"br label %{end}")
+        self.start(end)
+        results, lines = self._phis(found[0], sources[0])
+        self._close(lines, [self.operand(v) for v in found[1]], sources[1])
+        return results
+
+    # Memory
+
+    def indices(self, ref: Ref, equation: Any, leaves: list[Value]) -> list[Value]:
+        """Index in each dimension of an access to memory; a whole slice is the lane."""
+        (indexer,) = jax.tree.unflatten(equation.params["tree"], leaves)
+        found = []
+        for index, size in zip(indexer.indices, ref.shape, strict=True):
+            if isinstance(index, Value):
+                found.append(self.narrow(index))
+            elif isinstance(index, int | np.integer):
+                found.append(Value("i32", False, None, int(index)))
+            elif index.size == size == self.lanes:  # a slice
+                found.append(self.lane_index())
+            else:
+                raise NotImplementedError(
+                    f"a kernel's slice has {index.size} of {size} elements: it must be whole and "
+                    f"have one of each of the {self.lanes} lanes"
+                )
+        return found
+
+    def _one_a_lane(self, equation: Any) -> None:
+        shape = equation.outvars[0].aval.shape
+        if shape not in ((), (self.lanes,)):
+            raise NotImplementedError(
+                f"a kernel reads or writes one number of each lane at a time, not shape {shape}: "
+                "give every index but the lane's a number, or an array over the lanes"
+            )
+
+    # The walk through the jaxpr
+
+    def run(self, jaxpr: Any, consts: Any, args: list) -> list:
+        """Writes the instructions of a jaxpr; returns its results.
+
+        Raises:
+          NotImplementedError: If an operation has no rule, or its operands' dtype none.
+        """
+        values: dict[Any, Any] = {}
+
+        def read(atom: Any) -> Any:
+            literal = isinstance(atom, core.Literal)
+            return self.constant(np.asarray(atom.val, atom.aval.dtype)) if literal else values[atom]
+
+        numbers = [self.constant(np.asarray(c)) for c in consts]
+        values.update(zip(jaxpr.constvars, numbers, strict=True))
+        values.update(zip(jaxpr.invars, args, strict=True))
+        atoms = [a for e in jaxpr.eqns for a in e.invars] + list(jaxpr.outvars)
+        self.read |= {a for a in atoms if not isinstance(a, core.Literal)}
+        for equation in jaxpr.eqns:
+            results = self.equation(equation, [read(v) for v in equation.invars])
+            values.update(zip(equation.outvars, results, strict=True))
+        return [read(v) for v in jaxpr.outvars]
+
+    def equation(self, equation: Any, args: list) -> list:
+        """Writes one operation; returns its results."""
+        name, params = equation.primitive.name, equation.params
+        if name in _INLINE:
+            inner = params.get("jaxpr", params.get("call_jaxpr"))
+            return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
+        if name in _SAME:
+            return [self.spread(args[0]) if equation.outvars[0].aval.shape else args[0]]
+        control = {"scan": self.loop, "while": self.while_loop, "cond": self.branch}
+        if name in control:
+            return control[name](equation, args)
+        if name in ("get", "swap"):
+            self._one_a_lane(equation)
+        if name == "get":
+            return [self.load(args[0], self.indices(args[0], equation, args[1:]))]
+        if name == "swap":
+            place = self.indices(args[0], equation, args[2:])
+            before = self.load(args[0], place) if equation.outvars[0] in self.read else None
+            self.store(args[0], place, args[1])
+            return [before]
+        if name not in RULES:
+            raise NotImplementedError(
+                f"no LLVM instruction for JAX's operation {name!r} in a kernel; "
+                f"write it with others or add a rule to {RULES_FILE}"
+            )
+        return [RULES[name](self, equation, *args)]
+
+
+RULES_FILE = "codesign_jax/compiler/rules.py"
+
+
+def counters(jaxpr: Any, consts: int) -> list[int]:
+    """Which of a loop's carried values grow by one in every round."""
+    found = []
+    carried = jaxpr.invars[consts:]
+    for k, (before, after) in enumerate(zip(carried, jaxpr.outvars, strict=True)):
+        for e in jaxpr.eqns:
+            step = e.invars[1] if e.primitive.name == "add" else None
+            if isinstance(step, core.Literal) and e.outvars[0] is after and e.invars[0] is before:
+                found += [k] if step.val == 1 else []
+    return found

@@ -1,0 +1,329 @@
+"""Every operation that a kernel may have, against JAX's own result on the same device.
+
+The CPU runs in CI; the same tests run on an NVIDIA GPU with the marker `gpu`.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental import pallas as pl
+
+from codesign_jax.compiler import thread, vector
+from codesign_jax.compiler.launch import Kernel, launch
+
+BACKENDS = ["cpu", pytest.param("gpu", marks=pytest.mark.gpu)]
+BLOCKS = 26
+"""Enough for all pairs of the special numbers below on eight lanes."""
+
+
+def lanes_of(backend):
+    return 8 if backend == "cpu" else 32
+
+
+def run(functions, inputs, out_dtype, backend):
+    """Values of functions of vectors, one a row: (block, function, lane)."""
+    lanes = inputs[0].shape[-1]
+
+    def kernel(*refs):
+        *given, out = refs
+        values = [ref[0, :] for ref in given]
+        for k, function in enumerate(functions):
+            out[k, :] = function(*values).astype(out_dtype)
+
+    def spec(rows):
+        return pl.BlockSpec((None, rows, lanes), lambda i: (i, 0, 0))
+
+    shape = jax.ShapeDtypeStruct((BLOCKS, len(functions), lanes), out_dtype)
+    call = pl.pallas_call(
+        kernel,
+        grid=(BLOCKS,),
+        in_specs=[spec(1)] * len(inputs),
+        out_specs=spec(len(functions)),
+        out_shape=shape,
+    )
+    names = [f"{f.__code__.co_code!r}{f.__code__.co_consts!r}" for f in functions]
+    kind = Kernel(repr(names), backend, lanes)
+    return jax.jit(lambda *x: launch(call, x, [shape], kind)[0])(*(x[:, None] for x in inputs))
+
+
+def compare(operations, inputs, backend, out_dtype):
+    """Checks operations, by name with their relative tolerance, in one kernel."""
+    inputs = [jnp.asarray(x).reshape(BLOCKS, -1) for x in inputs]
+    functions = [function for function, _ in operations.values()]
+    got = run(functions, inputs, out_dtype, backend)
+    every = jax.jit(lambda *x: [jax.vmap(f)(*x).astype(out_dtype) for f in functions])
+    for k, want in enumerate(every(*inputs)):
+        name, (_, tolerance) = list(operations.items())[k]
+        np.testing.assert_allclose(
+            np.asarray(got[:, k]),
+            want,
+            rtol=tolerance,
+            atol=tolerance,
+            err_msg=f"{name} on {backend}",
+        )
+
+
+SPECIAL = [0.0, -0.0, np.nan, np.inf, -np.inf, 1.0, -1.0, 2.5, -3.5, 1e-3, 7e4, 3e9, -3e9, 0.5]
+
+
+def floats(backend, dtype):
+    """Every pair of special numbers, filled up with random ones."""
+    pairs = [(a, b) for a in SPECIAL for b in SPECIAL]
+    more = BLOCKS * lanes_of(backend) - len(pairs)
+    rest = 3 * np.random.default_rng(0).standard_normal((more, 2))
+    return np.concatenate([pairs, rest]).T.astype(dtype)
+
+
+# Relative tolerances in units of the last place: of division, roots and powers on a GPU in float32,
+# which are approximate there; of sine and cosine, whose reduction and polynomial round.
+ULP = 4
+
+
+def float_operations(eps):
+    ulp = ULP * eps
+    return {
+        "add": (lambda x, y: x + y, 0),
+        "sub": (lambda x, y: x - y, 0),
+        "mul": (lambda x, y: x * y, 0),
+        "div": (lambda x, y: x / y, ulp),
+        "neg": (lambda x, y: -x, 0),
+        "abs": (lambda x, y: jnp.abs(x), 0),
+        "max": (lambda x, y: jnp.maximum(x, y), 0),
+        "min": (lambda x, y: jnp.minimum(x, y), 0),
+        "clamp": (lambda x, y: jax.lax.clamp(jnp.zeros_like(x), x, jnp.ones_like(x)), 0),
+        "sign": (lambda x, y: jnp.sign(x), 0),
+        "square": (lambda x, y: jnp.square(x), 0),
+        "power 3": (lambda x, y: jax.lax.integer_pow(x, 3), ulp),
+        "power -2": (lambda x, y: jax.lax.integer_pow(x, -2), ulp),
+        "power 0": (lambda x, y: jax.lax.integer_pow(x, 0), 0),
+        "sqrt": (lambda x, y: jnp.sqrt(x), ulp),
+        "rsqrt": (lambda x, y: jax.lax.rsqrt(jnp.abs(x)), ulp),
+        "floor": (lambda x, y: jnp.floor(x), 0),
+        "ceil": (lambda x, y: jnp.ceil(x), 0),
+        "finite": (lambda x, y: jnp.isfinite(x), 0),
+        "lt": (lambda x, y: x < y, 0),
+        "le": (lambda x, y: x <= y, 0),
+        "gt": (lambda x, y: x > y, 0),
+        "ge": (lambda x, y: x >= y, 0),
+        "eq": (lambda x, y: x == y, 0),
+        "ne": (lambda x, y: x != y, 0),
+        "logic": (lambda x, y: ((x < y) & ~(y > 0.3)) | ((x != x) ^ (y >= 1)), 0),
+        "select": (lambda x, y: jnp.where(x < y, x, y), 0),
+        "select n": (
+            lambda x, y: jax.lax.select_n(jnp.clip(x.astype(jnp.int32), 0, 2), x, y, x - y),
+            0,
+        ),
+        "order": (lambda x, y: (x < 0) < (y < 0), 0),
+        "to int32": (lambda x, y: x.astype(jnp.int32), 0),
+        "to bool": (lambda x, y: x.astype(bool), 0),
+        "from bool": (lambda x, y: (x < y).astype(x.dtype), 0),
+        "lanes": (lambda x, y: jax.lax.broadcasted_iota(jnp.int32, x.shape, 0) - 3, 0),
+        "swap": (lambda x, y: jax.lax.rev(x.reshape(2, 2, -1), (1,)).reshape(x.shape), 0),
+        "swap all": (lambda x, y: jax.lax.rev(x, (0,)), 0),
+        "swap bool": (lambda x, y: jax.lax.rev(x < y, (0,)), 0),
+        "largest": (lambda x, y: x + jnp.max(jnp.clip(y, -9, 9).astype(jnp.int32)), 0),
+        "smallest": (lambda x, y: x + jnp.min(jnp.clip(y, -9, 9).astype(jnp.int32)), 0),
+    }
+
+
+def control_operations():
+    """Loops and conditionals; every carried value has another kind."""
+
+    def scan(x, y):
+        def body(k, c):
+            return (c[0] + k * x, c[1] + 2, ~c[2])
+
+        total, count, flag = jax.lax.fori_loop(1, 8, body, (y, jnp.int32(1), jnp.bool_(False)))
+        return jnp.where(flag, total, -total) + count
+
+    def swapped(x, y):
+        return jax.lax.fori_loop(0, 3, lambda k, c: (c[1], c[0] + k), (x, y))[0]
+
+    def search(x, y):
+        def going(c):
+            return (jnp.max((c[0] < 9).astype(jnp.int32)) > 0) & (c[1] < 40)
+
+        found, rounds = jax.lax.while_loop(
+            going, lambda c: (jnp.minimum(c[0] + jnp.abs(y) + 1, 10), c[1] + 1), (x, jnp.int32(0))
+        )
+        return found + rounds
+
+    def branch(x, y):
+        some = jnp.max((x > 2).astype(jnp.int32)) > 0
+        return jax.lax.cond(some, lambda: (x, y - x), lambda: (y, x))[1]
+
+    def nested(x, y):
+        def body(k, c):
+            inner = jax.lax.cond(k > 1, lambda: c + k, lambda: c - y)
+            return jax.lax.fori_loop(0, 2, lambda j, d: d + j * k, inner)
+
+        return jax.lax.fori_loop(0, 4, body, x)
+
+    names = (scan, swapped, search, branch, nested)
+    return {f.__name__: (f, 1e-5) for f in names}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_operations_on_floats(backend, dtype):
+    """Of all kinds of numbers, also infinite ones and what is no number."""
+    with jax.enable_x64(dtype == np.float64):
+        compare(float_operations(np.finfo(dtype).eps), floats(backend, dtype), backend, dtype)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_angles_and_control(backend, dtype):
+    """Sine and cosine to some units in the last place, and every kind of control flow."""
+    eps, size = np.finfo(dtype).eps, BLOCKS * lanes_of(backend)
+    rng = np.random.default_rng(1)
+    x, y = 3 * rng.standard_normal((2, size)).astype(dtype)
+    x[:6] = [0, np.pi / 4, -np.pi / 2, 1e3, -20, 1]
+    turns = {
+        f"{f.__name__} {s}": (lambda x, y, f=f, s=s: f(s * x), 4 * eps)
+        for f in (jnp.sin, jnp.cos)
+        for s in (1, 40)
+    }
+    with jax.enable_x64(dtype == np.float64):
+        compare(turns | control_operations(), (x, y), backend, dtype)
+        x[:3] = np.nan, np.inf, -np.inf
+        compare(turns, (x, y), backend, dtype)
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_operations_on_integers(backend, dtype):
+    """Of all kinds of numbers, also those at which processors trap; sums wrap around."""
+    info, size = np.iinfo(dtype), BLOCKS * lanes_of(backend)
+    numbers = [0, 1, -1, 2, -7, 9, info.min, info.max]
+    pairs = [(a, b) for a in numbers for b in numbers]
+    pairs += [(3, 2)] * (size - len(pairs))
+    operations = {
+        "add": lambda x, y: x + y,
+        "sub": lambda x, y: x - y,
+        "mul": lambda x, y: x * y,
+        "div": lambda x, y: jax.lax.div(x, y),
+        "rem": lambda x, y: jax.lax.rem(x, y),
+        "div by 3": lambda x, y: jax.lax.div(x, jnp.full_like(x, 3)),
+        "neg": lambda x, y: -x,
+        "abs": lambda x, y: jnp.abs(x),
+        "sign": lambda x, y: jnp.sign(x),
+        "max": lambda x, y: jnp.maximum(x, y),
+        "min": lambda x, y: jnp.minimum(x, y),
+        "and": lambda x, y: x & y,
+        "or": lambda x, y: x | y,
+        "xor": lambda x, y: x ^ y,
+        "not": lambda x, y: ~x,
+        "lt": lambda x, y: x < y,
+        "ge": lambda x, y: x >= y,
+        "ne": lambda x, y: x != y,
+        "to float": lambda x, y: x.astype(jnp.float32).astype(x.dtype) // 512,
+        "power": lambda x, y: jax.lax.integer_pow(x, 3),
+        "swap": lambda x, y: jax.lax.rev(x, (0,)),
+        "to other": lambda x, y: x.astype(jnp.int32).astype(x.dtype),
+    }
+    with jax.enable_x64(dtype == np.int64):
+        exact = {name: (function, 0) for name, function in operations.items()}
+        compare(exact, np.array(pairs, dtype).T, backend, dtype)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_remainder(backend):
+    """Of floats, as far as a GPU's product of quotient and divisor is exact."""
+    size = BLOCKS * lanes_of(backend)
+    rng = np.random.default_rng(2)
+    x, y = (9 * rng.standard_normal((2, size))).astype(np.float32)
+    compare({"rem": (lambda x, y: jax.lax.rem(x, y), 2e-5)}, (x, y), backend, np.float32)
+
+
+def write(function, *kinds, lanes=8):
+    """A function of vectors in LLVM's language, as vectors and as threads."""
+
+    def kernel(*refs):
+        *given, out = refs
+        out[0, :] = function(*(ref[0, :] for ref in given))
+
+    for writer, size in ((vector, lanes), (thread, 32)):
+        spec = pl.BlockSpec((None, 1, size), lambda i: (i, 0, 0))
+        inputs = [jax.ShapeDtypeStruct((2, 1, size), k) for k in kinds]
+        call = pl.pallas_call(
+            kernel, grid=(2,), in_specs=[spec] * len(kinds), out_specs=spec, out_shape=inputs[0]
+        )
+        (equation,) = jax.make_jaxpr(call)(*inputs).eqns
+        blocks = [((1, size), k) for k in (*kinds, kinds[0])]
+        extra = (size,) if writer is vector else ([False] * len(blocks), "test")
+        yield writer.write(equation.params["jaxpr"], blocks, *extra)
+
+
+@pytest.mark.parametrize(
+    ("function", "kind", "message"),
+    [
+        (jnp.tanh, np.float32, "'tanh'"),
+        (lambda x: x + x.astype(np.float16).astype(np.float32), np.float32, "no dtype float16"),
+        (lambda x: x + 1, np.uint32, "no dtype uint32"),
+        (lambda x: jnp.where(jnp.max(x) > 0, x, 0), np.float32, "reduces int32 .* not float32"),
+        (
+            lambda x: jax.lax.scan(lambda c, k: (c + k, c), x, jnp.arange(3.0))[0],
+            np.float32,
+            "no inputs or outputs of each round",
+        ),
+    ],
+)
+def test_what_has_no_instruction_is_named(function, kind, message):
+    """Instead of a wrong result, and before anything runs."""
+    with pytest.raises(NotImplementedError, match=message):
+        list(write(function, kind))
+
+
+def test_text_is_valid_for_both_targets():
+    """LLVM accepts it and makes PTX of it, with the instructions of a warp."""
+    from codesign_jax.compiler import nvptx
+
+    def function(x, y):
+        total = jax.lax.fori_loop(0, 3, lambda k, c: c + k * jnp.maximum(x, y), jnp.sin(x) / y)
+        return jax.lax.rev(total.reshape(2, -1), (0,)).reshape(x.shape)
+
+    for dtype in (np.float32, np.float64):
+        with jax.enable_x64(True):
+            _, text = write(function, dtype, dtype)
+        ptx = nvptx.assembly(text)
+        bits = 32 if dtype == np.float32 else 64
+        assert ".target sm_80" in ptx and "shfl.sync.bfly.b32" in ptx and ".maxntid 32" in ptx
+        assert f"fma.rn.f{bits}" in ptx and (bits == 64) == ("div.rn.f64" in ptx)
+        assert (bits == 64) or ("max.NaN.f32" in ptx and "div.full.f32" in ptx)
+
+
+def loop_text(reverse, rows=32, count=8):
+    """A loop that reads rows 2 k + 3 and 2 k + 4 in round k."""
+
+    def kernel(x, out):
+        def body(k, total):
+            at = 2 * (count - 1 - k if reverse else k)
+            return total + x[at + 3, :] * x[at + 4, :]
+
+        out[0, :] = jax.lax.fori_loop(0, count, body, x[0, :])
+
+    spec = pl.BlockSpec((None, rows, 32), lambda i: (i, 0, 0))
+    shape = jax.ShapeDtypeStruct((1, rows, 32), jnp.float32)
+    call = pl.pallas_call(kernel, grid=(1,), in_specs=[spec], out_specs=spec, out_shape=shape)
+    (equation,) = jax.make_jaxpr(call)(shape).eqns
+    blocks = [((rows, 32), np.float32)] * 2
+    return thread.write(equation.params["jaxpr"], blocks, [False] * 2, "test").splitlines()
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_loop_asks_for_what_it_reads_later(reverse):
+    """Rows 2 k + 3 and 2 k + 4 of round k: as many rounds on as memory takes, in their order."""
+    lines = loop_text(reverse)
+    (asked,) = [k for k, line in enumerate(lines) if "prefetch.global.L1" in line]
+    offset = int(lines[asked - 1].split("i64 ")[-1])
+    rounds = (offset / 128 - 3) / (-2 if reverse else 2)
+    begin, end = (
+        next(k for k, line in enumerate(lines) if text in line) for text in ("phi", "br i1")
+    )
+    reads = [k for k, line in enumerate(lines) if " load " in line and begin < k < end]
+    assert len(reads) == 2 and rounds == int(rounds) >= 1 and asked < reads[0]
+    assert rounds * (end - begin) >= thread.AHEAD > (rounds - 1) * (end - begin - 10)
+    # Two rows: lane 0 asks for the first one, all others for the second one.
+    assert any("umin.i32(i32 %lane, i32 1)" in line for line in lines)

@@ -11,6 +11,7 @@ _PACKAGES = (
     "codesign-jax",
     "jax",
     "jaxlib",
+    "llvmlite",
     "mujoco",
     "mujoco-mjx",
     "numpy",

@@ -58,10 +58,6 @@ def main() -> int:
         report.make_summary(args.docs.parent / "README.md", page, SCENES, found)
         return 0
     gpu = jax.default_backend() == "gpu"
-    if not gpu:
-        from codesign_jax.commands import common
-
-        common.use_all_cores("structured")
     every = study.cases(study.SIZES[args.size], args.parts, args.engines, args.data, gpu=gpu)
     every = [case for case in every if args.only in case.key]
     if args.list:

@@ -113,7 +113,6 @@ def find_types(args: argparse.Namespace) -> int:
     from codesign_jax.experiments.figures import LANDSCAPE_THRESHOLD
 
     common.use_compilation_cache()
-    common.use_all_cores(args.engine)
     grid = statistics.load(args.data, "landscape")
     if grid is None:
         sys.exit(f"error: {args.data} holds no landscape.npz")

@@ -73,7 +73,6 @@ def simulate(args: argparse.Namespace) -> int:
     from codesign_jax.commands import common
 
     common.use_compilation_cache()
-    common.use_all_cores("structured")
     chosen = variants(args)
     runs, particles, blocks, trials = SIZES[args.size]
     every = [winners.finals(args.data, name, runs, particles) for name in args.experiments]

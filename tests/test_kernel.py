@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import control, model
-from codesign_jax.compiler import native
+from codesign_jax.compiler import gpu, launch, vector
 from codesign_jax.engines.structured import StructuredEngine, elimination
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
@@ -89,8 +89,16 @@ def test_kernel_equals_the_engine(grasp):
 
 
 @pytest.mark.parametrize("effects", [{}, {"friction": "full", "neo_hookean": True, "wrist": False}])
-def test_kernel_becomes_ptx(effects):
+def test_kernel_becomes_ptx(effects, monkeypatch):
     """Every operation of the kernel has its instruction, with each effect and a trajectory."""
+    texts = []
+
+    def register(origin, trace, layout):
+        texts.append(gpu.device_code(trace(), layout))
+        return "registered"
+
+    monkeypatch.setattr(gpu, "register", register)
+    monkeypatch.setattr(launch, "available", lambda platform: None)
     scene = small.pinch("cylinder", links=2, **{f"effects__{k}": v for k, v in effects.items()})
     params, trials = small.random_worlds(scene, 3, 3)
     fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
@@ -103,7 +111,8 @@ def test_kernel_becomes_ptx(effects):
         )
 
     text = jax.jit(run).trace(fields, ctrl).lower(lowering_platforms=("cuda",)).as_text()
-    assert "__gpu$xla.gpu.ptx" in text and "fma.rn.f32" in text
+    (code,) = texts
+    assert "@registered" in text and f".entry {gpu.ENTRY}(" in code and "fma.rn.f32" in code
 
 
 def test_machine_code_equals_the_engine(grasp):
@@ -193,37 +202,45 @@ def test_neighbours_in_a_block_change_no_bit(grasp):
             np.testing.assert_array_equal(getattr(mixed, name), want, err_msg=name)
 
 
-def test_machine_code_is_kept(tmp_path):
-    """Beside JAX's compilation cache, under the kernel's name; without a cache it is built anew."""
-    built = []
-
-    def build():
-        built.append(1)
-        return b"code"
-
-    previous = jax.config.jax_compilation_cache_dir
-    try:
-        for folder, count in ((tmp_path / "new", 1), (tmp_path / "new", 1), (None, 2)):
-            jax.config.update("jax_compilation_cache_dir", folder and str(folder))
-            assert native._kept("grasp_a", build) == b"code" and len(built) == count
-        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "new"))
-        assert native._kept("grasp_b", build) == b"code" and len(built) == 3
-        (tmp_path / "file").touch()
-        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "file" / "none"))
-        assert native._kept("grasp_a", build) == b"code" and len(built) == 4
-    finally:
-        jax.config.update("jax_compilation_cache_dir", previous)
-
-
 def test_a_kernel_is_traced_once(grasp, monkeypatch):
     """The second program of a scene finds its machine code; other limits are another kernel."""
     scene, fields, ctrl = grasp
     first = jax.jit(StructuredEngine(scene).rollout)(fields, ctrl)
-    monkeypatch.setattr(native.vector, "write", lambda *_: pytest.fail("written again"))
+    monkeypatch.setattr(vector, "write", lambda *_: pytest.fail("written again"))
     again = jax.jit(StructuredEngine(scene).rollout)(fields, ctrl)
     np.testing.assert_array_equal(first.distance, again.distance)
     with pytest.raises(pytest.fail.Exception, match="written again"):
         jax.jit(StructuredEngine(scene, tolerance=1e-5).rollout)(fields, ctrl)
+
+
+def test_without_kernels_the_batch_form_runs(grasp, monkeypatch):
+    """One warning that names the reason, found before or at the call; who demands one is told."""
+    scene, fields, ctrl = grasp
+    ctrl = ctrl[:, :5]
+    want = jax.jit(StructuredEngine(scene, kernel=False).rollout)(fields, ctrl)
+    monkeypatch.setattr(launch, "_warned", set())
+    monkeypatch.setattr(launch, "_available", lambda platform: "no compiler")
+    with pytest.warns(RuntimeWarning, match="no kernel: no compiler") as warned:
+        engine, _ = StructuredEngine(scene), StructuredEngine(scene)
+    assert len(warned) == 1
+    got = jax.jit(engine.rollout)(fields, ctrl)
+    np.testing.assert_array_equal(got.distance, want.distance)
+    with pytest.raises(launch.KernelUnavailable, match="no compiler"):
+        StructuredEngine(scene, kernel=True)
+    monkeypatch.setattr(launch, "_available", lambda platform: None)
+    late, demanding = StructuredEngine(scene), StructuredEngine(scene, kernel=True)
+
+    def refuse(*_):
+        raise launch.KernelUnavailable("XLA refused")
+
+    monkeypatch.setattr(launch, "describe", refuse)
+    with pytest.warns(RuntimeWarning, match="no kernel: XLA refused") as warned:
+        got = jax.jit(late.rollout)(fields, ctrl)
+        jax.eval_shape(late.rollout, fields, ctrl)
+    np.testing.assert_array_equal(got.distance, want.distance)
+    assert len(warned) == 1
+    with pytest.raises(launch.KernelUnavailable, match="XLA refused"):
+        jax.jit(demanding.rollout)(fields, ctrl)
 
 
 def test_state_tables_give_the_states_back(grasp):

@@ -12,7 +12,8 @@ LANES, ROWS, BLOCKS, LENGTH = 8, 5, 3, 40
 
 
 def run(name, kernel, inputs, *outputs):
-    """Runs a kernel on blocks of arrays (block or 1 shared by all, row, lane) or (1, element)."""
+    """Runs a kernel on arrays (block, row, lane), and (1, element) that all blocks share."""
+    shared = tuple(k for k, x in enumerate(inputs) if x.shape[0] == 1)
 
     def spec(shape):
         own = shape[0] == BLOCKS
@@ -25,7 +26,7 @@ def run(name, kernel, inputs, *outputs):
         out_specs=[spec(x.shape) for x in outputs],
         out_shape=list(outputs),
     )
-    kind = Kernel(f"test {name} {[x.dtype for x in inputs]}", "cpu", LANES)
+    kind = Kernel(f"test {name} {[x.dtype for x in inputs]}", "cpu", LANES, shared)
     return jax.jit(lambda *x: launch(call, x, list(outputs), kind))(*inputs)
 
 

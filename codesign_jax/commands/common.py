@@ -1,6 +1,5 @@
 """What the commands share: designs, notes and JAX's compilation cache."""
 
-import contextlib
 import math
 from collections.abc import Mapping, Sequence
 
@@ -11,17 +10,6 @@ from codesign_jax import codesign, files, preflight, schema, statistics, types
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
-
-
-def use_all_cores(engine: str | None) -> None:
-    """Shares the structured engine's worlds between the cores; the others see to it themselves."""
-    if engine not in (None, "structured"):
-        return
-    from codesign_jax.engines.structured import cores
-
-    # JAX has been used before: whoever did chose the devices.
-    with contextlib.suppress(RuntimeError):
-        cores.use_all_cores()
 
 
 def use_compilation_cache() -> None:

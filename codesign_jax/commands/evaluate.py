@@ -36,7 +36,6 @@ def main(options: "Evaluate") -> int:
       SceneError: If something is wrong with the input.
     """
     common.use_compilation_cache()
-    common.use_all_cores(options.engine)
     case = _from_run(options) if options.run_folder else _from_flags(options)
     _check(options, case.engine)
     engine = make_engine(case.engine, case.scene)

@@ -30,7 +30,6 @@ def main(options: "Optimize") -> int:
       SceneError: If something is wrong with the input; nothing was created then.
     """
     common.use_compilation_cache()
-    common.use_all_cores(options.engine)
     scene, settings = resolve(options)
     # Everything that speaks against the run, before anything that takes time.
     plan = runs.prepare(scene, settings)

@@ -1,76 +1,200 @@
-"""Runs a Pallas kernel, on a GPU through `thread` and `nvptx`, or on a CPU through `vector`."""
+"""The one way to run a Pallas kernel: on a CPU through `cpu`, on an NVIDIA GPU through `gpu`."""
 
+import functools
+import importlib.metadata
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from codesign_jax.compiler import thread
+from codesign_jax.compiler import cache, ffi
+from codesign_jax.compiler.ffi import KernelUnavailable
+from codesign_jax.compiler.layout import INPUT, OUTPUT, SCRATCH, Array, Layout
+
+OLDEST_LLVMLITE = (0, 45)
+OLDEST_GPU = (8, 0)
+"""Oldest compute capability that device code is written for (sm_80)."""
+
+_warned: set[str] = set()
 
 
 class Kernel(NamedTuple):
     """What a kernel is.
 
     Attributes:
-      origin: What determines its code besides the package's own.
+      origin: What determines its code besides the compiler's own code and the types and shapes of
+        its blocks. Kernels of one origin and layout are taken to be the same; the code that writes
+        the kernel belongs into it, see `cache.sources`.
       backend: "gpu" or "cpu".
-      lanes: Lanes of a block.
+      lanes: Lanes of a block, see `block_lanes`.
       shared: Places of inputs of one block that all blocks read; their leading axis is 1.
+      scratch: Places among the outputs of memory that no block leaves to anybody. On a CPU every
+        thread has one block of it, on a GPU every block has its own.
     """
 
     origin: str
     backend: str
     lanes: int
     shared: tuple[int, ...] = ()
+    scratch: tuple[int, ...] = ()
+
+
+def available(platform: str) -> str | None:
+    """Why kernels cannot run on a platform, or None if they can.
+
+    Args:
+      platform: As `jax.default_backend` names it; "gpu" is only NVIDIA's.
+    """
+    return _available(platform)
+
+
+def warn(reason: str) -> None:
+    """Says once that kernels cannot run and what that means."""
+    if reason not in _warned:
+        _warned.add(reason)
+        text = f"no kernel: {reason}; simulating without it, which takes many times as long"
+        warnings.warn(text, RuntimeWarning, stacklevel=3)
+
+
+def block_lanes(platform: str, dtype: Any) -> int:
+    """Lanes that fill a vector of the CPU, or a warp."""
+    if platform == "cpu":
+        from codesign_jax.compiler import host
+
+        return host.vector_bytes() // np.dtype(dtype).itemsize
+    return 32
 
 
 def launch(
     call: Callable, inputs: tuple, outputs: list[jax.ShapeDtypeStruct], kernel: Kernel
-) -> list[jax.Array]:
+) -> list[jax.Array | None]:
     """Returns call(*inputs), where call is a `pallas_call` over the leading axis of its arrays.
+
+    The kernel is traced and compiled once for a layout, whatever the number of blocks.
 
     Args:
       call: The kernel as a function of arrays whose leading axis is the grid's.
       inputs: Its arguments.
       outputs: Shapes of its results.
       kernel: What it is.
+
+    Returns:
+      The results, None in the place of scratch memory.
+
+    Raises:
+      KernelUnavailable: If kernels cannot run here.
+      NotImplementedError: If the kernel does something that the compiler has no instruction for.
+      ValueError: If an array's leading axis is not that of the others.
     """
+    if reason := available(kernel.backend):
+        raise KernelUnavailable(reason)
+    if kernel.backend == "cpu":
+        from codesign_jax.compiler import cpu as device
+    else:
+        from codesign_jax.compiler import gpu as device
+    layout = describe(inputs, outputs, kernel)
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in inputs]
-    shapes = [tuple(x.shape[1:]) for x in (*avals, *outputs)]
 
     def trace() -> Any:
-        # A block knows nothing of the devices that share the worlds, and traces sooner without.
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-            return _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr).params["jaxpr"]
+        return kernel_jaxpr(call, avals)
 
-    if kernel.backend == "cpu":
-        from codesign_jax.compiler import native
+    origin = f"{kernel.origin} {cache.sources(Path(__file__).parent)} {jax.__version__}"
+    name = device.register(origin, trace, layout)
+    made = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
+    varying = _varying(inputs)
+    shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]
+    results: list[jax.Array | None] = [None] * len(outputs)
+    for k, result in zip(made, jax.ffi.ffi_call(name, shapes)(*inputs), strict=True):
+        results[k] = None if k in kernel.scratch else result
+    return results
 
-        sizes = [x.dtype.itemsize for x in (*avals, *outputs)]
-        layout = native.Layout(shapes, len(inputs), kernel.lanes, sizes[0], sizes)
-        name = native.register(kernel.origin, trace, layout)
-        return list(jax.ffi.ffi_call(name, outputs)(*inputs))
-    from codesign_jax.compiler import nvptx
 
-    jaxpr, number = trace(), np.int32
-    blocks = [(shape, v.aval.dtype) for shape, v in zip(shapes, jaxpr.invars, strict=True)]
-    text = thread.write(jaxpr, blocks, [k in kernel.shared for k in range(len(blocks))], "grasp")
-    results = jax.ffi.ffi_call("__gpu$xla.gpu.ptx", outputs)(
-        *inputs,
-        name="grasp",
-        kernel_type="ptx",
-        kernel_data=nvptx.assembly(text),
-        grid_x=number(outputs[0].shape[0]),
-        grid_y=number(1),
-        grid_z=number(1),
-        block_x=number(thread.LANES),
-        block_y=number(1),
-        block_z=number(1),
-        shared_mem_bytes=number(0),
-        output_indices=tuple(range(len(inputs), len(shapes))),
-    )
-    return list(results)
+def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:
+    """The layout of a kernel's arrays; scratch memory on a GPU is an output that nobody reads.
+
+    Raises:
+      ValueError: If an array's leading axis is neither the number of blocks nor, shared, 1.
+    """
+    arrays = []
+    scratch = SCRATCH if kernel.backend == "cpu" else OUTPUT
+    blocks = outputs[0].shape[0]
+    for k, x in enumerate((*inputs, *outputs)):
+        place = k - len(inputs)
+        role = INPUT if place < 0 else scratch if place in kernel.scratch else OUTPUT
+        shared = k in kernel.shared
+        if x.shape[0] != (1 if shared else blocks):
+            what = "is shared and must have one block" if shared else f"must have {blocks} blocks"
+            raise ValueError(f"array {k} of shape {x.shape} {what}")
+        if shared and role != INPUT:
+            raise ValueError(f"array {k} is an output; only inputs can be shared")
+        arrays.append(Array(tuple(x.shape[1:]), np.dtype(x.dtype).name, role, shared))
+    return Layout(tuple(arrays), kernel.lanes)
+
+
+def kernel_jaxpr(call: Callable, avals: list) -> Any:
+    """The jaxpr of a `pallas_call`'s kernel; its arguments are references to a block each."""
+    # A block knows nothing of the devices that share the worlds, and traces sooner without.
+    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        return _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr).params["jaxpr"]
+
+
+def _varying(inputs: tuple) -> dict[str, Any]:
+    """In `jax.shard_map`, the axes along which results differ: those of any input."""
+    every = frozenset().union(*(jax.typeof(x).manual_axis_type.varying for x in inputs))
+    if not every:
+        return {}
+    mesh, whole = jax.sharding.get_abstract_mesh(), jax.sharding.PartitionSpec()
+    return {
+        "sharding": jax.sharding.NamedSharding(mesh, whole),
+        "manual_axis_type": jax.sharding.ManualAxisType(varying=every),
+    }
+
+
+@functools.cache
+def _available(platform: str) -> str | None:
+    if platform not in ("cpu", "gpu"):
+        return f"kernels are compiled for CPUs and NVIDIA GPUs, not for {platform!r}"
+    return _llvmlite() or ffi.unsupported() or (_gpu() if platform == "gpu" else None)
+
+
+def _llvmlite() -> str | None:
+    """What is wrong with llvmlite."""
+    try:
+        version = importlib.metadata.version("llvmlite")
+        import llvmlite.binding  # noqa: F401  # its own library may not load
+    except (ImportError, OSError) as error:
+        return f"llvmlite, which compiles kernels, cannot be imported: {error}"
+    if tuple(int(n) for n in version.split(".")[:2]) < OLDEST_LLVMLITE:
+        return f"llvmlite {version} is older than {'.'.join(map(str, OLDEST_LLVMLITE))}"
+    return None
+
+
+def _gpu() -> str | None:
+    """What is wrong with the GPUs or their driver."""
+    from codesign_jax.compiler import gpu
+
+    try:
+        devices = jax.local_devices(backend="gpu")
+    except RuntimeError as error:
+        return f"no GPU: {error}"
+    for device in devices:
+        capability = str(getattr(device, "compute_capability", ""))
+        major, _, minor = capability.partition(".")
+        if not (major.isdecimal() and minor.isdecimal()):
+            return f"{device.device_kind} is no NVIDIA GPU"
+        if (int(major), int(minor)) < OLDEST_GPU:
+            oldest = ".".join(map(str, OLDEST_GPU))
+            return (
+                f"{device.device_kind} has compute capability {capability}, kernels need {oldest}"
+            )
+    try:
+        gpu.driver()
+    except KernelUnavailable as error:
+        return str(error)
+    return None
 
 
 def _pallas_call(jaxpr: Any) -> Any:

@@ -1,6 +1,5 @@
 """Flat batches of worlds: one program, called chunk by chunk, on one or more devices."""
 
-import contextlib
 from typing import NamedTuple
 
 import jax
@@ -8,7 +7,6 @@ import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax.engines import Engine
-from codesign_jax.engines.structured import cores
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Trial
@@ -71,15 +69,12 @@ class Worlds:
         if not 1 <= devices <= len(available):
             raise ValueError(f"{devices=}; {len(available)} available")
         self.scene, self.space, self.chunk = scene, space, chunk
-        # With one device the engine may still share a call between a CPU's cores.
         self.devices = available[:devices] if devices > 1 else [None]
         self.grasps = 0
-        alone = cores.on_one_core if devices > 1 else contextlib.nullcontext
 
         def simulate(designs: jax.Array, trials: Trial) -> Outcome:
             params = jax.vmap(space.params)(designs)
-            with alone():
-                return rollout.simulate(scene, engine, params, trials)[0]
+            return rollout.simulate(scene, engine, params, trials)[0]
 
         # A program of its own on each device instead of one over all: its shapes, and with them
         # its bits, are those of a single device.

@@ -2,13 +2,13 @@
 
 import copy
 from functools import partial
-from importlib.util import find_spec
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax import effects
+from codesign_jax.compiler import launch
 from codesign_jax.engines.structured import (
     collision,
     finger_pairs,
@@ -18,7 +18,6 @@ from codesign_jax.engines.structured import (
 )
 from codesign_jax.engines.structured.constants import WorldConstants, apply_columns, world_constants
 from codesign_jax.engines.structured.contact import Contacts
-from codesign_jax.engines.structured.cores import on_all_cores
 from codesign_jax.engines.structured.inertia import Bodies, bodies, smooth_forces
 from codesign_jax.engines.structured.integration import integrate, rigid_arm
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
@@ -78,9 +77,10 @@ class StructuredEngine:
             repeats the rest of each step; costs nothing without a derivative.
           kernel: Whether one kernel runs a rollout where it can: scenes of `in_kernel`, on a GPU in
             float32. Without it all worlds step in unison, to the end of the rollout. By default
-            where kernels can be compiled.
+            where kernels can run; elsewhere a warning says why not.
 
         Raises:
+          KernelUnavailable: If `kernel` is true and kernels cannot run here.
           SceneError: If a mesh's distance cannot be put on a grid.
         """
         effects.refuse(scene.effects, self.name)
@@ -89,8 +89,9 @@ class StructuredEngine:
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
-        kernel = _has_kernel() if kernel is None else kernel
-        self.kernel, self.differentiable = kernel and not differentiable, differentiable
+        self.demanded, self.differentiable = bool(kernel), differentiable
+        wanted = kernel is not False and in_kernel(scene) and not differentiable
+        self.kernel = wanted and _has_kernel(self.demanded)
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -229,10 +230,13 @@ class StructuredEngine:
         """See `Engine.rollout`; where it can, one kernel runs it all, see `kernel`."""
         fits = in_kernel(self.scene)
         if fits and self.kernel and (self.conditional or ctrl.dtype == jnp.float32):
-            return on_all_cores(partial(self._one_kernel, trajectory=trajectory), fields, ctrl)
+            try:
+                return self._one_kernel(fields, ctrl, trajectory=trajectory)
+            except launch.KernelUnavailable as error:
+                if self.demanded:
+                    raise
+                launch.warn(str(error))
         with jax.default_matmul_precision("highest"):
-            if self.conditional and not self.differentiable:
-                return on_all_cores(partial(self._rollout, trajectory=trajectory), fields, ctrl)
             return self._rollout(fields, ctrl, trajectory=trajectory)
 
     def _one_kernel(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
@@ -301,10 +305,14 @@ class StructuredEngine:
         return jnp.abs(qvel).max(1) + 0.0 * qpos.sum(1)
 
 
-def _has_kernel() -> bool:
-    """Whether kernels can be compiled for this device."""
-    backend = jax.default_backend()
-    return backend == "gpu" or (backend == "cpu" and find_spec("llvmlite") is not None)
+def _has_kernel(demanded: bool) -> bool:
+    """Whether kernels can run on this device; if not, warns once with the reason, or raises it."""
+    reason = launch.available(jax.default_backend())
+    if reason is not None and demanded:
+        raise launch.KernelUnavailable(reason)
+    if reason is not None:
+        launch.warn(reason)
+    return reason is None
 
 
 def in_kernel(scene: Scene) -> bool:

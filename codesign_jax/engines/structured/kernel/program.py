@@ -6,6 +6,7 @@ are all decided.
 """
 
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -13,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 
-from codesign_jax.compiler.launch import Kernel, launch
-from codesign_jax.compiler.thread import LANES
+from codesign_jax.compiler import cache
+from codesign_jax.compiler.launch import Kernel, block_lanes, launch
 from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.kernel import hull, objects
@@ -28,6 +29,9 @@ from codesign_jax.model import layout
 from codesign_jax.model.layout import palm_points, palm_touches
 from codesign_jax.scene import Scene
 
+PACKAGE = Path(__file__).parents[3]
+UNRELATED = ("accuracy", "benchmark", "commands", "experiments", "optimize", "report", "runs")
+"""The package's folders that no kernel depends on: they import engines, never the other way."""
 TRACE = ("distance", "height", "speed", "residual", "iterations")
 
 
@@ -48,7 +52,7 @@ class Limits(NamedTuple):
 class Program:
     """Tables and kernel of a scene's rollout for one size of block."""
 
-    def __init__(self, scene: Scene, limits: Limits, *, backend: str = "gpu", width: int = LANES):
+    def __init__(self, scene: Scene, limits: Limits, *, backend: str = "gpu", width: int = 32):
         """Lays out the memory.
 
         Args:
@@ -75,12 +79,8 @@ class Program:
     @classmethod
     def here(cls, scene: Scene, limits: Limits, dtype: Any) -> "Program":
         """The program for this device and type, whose blocks fill a GPU's warp or CPU's vector."""
-        if (backend := jax.default_backend()) != "cpu":
-            return cls(scene, limits)
-        from codesign_jax.compiler import native
-
-        width = native.vector_bytes() // jnp.dtype(dtype).itemsize
-        return cls(scene, limits, backend=backend, width=width)
+        backend = jax.default_backend()
+        return cls(scene, limits, backend=backend, width=block_lanes(backend, dtype))
 
     def _sets(self) -> list[ContactSet]:
         e, k = self.scene.effects, self.k
@@ -278,12 +278,10 @@ class Program:
         if hand.mesh is not None:
             inputs += (hand.mesh.values[None],)
         blocks, steps, dtype = inputs[0].shape[0], ctrl.shape[1], ctrl.dtype
-        # A core runs block after block: they share what no block leaves to another.
-        scratch = 1 if self.backend == "cpu" else blocks
         shapes = [
             (blocks, self.finger_state.rows, self.size),
             (blocks, self.world_state.rows, self.block),
-            (scratch, self.scratch.rows, self.size),
+            (blocks, self.scratch.rows, self.size),
             (blocks, steps, len(self.trace), self.block),
         ]
         if trajectory:
@@ -307,8 +305,8 @@ class Program:
         if self.backend == "interpreter":
             out = call(*inputs)
         else:
-            origin = repr((self.scene, self.limits, trajectory))
-            kernel = Kernel(origin, self.backend, self.size, shared)
+            origin = repr((self.scene, self.limits, trajectory, cache.sources(PACKAGE, UNRELATED)))
+            kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
             out = launch(call, inputs, outputs, kernel)
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(self.trace))[: ctrl.shape[0]]

@@ -1,0 +1,237 @@
+"""Kernels on a CPU: machine code by LLVM, whose blocks XLA's own threads share.
+
+A handler takes blocks one by one, and so do the tasks that it gives to XLA's thread pool, until
+none is left.  It then waits for blocks that a task has begun, never for a task to begin: a pool
+that is busy, or that runs tasks late, cannot stop it.  What a late task looks at is a record in the
+heap that lives until the last of them has seen it.  Blocks do not depend on each other, so that
+results do not depend on the number of threads.
+"""
+
+import ctypes
+from collections.abc import Callable
+from ctypes import c_int64
+from typing import Any
+
+from codesign_jax.compiler import cache, ffi, host, vector
+from codesign_jax.compiler.code import Code
+from codesign_jax.compiler.handler import Handler
+from codesign_jax.compiler.layout import SCRATCH, Layout
+
+_ALIGNMENT = 64  # bytes: a line of the cache
+_YIELDS, _SLEEP = 100, 50_000  # times that a handler looks again at once, then pauses [ns]
+
+
+class Job(ctypes.Structure):
+    """A call's record, followed by the address of each array."""
+
+    _fields_ = [
+        ("next", c_int64),  # block that nobody has taken yet
+        ("done", c_int64),  # blocks that have been run
+        ("users", c_int64),  # tasks, and the handler, that may still look at the record
+        ("blocks", c_int64),
+        ("arrays", c_int64),
+    ]
+
+
+_DECLARATIONS = """
+declare i32 @posix_memalign(ptr, i64, i64)
+declare ptr @malloc(i64)
+declare void @free(ptr)
+declare i32 @sched_yield()
+declare i32 @nanosleep(ptr, ptr)
+declare i64 @llvm.smax.i64(i64, i64)
+"""
+
+
+def block_code(jaxpr: Any, layout: Layout) -> str:
+    """The function `block` of LLVM's language, of one address an array, that runs one block."""
+    return vector.write(jaxpr, layout.blocks, layout.lanes)
+
+
+def handler_code(name: str, layout: Layout) -> str:
+    """The handler of a kernel whose function `block` is in the same module."""
+    return _DECLARATIONS + _work(layout) + _task() + _drop() + _handler(name, layout)
+
+
+def register(origin: str, trace: Callable[[], Any], layout: Layout) -> str:
+    """Compiles a kernel and makes it known to XLA; returns the name to call it by.
+
+    Args:
+      origin: What determines the kernel besides the compiler's code and the layout; one that was
+        compiled before is not traced again.
+      trace: Returns the kernel's jaxpr; its arguments are references to a block of each array.
+      layout: Its arrays.
+
+    Raises:
+      KernelUnavailable: If XLA does not take the handler.
+      NotImplementedError: If the kernel does something that has no instruction.
+    """
+    name = cache.key("cpu", origin, layout, *host.identity())
+
+    def build() -> bytes:
+        return host.compile(block_code(trace(), layout) + handler_code(name, layout))
+
+    with host.LOCK:
+        if not host.known(name):
+            host.register(name, host.Loaded(cache.kept(name, build)), "cpu")
+    return name
+
+
+def _work(layout: Layout) -> str:
+    """Takes blocks until none is left; true if there was no memory to run them in."""
+    c = Code("define internal i1 @work(ptr %job) noinline nounwind")
+    blocks = c.get("%job", Job, "blocks")
+    following = c.at("%job", Job, "next")
+    waiting = c.let(f"load atomic i64, ptr {following} monotonic, align 8")
+    with c.when(c.let(f"icmp sge i64 {waiting}, {blocks}")):
+        c.end("ret i1 false")
+    offsets, total = {}, 0
+    for k in layout.of(SCRATCH):
+        offsets[k] = total
+        total += -(-layout.arrays[k].bytes // _ALIGNMENT) * _ALIGNMENT
+    memory = "null"
+    if offsets:
+        place = c.local("ptr")
+        lacks = c.let(f"call i32 @posix_memalign(ptr {place}, i64 {_ALIGNMENT}, i64 {total})")
+        with c.when(c.let(f"icmp ne i32 {lacks}, 0")):
+            c.end("ret i1 true")
+        memory = c.let(f"load ptr, ptr {place}")
+    first = c.at("%job", Job, "arrays")
+    bases = [c.let(f"load ptr, ptr {c.byte(first, 8 * k)}") for k in range(len(layout.arrays))]
+    c.start("again")
+    block = c.let(f"atomicrmw add ptr {following}, i64 1 monotonic")
+    with c.when(c.let(f"icmp slt i64 {block}, {blocks}")):
+        places = []
+        for k, array in enumerate(layout.arrays):
+            if k in offsets:
+                places.append(c.byte(memory, offsets[k]))
+            else:
+                offset = c.let(f"mul i64 {block}, {0 if array.shared else array.bytes}")
+                places.append(c.byte(bases[k], offset))
+        c.do(f"call void @block({', '.join(f'ptr {p}' for p in places)})")
+        c.do(f"atomicrmw add ptr {c.at('%job', Job, 'done')}, i64 1 release")
+        c.end("br label %again")
+    if offsets:
+        c.do(f"call void @free(ptr {memory})")
+    c.end("ret i1 false")
+    return c.text()
+
+
+def _task() -> str:
+    """What XLA's threads run; without memory it leaves the blocks to others."""
+    c = Code("define internal void @task(ptr %job) nounwind")
+    c.let("call i1 @work(ptr %job)")
+    c.do("call void @drop(ptr %job)")
+    c.end("ret void")
+    return c.text()
+
+
+def _drop() -> str:
+    """Takes leave of a record; the last user frees it."""
+    c = Code("define internal void @drop(ptr %job) nounwind")
+    users = c.let(f"atomicrmw sub ptr {c.at('%job', Job, 'users')}, i64 1 acq_rel")
+    with c.when(c.let(f"icmp eq i64 {users}, 1")):
+        c.do("call void @free(ptr %job)")
+    c.end("ret void")
+    return c.text()
+
+
+def _handler(name: str, layout: Layout) -> str:
+    """Shares the blocks with XLA's threads, and waits for all that were begun."""
+    h = Handler(name, layout)
+    c, blocks = h.code, h.blocks
+    with c.when(c.let(f"icmp eq i64 {blocks}, 0")):
+        c.end("ret ptr null")
+    workers = _smaller(c, _threads(h), blocks)
+    job = _job(h, workers)
+    _schedule(h, job, workers)
+    short = c.local("i1")
+    begun = c.local("i64")
+    c.do(f"store i1 false, ptr {short}")
+    c.do(f"store i64 {blocks}, ptr {begun}")
+    with c.when(c.let(f"call i1 @work(ptr {job})")):
+        # Nobody begins another block; tasks that have memory finish theirs.
+        taken = c.let(f"atomicrmw xchg ptr {c.at(job, Job, 'next')}, i64 {blocks} monotonic")
+        c.do(f"store i64 {_smaller(c, taken, blocks)}, ptr {begun}")
+        c.do(f"store i1 {c.let(f'icmp slt i64 {taken}, {blocks}')}, ptr {short}")
+    _wait(c, job, c.let(f"load i64, ptr {begun}"))
+    c.do(f"call void @drop(ptr {job})")
+    with c.when(c.let(f"load i1, ptr {short}")):
+        h.fail(ffi.RESOURCE_EXHAUSTED, h.message(f"kernel {name}: no memory for a block's scratch"))
+    c.end("ret ptr null")
+    return h.text()
+
+
+def _smaller(c: Code, a: str, b: str) -> str:
+    """The smaller one of two 64-bit numbers."""
+    return c.let(f"select i1 {c.let(f'icmp slt i64 {a}, {b}')}, i64 {a}, i64 {b}")
+
+
+def _threads(h: Handler) -> str:
+    """Threads of XLA's pool; one, the caller's, if there is no pool."""
+    c, number = h.code, h.code.local("i64")
+    c.do(f"store i64 1, ptr {number}")
+    record = c.record(ffi.NumThreads, ctx=h.ctx, num_threads=number)
+    error = h.call("thread_pool_num_threads", record)
+    with c.when(c.let(f"icmp ne ptr {error}, null")):
+        _destroy(h, error)
+        c.do(f"store i64 1, ptr {number}")
+    return c.let(f"call i64 @llvm.smax.i64(i64 {c.let(f'load i64, ptr {number}')}, i64 1)")
+
+
+def _destroy(h: Handler, error: str) -> None:
+    """Gives an error of XLA's back to it."""
+    record = h.code.record(ffi.ErrorDestroy, error=error)
+    destroy = h.code.get(h.api, ffi.Api, "error_destroy")
+    h.code.do(f"call void {destroy}(ptr {record})")
+
+
+def _job(h: Handler, users: str) -> str:
+    """A new record of the call."""
+    c, arrays = h.code, h.layout.arrays
+    size = Job.arrays.offset + 8 * len(arrays)
+    job = c.let(f"call ptr @malloc(i64 {size})")
+    with c.when(c.let(f"icmp eq ptr {job}, null")):
+        h.fail(ffi.RESOURCE_EXHAUSTED, h.message(f"kernel {h.name}: no memory for a call's record"))
+    for field, value in (("next", 0), ("done", 0), ("users", users), ("blocks", h.blocks)):
+        c.put(job, Job, field, value)
+    first = c.at(job, Job, "arrays")
+    for k in range(len(arrays)):
+        c.do(f"store ptr {h.data.get(k, 'null')}, ptr {c.byte(first, 8 * k)}")
+    return job
+
+
+def _schedule(h: Handler, job: str, workers: str) -> None:
+    """Gives XLA's threads one task less than there are workers: the caller is one of them."""
+    c, count = h.code, h.code.local("i64")
+    record = c.record(ffi.Schedule, ctx=h.ctx, task="@task", data=job)
+    c.do(f"store i64 1, ptr {count}")
+    c.start("schedule")
+    number = c.let(f"load i64, ptr {count}")
+    with c.when(c.let(f"icmp slt i64 {number}, {workers}")):
+        c.do(f"store i64 {c.let(f'add i64 {number}, 1')}, ptr {count}")
+        error = h.call("thread_pool_schedule", record)
+        with c.when(c.let(f"icmp ne ptr {error}, null")):
+            _destroy(h, error)
+            missing = c.let(f"sub i64 {workers}, {number}")
+            c.do(f"atomicrmw sub ptr {c.at(job, Job, 'users')}, i64 {missing} monotonic")
+            c.do(f"store i64 {workers}, ptr {count}")
+        c.end("br label %schedule")
+
+
+def _wait(c: Code, job: str, begun: str) -> None:
+    """Waits until as many blocks are done as were begun."""
+    looks, pause = c.local("i64"), c.local("[2 x i64]")
+    c.do(f"store i64 0, ptr {looks}")
+    c.do(f"store [2 x i64] [i64 0, i64 {_SLEEP}], ptr {pause}")
+    done = c.at(job, Job, "done")
+    c.start("wait")
+    finished = c.let(f"load atomic i64, ptr {done} acquire, align 8")
+    with c.when(c.let(f"icmp ne i64 {finished}, {begun}")):
+        look = c.let(f"load i64, ptr {looks}")
+        c.do(f"store i64 {c.let(f'add i64 {look}, 1')}, ptr {looks}")
+        with c.when(c.let(f"icmp slt i64 {look}, {_YIELDS}")):
+            c.let("call i32 @sched_yield()")
+            c.end("br label %wait")
+        c.let(f"call i32 @nanosleep(ptr {pause}, ptr null)")
+        c.end("br label %wait")

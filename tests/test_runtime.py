@@ -1,0 +1,501 @@
+"""How kernels reach XLA on a CPU: threads, checks, versions, fallback, and kept machine code."""
+
+import ctypes
+import importlib.metadata
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from codesign_jax.compiler import cache, cpu, ffi, gpu, host, launch, vector
+from codesign_jax.compiler.layout import OUTPUT, SCRATCH, Array, Layout
+from tests import frames, kernels
+
+LAYOUT = Layout(
+    (
+        Array((2, 8), "float32"),
+        Array((1, 8), "float32", shared=True),
+        Array((1, 8), "float32", OUTPUT),
+        Array((3, 8), "float32", SCRATCH),
+    ),
+    8,
+)
+
+
+@pytest.fixture(scope="module")
+def handler():
+    """Address of the handler of `kernels.body`, not registered."""
+    x, table = (jax.ShapeDtypeStruct(v.shape, v.dtype) for v in kernels.numbers(4))
+    jaxpr = launch.kernel_jaxpr(kernels.call(x, table)[0], [x, table])
+    text = cpu.block_code(jaxpr, LAYOUT) + cpu.handler_code("plain", LAYOUT)
+    return host.Loaded(host.compile(text)).function("plain")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder where kernels are kept."""
+    previous = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", previous)
+
+
+# Threads
+
+
+@pytest.mark.parametrize("pool", ["late", "at once", "threads", "refused"])
+@pytest.mark.parametrize(("threads", "blocks"), [(0, 3), (1, 3), (4, 1), (4, 2), (4, 100), (3, 0)])
+def test_any_number_of_threads_gives_the_same_bits(handler, pool, threads, blocks):
+    """One task less than threads and blocks; a pool that runs none of them in time does not matter.
+
+    Tasks that run late look at the call's record after the handler has returned.
+    """
+    x, table = kernels.numbers(blocks)
+    xla, out = frames.Xla(threads, pool), np.full((blocks, 1, 8), np.nan, np.float32)
+    assert xla.call(handler, [x, table], [out]) is None
+    alone = np.empty_like(out)
+    assert frames.Xla(1).call(handler, [x, table], [alone]) is None
+    np.testing.assert_array_equal(out, alone)
+    # Ten rounds of a map that doubles differences; a few roundings of 6e-8 in each.
+    np.testing.assert_allclose(out, kernels.expected(x, table), atol=2**10 * 4 * 6e-8)
+    wanted = max(min(threads, blocks) - 1, 0)
+    assert xla.scheduled == (min(wanted, 2) if pool == "refused" else wanted)
+    assert len(xla.destroyed) == len(xla.errors)
+    xla.run_late()
+    np.testing.assert_array_equal(out, alone)
+
+
+def test_all_cores_work():
+    """XLA's threads take a real part of the blocks of one device."""
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("one core")
+    x, table = map(jnp.asarray, kernels.numbers(200))
+    run = jax.jit(partial(kernels.run, rounds=50_000)).lower(x, table).compile()
+
+    def spent():  # nanoseconds on a core, by thread
+        tasks = Path("/proc/self/task").iterdir()
+        return {t.name: int((t / "schedstat").read_text().split()[0]) for t in tasks}
+
+    before = spent()
+    jax.block_until_ready(run(x, table))
+    took = sorted(v - before.get(k, 0) for k, v in spent().items())
+    assert took[-2] > 0.1 * took[-1] > 1e6
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_calls_of_one_program_and_of_many_threads(dtype):
+    """Several calls at once, in one program and from several threads, find the pool busy."""
+    with jax.enable_x64(True):
+        lanes = launch.block_lanes("cpu", dtype)
+        batches = [kernels.numbers(n, dtype, lanes) for n in (1, 2, 7, 64)]
+        batches = jax.tree.map(jnp.asarray, batches)
+        program = jax.jit(lambda b: [kernels.run(x, t, 500) for x, t in b])
+        program = program.lower(batches).compile()
+        want = program(batches)
+        alone = [jax.jit(partial(kernels.run, rounds=500))(x, t) for x, t in batches]
+        found = []
+        call = [lambda: found.append(jax.block_until_ready(program(batches)))] * 4
+        threads = [threading.Thread(target=c) for c in call]
+        for t in threads:
+            t.start()
+        for t in threads:
+            t.join()
+    assert len(found) == 4
+    for got in [alone, *found]:
+        jax.tree.map(np.testing.assert_array_equal, want, got)
+
+
+def test_subnormal_numbers_are_the_same_on_every_thread():
+    """XLA's threads and the caller's treat numbers near 0 alike."""
+    x, table = kernels.numbers(400)
+    x[:], table[:] = 1e-30, 1e-12  # 200 rounds leave 1e-30 times 3.9**200, so none are left
+    x[:, 1] = 0.0
+    got = np.asarray(jax.jit(partial(kernels.run, rounds=0))(x, table))
+    assert len(np.unique(got)) == 1
+
+
+def test_blocks_of_another_number_need_no_other_code(monkeypatch):
+    """The machine code does not know how many blocks there are."""
+    jax.jit(kernels.run)(*kernels.numbers(2))
+    monkeypatch.setattr(vector, "write", lambda *_: pytest.fail("written again"))
+    x, table = kernels.numbers(5)
+    got = jax.jit(kernels.run)(x, table)
+    np.testing.assert_allclose(got, kernels.expected(x, table), atol=2**10 * 4 * 6e-8)
+
+
+DEVICES = """
+import jax, sys
+jax.config.update("jax_num_cpu_devices", 3)
+jax.config.update("jax_compilation_cache_dir", sys.argv[1])
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec as P
+from codesign_jax.compiler import vector
+from tests import kernels
+vector.write = None  # the machine code is there
+x, table = kernels.numbers(12)
+alone = jax.jit(kernels.run)(x, table)
+mesh = Mesh(np.array(jax.devices()), ("device",))
+for check in (False, True):
+    share = jax.shard_map(
+        kernels.run, mesh=mesh, in_specs=(P("device"), P()), out_specs=P("device"), check_vma=check
+    )
+    got = jax.jit(share)(x, table)
+    assert len(got.devices()) == 3
+    np.testing.assert_array_equal(got, alone)
+try:
+    jax.jit(jax.shard_map(kernels.run, mesh=mesh, in_specs=(P("device"), P()), out_specs=P()))(
+        x, table
+    )
+except ValueError as error:
+    assert "out_specs" in str(error), error
+else:
+    raise AssertionError("results that differ between devices were taken for equal ones")
+"""
+
+
+def test_kept_code_runs_in_another_process_on_several_devices(folder):
+    """Shares of `shard_map` use the pool together; XLA knows that their results differ."""
+    x, table = kernels.numbers(12)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host, "known", lambda name: False)  # another test may have compiled it
+        patch.setattr(host, "register", lambda *_: None)
+        jax.jit(kernels.run).lower(x, table)
+    assert list(folder.rglob("*.kernel"))
+    here = {**os.environ, "PYTHONPATH": os.pathsep.join([".", *sys.path])}
+    done = subprocess.run(
+        [sys.executable, "-c", DEVICES, str(folder)],
+        env=here,
+        cwd=Path(__file__).parent.parent,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+# What a handler refuses
+
+
+def test_arrays_of_another_kind_are_refused():
+    """By XLA's own call: an exception that names the array, and nothing is written."""
+    x, table = kernels.numbers(3)
+    lowered = jax.jit(kernels.run).lower(x, table).as_text()
+    name = next(w for w in lowered.replace("@", " ").replace("(", " ").split() if "kernel_" in w)
+    out = jax.ShapeDtypeStruct((3, 1, 8), np.float32)
+
+    def call(x, table, out=out):
+        return jax.block_until_ready(jax.jit(lambda *a: jax.ffi.ffi_call(name, out)(*a))(x, table))
+
+    call(x, table)
+    wrong = {
+        "array 0 to be input": (x[:, :, :4], table),
+        "array 0 to be": (x[0], table),
+        "array 1 to be input float32.1, 1, 8.": (x, np.concatenate([table] * 3)),
+        "array 1 to be input": (x, table.astype(np.int32)),
+        "array 2 to be output": (x, table, jax.ShapeDtypeStruct((4, 1, 8), np.float32)),
+        "2 inputs": None,
+    }
+    for message, arguments in wrong.items():
+        with pytest.raises(Exception, match=f"INVALID_ARGUMENT.*needs {message}"):
+            if arguments is None:
+                jax.block_until_ready(jax.ffi.ffi_call(name, out)(x))
+            else:
+                call(*arguments)
+
+
+@pytest.mark.parametrize("structure", ["args", "buffer"])
+def test_smaller_structures_are_refused(handler, structure, monkeypatch):
+    """A structure that ends early is not read."""
+    (x, table), out = kernels.numbers(2), np.zeros((2, 1, 8), np.float32)
+    kind = {"args": ffi.Arguments, "buffer": ffi.Buffer}[structure]
+    size = ffi.size
+    monkeypatch.setattr(ffi, "size", lambda s: size(s) - 8 * (s is kind))
+    xla = frames.Xla()
+    code, message = xla.call(handler, [x, table], [out])
+    assert code == ffi.INVALID_ARGUMENT and "plain needs" in message and not out.any()
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_missing_memory_is_an_error(threads):
+    """Scratch memory of a petabyte: the call fails, and says why."""
+    large = Layout((*LAYOUT.arrays[:3], Array((2**40, 256), "float32", SCRATCH)), 8)
+    block = "define internal void @block(ptr %a, ptr %b, ptr %c, ptr %d) {\nret void\n}\n"
+    loaded = host.Loaded(host.compile(block + cpu.handler_code("large", large)))
+    (x, table), out = kernels.numbers(8), np.zeros((8, 1, 8), np.float32)
+    xla = frames.Xla(threads, "threads")
+    code, message = xla.call(loaded.function("large"), [x, table], [out])
+    xla.run_late()
+    assert code == ffi.RESOURCE_EXHAUSTED and "scratch" in message
+
+
+def test_wrong_arguments_of_a_launch():
+    """Before anything is compiled."""
+    x, table = kernels.numbers(3)
+    with pytest.raises(ValueError, match=r"array 1 of shape \(3, 1, 8\) is shared"):
+        jax.jit(kernels.run)(x, np.concatenate([table] * 3))
+    function, outputs = kernels.call(x, table)
+    with pytest.raises(ValueError, match=r"array 1 of shape \(1, 1, 8\) must have 3 blocks"):
+        launch.launch(function, (x, table), outputs, launch.Kernel("none", "cpu", 8))
+    with pytest.raises(ValueError, match="array 2 is an output"):
+        launch.describe((x[:1],), [table, table], launch.Kernel("none", "cpu", 8, shared=(2,)))
+
+
+# The interface's version and structures
+
+
+def test_structures_are_those_of_the_header(tmp_path):
+    """Places and sizes as a C compiler finds them in the installed header."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    names = {
+        "XLA_FFI_Metadata": ffi.Metadata,
+        "XLA_FFI_Metadata_Extension": ffi.MetadataExtension,
+        "XLA_FFI_Api_Version": ffi.Version,
+        "XLA_FFI_Buffer": ffi.Buffer,
+        "XLA_FFI_Args": ffi.Arguments,
+        "XLA_FFI_Rets": ffi.Arguments,
+        "XLA_FFI_Attrs": ffi.Attributes,
+        "XLA_FFI_CallFrame": ffi.CallFrame,
+        "XLA_FFI_Api": ffi.Api,
+        "XLA_FFI_Error_Create_Args": ffi.ErrorCreate,
+        "XLA_FFI_Error_Destroy_Args": ffi.ErrorDestroy,
+        "XLA_FFI_Stream_Get_Args": ffi.StreamGet,
+        "XLA_FFI_ThreadPool_Schedule_Args": ffi.Schedule,
+        "XLA_FFI_ThreadPool_NumThreads_Args": ffi.NumThreads,
+    }
+    functions = {
+        "error_create": "Error_Create",
+        "error_get_message": None,  # renamed since
+        "error_destroy": "Error_Destroy",
+        "handler_register": "Handler_Register",
+        "stream_get": "Stream_Get",
+        "type_register": "Type_Register",
+        "execution_context_get": None,
+        "state_set": "State_Set",
+        "state_get": "State_Get",
+        "device_memory_allocate": "DeviceMemory_Allocate",
+        "device_memory_free": "DeviceMemory_Free",
+        "thread_pool_schedule": "ThreadPool_Schedule",
+        "thread_pool_num_threads": "ThreadPool_NumThreads",
+    }
+    other = {("XLA_FFI_Args", "values"): "args", ("XLA_FFI_Rets", "values"): "rets"}
+    lines, want = [], []
+    for name, structure in names.items():
+        for field, _ in structure._fields_:
+            theirs = other.get((name, field), field)
+            if structure is ffi.Api and field in functions:
+                if functions[field] is None:
+                    continue
+                theirs = "XLA_FFI_" + functions[field]
+            at = f"offsetof({name}, {theirs}), sizeof((({name}*)0)->{theirs})"
+            lines.append(f'printf("{name}.{field} %zu %zu\\n", {at});')
+            place = getattr(structure, field)
+            want.append(f"{name}.{field} {place.offset} {place.size}")
+    codes = [f"XLA_FFI_Error_Code_{n}" for n in ("INVALID_ARGUMENT", "RESOURCE_EXHAUSTED")]
+    lines += [f'printf("%d\\n", {n});' for n in (*codes, "XLA_FFI_Extension_Metadata")]
+    want += [str(n) for n in (ffi.INVALID_ARGUMENT, ffi.RESOURCE_EXHAUSTED, ffi.METADATA)]
+    (tmp_path / "a.c").write_text(
+        f'#include <stdio.h>\n#include "{ffi.header()}"\nint main() {{ {" ".join(lines)} }}\n'
+    )
+    subprocess.run([compiler, "-w", "a.c", "-o", "a"], cwd=tmp_path, check=True)
+    done = subprocess.run([tmp_path / "a"], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == want
+    text = ffi.header().read_text()
+    for name, number in ffi.DTYPES.items():
+        letters = {"int": "S", "uint": "U", "float": "F", "bfloat": "BF"}
+        kind = name.rstrip("0123456789")
+        theirs = "PRED" if name == "bool" else letters[kind] + name[len(kind) :]
+        assert f"XLA_FFI_DataType_{theirs} = {number}," in text
+
+
+def test_a_newer_version_is_refused_by_xla(monkeypatch):
+    """Which checks the version that handlers claim; the next kernel runs as before."""
+    x, table = kernels.numbers(2)
+    monkeypatch.setattr(ffi, "MINOR", 99)
+    with pytest.raises(launch.KernelUnavailable, match=r"API version \(0\.99\) is incompatible"):
+        jax.jit(partial(kernels.run, rounds=3)).lower(x, table)
+    monkeypatch.undo()
+    jax.jit(partial(kernels.run, rounds=4))(x, table)
+
+
+def test_smaller_structures_of_xla_are_told(monkeypatch):
+    """Handlers written for an interface with more functions than XLA has."""
+
+    class More(ctypes.Structure):
+        _fields_ = [*ffi.Api._fields_, ("more", ctypes.c_void_p * 40)]
+
+    x, table = kernels.numbers(2)
+    monkeypatch.setattr(ffi, "Api", More)
+    with pytest.raises(launch.KernelUnavailable, match="XLA's functions has .* bytes; handlers"):
+        jax.jit(partial(kernels.run, rounds=5)).lower(x, table)
+
+
+# Where kernels cannot run
+
+
+def no(module):
+    def imports(name, *args, **kwargs):
+        if name.startswith(module):
+            raise ImportError(f"No module named {name!r}")
+        return original(name, *args, **kwargs)
+
+    import builtins
+
+    original = builtins.__import__
+    return imports
+
+
+def gpus(monkeypatch, capability, kind="NVIDIA T4"):
+    device = SimpleNamespace(device_kind=kind, compute_capability=capability)
+    monkeypatch.setattr(jax, "local_devices", lambda backend: [device])
+
+
+def old_llvmlite(monkeypatch):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.44.1")
+
+
+def no_llvmlite(monkeypatch):
+    monkeypatch.setattr("builtins.__import__", no("llvmlite"))
+
+
+def old_header(monkeypatch):
+    monkeypatch.setattr(ffi, "installed_version", lambda: (0, 2))
+
+
+def new_major(monkeypatch):
+    monkeypatch.setattr(ffi, "installed_version", lambda: (1, 0))
+
+
+def no_header(monkeypatch):
+    ffi.installed_version.cache_clear()
+    monkeypatch.setattr(ffi, "header", lambda: Path("nowhere"))
+
+
+def old_gpu(monkeypatch):
+    gpus(monkeypatch, "7.5")
+
+
+def rocm(monkeypatch):
+    gpus(monkeypatch, "gfx90a", "AMD Instinct")
+
+
+def no_driver(monkeypatch):
+    gpus(monkeypatch, "9.0")
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: (_ for _ in ()).throw(OSError("no libcuda")))
+
+
+def old_driver(monkeypatch):
+    def version(pointer):
+        pointer._obj.value = 11080
+        return 0
+
+    library = SimpleNamespace(cuInit=lambda _: 0, cuDriverGetVersion=version)
+    gpus(monkeypatch, "9.0")
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: library)
+
+
+@pytest.mark.parametrize(
+    ("platform", "cause", "reason"),
+    [
+        ("cpu", old_llvmlite, "llvmlite 0.44.1 is older than 0.45"),
+        ("cpu", no_llvmlite, "llvmlite, which compiles kernels, cannot be imported"),
+        ("cpu", old_header, r"version 0\.2; handlers are written for 0\.3"),
+        ("cpu", new_major, r"version 1\.0; handlers"),
+        ("cpu", no_header, "the header of XLA's foreign function interface"),
+        ("gpu", old_gpu, "NVIDIA T4 has compute capability 7.5, kernels need 8.0"),
+        ("gpu", rocm, "AMD Instinct is no NVIDIA GPU"),
+        ("gpu", no_driver, "NVIDIA's driver cannot be loaded: no libcuda"),
+        ("gpu", old_driver, "supports CUDA 11.8; kernels need 12.0"),
+        ("tpu", lambda monkeypatch: None, "not for 'tpu'"),
+    ],
+)
+def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
+    """Each reason is named, and launching says the same."""
+    launch._available.cache_clear()
+    gpu.driver.cache_clear()
+    cause(monkeypatch)
+    try:
+        found = launch.available(platform)
+        assert found is not None
+        with pytest.raises(launch.KernelUnavailable, match=reason):
+            kernels.run(*kernels.numbers(2), backend=platform)
+    finally:
+        monkeypatch.undo()
+        launch._available.cache_clear()
+        gpu.driver.cache_clear()
+        ffi.installed_version.cache_clear()
+    assert launch.available("cpu") is None
+
+
+# Kept code
+
+
+def test_code_is_kept_and_damage_is_seen(folder):
+    """One file a kernel; a damaged one is built again; without a folder nothing is written."""
+    built = []
+
+    def build():
+        built.append(1)
+        return b"code"
+
+    for count in (1, 1):
+        assert cache.kept("a", build) == b"code" and len(built) == count
+    (path,) = folder.rglob("*.kernel")
+    for damage in (path.read_bytes()[:-1], b"", path.read_bytes()[:-1] + b"f"):
+        path.write_bytes(damage)
+        before = len(built)
+        assert cache.kept("a", build) == b"code" and len(built) == before + 1
+    for place in (None, "gs://bucket/cache", str(path / "none")):
+        jax.config.update("jax_compilation_cache_dir", place)
+        before = len(built)
+        assert cache.kept("a", build) == b"code" and len(built) == before + 1
+    assert list(folder.rglob("*")) == [path.parent, path] and not Path("gs:").exists()
+
+
+def test_what_is_not_used_goes(folder, monkeypatch):
+    """Ten kernels of 100 bytes under a limit of 532: four stay, the used one among them."""
+    monkeypatch.setenv(cache.LIMIT, str(4 * 132 + 4))
+    abandoned = folder / "kernels" / "x.part"
+    for k in range(10):
+        cache.kept(f"k{k}", lambda: bytes(100))
+        for n in range(k + 1):  # files of one instant have an order all the same
+            path = folder / "kernels" / f"k{n}.kernel"
+            if path.exists() and n:
+                os.utime(path, ns=(10**9 * n, 10**9 * n))
+        cache.kept("k0", lambda: pytest.fail("gone"))
+        if not k:
+            abandoned.write_bytes(b"part")
+            os.utime(abandoned, (0, 0))
+    assert {p.name for p in (folder / "kernels").iterdir()} == {
+        f"k{k}.kernel" for k in (0, 7, 8, 9)
+    }
+    monkeypatch.setenv(cache.LIMIT, "much")
+    with pytest.raises(ValueError, match="must be a number of bytes"):
+        cache.kept("new", lambda: b"")
+
+
+def test_sources_are_part_of_the_key(tmp_path):
+    """Another line of code in any file but in those left out is another kernel."""
+    for name in ("a.py", "deep/b.py", "report/c.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+
+    def digest():
+        cache.sources.cache_clear()
+        return cache.sources(tmp_path, ("report",))
+
+    first = digest()
+    (tmp_path / "report" / "c.py").write_text("other")
+    assert digest() == first
+    (tmp_path / "deep" / "b.py").write_text("other")
+    assert digest() != first

@@ -9,11 +9,12 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
-.PHONY: demo test test-slow stability notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo test test-gpu test-slow stability notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
+	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
 	@echo "make stability   the hard cases and their margins, docs/stability.md"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
@@ -26,6 +27,12 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+# Everything that needs a GPU; GPU=docs/data/gpu_suite_h200.json keeps what it found.
+GPU ?= runs/gpu_suite.json
+test-gpu: $(STAMP)
+	mkdir -p $(dir $(GPU))
+	$(BIN)/python scripts/gpu_suite.py --json $(GPU) $(ARGS)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow

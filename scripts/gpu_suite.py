@@ -1,0 +1,123 @@
+"""Runs everything that needs a GPU, tests and rates, and writes the result with its provenance.
+
+python scripts/gpu_suite.py --json docs/data/gpu_suite_h200.json
+
+A change of the kernel counts as done for GPUs when this ran with it on one.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from codesign_jax import scene as scenes
+from codesign_jax.benchmark import measure, work
+from codesign_jax.engines.structured import StructuredEngine
+
+SEPARATE = {"effects": {"surface": "spheres", "finger_finger": False}}
+"""Scenes whose rates are measured start from this one."""
+RATES: dict[str, dict[str, Any]] = {
+    "spheres": {},
+    "spheres, float64": {"dtype": np.float64, "worlds": 4096},
+    "spheres, 40 links": {"discretization": {"links": 40}},
+    "hull": {"effects": {"surface": "hull"}},
+    "spheres and fingers": {"effects": {"finger_finger": True}},
+    "hull and fingers": {"effects": {"surface": "hull", "finger_finger": True}},
+    "household meshes": {"objects": "household"},
+}
+WORLDS, STEPS, DISTINCT = 16384, 50, 24
+
+
+class Recorder:
+    """Remembers how each test ended."""
+
+    def __init__(self) -> None:
+        """Starts empty."""
+        self.tests: dict[str, dict[str, Any]] = {}
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Called by pytest for each phase of a test."""
+        if report.when == "call" or report.outcome != "passed":
+            self.tests[report.nodeid] = {
+                "outcome": report.outcome,
+                "seconds": round(report.duration, 2),
+            }
+
+
+def rate(name: str, values: dict[str, Any]) -> dict[str, Any]:
+    """World-steps a second of short rollouts in contact.
+
+    Args:
+      name: Name of the case.
+      values: Its overrides of the scene, object set, dtype and number of worlds.
+    """
+    values = dict(values)
+    dtype, worlds = values.pop("dtype", np.float32), values.pop("worlds", WORLDS)
+    objects = values.pop("objects", None)
+    overrides = {k: {**SEPARATE.get(k, {}), **values.get(k, {})} for k in {*SEPARATE, *values}}
+    scene = scenes.load("paper", object_set=objects, overrides=overrides)
+    # Start states are those of MuJoCo C, which has no meshes: the primitives' states serve.
+    plain = scenes.load("paper", overrides=overrides)
+    starts, ctrl = work.window(plain, DISTINCT, STEPS, distinct=DISTINCT)
+    made, _ = work.inputs(scene, work.make_worlds(scene, DISTINCT))
+    fields = made._replace(start=starts.start)
+    index = np.arange(worlds) % DISTINCT
+    with jax.enable_x64(dtype == np.float64):
+        fields, ctrl = jax.tree.map(lambda x: jax.numpy.asarray(x, dtype)[index], (fields, ctrl))
+        engine = StructuredEngine(scene)
+        run = jax.jit(lambda f, c: engine.rollout(f, c).distance[:, -1])
+        begin = time.perf_counter()
+        compiled = run.lower(fields, ctrl).compile()
+        built = time.perf_counter() - begin
+        jax.block_until_ready(compiled(fields, ctrl))
+        times = []
+        for _ in range(5):
+            begin = time.perf_counter()
+            jax.block_until_ready(compiled(fields, ctrl))
+            times.append(time.perf_counter() - begin)
+    median = float(np.median(times))
+    found = {"case": name, "worlds": worlds, "steps": STEPS, "median_s": median}
+    return {**found, "compile_s": round(built, 2), "world_steps_per_s": worlds * STEPS / median}
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--commit", help="commit of the code, for a machine without its repository")
+    parser.add_argument(
+        "--parts", nargs="+", choices=("rates", "tests"), default=["rates", "tests"]
+    )
+    arguments = parser.parse_args()
+    begin, recorder, rates, code = time.monotonic(), Recorder(), [], 0
+    provenance = measure.provenance(commit=arguments.commit)
+
+    def write() -> None:
+        result = {"provenance": provenance, "seconds": round(time.monotonic() - begin, 1)}
+        result |= {"rates": rates, "tests": recorder.tests}
+        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
+
+    for name, values in RATES.items() if "rates" in arguments.parts else ():
+        try:
+            rates.append(rate(name, values))
+        except Exception as error:  # one case must not hide the others
+            rates.append({"case": name, "failed": f"{type(error).__name__}: {error}"[:500]})
+            code = 1
+        print(rates[-1], flush=True)
+        write()
+    if "tests" in arguments.parts:
+        options = ["-m", "gpu", "-q", "-p", "no:cacheprovider", "tests"]
+        code |= int(pytest.main(options, plugins=[recorder]))
+    write()
+    return code
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

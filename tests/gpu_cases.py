@@ -1,0 +1,95 @@
+"""What the GPU suite simulates on both devices; run as a program it stores the CPU's results.
+
+python tests/gpu_cases.py RESULTS.npz
+"""
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from codesign_jax import control, cost, model, rollout
+from codesign_jax import scene as scenes
+from codesign_jax.benchmark import work
+from codesign_jax.engines.structured import StructuredEngine
+from tests import small
+
+STEPS = 230
+"""Steps of a short grasp: through the approach and the first touch into the inflation."""
+
+EFFECTS = {
+    "spheres": {},
+    "no friction, rigid arm": {"effects__friction": "none", "effects__wrist": False},
+    "full friction, neo-Hookean": {"effects__friction": "full", "effects__neo_hookean": True},
+    "no table, no gravity": {"effects__object_table": False, "effects__gravity": False},
+    "bending only": {"effects__lateral_bending": False, "effects__twist": False},
+    "air supply": {"effects__pressure_dynamics": True},
+    "hull": {"effects__surface": "hull"},
+    "fingers": {"effects__finger_finger": True},
+    "hull and fingers": {"effects__surface": "hull", "effects__finger_finger": True},
+}
+"""Effects of the scenes that are compared, by name."""
+
+GRASPS = 384
+WHOLE = {"spheres": {}, "hull and fingers": EFFECTS["hull and fingers"]}
+"""Effects of the whole grasps whose verdicts are compared."""
+
+
+def inputs(scene, count):
+    """Model fields and controls of random worlds."""
+    params, trials = small.random_worlds(scene, 3, count)
+    fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
+    return fields, jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)
+
+
+def short_scene(name):
+    """A small scene: two fingers of two links and a cylinder, or a mug from a mesh."""
+    if name == "mesh":
+        return scenes.load(
+            "paper",
+            hand_name=small.DATA / "pinch.toml",
+            object_set="household",
+            overrides={"discretization": {"links": 2}},
+        )
+    return small.pinch("cylinder", links=2, **EFFECTS[name])
+
+
+def short(name):
+    """Trace of a short grasp of five worlds, solved to rounding in float64."""
+    with jax.enable_x64(True):
+        scene = short_scene(name)
+        fields, ctrl = inputs(scene, 5)
+        engine = StructuredEngine(scene, iterations=60, evaluations=30, tolerance=1e-18)
+        run = jax.jit(partial(engine.rollout, trajectory=True))
+        trace = run(fields, ctrl[:, :STEPS])
+        assert trace.qpos.dtype == np.float64
+        return {k: np.asarray(getattr(trace, k)) for k in ("distance", "height", "qpos")}
+
+
+def paper(name):
+    """The paper's scene with effects by name."""
+    values = {key.split("__")[1]: value for key, value in WHOLE[name].items()}
+    return scenes.load("paper", overrides={"effects": values})
+
+
+def whole(name):
+    """Costs of whole grasps in the paper's scene, in float32."""
+    scene = paper(name)
+    worlds = work.make_worlds(scene, GRASPS)
+    engine = StructuredEngine(scene)
+    outcome, _ = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t))(*worlds)
+    return {"cost": np.asarray(outcome.cost), "failed": np.asarray(cost.failed(outcome.status))}
+
+
+def main(path):
+    """Stores everything."""
+    found = {f"short/{n}": short(n) for n in [*EFFECTS, "mesh"]}
+    found |= {f"whole/{n}": whole(n) for n in WHOLE}
+    np.savez(path, **{f"{n}/{k}": v for n, group in found.items() for k, v in group.items()})
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    main(sys.argv[1])

@@ -1,0 +1,106 @@
+"""The shell examples of README and docs: every command is one that the program takes."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from toy import TINY
+
+from codesign_jax import cli
+from codesign_jax.commands import evaluate, replay
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SMALL = ["--particles", "2", "--trials", "3", "--episodes", "1", "--test-trials", "0"]
+
+
+def examples(program):
+    """Arguments of every call of a program in the pages' code blocks, without comments."""
+    found = []
+    for page in PAGES:
+        blocks = re.findall(r"^```(?:bash|sh)?\n(.*?)^```", page.read_text(), re.S | re.M)
+        for line in "".join(blocks).replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
+                words = words[1:]  # variables of the environment
+            if words[:1] == [program]:
+                found.append(words[1:])
+    return found
+
+
+CODESIGN = [" ".join(words) for words in examples("codesign")]
+
+
+def test_the_pages_have_examples():
+    kinds = {example.split()[0] for example in CODESIGN}
+    assert kinds == {"optimize", "evaluate", "scenes", "replay"} and len(CODESIGN) > 10
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A working directory with the files that the examples name: a run and a set of objects."""
+    place = tmp_path_factory.mktemp("examples")
+    shutil.copy(TINY.parent / "box.toml", place / "my_objects.toml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(place / "cache"))
+        engine = ["--scene", str(TINY), "--engine", "mujoco"]
+        run = ["optimize", *engine, *SMALL, "--out", str(place / "runs" / "demo")]
+        assert cli.main(run) == 0
+    return place
+
+
+@pytest.fixture
+def here(folder, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.mark.parametrize("example", CODESIGN)
+def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch):
+    """Scene, design, files and preflight are the example's own; nothing is simulated."""
+    arguments = shlex.split(example)
+    reached = []
+    if arguments[0] == "optimize":
+        arguments.append("--dry-run")
+    elif arguments[0] == "evaluate":
+        for name in ("_evaluate", "_render"):
+            monkeypatch.setattr(evaluate, name, lambda *rest: reached.append(rest))
+    elif arguments[0] == "replay":
+        monkeypatch.setattr(replay, "main", lambda options: reached.append(options) or 0)
+    assert cli.main(arguments) == 0
+    assert bool(reached) == (arguments[0] in ("evaluate", "replay"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", [e for e in CODESIGN if not e.startswith("replay")])
+def test_every_command_runs_at_a_small_size(example, here):
+    size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"], "scenes": []}
+    arguments = shlex.split(example)
+    if arguments[0] == "optimize" and "switch" in example:
+        size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]
+    assert cli.main([*arguments, *size[arguments[0]]]) == 0
+
+
+def test_every_target_of_make_is_there():
+    named = {word for words in examples("make") for word in words}
+    rules = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.M))
+    assert named and named <= rules
+
+
+SCRIPTS = sorted({words[0] for words in examples("python")})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_script_has_the_flags_of_its_examples(script):
+    program = [sys.executable, str(ROOT / script), "--help"]
+    text = subprocess.run(program, check=True, capture_output=True, text=True).stdout
+    for words in examples("python"):
+        if words[0] == script:
+            missing = [w for w in words if w.startswith("--") and w not in text]
+            assert not missing

@@ -18,6 +18,7 @@ from codesign_jax import cli, preflight, runs
 from codesign_jax.checkpoint import Checkpoints, digest
 from codesign_jax.commands import common
 from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax.runs import columns
 from codesign_jax.runs.record import to_arrays
 from codesign_jax.types import Status
 
@@ -110,6 +111,7 @@ def test_run_folder_is_complete(finished):
     names = {p.name for p in finished.iterdir()}
     assert names >= {*RESULTS, "scene.toml", "hand.toml", "objects.toml", "provenance.json"}
     assert names >= {"checkpoints", "events.log", "figures"}
+    assert names <= {*columns.FILES, *columns.TABLES, ".lock"}, "a file that docs/files.md lacks"
     assert not list(finished.rglob("*.tmp"))
     provenance = json.loads((finished / "provenance.json").read_text())
     assert provenance["settings"]["seed"] == 3

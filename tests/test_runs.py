@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from toy import tiny
 
 from codesign_jax import codesign, files, parameters, scene
 from codesign_jax.checkpoint import digest
-from codesign_jax.runs import rates, tables
+from codesign_jax.runs import columns, rates, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.interrupts import Interrupts, Stopped
@@ -23,6 +24,8 @@ from codesign_jax.runs.progress import Progress, duration
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.types import Status
+
+ROOT = Path(__file__).parent.parent
 
 
 def settings(**changes):
@@ -145,12 +148,26 @@ def test_tables_hold_the_history_with_units(run, tmp_path):
     lengths = [float(r["length_mm"]) for r in read(tmp_path / "particles.csv")]
     np.testing.assert_allclose(lengths, 1e3 * history.population[..., 0].ravel(), rtol=1e-6)
     episodes = read(tmp_path / "episodes.csv")
-    assert [int(r["episode"]) for r in episodes] == [0, 1, 2]
+    assert [int(r["episode"]) for r in episodes] == [1, 2, 3]  # as the console counts
     for row, cost in zip(episodes, history.cost, strict=True):
         assert np.float32(row["best_cost"]) == cost.min()
     rows = read(tmp_path / "tests.csv")
     assert [int(r["trials"]) for r in rows] == [6] * 4  # three in two rounds of two, and two before
     assert [np.float32(r["test_cost"]) for r in rows] == np.asarray(test.cost).tolist()
+
+
+def test_every_file_and_column_is_described_on_the_reference_page(run, tmp_path):
+    the_scene, space, record, test = run
+    tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
+    tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
+    assert {p.name for p in tmp_path.iterdir()} == {*columns.TABLES}
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    assert page == columns.page(), "run scripts/files_page.py"
+    for name, table in columns.TABLES.items():
+        section = page.split(f"## {name}\n")[1].split("\n## ")[0]
+        designs = {f"{table.designs}{d}" for d in tables.design_columns(space)}
+        own = {*read(tmp_path / name)[0]} - designs
+        assert own and all(f"| `{column}` | " in section for column in own)
 
 
 def test_tables_by_episode_equal_tables_at_once(run, tmp_path):

@@ -1,11 +1,6 @@
 """The run folder: one run, one process at a time, and nothing in it that is not the run's.
 
-scene.toml, hand.toml, objects.toml   the resolved scene, with meshes/ if its objects have any
-provenance.json                       settings, code, versions, machine
-checkpoints/                          the last few episodes, see `checkpoint`
-episodes.csv particles.csv trials.csv tests.csv   results, see `tables`
-events.log                            what happened when
-figures/                              pictures
+`columns` has its files and what is in them.
 """
 
 import contextlib
@@ -23,15 +18,14 @@ from typing import Any
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs import scene_files
+from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
 
 _LOCK = ".lock"
 _PROVENANCE = "provenance.json"
-_TABLES = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
-_OURS = {*scene_files.NAMES, scene_files.MESHES, _PROVENANCE, *_TABLES, _LOCK}
-_OURS |= {"checkpoints", "events.log", "failures", "figures"}
+_OURS = {*FILES, *TABLES, _LOCK}
 
 
 class RunDirectory:

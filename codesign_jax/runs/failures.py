@@ -27,7 +27,7 @@ class Failure(NamedTuple):
         if the engine does not tell.
       status: Bits of `Status`.
       bad_step: First bad time step, or -1 (STUCK).
-      place: Episode, particle and trial.
+      place: Number of the episode, from 1, and indices of particle and trial.
     """
 
     design: np.ndarray
@@ -43,7 +43,7 @@ def save(folder: Path, episode: int, info: EpisodeInfo, trials: Trial) -> list[P
 
     Args:
       folder: The run folder.
-      episode: Number of the episode.
+      episode: Number of the episode, from 1.
       info: Its report.
       trials: Its trials, leading axis (trial,).
     """

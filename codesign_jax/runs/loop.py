@@ -203,7 +203,7 @@ class _Loop:
             return
         plan = self.plan
         trials = codesign.episode_trials(plan.scene, key, e, plan.settings.trials)
-        for path in failures.save(self.run_directory.path, e, info, trials):
+        for path in failures.save(self.run_directory.path, e + 1, info, trials):
             self.run_directory.log(f"failed world: codesign replay {path}")
 
     def _compile(self) -> EpisodeFunction:

@@ -1,4 +1,4 @@
-"""Results as CSV, units in the column names; a resumed run writes the same bytes.
+"""Results as CSV, units in the column names (see `columns`); a resumed run writes the same bytes.
 
 Numbers have nine significant digits, which name a float32 exactly.  Times of day and durations are
 in events.log.
@@ -14,6 +14,7 @@ import numpy as np
 from codesign_jax import types
 from codesign_jax.codesign import FinalTest
 from codesign_jax.parameters import DesignSpace
+from codesign_jax.runs.columns import TABLES
 from codesign_jax.runs.record import History
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status
@@ -42,13 +43,13 @@ def write_episodes(
     """
     span = range(start, stop)
     designs = design_columns(space)
-    head = ["episode", "mean_cost", "best_cost", "failed_trials", "effective_sample_size"]
-    _write(folder / "episodes.csv", head + _best(designs), _episodes(history, space, span), start)
-    head = ["episode", "particle", "cost", "weight", "next_copies_particle", *designs]
-    _write(folder / "particles.csv", head, _particles(history, space, span), start)
-    head = ["episode", "particle", "trial", "object", "cost", "lost_time_s", "status"]
-    head.append("first_bad_step")
-    _write(folder / "trials.csv", head, _trials(history, scene, span), start)
+    rows = {
+        "episodes.csv": _episodes(history, space, span),
+        "particles.csv": _particles(history, space, span),
+        "trials.csv": _trials(history, scene, span),
+    }
+    for name, values in rows.items():
+        _write(folder / name, TABLES[name].head(designs), values, start)
 
 
 def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: FinalTest) -> None:
@@ -60,13 +61,12 @@ def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: F
       particles: Final particles [SI units], shape (particle, parameter).
       test: Their test.
     """
-    head = ["particle", "test_cost", "trials", "failed_trials", "success", *design_columns(space)]
     failed = types.failed(np.asarray(test.trials.status))
     rows = (
         [i, _number(test.cost[i]), failed.shape[1], failed[i].sum(), int(test.success[i]), *design]
         for i, design in enumerate(_designs(space, particles))
     )
-    _write(folder / TESTS, head, rows, 0)
+    _write(folder / TESTS, TABLES[TESTS].head(design_columns(space)), rows, 0)
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:
@@ -86,24 +86,20 @@ def status_counts(status: np.ndarray) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
 
 
-def _best(designs: list[str]) -> list[str]:
-    return [f"best_{name}" for name in designs]
-
-
 def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[list]:
     for e in span:
         best = int(np.argmin(history.cost[e]))
         failed = int(types.failed(history.trials.status[e]).sum())
         size = 1 / (history.weight[e] ** 2).sum()
         costs = [_number(history.cost[e].mean()), _number(history.cost[e, best])]
-        yield [e, *costs, failed, _number(size), *_designs(space, history.population[e])[best]]
+        yield [e + 1, *costs, failed, _number(size), *_designs(space, history.population[e])[best]]
 
 
 def _particles(history: History, space: DesignSpace, span: range) -> Iterator[list]:
     for e in span:
         for i, design in enumerate(_designs(space, history.population[e])):
             numbers = [_number(history.cost[e, i]), _number(history.weight[e, i])]
-            yield [e, i, *numbers, history.ancestors[e, i], *design]
+            yield [e + 1, i, *numbers, history.ancestors[e, i], *design]
 
 
 def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
@@ -113,7 +109,7 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
             numbers = [_number(trials.cost[e, i, t]), _number(trials.lost_time[e, i, t])]
             status = status_names(trials.status[e, i, t])
             bad_step = int(trials.bad_step[e, i, t])
-            row = [e, i, t, names[t % len(names)], *numbers, status]
+            row = [e + 1, i, t, names[t % len(names)], *numbers, status]
             yield [*row, bad_step if bad_step >= 0 else ""]
 
 

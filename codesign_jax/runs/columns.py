@@ -1,0 +1,144 @@
+"""What is in a run folder: every file, and every column of its tables with unit and meaning.
+
+`runs.tables` writes these columns and no others; `scripts/files_page.py` writes docs/files.md.
+"""
+
+import dataclasses
+
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.types import WARNINGS, Status
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A table of results.
+
+    Attributes:
+      rows: What a row is.
+      columns: Meaning of each column, by its name, in the file's order.
+      designs: What precedes the names of the design's columns, which come last; None without them.
+      design: What design they hold.
+    """
+
+    rows: str
+    columns: dict[str, str]
+    designs: str | None = None
+    design: str = ""
+
+    def head(self, designs: list[str]) -> list[str]:
+        """Names of all columns.
+
+        Args:
+          designs: Names of the free parameters with units; see `tables.design_columns`.
+        """
+        own = [*self.columns]
+        return own if self.designs is None else own + [self.designs + name for name in designs]
+
+
+_EPISODE = "number of the episode, from 1, as on the console"
+_PARTICLE = "index of the particle, from 0"
+_FAILED = "trials that failed: they say nothing about the grasp (see `status`)"
+
+TABLES = {
+    "episodes.csv": Table(
+        "an episode",
+        {
+            "episode": _EPISODE,
+            "mean_cost": "mean of the particles' costs",
+            "best_cost": "lowest of the particles' costs",
+            "failed_trials": _FAILED,
+            "effective_sample_size": "1 / sum of the squared weights: particles that resampling "
+            "could keep, from 1 to all",
+        },
+        "best_",
+        "the particle of the lowest cost, as simulated",
+    ),
+    "particles.csv": Table(
+        "a particle of an episode",
+        {
+            "episode": _EPISODE,
+            "particle": _PARTICLE,
+            "cost": "mean cost of its trials by the scene's rule for failed ones (`cost.failure`): "
+            "left out, or counted with `cost.maximum`",
+            "weight": "its weight in the resampling; the weights of an episode sum to 1",
+            "next_copies_particle": "the particle of this episode that the next episode's particle "
+            "of this index is copied from, before it moves",
+        },
+        "",
+        "the particle as simulated",
+    ),
+    "trials.csv": Table(
+        "a trial of a particle of an episode",
+        {
+            "episode": _EPISODE,
+            "particle": _PARTICLE,
+            "trial": "index of the trial, from 0; trial t is the same object and noise for every "
+            "particle of the episode",
+            "object": "name of the object",
+            "cost": "`cost.maximum` * (t_end - t_lost) / (t_end - t_0): 0 if kept, the maximum if "
+            "lost as the lift begins or if the trial failed. t_0 is the end of inflation, t_end "
+            "that of the disturbance, t_lost `lost_time_s`",
+            "lost_time_s": "first time from t_0 to t_end at which the object's centre is "
+            "`cost.lost_distance` or more from the hand's, the mean position of its finger "
+            "segments [s]; inf if it was kept",
+            "status": "OK, or the bits of `codesign_jax.types.Status` joined by +; "
+            f"{Status(WARNINGS).name} is a warning, every other bit makes the trial a failed one",
+            "first_bad_step": "time step at which the trial failed, from 0; empty if it did not",
+        },
+    ),
+    "tests.csv": Table(
+        "a final particle in the final test",
+        {
+            "particle": _PARTICLE,
+            "test_cost": "mean cost of its trials by the scene's rule for failed ones",
+            "trials": "its trials: the last episode's and the test's",
+            "failed_trials": _FAILED,
+            "success": f"1 if the test's cost is below {SUCCESS_COST}, else 0",
+        },
+        "",
+        "the particle",
+    ),
+}
+
+FILES = {
+    "scene.toml": "the scene as simulated, every value with its unit; it names the two files below",
+    "hand.toml": "the hand",
+    "objects.toml": "the objects",
+    "meshes": "mesh files of the objects, if there are any",
+    "provenance.json": "settings, command lines of start, resumptions and extensions, versions of "
+    "code and packages, machine",
+    "checkpoints": "state after each of the last episodes, with SHA-256 digests",
+    "events.log": "what happened when, with the wall time of each episode",
+    "failures": "worlds that failed, at most ten an episode, for `codesign replay`",
+    "figures": "pictures",
+}
+
+
+def page() -> str:
+    """The reference page, Markdown."""
+    lines = [
+        "# Files of a run",
+        "",
+        "Generated from `codesign_jax/runs/columns.py`; do not edit.",
+        "",
+    ]
+    lines += [
+        "`codesign optimize` writes a folder. Its tables are CSV in UTF-8: a line of names, numbers"
+    ]
+    lines += ["with nine significant digits, which name a float32 exactly. Costs have no unit.", ""]
+    lines += ["| file | content |", "| --- | --- |"]
+    lines += [f"| `{name}` | {text} |" for name, text in FILES.items()]
+    lines += [f"| `{name}` | a row for {table.rows} |" for name, table in TABLES.items()]
+    for name, table in TABLES.items():
+        lines += ["", f"## {name}", "", f"A row for {table.rows}.", ""]
+        lines += ["| column | meaning |", "| --- | --- |"]
+        lines += [f"| `{column}` | {text} |" for column, text in table.columns.items()]
+        if table.designs is not None:
+            example = f"`{table.designs}length_mm`, `{table.designs}pressure_0_kPa`"
+            lines += [
+                f"| {example}, ... | {table.design}: a column for each free parameter of the "
+            ]
+            lines[-1] += (
+                "design space, its name and the hand file's unit; numbers are finger indices |"
+            )
+    return "\n".join(lines) + "\n"

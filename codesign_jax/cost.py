@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from codesign_jax import verdict
 from codesign_jax.scene import Scene
 from codesign_jax.types import WARNINGS, Outcome, Status, Trace, failed
 
@@ -21,21 +22,16 @@ def outcome(scene: Scene, trace: Trace, initial: jax.Array | int = 0) -> Outcome
       trace: Trace of one world, arrays of shape (time,).
       initial: Bits of `Status` that the world starts with, shape () int32.
     """
-    steps = trace.distance.shape[0]
-    time = np.arange(steps) * scene.discretization.timestep
-    (start, end), dtype = scene.window, trace.distance.dtype
-    # Half a step of slack: k * timestep is not exactly the phase's end in floating point.
-    slack = scene.discretization.timestep / 2
-    window = (time >= start - slack) & (time < end - slack)
-    lost_step = _first(window & (trace.distance >= scene.cost.lost_distance))
-    bits = _failures(scene, trace)
+    steps, (start, end), dtype = trace.distance.shape[0], scene.window, trace.distance.dtype
+    lost_step = _first(verdict.lost(scene, trace.distance, np.arange(steps)))
+    bits = verdict.failures(scene, trace)
     bits = bits.at[0].set(bits[0] | jnp.asarray(initial, jnp.int32))
     bad_step = _first(bits != 0)
     bad = bad_step < lost_step
     lost = (lost_step < steps) & ~bad
     lost_time = jnp.where(lost, lost_step * scene.discretization.timestep, jnp.inf).astype(dtype)
     cost = scene.cost.maximum * (end - jnp.where(lost, lost_time, end)) / (end - start)
-    stuck = _bit(_stuck(scene, trace) & ~lost & ~bad, Status.STUCK)
+    stuck = verdict.as_bit(_stuck(scene, trace) & ~lost & ~bad, Status.STUCK)
     status = bad * bits[jnp.minimum(bad_step, steps - 1)] | stuck
     status |= _warnings(trace, jnp.minimum(bad_step, lost_step))
     cost = jnp.where(failed(status), scene.cost.maximum, cost)
@@ -69,23 +65,6 @@ def _first(condition: jax.Array) -> jax.Array:
     return jnp.where(condition.any(), jnp.argmax(condition), steps).astype(jnp.int32)
 
 
-def _failures(scene: Scene, trace: Trace) -> jax.Array:
-    """Status bits of every step, shape (time,) int32."""
-    finite = jnp.isfinite(trace.speed) & jnp.isfinite(trace.distance)
-    below = trace.height < -scene.limits.penetration
-    bits = _bit(~finite, Status.NONFINITE)
-    bits |= _bit(trace.speed > scene.limits.speed, Status.SPEED) | _bit(below, Status.PENETRATION)
-    if trace.status is not None:
-        told = jnp.asarray(trace.status, jnp.int32)
-        bits |= jnp.where(failed(told), told, jnp.zeros_like(told))
-    return bits
-
-
-def _bit(condition: jax.Array, bit: Status) -> jax.Array:
-    """The bit where the condition holds, int32 in every mode of JAX."""
-    return condition.astype(jnp.int32) * np.int32(bit)
-
-
 def _warnings(trace: Trace, decided: jax.Array) -> jax.Array:
     """Warnings of the steps before the one at which the trial was decided, shape () int32."""
     if trace.status is None:
@@ -94,7 +73,7 @@ def _warnings(trace: Trace, decided: jax.Array) -> jax.Array:
     steps = trace.status.shape[0]
     counts = np.arange(steps) < jnp.minimum(decided, steps - 1)
     warned = counts & ((trace.status & int(WARNINGS)) != 0)
-    return _bit(warned.any(), WARNINGS)
+    return verdict.as_bit(warned.any(), WARNINGS)
 
 
 def _stuck(scene: Scene, trace: Trace) -> jax.Array:

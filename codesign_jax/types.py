@@ -94,6 +94,14 @@ class Trial(NamedTuple):
 class Trace(NamedTuple):
     """What a rollout reports of every time step; entry k describes the state at time k * timestep.
 
+    A world that failed stays in its last good state: the one before a step to a state that is too
+    fast or not finite, and the first one below the table.  From the failure on its speed is that of
+    the failed step, and its other entries repeat.
+
+    A world that lost its object within the window of the cost is decided.  Without a trajectory it
+    stays where that happened, and its later entries repeat; with one it is simulated to the end of
+    the grasp, so that pictures and costs of one's own see all of it.  Its `Outcome` is the same.
+
     Attributes:
       distance: Object centre to hand centre [m], shape (time,).
       height: Object centre above the table [m], shape (time,).
@@ -103,8 +111,8 @@ class Trace(NamedTuple):
         (time, 0).
       status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP,
         CONTACT_OVERFLOW), shape (time,) int32, or None if it does not tell.
-      last: Generalized positions and velocities at the end, a failed world's last good state, shape
-        (nq + nv,), or None.
+      last: Generalized positions and velocities at the end, those in which a decided world stays,
+        shape (nq + nv,), or None.
     """
 
     distance: jax.Array

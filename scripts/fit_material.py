@@ -93,7 +93,7 @@ def main() -> None:
     truth = fit.Material(jnp.asarray(70e3), jnp.asarray(0.012))
     guess = fit.Material(jnp.asarray(50e3), jnp.asarray(0.006))
     measured = measure(the_scene, ctrl, truth, args.noise, args.seed)
-    engine, fields = StructuredEngine(the_scene, differentiable=True), world_fields(the_scene)
+    engine, fields = StructuredEngine(the_scene), world_fields(the_scene)
     found = fit.fit_material(engine, fields, ctrl, measured, guess, steps=args.steps)
     for name, unit in (("shear_modulus", "Pa"), ("damping_time", "s")):
         first, last, true = (float(getattr(m, name)) for m in (guess, found.material, truth))

@@ -31,9 +31,7 @@ def test_step_against_central_differences(effect):
         hand, trial = small.hand_world(scene, length=0.1)
         fields = model.model_fields(scene, jax.tree.map(jnp.asarray, hand), trial)
         fields = jax.tree.map(lambda x: x[None], fields)
-        engine = StructuredEngine(
-            scene, iterations=200, evaluations=20, tolerance=1e-26, differentiable=True
-        )
+        engine = StructuredEngine(scene, iterations=200, evaluations=20, tolerance=1e-26)
         random, lay = np.random.default_rng(0), model.layout(scene)
         qpos = np.array(fields.start[0])
         qpos[2] = 0.07

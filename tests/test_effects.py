@@ -131,9 +131,7 @@ def test_gradients_of_a_step(name):
     """The implicit derivative with respect to controls and stiffness against differences."""
     with jax.enable_x64(True):
         scene, _, fields, ctrl = setting(SETTINGS[name])
-        engine = StructuredEngine(
-            scene, iterations=100, evaluations=16, tolerance=1e-24, differentiable=True
-        )
+        engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
         # Fingers bent against the table.
         qpos = np.array(fields.start)
@@ -345,7 +343,7 @@ def test_the_kernel_does_not_run_what_it_lacks(monkeypatch):
         return run
 
     monkeypatch.setattr(StructuredEngine, "_one_kernel", taken("kernel"))
-    monkeypatch.setattr(StructuredEngine, "_rollout", taken("batch"))
+    monkeypatch.setattr(StructuredEngine, "_batch", taken("batch"))
     ctrl = jnp.zeros((1, 2, 8), jnp.float32)
     for values, way in (
         ({}, "kernel"),
@@ -357,7 +355,7 @@ def test_the_kernel_does_not_run_what_it_lacks(monkeypatch):
     ):
         engine = StructuredEngine(effects_scene(values), kernel=True)
         with pytest.raises(RuntimeError, match=way):
-            engine.rollout(None, ctrl)
+            engine.simulate(None, ctrl)
 
 
 def test_kernel_without_palm_on_table():

@@ -67,7 +67,7 @@ def short_grasp():
 
 def tight(scene, kind=StructuredEngine):
     """An engine whose solver converges to rounding: differences divide its error by 1e-6."""
-    return kind(scene, iterations=50, evaluations=20, tolerance=1e-24, differentiable=True)
+    return kind(scene, iterations=50, evaluations=20, tolerance=1e-24, kernel=False)
 
 
 def world(scene, design, value):

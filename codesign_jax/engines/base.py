@@ -25,12 +25,12 @@ class Engine(Protocol):
         Args:
           fields: Model fields and start states, every array with a leading world axis.
           ctrl: Controls, shape (world, time, nu).
-          trajectory: Whether to return qpos of every step.
+          trajectory: Whether to return qpos of every step, and to simulate worlds that lost their
+            object to the end of the grasp.
 
         Returns:
-          The trace of every world, every array with a leading world axis.  A world that fails is
-          frozen at its last good state, which the trace returns; its trace shows the failure at
-          the failing step and stays there.
+          The trace of every world, every array with a leading world axis; `Trace` says what it
+          shows of worlds that are decided before the end.
         """
         ...
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
-from codesign_jax import effects
+from codesign_jax import effects, verdict
 from codesign_jax.engines.base import refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
 from codesign_jax.scene import Scene
@@ -26,6 +26,7 @@ class _Carry(NamedTuple):
     qvel: jax.Array
     warmstart: jax.Array
     speed: jax.Array
+    alive: jax.Array
 
 
 class MjxEngine:
@@ -63,31 +64,31 @@ class MjxEngine:
             return jax.vmap(lambda f, c: self._world(f, c, trajectory))(fields, ctrl)
 
     def _world(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
-        lay, limits = layout(self.scene), self.scene.limits
+        lay, scene = layout(self.scene), self.scene
         weights = jnp.asarray(lay.centre_weights, ctrl.dtype)
 
-        def body(carry: _Carry, u: jax.Array) -> tuple[_Carry, Trace]:
+        def body(carry: _Carry, x: tuple) -> tuple[_Carry, Trace]:
+            u, step = x
             data = self.reset(fields).replace(
                 qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart
             )
             new = self.step(fields, data, u)
             # Positions computed by a step belong to the state before it.
             centre, middle = weights @ new.xipos, new.xipos[lay.object]
-            entry = Trace(
-                jnp.linalg.norm(middle - centre),
-                middle[2],
-                carry.speed,
-                carry.qpos if trajectory else carry.qpos[:0],
-            )
+            distance, height = jnp.linalg.norm(middle - centre), middle[2]
+            qpos = carry.qpos if trajectory else carry.qpos[:0]
+            entry = Trace(distance, height, carry.speed, qpos)
             # The sum makes the speed not finite if any position is not.
             speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()
-            failed = ~(carry.speed <= limits.speed) | ~(middle[2] >= -limits.penetration)
-            good = ~failed & (speed <= limits.speed)
-            state = _Carry(new.qpos, new.qvel, new.qacc_warmstart, speed)
-            kept = carry._replace(speed=jnp.where(failed, carry.speed, speed))
-            return jax.tree.map(lambda a, b: jnp.where(good, a, b), state, kept), entry
+            goes_on = carry.alive & verdict.goes_on(
+                scene, distance, height, carry.speed, step, to_end=trajectory
+            )
+            moved = goes_on & verdict.slow(scene, speed)
+            state = _Carry(new.qpos, new.qvel, new.qacc_warmstart, speed, moved)
+            kept = carry._replace(speed=jnp.where(goes_on, speed, carry.speed), alive=moved)
+            return jax.tree.map(lambda a, b: jnp.where(moved, a, b), state, kept), entry
 
         zero = jnp.zeros(self.template.nv, ctrl.dtype)
-        start = _Carry(fields.start, zero, zero, jnp.zeros((), ctrl.dtype))
-        end, trace = jax.lax.scan(body, start, ctrl)
+        start = _Carry(fields.start, zero, zero, jnp.zeros((), ctrl.dtype), jnp.array(True))
+        end, trace = jax.lax.scan(body, start, (ctrl, jnp.arange(ctrl.shape[0])))
         return trace._replace(last=jnp.concatenate([end.qpos, end.qvel]))

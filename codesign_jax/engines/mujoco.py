@@ -7,7 +7,7 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from codesign_jax import effects
+from codesign_jax import effects, verdict
 from codesign_jax.engines.base import refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
 from codesign_jax.scene import Scene
@@ -23,8 +23,7 @@ _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN
 class MujocoEngine:
     """Runs worlds with MuJoCo C, whatever the float type of the caller.
 
-    Worlds that are decided (the object is lost inside the cost window, or the world failed) are not
-    simulated further; their remaining trace repeats its last entry.
+    Worlds that are decided, see `verdict`, are not simulated further.
     """
 
     name = "mujoco"
@@ -88,7 +87,6 @@ class MujocoEngine:
         )
         series = (distance, height, speed, qpos, status)
         last = np.concatenate([fields.start, np.zeros((worlds, self.template.nv))], 1)
-        start, end = (round(t / scene.discretization.timestep) for t in scene.window)
         going = np.arange(worlds)
         chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
         for first in range(0, steps, chunk):
@@ -96,27 +94,23 @@ class MujocoEngine:
             if scene.effects.neo_hookean:
                 _apply_softening(scene, batch, fields, going)
             new, taken, states = self._advance(batch, going, ctrl[going, part], trajectory)
-            for array, values in zip(series, new[:-1], strict=True):
-                array[going, part] = np.asarray(values)
-            # The cost window's end counts as lost only strictly inside it, as in `cost.outcome`.
-            time = np.arange(part.start, part.stop)
-            lost = (new.distance >= scene.cost.lost_distance) & (time >= start) & (time < end)
-            failed = ~np.isfinite(new.speed) | (new.speed > scene.limits.speed)
             # MuJoCo warned (a bad control, state or inertia, a full contact list) and stopped.
             stopped = batch.warning[going, :, 0].any(1) | (taken == 0)
-            failed |= new.height < -scene.limits.penetration
-            done = lost.any(1) | failed.any(1) | stopped
-            # The entry before the first bad one, which may be the last chunk's, or the last taken.
-            good = np.where(failed.any(1), failed.argmax(1) - 1, taken - 1)
-            here = good >= 0
-            last[going[here]] = states[here, good[here]]
-            for array in series:
-                array[going[done], part.stop :] = array[going[done], part.stop - 1][:, None]
-            for world, count in zip(going[stopped], taken[stopped], strict=True):
-                speed[world, first + count :] = np.nan
+            count = part.stop - first
+            new.speed[stopped[:, None] & (np.arange(count) >= taken[:, None])] = np.nan
+            for array, values in zip(series, new[:-1], strict=True):
+                array[going, part] = np.asarray(values)
             full = batch.warning[:, _FULL, 0].any(1)[going]
-            for world, count in zip(going[full], taken[full], strict=True):
-                status[world, first + count - 1] |= int(Status.CONTACT_OVERFLOW)
+            status[going[full], first + taken[full] - 1] |= int(Status.CONTACT_OVERFLOW)
+            entry, kept = _decisions(scene, new, first, to_end=trajectory)
+            done = (entry < count) | stopped
+            here = kept >= 0
+            last[going[here]] = states[here, kept[here]]
+            for world, at, state in zip(going[done], entry[done], kept[done], strict=True):
+                rest = slice(first + at, None)
+                for array in (distance, height, qpos, status):
+                    array[world, rest] = array[world, max(first + state, 0)]
+                speed[world, rest] = speed[world, first + at] if at < count else np.nan
             going = going[~done]
             if not going.size:
                 break
@@ -153,6 +147,31 @@ class MujocoEngine:
         kept = qpos if trajectory else qpos[..., :0]
         states = np.concatenate([qpos, qvel], -1)
         return Trace(distance, middle[..., 2], speed, kept, status), taken, states
+
+
+def _decisions(
+    scene: Scene, new: Trace, first: int, *, to_end: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """When worlds are decided within a chunk, and where they stay.
+
+    Args:
+      scene: The scene.
+      new: The chunk's trace, arrays of shape (world, step).
+      first: Index of its first step.
+      to_end: As in `verdict.goes_on`.
+
+    Returns:
+      Index of the entry that decides each world, or the number of entries, and of the entry whose
+      state it keeps: the same one, or the one before if the state is no good; shape (world,).
+    """
+    count = new.speed.shape[1]
+    entries = new.distance, new.height, new.speed
+    goes_on = verdict.goes_on(scene, *entries, first + np.arange(count), to_end=to_end)
+    entry = np.where(goes_on.all(1), count, goes_on.argmin(1))
+    at = np.minimum(entry, count - 1)[:, None]
+    distance, speed = (np.take_along_axis(v, at, 1)[:, 0] for v in (new.distance, new.speed))
+    good = (entry < count) & verdict.slow(scene, speed) & (distance <= verdict.FAR)
+    return entry, np.where(good, entry, entry - 1)
 
 
 def _rollout(

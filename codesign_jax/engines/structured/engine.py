@@ -1,13 +1,12 @@
 """Step and rollout of the structured engine behind the common interface."""
 
-import copy
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import effects
+from codesign_jax import effects, verdict
 from codesign_jax.compiler import launch
 from codesign_jax.engines.structured import (
     collision,
@@ -15,6 +14,7 @@ from codesign_jax.engines.structured import (
     hull,
     implicit,
     mesh,
+    transforms,
 )
 from codesign_jax.engines.structured.constants import WorldConstants, apply_columns, world_constants
 from codesign_jax.engines.structured.contact import Contacts
@@ -23,10 +23,11 @@ from codesign_jax.engines.structured.integration import integrate, rigid_arm
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State, kinematics
 from codesign_jax.engines.structured.lanes import Stages, total
 from codesign_jax.engines.structured.problem import Matrices, Problem, Spatial
+from codesign_jax.engines.structured.transforms import Path
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
-from codesign_jax.types import Status, Trace
+from codesign_jax.types import Status, Trace, failed
 
 
 class StepInfo(NamedTuple):
@@ -60,8 +61,6 @@ class StructuredEngine:
         iterations: int = 24,
         evaluations: int = 6,
         tolerance: float = 1e-6,
-        differentiable: bool = False,
-        checkpoint: bool = True,
         kernel: bool | None = None,
     ):
         """Prepares the engine.
@@ -71,13 +70,9 @@ class StructuredEngine:
           iterations: Largest number of Newton iterations a step.
           evaluations: Line-search evaluations an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
-          differentiable: Whether `rollout` can be differentiated: all worlds step in unison. Needs
-            a tighter tolerance, as the derivative is that of the solution.
-          checkpoint: Whether the derivative of a rollout stores only states and accelerations and
-            repeats the rest of each step; costs nothing without a derivative.
           kernel: Whether one kernel runs a rollout where it can: scenes of `in_kernel`, on a GPU in
-            float32. Without it all worlds step in unison, to the end of the rollout. By default
-            where kernels can run; elsewhere a warning says why not.
+            float32. Without it all worlds step in unison. By default where kernels can run;
+            elsewhere a warning says why not.
 
         Raises:
           KernelUnavailable: If `kernel` is true and kernels cannot run here.
@@ -87,10 +82,9 @@ class StructuredEngine:
         mesh.tables(scene)
         self.scene = scene
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
-        self.checkpoint = checkpoint
         self.conditional = jax.default_backend() == "cpu"  # see Stages
-        self.demanded, self.differentiable = bool(kernel), differentiable
-        wanted = kernel is not False and in_kernel(scene) and not differentiable
+        self.demanded = bool(kernel)
+        wanted = kernel is not False and in_kernel(scene)
         self.kernel = wanted and _has_kernel(self.demanded)
 
     def reset(self, fields: ModelFields) -> State:
@@ -115,14 +109,22 @@ class StructuredEngine:
             acc,
         )
 
-    def place(self, state: State, qpos: jax.Array, qvel: jax.Array) -> State:
-        """The state at MuJoCo's qpos (world, nq) and qvel (world, nv); see `qpos` and `qvel`."""
+    def place(
+        self, state: State, qpos: jax.Array, qvel: jax.Array, acc: jax.Array | None = None
+    ) -> State:
+        """The state at MuJoCo's qpos (world, nq) and qvel (world, nv); see `qpos` and `qvel`.
+
+        The warm start is the given one, see `flat_acc`, or the state's own.
+        """
         lay, end = layout(self.scene), 6 + layout(self.scene).dofs.size
         q, v = qpos.T[:, None], qvel.T[:, None]
 
         def finger(x: jax.Array) -> jax.Array:
             return jnp.moveaxis(x[6:end, 0].reshape(*lay.dofs.shape, -1), 0, 2)
 
+        if acc is not None:
+            a = acc.T[:, None]
+            state = state._replace(acc=Acc(a[:6], finger(a), a[end:]))
         return state._replace(
             wrist=q[:6],
             finger=finger(q),
@@ -195,7 +197,14 @@ class StructuredEngine:
     def step(
         self, hand: WorldConstants, state: State, ctrl: jax.Array, *, iterations: int | None = None
     ) -> tuple[State, StepInfo]:
-        """Advances a batch by one time step under controls of shape (nu, world)."""
+        """Advances a batch by one time step under controls of shape (nu, world).
+
+        Args:
+          hand: Constants of the worlds.
+          state: Their states.
+          ctrl: Controls, shape (nu, world).
+          iterations: As in the engine, by default its own; 0 takes the warm start for the solution.
+        """
         # The compiler does not know that a shape's index is never negative.
         run = Stages(hand.object_id[0, 0] >= 0 if self.conditional else None)
         problem, velocity = self.problem(run, hand, state, ctrl)
@@ -204,7 +213,7 @@ class StructuredEngine:
             problem,
             velocity,
             state.acc,
-            iterations=iterations or self.iterations,
+            iterations=self.iterations if iterations is None else iterations,
             evaluations=self.evaluations,
             tolerance=self.tolerance,
         )
@@ -227,66 +236,85 @@ class StructuredEngine:
         return total([every[:, f : f + 1] for f in range(n)]) / (n * links)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """See `Engine.rollout`; where it can, one kernel runs it all, see `kernel`."""
-        fits = in_kernel(self.scene)
-        if fits and self.kernel and (self.conditional or ctrl.dtype == jnp.float32):
+        """See `Engine.rollout`; what JAX's transformations make of it stands in `transforms`."""
+        return transforms.rollout(self, fields, ctrl, trajectory=trajectory)
+
+    def simulate(
+        self,
+        fields: ModelFields,
+        ctrl: jax.Array,
+        *,
+        trajectory: bool = False,
+        states: bool = False,
+    ) -> tuple[Trace, Path | None]:
+        """The rollout itself, in one kernel where there is one, see `kernel`.
+
+        Args:
+          fields: As in `Engine.rollout`.
+          ctrl: As in `Engine.rollout`.
+          trajectory: As in `Engine.rollout`.
+          states: Whether to return every step's state and accelerations.
+
+        Returns:
+          The trace, and what a derivative reads of it if states are asked for, else None.
+        """
+        record = {"trajectory": trajectory, "states": states}
+        if self.kernel and (self.conditional or ctrl.dtype == jnp.float32):
             try:
-                return self._one_kernel(fields, ctrl, trajectory=trajectory)
+                return self._one_kernel(fields, ctrl, **record)
             except launch.KernelUnavailable as error:
                 if self.demanded:
                     raise
                 launch.warn(str(error))
         with jax.default_matmul_precision("highest"):
-            return self._rollout(fields, ctrl, trajectory=trajectory)
+            return self._batch(fields, ctrl, **record)
 
-    def _one_kernel(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
+    def _one_kernel(
+        self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool, states: bool
+    ) -> tuple[Trace, Path | None]:
         from codesign_jax.engines.structured.kernel import Limits, Program
 
         # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
         limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
         program = Program.here(self.scene, limits, ctrl.dtype)
-        hand = world_constants(self.scene, fields)
-        found, end = program.simulate(hand, self.reset(fields), ctrl, trajectory=trajectory)
-        qpos = found.get("qpos", jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype))
+        hand, start = world_constants(self.scene, fields), self.reset(fields)
+        found, end = program.simulate(hand, start, ctrl, trajectory=trajectory, states=states)
+        qpos = found["qpos"] if trajectory else jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
         overflow = found["overflow"][None] > 0 if "overflow" in found else None
-        status = self._status(found["residual"], overflow)
-        return Trace(
-            found["distance"], found["height"], found["speed"], qpos, status, self._flat(end)
-        )
+        status, last = self._status(found["residual"], overflow), self.flat(end)
+        trace = Trace(found["distance"], found["height"], found["speed"], qpos, status, last)
+        if not states:
+            return trace, None
+        return trace, Path(found["qpos"], found["qvel"], found["acc"], found["moved"] > 0)
 
-    def _rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool) -> Trace:
-        hand, limits = world_constants(self.scene, fields), self.scene.limits
-        step = self._checkpointed() if self.checkpoint else self.step
+    def _batch(
+        self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool, states: bool
+    ) -> tuple[Trace, Path | None]:
+        hand, scene = world_constants(self.scene, fields), self.scene
 
-        def body(carry, u):
-            state, speed = carry
-            new, info = step(hand, state, u)
-            away = state.position - info.centre
-            entry = Trace(
-                jnp.sqrt(total([away[i, 0] ** 2 for i in range(3)])),
-                state.position[2, 0],
-                speed,
-                self.qpos(state) if trajectory else jnp.zeros((u.shape[1], 0), u.dtype),
-                self._status(info.residual[0], info.overflow),
-            )
-            new_speed = self._speed(new)
-            was_good = speed <= limits.speed
-            good = was_good & (new_speed <= limits.speed)
-            good &= state.position[2, 0] >= -limits.penetration
-            state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
-            return (state, jnp.where(was_good, new_speed, speed)), entry
+        def body(carry, x):
+            state, speed, alive = carry
+            u, t = x
+            new, info = self.step(hand, state, u)
+            away, height = state.position - info.centre, state.position[2, 0]
+            distance = jnp.sqrt(total([away[i, 0] ** 2 for i in range(3)]))
+            status = self._status(jnp.where(alive, info.residual[0], 0.0), info.overflow)
+            qpos = self.qpos(state)
+            entry = Trace(distance, height, speed, qpos if trajectory else qpos[:, :0], status)
+            goes_on = verdict.goes_on(scene, distance, height, speed, t, to_end=trajectory)
+            goes_on &= alive & ~failed(status)
+            new_speed = self.speed(new)
+            moved = goes_on & verdict.slow(scene, new_speed)
+            path = Path(qpos, self.qvel(state), self.flat_acc(info.acc), moved) if states else None
+            state = jax.tree.map(lambda a, b: jnp.where(moved, a, b), new, state)
+            return (state, jnp.where(goes_on, new_speed, speed), moved), (entry, path)
 
-        start = (self.reset(fields), jnp.zeros(ctrl.shape[0], ctrl.dtype))
-        (end, _), trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 0, -1))
-        trace = jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), trace)
-        return trace._replace(last=self._flat(end))
-
-    def _checkpointed(self):
-        """The step with a derivative that stores little; see `implicit.checkpointed`."""
-        solved = copy.copy(self)
-        solved.iterations = 0
-        limit = self.scene.limits.speed
-        return implicit.checkpointed(self.step, solved.step, lambda s: self._speed(s) <= limit)
+        worlds = ctrl[:, 0, 0]
+        start = (self.reset(fields), jnp.zeros_like(worlds), worlds == worlds)
+        steps = jnp.moveaxis(ctrl, 0, -1), jnp.arange(ctrl.shape[1])
+        (end, *_), recorded = jax.lax.scan(body, start, steps)
+        trace, path = jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), recorded)
+        return trace._replace(last=self.flat(end)), path
 
     def _status(self, residual: jax.Array, overflow: jax.Array | None = None) -> jax.Array:
         """SOLVER_CAP above the tolerance, CONTACT_OVERFLOW; int32 of the residual's shape."""
@@ -295,11 +323,16 @@ class StructuredEngine:
             return status
         return status | jnp.where(overflow[0], int(Status.CONTACT_OVERFLOW), 0)
 
-    def _flat(self, state: State) -> jax.Array:
+    def flat_acc(self, acc: Acc) -> jax.Array:
+        """Accelerations in the order of qvel, shape (world, nv); the object's as in `Acc`."""
+        finger = jnp.moveaxis(acc.finger, 2, 0).reshape(-1, acc.finger.shape[-1])
+        return jnp.concatenate([acc.wrist[:, 0], finger, acc.object[:, 0]]).T
+
+    def flat(self, state: State) -> jax.Array:
         """Generalized positions and velocities, shape (world, nq + nv)."""
         return jnp.concatenate([self.qpos(state), self.qvel(state)], 1)
 
-    def _speed(self, state: State) -> jax.Array:
+    def speed(self, state: State) -> jax.Array:
         """Largest absolute generalized velocity; not finite if any velocity or position is not."""
         qvel, qpos = self.qvel(state), self.qpos(state)
         return jnp.abs(qvel).max(1) + 0.0 * qpos.sum(1)

@@ -1,4 +1,4 @@
-"""Reverse-mode derivatives of the structured engine: implicit solve and steps that store little.
+"""Reverse-mode derivative of a step's solution by the implicit function theorem.
 
 The accelerations a of a step are where the gradient of its objective vanishes,
   F(a, theta) = M a - tau - J' f(J a - aref) = 0,
@@ -9,16 +9,12 @@ power of the unbalanced forces along the virtual accelerations lambda, is a scal
 factored form gives without J or M.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import solver
-from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.contact import Contacts, respond
-from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.engines.structured.kinematics import Acc
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, sum_items
 from codesign_jax.engines.structured.newton import linear_solve, respond_all
 from codesign_jax.engines.structured.problem import (
@@ -147,39 +143,3 @@ def _jar(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Arra
     """J a - aref of a set of contacts."""
     speed = c.relative(relative(name, velocity, c))
     return c.relative(relative(name, motion, c)) - c.reference(speed)
-
-
-def checkpointed(step: Callable, resume: Callable, good: Callable[[State], jax.Array]) -> Callable:
-    """Returns the step with a derivative that stores only its inputs and its accelerations.
-
-    The backward pass repeats the step from its known solution, that is all of it but the solver's
-    iterations.  A world whose step failed passes no gradient; zero times a derivative that is not
-    finite would spoil its whole past.
-
-    Args:
-      step: Maps hand, state and controls to state and info with the accelerations as `acc`.
-      resume: The same step if the state's warm start is the solution.
-      good: Tells from the new state which worlds' steps succeeded, shape (world,).
-    """
-
-    @jax.custom_vjp
-    def light(hand: WorldConstants, state: State, ctrl: jax.Array):
-        return step(hand, state, ctrl)
-
-    def forward(hand: WorldConstants, state: State, ctrl: jax.Array):
-        new, info = step(hand, state, ctrl)
-        return (new, info), (hand, state._replace(acc=info.acc), ctrl)
-
-    def backward(saved: tuple, cotangent: Any):
-        (new, _), pull = jax.vjp(resume, *saved)
-        fine = good(new)
-
-        def keep(v: jax.Array) -> jax.Array:
-            if v.dtype == jax.dtypes.float0 or not v.size:
-                return v
-            return jnp.where(fine, v, 0)
-
-        return jax.tree.map(keep, pull(cotangent))
-
-    light.defvjp(forward, backward)
-    return light

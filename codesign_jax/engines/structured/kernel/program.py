@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 
+from codesign_jax import verdict
 from codesign_jax.compiler import cache
 from codesign_jax.compiler.launch import Kernel, block_lanes, launch
 from codesign_jax.engines.structured import collision
@@ -32,7 +33,7 @@ from codesign_jax.scene import Scene
 PACKAGE = Path(__file__).parents[3]
 UNRELATED = ("accuracy", "benchmark", "commands", "experiments", "optimize", "report", "runs")
 """The package's folders that no kernel depends on: they import engines, never the other way."""
-TRACE = ("distance", "height", "speed", "residual", "iterations")
+TRACE = ("distance", "height", "speed", "residual", "iterations", "moved")
 
 
 class Limits(NamedTuple):
@@ -259,7 +260,13 @@ class Program:
         return self.simulate(hand, state, ctrl)[0]
 
     def simulate(
-        self, hand: WorldConstants, state: State, ctrl: jax.Array, *, trajectory: bool = False
+        self,
+        hand: WorldConstants,
+        state: State,
+        ctrl: jax.Array,
+        *,
+        trajectory: bool = False,
+        states: bool = False,
     ) -> tuple[dict[str, jax.Array], State]:
         """Runs a rollout.
 
@@ -267,11 +274,13 @@ class Program:
           hand: Constants of the worlds.
           state: Their start states.
           ctrl: Controls, shape (world, time, nu).
-          trajectory: Whether to record qpos.
+          trajectory: Whether to record qpos, and to simulate worlds that lost their object to the
+            end.
+          states: Whether to record qpos, qvel and the accelerations of every step.
 
         Returns:
-          `trace` by name, shape (world, time), with "qpos", shape (world, time, nq), if it is
-          recorded; and the last states.
+          `trace` by name, shape (world, time), with "qpos", "qvel" and "acc", shape (world, time,
+          nq or nv), of what is recorded; and the last states.
         """
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         shared = (len(inputs),) if self.meshes else ()
@@ -284,8 +293,8 @@ class Program:
             (blocks, self.scratch.rows, self.size),
             (blocks, steps, len(self.trace), self.block),
         ]
-        if trajectory:
-            angles, places = self._path_rows()
+        if trajectory or states:
+            angles, places = self._path_rows(states)
             shapes += [(blocks, steps, angles, self.size), (blocks, steps, places, self.block)]
 
         def spec(shape: tuple[int, ...]) -> pl.BlockSpec:
@@ -294,7 +303,7 @@ class Program:
 
         outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
         call = pl.pallas_call(
-            partial(self._kernel, steps),
+            partial(self._kernel, steps, trajectory, states),
             grid=(blocks,),
             in_specs=[spec(x.shape) for x in inputs],
             out_specs=[spec(s) for s in shapes],
@@ -305,29 +314,49 @@ class Program:
         if self.backend == "interpreter":
             out = call(*inputs)
         else:
-            origin = repr((self.scene, self.limits, trajectory, cache.sources(PACKAGE, UNRELATED)))
+            code = cache.sources(PACKAGE, UNRELATED)
+            origin = repr((self.scene, self.limits, trajectory, states, code))
             kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
             out = launch(call, inputs, outputs, kernel)
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
         trace = trace.reshape(-1, steps, len(self.trace))[: ctrl.shape[0]]
         found = {name: trace[..., k] for k, name in enumerate(self.trace)}
-        if trajectory:
-            found["qpos"] = self._qpos(out[4], out[5])[: ctrl.shape[0]]
-        return found, self.unpack_state(out[0], out[1], ctrl.shape[0])
+        if trajectory or states:
+            found |= {k: v[: ctrl.shape[0]] for k, v in self._path(out[4], out[5], states).items()}
+        last = self.unpack_state(out[0], out[1], ctrl.shape[0])
+        if states:
+            # A row holds the acceleration of the step before it, the solver's warm start.
+            fingers = jnp.moveaxis(last.acc.finger, 2, 0).reshape(-1, ctrl.shape[0])
+            parts = [last.acc.wrist[:, 0], fingers, last.acc.object[:, 0]]
+            end = jnp.concatenate(parts).T[:, None]
+            found["acc"] = jnp.concatenate([found["acc"][:, 1:], end], 1)
+        return found, last
 
-    def _path_rows(self) -> tuple[int, int]:
-        """Rows of the state's tables that are positions, the first of each."""
+    def _path_rows(self, states: bool) -> tuple[int, int]:
+        """Numbers of rows of the state's tables that are recorded: all, or the positions."""
+        if states:
+            return self.finger_state.rows, self.world_state.rows
         return self.finger_state.offset["finger_vel"], self.world_state.offset["wrist_vel"]
 
-    def _qpos(self, angles: jax.Array, places: jax.Array) -> jax.Array:
-        """MuJoCo's qpos (world, time, nq) of recorded rows (block, time, row, lane or world)."""
-        steps = angles.shape[1]
-        split = (-1, steps, self.links, self.axes, self.fingers, self.block)
-        joints = angles.reshape(split)[..., : self.num_fingers, :]
-        joints = joints.transpose(0, 5, 1, 4, 2, 3)  # (block, world, time, finger, link, axis)
-        joints = joints.reshape(-1, steps, self.num_fingers * self.links * self.axes)
-        world_state = jnp.moveaxis(places, 3, 1).reshape(-1, steps, places.shape[2])
-        return jnp.concatenate([world_state[..., :6], joints, world_state[..., 6:]], -1)
+    def _path(self, fingers: jax.Array, worlds: jax.Array, states: bool) -> dict[str, jax.Array]:
+        """Coordinates of recorded rows (block, time, row, lane or world)."""
+        steps, size = fingers.shape[1], self.links * self.axes
+        names = [("qpos", "finger", ("wrist", "position", "quat"))]
+        if states:
+            names += [("qvel", "finger_vel", ("wrist_vel", "linear_vel", "angular_vel"))]
+            names += [("acc", "acc", ("acc_wrist", "acc_object"))]
+        found = {}
+        for name, joint, others in names:
+            rows = self.finger_state.offset[joint] + np.arange(size)
+            split = (-1, steps, size, self.fingers, self.block)
+            joints = fingers[:, :, rows].reshape(split)[..., : self.num_fingers, :]
+            joints = joints.transpose(0, 4, 1, 3, 2)  # (block, world, time, finger, link and axis)
+            joints = joints.reshape(-1, steps, self.num_fingers * size)
+            where = [(self.world_state.offset[o], self.world_state.groups[o][1][0]) for o in others]
+            rows = np.concatenate([np.arange(first, first + count) for first, count in where])
+            rest = jnp.moveaxis(worlds[:, :, rows], 3, 1).reshape(-1, steps, rows.size)
+            found[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
+        return found
 
     def unpack_state(self, finger_state: jax.Array, world_state: jax.Array, worlds: int) -> State:
         """Inverse of `pack_state`."""
@@ -336,7 +365,7 @@ class Program:
         acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
         return State(**wide, **narrow, acc=acc)
 
-    def _kernel(self, steps: int, *refs: Any) -> None:
+    def _kernel(self, steps: int, to_end: bool, states: bool, *refs: Any) -> None:
         (
             hand,
             world,
@@ -359,13 +388,11 @@ class Program:
         own = block.world
         _copy(finger_state0, finger_state, self.finger_state.rows)
         _copy(world_state0, world_state, self.world_state.rows, own)
-        start, end = (round(t / self.scene.discretization.timestep) for t in self.scene.window)
-        limits, far = self.scene.limits, self.scene.cost.lost_distance
         alive = self.world.read(world, "alive", 0, own).lane
 
         def record(t: jax.Array) -> None:
             if path:
-                angles, places = self._path_rows()
+                angles, places = self._path_rows(states)
                 _copy(finger_state, path[0], angles, at=(t,))
                 _copy(world_state, path[1], places, own, at=(t,))
 
@@ -373,16 +400,16 @@ class Program:
             t, alive, speed = carry
 
             def judge(distance: jax.Array, height: jax.Array) -> jax.Array:
-                lost = (distance >= far) & (t >= start) & (t < end)
-                return ~lost & (height >= -limits.penetration)
+                return verdict.goes_on(self.scene, distance, height, speed, t, to_end=to_end)
 
             record(t)
             commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)
             chamber = lanes([pressure[t]], (), wide=True)
             entry, new_speed, moved = step.advance(commands, chamber, judge, alive > 0, speed)
-            for k, value in enumerate((*entry[:2], speed, *entry[2:])):
+            alive = jnp.where(moved, alive, 0.0)
+            for k, value in enumerate((*entry[:2], speed, *entry[2:4], alive, *entry[4:])):
                 trace[t, k, own] = value
-            return t + 1, jnp.where(moved, alive, 0.0), new_speed
+            return t + 1, alive, new_speed
 
         def going(carry: tuple) -> jax.Array:
             return (carry[0] < steps) & anywhere(carry[1] > 0)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax import verdict
 from codesign_jax.engines.structured import collision, inertia
 from codesign_jax.engines.structured import kinematics as kin
 from codesign_jax.engines.structured.constants import apply_columns
@@ -70,7 +71,7 @@ class Step:
         Args:
           arm: Commands of the arm frame, shape (6, 1, world).
           pressure: Chamber pressures, lanes.
-          judge: Whether a world goes on after this step, from distance and height before it.
+          judge: Whether a world takes this step, from distance and height before it.
           waiting: Worlds whose convergence is waited for.
           speed: Largest velocity before the step.
 
@@ -100,15 +101,15 @@ class Step:
         now, quality = newton.solve(now, waiting, *p.limits)
         distance = lanewise(_distance, state["position"], state["wrist"], centre).lane
         height = state["position"][2].lane
-        goes_on = waiting & judge(distance, height)
+        goes_on, slots = waiting & judge(distance, height), []
+        if p.slotted:
+            slots = [self._overflow(bound, waiting)]
+            goes_on &= slots[0] == 0
         new_speed, good = self._integrate(state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
         # A decided world is not iterated for: what it is short of says nothing.
         residual = jnp.where(waiting, quality.residual.lane, 0.0)
-        entry = [distance, height, residual, count]
-        if p.slotted:
-            entry.append(self._overflow(bound, waiting))
-        return tuple(entry), new_speed, good
+        return (distance, height, residual, count, *slots), new_speed, good
 
     def _overflow(self, bound: dict[str, Any], waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
@@ -324,8 +325,7 @@ class Step:
         like = jnp.zeros((p.size,), self.finger_state.dtype)
         fingers = loop(p.links, link, zeros((), like), p.size).lane
         largest = _worse(size.lane, self.block.fold(fingers, _worse))
-        limit = p.scene.limits
-        good = goes_on & (speed <= limit.speed) & (largest <= limit.speed)
+        good = goes_on & verdict.slow(p.scene, largest)
         acc = {"acc_wrist": now.wrist, "acc_object": now.object}
         for name, value in {**new, **acc}.items():
             kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
@@ -340,7 +340,7 @@ class Step:
             return x
 
         jax.lax.fori_loop(0, p.links, store, jnp.int32(0))
-        return jnp.where(goes_on & (speed <= limit.speed), largest, speed), good
+        return jnp.where(goes_on, largest, speed), good
 
 
 def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, pressure, section):

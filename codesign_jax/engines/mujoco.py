@@ -114,6 +114,9 @@ class MujocoEngine:
             going = going[~done]
             if not going.size:
                 break
+        state = np.concatenate([batch.bind("qpos")[going], batch.bind("qvel")[going]], 1)
+        good = np.isfinite(state).all(1) & verdict.slow(scene, np.abs(state[:, nq:]).max(1))
+        last[going[good]] = state[good]
         return Trace(*series, last)
 
     def _advance(

@@ -9,13 +9,14 @@ cut short.  The newest step whose digests match is used.
 """
 
 import hashlib
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from codesign_jax import files
 
 Arrays = dict[str, Any]
 """Nested dictionaries of NumPy arrays; orbax stores none of size zero."""
@@ -84,7 +85,8 @@ class Checkpoints:
             if path.is_file():
                 name = path.relative_to(self.folder).as_posix()
                 lines.append(f"{_file_digest(path)}  {name}")
-        _write_atomically(self._digests(step), "\n".join(lines))
+        with files.atomically(self._digests(step)) as part:
+            part.write_text("\n".join(lines) + "\n")
         self._forget_old_digests()
 
     def restore(self) -> Restored:
@@ -151,12 +153,3 @@ def _leaves(arrays: Arrays, prefix: str = "") -> Iterator[tuple[str, np.ndarray]
             yield from _leaves(value, f"{prefix}{name}/")
         else:
             yield f"{prefix}{name}", np.asarray(value)
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w") as file:
-        file.write(text + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)

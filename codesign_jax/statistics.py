@@ -11,14 +11,14 @@ class Interval(NamedTuple):
     high: float
 
 
-def proportion(successes: int, total: int) -> Interval:
+def wilson(successes: int, total: int) -> Interval:
     """Share of successes with Wilson's score interval (Wilson 1927).
 
     Args:
       successes: Number of successes.
       total: Number of trials, at least one.
     """
-    from scipy import stats  # takes half a second to import
+    from scipy import stats  # takes half a second to import: commands do so once they are done
 
     found = stats.binomtest(successes, total).proportion_ci(0.95, method="wilson")
     return Interval(successes / total, float(found.low), float(found.high))

@@ -121,7 +121,10 @@ def test_run_folder_is_complete(finished):
 
 def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
     folder = shutil.copytree(finished, tmp_path / "copy")
+    left = folder / "trials.csv.4711.tmp"  # of a process that was killed while it wrote
+    left.write_text("half")
     assert command(*RUN, "--out", folder) == 0
+    assert not left.exists()
     assert f"all {EPISODES} episodes are done" in capsys.readouterr().out
     assert_same_run(folder, finished)
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-import scipy.stats
 from toy import ToyEngine, tiny
 
 from codesign_jax import codesign
@@ -35,6 +34,7 @@ from codesign_jax.experiments import (
 from codesign_jax.experiments.worlds import chunking
 from codesign_jax.optimize import schedule
 from codesign_jax.parameters import design_space
+from codesign_jax.statistics import wilson
 from codesign_jax.types import Outcome
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
@@ -327,10 +327,13 @@ def test_means_by_either_rule():
 
 
 @pytest.mark.parametrize(("successes", "total"), [(0, 30), (1, 30), (17, 30), (30, 30)])
-def test_wilson_is_scipys(successes, total):
-    ours = statistics.wilson(successes, total)
-    ref = scipy.stats.binomtest(successes, total).proportion_ci(method="wilson")
-    np.testing.assert_allclose(ours, [successes / total, ref.low, ref.high], atol=1e-12)
+def test_wilson_is_the_score_interval(successes, total):
+    """Its ends are the proportions q with |p - q| = z sqrt(q (1 - q) / n), z = 1.95996."""
+    value, low, high = wilson(successes, total)
+    assert value == successes / total and low <= value <= high
+    for end in (low, high):
+        distance = 1.9599639845 * np.sqrt(end * (1 - end) / total)
+        assert abs(value - end) == pytest.approx(distance, abs=1e-9)
 
 
 def test_quantiles_and_medians_with_runs_that_never_converged():

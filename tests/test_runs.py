@@ -87,11 +87,14 @@ def test_resolved_scene_ignores_the_working_directory(tmp_path, monkeypatch):
 def test_resolved_scene_names_units(tmp_path):
     write_scene(scene.load(), tmp_path)
     assert "timestep = 0.01  # s\n" in (tmp_path / "scene.toml").read_text()
-    assert "shear_modulus = 56000.0  # Pa\n" in (tmp_path / "hand.toml").read_text()
+    hand = (tmp_path / "hand.toml").read_text()
+    assert "shear_modulus = 56000.0  # Pa\n" in hand
+    assert "finger = [  # azimuth in deg, radius in m, tilt in deg\n" in hand
+    assert "size = [  # m\n" in (tmp_path / "objects.toml").read_text()
 
 
 def test_text_survives_the_scene_file(tmp_path):
-    odd = 'quote " backslash \\ newline \n tab \t é 🖐'
+    odd = 'quote " backslash \\ newline \n return \r\n tab \t delete \x7f = # é 🖐'
     original = scene.load(overrides={"description": odd})
     write_scene(original, tmp_path)
     assert scene.load(tmp_path / "scene.toml").description == odd

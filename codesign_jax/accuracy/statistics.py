@@ -11,8 +11,8 @@ import scipy.stats
 from codesign_jax.accuracy import decision, impulse, tip
 from codesign_jax.accuracy.settings import Setting
 from codesign_jax.codesign import SUCCESS_COST
-from codesign_jax.experiments.statistics import Interval, wilson
 from codesign_jax.scene import load as load_scene
+from codesign_jax.statistics import Interval, wilson
 
 Records = list[dict[str, Any]]
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import sys
 import time
 import traceback
@@ -10,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from codesign_jax import files
 from codesign_jax.accuracy.settings import Setting
 from codesign_jax.benchmark import measure
 from codesign_jax.schema import SceneError
@@ -103,7 +103,5 @@ class Store:
 
     def write(self) -> None:
         """Writes the file as a whole or not at all."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.path.with_name(self.path.name + ".tmp")
-        temporary.write_text(json.dumps(self.data, separators=(",", ":")) + "\n")
-        os.replace(temporary, self.path)
+        with files.atomically(self.path) as part:
+            part.write_text(json.dumps(self.data, separators=(",", ":")) + "\n")

@@ -20,8 +20,8 @@ from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kinematics import State
-from codesign_jax.experiments.statistics import wilson
 from codesign_jax.scene import Scene
+from codesign_jax.statistics import wilson
 from codesign_jax.types import Params, failed
 
 CONTACTS = ("finger_object", "palm_object", "finger_table", "palm_table", "object_table")

@@ -111,7 +111,7 @@ def verdict(mean: float, cost: np.ndarray, status: np.ndarray) -> str:
     if not counted.any():
         return f"{text}; every trial failed, which says nothing about the grasp"
     kept, total = int((cost[counted] < limit).sum()), int(counted.sum())
-    share = statistics.proportion(kept, total)
+    share = statistics.wilson(kept, total)
     return (
         f"{text}; {kept} of {total} trials kept the object: the design keeps it in "
         f"{100 * share.low:.0f} to {100 * share.high:.0f} % of grasps (95 % interval)"

@@ -6,8 +6,9 @@ import matplotlib.figure
 import numpy as np
 
 from codesign_jax.codesign import CONVERGED_COST
-from codesign_jax.experiments.statistics import RULES, Study, quantile, regions, wilson
+from codesign_jax.experiments.statistics import RULES, Study, quantile, regions
 from codesign_jax.report.figures import cost_evolution
+from codesign_jax.statistics import wilson
 
 LABELS = {"single": "s.d.", "concurrent": "conc."}
 _COLORS = {"exclude": "tab:blue", "worst": "tab:orange"}

@@ -1,7 +1,6 @@
 """Every grasp of an experiment as a row of a Parquet file (pyarrow, the extra `parquet`)."""
 
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -9,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from codesign_jax import files
 from codesign_jax.experiments import results
 from codesign_jax.experiments.batch import Batch
 from codesign_jax.experiments.landscape import Grid
@@ -82,12 +82,12 @@ def write(path: Path, experiment: Batch | Grid, record: Arrays, notes: dict[str,
     schema = _schema(pa, experiment, notes)
     batch = isinstance(experiment, Batch)
     tables = _strategies(experiment, record) if batch else _points(experiment, record)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    with pa.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer:
+    with (
+        files.atomically(path) as part,
+        pa.parquet.ParquetWriter(part, schema, compression="zstd") as writer,
+    ):
         for columns in tables:
             writer.write_table(_table(pa, schema, columns))
-    os.replace(temporary, path)
     return path
 
 

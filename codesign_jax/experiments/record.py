@@ -3,12 +3,12 @@
 import dataclasses
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from codesign_jax import files
 from codesign_jax.checkpoint import digest
 from codesign_jax.experiments.plan import Landscape, Strategies
 from codesign_jax.runs.scene_files import scene_texts
@@ -59,18 +59,13 @@ def settings(
 
 def save(path: Path, record: Arrays, settings: dict[str, object]) -> None:
     """Writes a record with the settings it belongs to and a digest; as a whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as file:
+    with files.atomically(path) as part, part.open("wb") as file:
         np.savez_compressed(
             file,
             **record,  # type: ignore[arg-type]
             _settings=np.array(json.dumps(settings, sort_keys=True)),
             _digest=np.array(digest(record)),
         )
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
 
 
 def load(path: Path, settings: dict[str, object]) -> Arrays:

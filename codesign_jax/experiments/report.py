@@ -7,6 +7,7 @@ import numpy as np
 from codesign_jax.experiments import figures, grasp_types, statistics
 from codesign_jax.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
 from codesign_jax.experiments.statistics import RULES, Interval, Study
+from codesign_jax.statistics import wilson
 
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 """Marks between which a page's table is replaced."""
@@ -103,9 +104,9 @@ def details(study: Study) -> str:
         ]
         cells = [
             figures.label(strategy),
-            _percent(statistics.wilson(int(good[s].sum()), good[s].size)),
+            _percent(wilson(int(good[s].sum()), good[s].size)),
             p[0],
-            _percent(statistics.wilson(int(strict[s].sum()), strict[s].size)),
+            _percent(wilson(int(strict[s].sum()), strict[s].size)),
             f"{int(np.isfinite(episodes[s]).sum())}/{episodes.shape[1]}",
             f"{middle} [{low}, {high}]",
             p[1],

@@ -9,20 +9,13 @@ import numpy as np
 import scipy.stats
 
 from codesign_jax.codesign import SUCCESS_COST, convergence_episode
+from codesign_jax.statistics import Interval
 
 RULES = ("exclude", "worst")
 """Rules for failed trials under which results are evaluated; see `cost.particle_cost`."""
 
 _CONFIDENCE = 0.95
 _RESAMPLES = 10_000
-
-
-class Interval(NamedTuple):
-    """A value with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,16 +78,6 @@ def load_study(folder: Path, name: str) -> Study | None:
     return Study(notes["settings"]["plan"], notes, data)
 
 
-def wilson(successes: int, total: int) -> Interval:
-    """Wilson's score interval of a proportion (Wilson 1927)."""
-    z = float(scipy.stats.norm.ppf(0.5 + _CONFIDENCE / 2))
-    p, spread = successes / total, z * z / total
-    centre = (p + spread / 2) / (1 + spread)
-    half = np.sqrt(p * (1 - p) * spread + spread**2 / 4) / (1 + spread)
-    # Rounding must not put the proportion outside where it is zero or one.
-    return Interval(p, min(p, max(0.0, centre - half)), max(p, min(1.0, centre + half)))
-
-
 def quantile(values: np.ndarray, q: float) -> np.ndarray:
     """Quantile over the last axis, also where numbers are infinite.
 
@@ -109,6 +92,8 @@ def quantile(values: np.ndarray, q: float) -> np.ndarray:
 
 def bootstrap(values: np.ndarray, statistic, *, seed: int = 0) -> Interval:
     """Percentile bootstrap over the last axis; runs never converged take part as infinite.
+
+    SciPy's interpolates between resamples, which makes two infinite neighbours not a number.
 
     Args:
       values: Numbers of the runs, shape (..., run): leading rows are resampled together, which

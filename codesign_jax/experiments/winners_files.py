@@ -1,13 +1,13 @@
 """The winners' results and, as JSON beside them, the runs that made each call; joining both."""
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from codesign_jax import files
 from codesign_jax.experiments import record as records
 from codesign_jax.experiments.record import Arrays, StateError
 
@@ -64,12 +64,9 @@ def note(runs: list[Run], key: str) -> None:
 
 def write_runs(path: Path, settings: dict[str, Any], runs: Sequence[Run]) -> None:
     """Writes the .json of a results file; as a whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    target = path.with_suffix(".json")
-    temporary = target.with_name(target.name + ".tmp")
     kept = [run for run in runs if run["calls"]]
-    temporary.write_text(json.dumps({"settings": settings, "runs": kept}, indent=2) + "\n")
-    os.replace(temporary, target)
+    with files.atomically(path.with_suffix(".json")) as part:
+        part.write_text(json.dumps({"settings": settings, "runs": kept}, indent=2) + "\n")
 
 
 def merge(paths: Sequence[Path], out: Path) -> list[str]:

@@ -13,6 +13,7 @@ from codesign_jax.experiments.report import fill
 from codesign_jax.experiments.statistics import Interval
 from codesign_jax.experiments.winners import STANDARD, VARIANTS, Finals
 from codesign_jax.experiments.winners_files import Run
+from codesign_jax.statistics import wilson
 from codesign_jax.types import failed
 
 MARK = "winners"
@@ -137,7 +138,7 @@ def _row(
     return Row(
         name,
         cost.shape[-1],
-        statistics.wilson(int(good[won].sum()), max(int(won.sum()), 1)),
+        wilson(int(good[won].sum()), max(int(won.sum()), 1)),
         (int(good[won].sum()), int(won.sum())),
         shared,
         p,

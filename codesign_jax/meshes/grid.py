@@ -1,6 +1,6 @@
 """Signed distance on a voxel grid, as fine as a bound on its interpolation error asks for."""
 
-import os
+import contextlib
 import time
 import zipfile
 from pathlib import Path
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
+from codesign_jax import files
 from codesign_jax.meshes import surface as surfaces
 from codesign_jax.meshes.surface import Surface
 
@@ -131,8 +132,7 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> G
       faces: As for `build`.
       bound: As for `build`.
     """
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    path = root / "codesign-jax" / "meshes" / f"{key}-{_FORMAT}.npz"
+    path = files.cache_folder() / "meshes" / f"{key}-{_FORMAT}.npz"
     stored = _read(path)
     if stored is not None:
         return stored
@@ -155,12 +155,6 @@ def _read(path: Path) -> Grid | None:
 
 
 def _write(path: Path, grid: Grid) -> None:
-    """Writes beside and renames, so that nobody reads half a file; a full disk is no error."""
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, **grid._asdict())
-        os.replace(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
+    """Writes a grid to the cache; a full disk is no error."""
+    with contextlib.suppress(OSError), files.atomically(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **grid._asdict())

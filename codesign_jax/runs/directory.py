@@ -10,11 +10,13 @@ import difflib
 import fcntl
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from codesign_jax import files
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs import scene_files
@@ -68,6 +70,8 @@ def open_run(
     made = not path.exists()
     path.mkdir(parents=True, exist_ok=True)
     with _locked(path):
+        for left in path.glob("*.tmp"):
+            left.unlink()
         notes = []
         if fresh:
             _clear(path)
@@ -148,7 +152,8 @@ def _refuse_foreign(path: Path) -> None:
     if path.exists() and not path.is_dir():
         raise SceneError([f"--out {path} is a file"])
     # A killed process leaves the temporary of a file that it was replacing.
-    present = {p.name.removesuffix(".tmp") for p in path.iterdir()} if path.exists() else set()
+    present = {p.name for p in path.iterdir()} if path.exists() else set()
+    present = {re.sub(r"\.[0-9]+\.tmp$", "", name) for name in present}
     others = sorted(present - _OURS)
     if others:
         names = ", ".join(others[:3])
@@ -201,9 +206,8 @@ def _start(command: list[str]) -> dict[str, Any]:
 
 
 def _write_provenance(path: Path, content: dict[str, Any]) -> None:
-    temporary = path / (_PROVENANCE + ".tmp")
-    temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    os.replace(temporary, path / _PROVENANCE)
+    with files.atomically(path / _PROVENANCE) as part:
+        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:

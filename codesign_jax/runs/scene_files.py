@@ -1,9 +1,11 @@
 """A resolved scene as TOML: scene, hand and objects, each value with its unit."""
 
 import dataclasses
-import json
+import re
 from pathlib import Path
 from typing import Any
+
+import tomli_w
 
 from codesign_jax import scene as scenes
 from codesign_jax.objects import Shape
@@ -15,7 +17,7 @@ MESHES = "meshes"  # folder of the objects' meshes
 
 def scene_texts(scene: Scene) -> dict[str, str]:
     """Returns the three files of a resolved scene by name; the scene refers to the others."""
-    top = _fields(scene) | {"hand": "hand.toml", "objects": "objects.toml"}
+    top = _plain(scene) | {"hand": "hand.toml", "objects": "objects.toml"}
     shapes = tuple(
         dataclasses.replace(shape, file=_mesh_name(shape, i) if shape.mesh else None)
         for i, shape in enumerate(scene.objects.object)
@@ -23,8 +25,8 @@ def scene_texts(scene: Scene) -> dict[str, str]:
     objects = dataclasses.replace(scene.objects, object=shapes)
     return {
         "scene.toml": _document(top, _units(scene) | {"gravity": "m/s^2"}),
-        "hand.toml": _document(_fields(scene.hand), _units(scene.hand)),
-        "objects.toml": _document(_fields(objects), _units(objects)),
+        "hand.toml": _document(_plain(scene.hand), _units(scene.hand)),
+        "objects.toml": _document(_plain(objects), _units(objects)),
     }
 
 
@@ -55,54 +57,37 @@ def _mesh_name(shape: Shape, index: int) -> str:
 
 
 def _document(table: dict[str, Any], units: dict[str, str]) -> str:
-    lines: list[str] = []
-    _write_table(table, units, "", lines)
-    return "\n".join(lines).strip() + "\n"
+    """TOML of a table, with the units of its values as comments."""
+    lines, place = [], ""
+    for line in tomli_w.dumps(table).splitlines():
+        if header := re.fullmatch(r"\[+(.*?)\]+", line):
+            place = header[1] + "."
+        key, equals, _ = line.partition(" = ")
+        unit = units.get(place + key, "") if equals else ""
+        lines.append(f"{line}  # {unit}" if unit else line)
+    return "\n".join(lines) + "\n"
 
 
-def _write_table(table: dict[str, Any], units: dict[str, str], path: str, lines: list[str]) -> None:
-    """Writes plain values first, as TOML asks, then tables and arrays of tables."""
-    nested = {k: v for k, v in table.items() if _is_table(v) or _is_tables(v)}
-    for key, value in table.items():
-        if key not in nested:
-            unit = units.get(key, "")
-            lines.append(f"{key} = {_literal(value)}" + (f"  # {unit}" if unit else ""))
-    for key, value in nested.items():
-        name = f"{path}.{key}" if path else key
-        for item in [value] if _is_table(value) else value:
-            lines += ["", f"[{name}]" if _is_table(value) else f"[[{name}]]"]
-            _write_table(_fields(item), _units(item), name, lines)
-
-
-def _is_table(value: Any) -> bool:
-    return dataclasses.is_dataclass(value) or isinstance(value, dict)
-
-
-def _is_tables(value: Any) -> bool:
-    return isinstance(value, tuple) and bool(value) and all(_is_table(v) for v in value)
-
-
-def _fields(value: Any) -> dict[str, Any]:
-    """Key-value pairs of a dataclass or a dictionary; TOML has no null, so None is left out."""
+def _plain(value: Any) -> Any:
+    """Dataclasses as dictionaries and tuples as lists; TOML has no null, so None is left out."""
+    if dataclasses.is_dataclass(value):
+        fields = [f for f in dataclasses.fields(value) if f.metadata.get("in_file", True)]
+        value = {f.name: getattr(value, f.name) for f in fields}
     if isinstance(value, dict):
-        return value
-    fields = [f for f in dataclasses.fields(value) if f.metadata.get("in_file", True)]
-    pairs = {f.name: getattr(value, f.name) for f in fields}
-    return {k: v for k, v in pairs.items() if v is not None}
+        return {k: _plain(v) for k, v in value.items() if v is not None}
+    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
 
 
-def _units(value: Any) -> dict[str, str]:
-    if isinstance(value, dict):
-        return {}
-    return {f.name: f.metadata.get("unit", "") for f in dataclasses.fields(value)}
-
-
-def _literal(value: Any) -> str:
-    """TOML of a plain value; `repr` of a float reads back as the same number."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_literal(v) for v in value) + "]"
-    return repr(value)
+def _units(value: Any, place: str = "") -> dict[str, str]:
+    """Units of a dataclass's numbers by dotted key path; those of an array's entries are alike."""
+    found: dict[str, str] = {}
+    if isinstance(value, tuple):
+        for entry in value:
+            found |= _units(entry, place)
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            inside = _units(getattr(value, field.name), f"{place}{field.name}.")
+            # The writer puts an array of small tables under its own key, an entry a line.
+            listed = [f"{k.rpartition('.')[2]} in {u}" for k, u in inside.items() if u]
+            found |= inside | {place + field.name: field.metadata.get("unit", ", ".join(listed))}
+    return found

@@ -5,13 +5,12 @@ in events.log.
 """
 
 import csv
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from codesign_jax import types
+from codesign_jax import files, types
 from codesign_jax.codesign import FinalTest
 from codesign_jax.parameters import DesignSpace
 from codesign_jax.runs.columns import TABLES
@@ -127,9 +126,7 @@ def _write(path: Path, head: list[str], rows: Iterable[list], start: int) -> Non
         with path.open("a", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
         return
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", newline="", encoding="utf-8") as file:
+    with files.atomically(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(head)
         writer.writerows(rows)
-    os.replace(temporary, path)

@@ -16,7 +16,7 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import Info, ParticleFilter, Space, State, rejection_sample
 from codesign_jax.parameters import DesignSpace
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Constants, Scene
 from codesign_jax.types import Outcome, Trial
 
 # Four ASCII letters each, as the optimiser's streams, so that no two streams of a seed meet.
@@ -34,8 +34,8 @@ CONVERGED_COST = 1.0
 SEED_COST = 2.0
 """Cost that a seed particle must exceed, so that no run starts with a solution (section VI.4)."""
 
-EpisodeFunction = Callable[[State, jax.typing.ArrayLike], tuple[State, "EpisodeInfo"]]
-EvaluateFunction = Callable[[jax.Array, jax.Array], Outcome]
+EpisodeFunction = Callable[..., tuple[State, "EpisodeInfo"]]
+EvaluateFunction = Callable[..., Outcome]
 
 
 class EpisodeInfo(NamedTuple):
@@ -86,7 +86,9 @@ def make_evaluate(
 ) -> EvaluateFunction:
     """Returns a function (population, key) -> outcomes of shape (particle, trial); one program.
 
-    All particles meet the same trials: common random numbers compare designs, not luck.
+    All particles meet the same trials: common random numbers compare designs, not luck.  As a third
+    argument it takes `Constants` instead of the scene's, leaves of shape () or (trial,): other
+    numbers compile nothing.
 
     Args:
       scene: The scene.
@@ -96,13 +98,16 @@ def make_evaluate(
     """
 
     @jax.jit
-    def simulate(population: jax.Array, key: jax.Array) -> Outcome:
-        trials = rollout.sample_trials(scene, key, num_trials)
-        return rollout.evaluate(scene, engine, jax.vmap(space.params)(population), trials)
+    def simulate(population: jax.Array, key: jax.Array, constants: Constants | None) -> Outcome:
+        trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
+        hands = jax.vmap(space.params)(population)
+        return rollout.evaluate(scene, engine, hands, trials, constants=constants)
 
-    def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
+    def evaluate(
+        population: jax.Array, key: jax.Array, constants: Constants | None = None
+    ) -> Outcome:
         space.refuse_unit_slips(population)
-        return simulate(population, key)
+        return simulate(population, key, rollout.numbers(scene, constants))
 
     return evaluate
 
@@ -116,7 +121,9 @@ def make_episode(
 ) -> EpisodeFunction:
     """Returns the jitted function (state, mask) -> (state, info) that runs one episode.
 
-    The mask, bool of shape (parameter,), is data: every schedule shares one compile.  The noise of
+    The mask, bool of shape (parameter,), is data: every schedule shares one compile.  So are
+    `Constants` instead of the scene's, an optional third argument, leaves of shape () or (trial,)
+    but for `cost.maximum`, which is one number.  The noise of
     trial t derives from (root key, stream, episode, t), so that it depends neither on the number
     of particles nor on where a run was resumed.
 
@@ -129,22 +136,32 @@ def make_episode(
     """
 
     @jax.jit
-    def episode(state: State, mask: jax.typing.ArrayLike) -> tuple[State, EpisodeInfo]:
+    def episode(
+        state: State, mask: jax.typing.ArrayLike, constants: Constants | None = None
+    ) -> tuple[State, EpisodeInfo]:
         population = optimizer.ask(state, mask)
-        noise = episode_trials(scene, state.key, state.episode, num_trials)
+        numbers = rollout.numbers(scene, constants)
+        noise = episode_trials(scene, state.key, state.episode, num_trials, constants=numbers)
         hands = jax.vmap(space.params)(population)
-        trials, last = rollout.evaluate_to_end(scene, engine, hands, noise)
-        new, selection = optimizer.tell(state, population, particle_cost(scene, trials))
+        trials, last = rollout.evaluate_to_end(scene, engine, hands, noise, constants=numbers)
+        costs = particle_cost(scene.with_constants(numbers), trials)
+        new, selection = optimizer.tell(state, population, costs)
         return new, EpisodeInfo(population, trials, selection, last)
 
     return episode
 
 
 def episode_trials(
-    scene: Scene, key: jax.Array, episode: jax.typing.ArrayLike, num_trials: int
+    scene: Scene,
+    key: jax.Array,
+    episode: jax.typing.ArrayLike,
+    num_trials: int,
+    *,
+    constants: Constants | None = None,
 ) -> Trial:
     """Trials of an episode of the run with this root key, leading axis (trial,)."""
-    return rollout.sample_trials(scene, stream_key(key, STREAM_TRIAL, episode), num_trials)
+    own = stream_key(key, STREAM_TRIAL, episode)
+    return rollout.sample_trials(scene, own, num_trials, constants=constants)
 
 
 def evaluate_by(episode: EpisodeFunction, num_parameters: int) -> EvaluateFunction:

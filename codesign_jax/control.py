@@ -1,5 +1,7 @@
 """Open-loop key frames: pressures and the pose of the arm frame X_D over a grasp (paper Fig. 3)."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,7 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     to (k+1) h.
 
     Args:
-      scene: The scene.
+      scene: The scene; of `Scene.with_constants` if its numbers are traced.
       params: Parameters of one hand.
       trial: Its trial; the arm frame carries the trial's roll and pitch noise.
     """
@@ -26,7 +28,7 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     # The approach is vertical: lateral position and orientation are the grasp's from the start
     # [ours].
     frames = jnp.stack([jnp.asarray(start, arm.dtype), grasp, grasp, jnp.asarray(start, arm.dtype)])
-    height = jnp.interp(time, np.array([0.0, p.approach, p.inflate, p.lift]), frames)
+    height = jnp.interp(time, _stack([0.0, p.approach, p.inflate, p.lift]), frames)
     roll, pitch = _shake(scene, time)
     ones = jnp.ones_like(height)
     # Positive pitch points the fingers towards +x, so that Table I's x = -20 mm with 15 degrees
@@ -58,7 +60,8 @@ def supplied(scene: Scene, wanted: jax.Array) -> jax.Array:
       wanted: Wanted pressures [Pa].
     """
     p, h = scene.pneumatics, scene.discretization.timestep
-    gain = -np.expm1(-h / p.lag) if p.lag > 0 else 1.0
+    lagging = p.lag > 0
+    gain = jnp.where(lagging, -jnp.expm1(-h / jnp.where(lagging, p.lag, 1.0)), 1.0)
     target = jnp.minimum(wanted, p.maximum)
 
     def step(now: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -67,29 +70,33 @@ def supplied(scene: Scene, wanted: jax.Array) -> jax.Array:
     return jax.lax.scan(step, target[:, 0], target.T)[1].T
 
 
-def _inflation(scene: Scene, time: np.ndarray) -> np.ndarray:
+def _stack(keys: list[Any]) -> jax.Array:
+    return jnp.stack([jnp.asarray(k, float) for k in keys])
+
+
+def _inflation(scene: Scene, time: np.ndarray) -> jax.Array:
     """Fraction of the nominal pressure, shape (time,)."""
     p = scene.phases
     keys, values = [p.approach, p.inflate], [0.0, 1.0]
     if scene.effects.ungrasp:
         end = scene.window[1]
         keys, values = [*keys, end, end + p.deflate_time], [*values, 1.0, 0.0]
-    return np.interp(time, keys, values)
+    return jnp.interp(time, _stack(keys), _stack(values))
 
 
-def _shake(scene: Scene, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shake(scene: Scene, time: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """Roll and pitch that the disturbance adds [rad], each of shape (time,).
 
     A sine whose amplitude grows linearly over the phase; whole periods alternate between roll and
     pitch. Afterwards the arm returns linearly to its nominal pose while the chambers deflate.
     """
     if not scene.effects.disturb:
-        return np.zeros_like(time), np.zeros_like(time)
+        return jnp.zeros(len(time)), jnp.zeros(len(time))
     p, arm = scene.phases, scene.arm
-    inside = np.clip(time, p.lift, p.disturb) - p.lift
-    growth = np.deg2rad(arm.shake_amplitude) * inside / (p.disturb - p.lift)
+    inside = jnp.clip(time, p.lift, p.disturb) - p.lift
+    growth = jnp.deg2rad(arm.shake_amplitude) * inside / (p.disturb - p.lift)
     period = arm.shake_frequency * inside
-    angle = growth * np.sin(2 * np.pi * period)
-    angle = angle * np.clip(1 - (time - p.disturb) / p.deflate_time, 0, 1)
-    odd = np.floor(period).astype(int) % 2 == 1
-    return np.where(odd, 0.0, angle), np.where(odd, angle, 0.0)
+    angle = growth * jnp.sin(2 * np.pi * period)
+    angle = angle * jnp.clip(1 - (time - p.disturb) / p.deflate_time, 0, 1)
+    odd = jnp.floor(period).astype(int) % 2 == 1
+    return jnp.where(odd, 0.0, angle), jnp.where(odd, angle, 0.0)

@@ -18,12 +18,12 @@ def outcome(scene: Scene, trace: Trace, initial: jax.Array | int = 0) -> Outcome
     trial says nothing about the grasp and shows c_max; `particle_cost` decides what it counts.
 
     Args:
-      scene: The scene.
+      scene: The scene; of `Scene.with_constants` if its numbers are traced.
       trace: Trace of one world, arrays of shape (time,).
       initial: Bits of `Status` that the world starts with, shape () int32.
     """
     steps, (start, end), dtype = trace.distance.shape[0], scene.window, trace.distance.dtype
-    lost_step = _first(verdict.lost(scene, trace.distance, np.arange(steps)))
+    lost_step = _first(verdict.lost(verdict.bounds(scene), trace.distance, np.arange(steps)))
     bits = verdict.failures(scene, trace)
     bits = bits.at[0].set(bits[0] | jnp.asarray(initial, jnp.int32))
     bad_step = _first(bits != 0)
@@ -82,6 +82,6 @@ def _stuck(scene: Scene, trace: Trace) -> jax.Array:
         return jnp.zeros((), bool)
     # A resting object's centre is at most its bounding radius above the table, whatever side it
     # lies on.
-    radius = max(shape.radius for shape in scene.objects.object)
+    radius = jnp.stack([jnp.asarray(shape.radius) for shape in scene.objects.object]).max()
     resting = trace.height[-1] < radius * (1 + 4 * scene.objects.noise.size)
     return (trace.distance[-1] <= scene.cost.lost_distance) & ~resting

@@ -88,8 +88,8 @@ class Wrist:
 
     linear_stiffness: float = quantity("N/m", 1, 1e5)
     angular_stiffness: float = quantity("N m/rad", 0.01, 1e4)
-    linear_damping: float = quantity("N s/m", 0, 1e4)
-    angular_damping: float = quantity("N m s/rad", 0, 1e3)
+    linear_damping: float = quantity("N s/m", 0, 1e4, typical=20.0)
+    angular_damping: float = quantity("N m s/rad", 0, 1e3, typical=0.1)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -107,9 +107,12 @@ class Parameter:
 
 @dataclasses.dataclass(frozen=True)
 class PressureLimit:
-    """Upper limit of the pressure, proportional to the hull thickness (Table I)."""
+    """Upper limit of the pressure, proportional to the hull thickness (Table I).
 
-    per_wall: float = quantity("Pa/m", 1e5, 1e9)
+    It bounds the design space, not the simulation.
+    """
+
+    per_wall: float = quantity("Pa/m", 1e5, 1e9, structure=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,6 +152,18 @@ class Hand:
     parameter: tuple[Parameter, ...]
     pressure_limit: PressureLimit
     preset: tuple[Preset, ...] = ()
+
+
+def structure(hand: Hand) -> Hand:
+    """The hand without what no program depends on; its numbers are left to `schema.typical`."""
+    return dataclasses.replace(
+        hand,
+        name="",
+        description="",
+        parameter=(),
+        preset=(),
+        pressure_limit=PressureLimit(0.0),
+    )
 
 
 def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Hand:

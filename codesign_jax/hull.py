@@ -11,13 +11,12 @@ joint j + 1 between them alone:
 The topology is the scene's; sizes are the parameters', so that fingers of a batch share it.
 """
 
-import functools
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, by_structure
 
 
 class Hull(NamedTuple):
@@ -78,7 +77,7 @@ def outline(points: int) -> tuple[np.ndarray, np.ndarray]:
     return place, (steps + np.roll(steps, 1, 0)) / 2
 
 
-@functools.cache
+@by_structure
 def slots(scene: Scene) -> Slots:
     """The contact points of a scene's fingers."""
     d = scene.discretization
@@ -112,7 +111,7 @@ def slots(scene: Scene) -> Slots:
     )
 
 
-@functools.cache
+@by_structure
 def hull(scene: Scene) -> Hull:
     """The closed mesh of a scene's fingers: base, rings, tip."""
     d, s = scene.discretization, slots(scene)

@@ -18,15 +18,18 @@ _MASS, _SIZE = ("kg", 0.001, 10.0), ("m", 0.002, 0.25)
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """Standard deviations of a trial's Gaussian noise: metres, degrees and two relative values.
+    """Standard deviations of a trial's Gaussian noise; z is a draw of the standard normal.
 
-    The upper bounds of the relative ones keep every factor 1 + sigma z positive.
+    Mass and size of the object have factors 1 + sigma z, which the upper bounds keep positive.  The
+    friction of all contacts and the shear modulus of the fingers have factors exp(sigma z) [ours].
     """
 
     position: float = quantity("m", 0, 0.1)
     orientation: float = quantity("deg", 0, 90)
     mass: float = quantity("", 0, 0.15)
     size: float = quantity("", 0, 0.15)
+    friction: float = quantity("", 0, 1, default=0.0)
+    stiffness: float = quantity("", 0, 1, default=0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,12 +61,12 @@ class _ShapeFile:
     friction: float = quantity("", 0, 5)
     size: tuple[float, ...] | None = quantity(*_SIZE, default=None)
     mass: float | None = quantity(*_MASS, default=None)
-    density: float | None = quantity("kg/m^3", 10, 25000, default=None)
+    density: float | None = quantity("kg/m^3", 10, 25000, structure=True, default=None)
     # Two objects are equal if their meshes are, wherever the files lie.
     file: str | None = dataclasses.field(default=None, compare=False)
     unit: str | None = choice("m", "cm", "mm", "in", default=None)
     repair: bool | None = None
-    voxel_error: float | None = quantity("m", 5e-5, 5e-3, default=None)
+    voxel_error: float | None = quantity("m", 5e-5, 5e-3, structure=True, default=None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +107,19 @@ class ObjectSet:
     noise: Noise
     table: Table
     object: tuple[Shape, ...]
+
+
+def structure(objects: ObjectSet) -> ObjectSet:
+    """The set without what no program depends on; its numbers are left to `schema.typical`.
+
+    Meshes stay, and their names, by which they are refused.
+    """
+    unused = {"file": None, "unit": None, "repair": None, "voxel_error": None}
+    shapes = tuple(
+        dataclasses.replace(shape, **unused, **({} if shape.mesh else {"name": ""}))
+        for shape in objects.object
+    )
+    return dataclasses.replace(objects, name="", description="", object=shapes)
 
 
 def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> ObjectSet:

@@ -1,17 +1,24 @@
 """Particles x trials in one batch: noise, commands, model fields, engine and cost put together."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from codesign_jax import control, cost, model, parameters, schema
+from codesign_jax.constants import batch_axes, check
 from codesign_jax.engines import Engine
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Constants, Scene
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Trace, Trial
 
+# Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
+_LATER = 1
 
-def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
+
+def sample_trials(
+    scene: Scene, key: jax.Array, num_trials: int, *, constants: Constants | None = None
+) -> Trial:
     """Draws objects and noise of trials (paper Sec. VI.2); shapes take turns in the set's order.
 
     Args:
@@ -19,16 +26,19 @@ def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
       key: Typed key; trial t draws from fold_in(key, t), so that more trials do not change earlier
         ones.
       num_trials: Number of trials.
+      constants: Numbers instead of the scene's, of which the noise is read; leaves of shape () or
+        (trial,).
 
     Returns:
       Trials with leading axis (trial,).
     """
-    index = jnp.arange(num_trials)
-    noise = scene.objects.noise
+    index, noises = jnp.arange(num_trials), numbers(scene, constants).objects.noise
 
-    def draw(t: jax.Array) -> Trial:
-        z = jax.random.normal(jax.random.fold_in(key, t), (7,))
-        angles = np.deg2rad(noise.orientation) * z[2:5]
+    def draw(t: jax.Array, noise: Any) -> Trial:
+        own = jax.random.fold_in(key, t)
+        z = jax.random.normal(own, (7,))
+        later = jax.random.normal(jax.random.fold_in(own, _LATER), (2,))
+        angles = jnp.deg2rad(noise.orientation) * z[2:5]
         return Trial(
             shape=t % len(scene.objects.object),
             position=noise.position * z[:2],
@@ -36,9 +46,23 @@ def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
             arm_tilt=angles[1:],
             mass=1.0 + noise.mass * z[5],
             size=1.0 + noise.size * z[6],
+            friction=jnp.exp(noise.friction * later[0]),
+            stiffness=jnp.exp(noise.stiffness * later[1]),
         )
 
-    return jax.vmap(draw)(index)
+    return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(index, noises)
+
+
+def numbers(scene: Scene, constants: Constants | None) -> Constants:
+    """The constants if there are any, checked, or else the scene's.
+
+    Raises:
+      SceneError: If they do not fit the scene, see `constants.check`.
+    """
+    if constants is None:
+        return scene.constants()
+    check(scene, constants)
+    return constants
 
 
 def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
@@ -53,11 +77,17 @@ def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
         raise schema.SceneError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
     index = names.index(shape) if isinstance(shape, str) else shape
     zero, one = jnp.zeros(()), jnp.ones(())
-    return Trial(jnp.int32(index), jnp.zeros(2), zero, jnp.zeros(2), one, one)
+    return Trial(jnp.int32(index), jnp.zeros(2), zero, jnp.zeros(2), one, one, one, one)
 
 
 def simulate(
-    scene: Scene, engine: Engine, params: Params, trials: Trial, *, trajectory: bool = False
+    scene: Scene,
+    engine: Engine,
+    params: Params,
+    trials: Trial,
+    *,
+    trajectory: bool = False,
+    constants: Constants | None = None,
 ) -> tuple[Outcome, Trace]:
     """Simulates a batch of worlds; jit it, with scene and engine closed over.
 
@@ -67,23 +97,42 @@ def simulate(
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
       trajectory: Whether the trace holds qpos of every step.
+      constants: Numbers instead of the scene's, see `Scene.constants`; leaves of shape () or
+        (world,). The engine may be that of any scene of the same structure.
 
     Returns:
       Outcome and trace with leading axis (world,).
 
     Raises:
-      SceneError: If a parameter is out of its range by a factor between units, such as
-        millimetres given for metres; not inside a program that is being traced.
+      SceneError: If the constants do not fit the scene or lie outside their ranges, or if a
+        parameter is out of its range by a factor between units, such as millimetres given for
+        metres; of traced ones no values are known.
     """
     parameters.refuse_unit_slips(params)
-    fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
-    ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)
+    constants = numbers(scene, constants)
+    axes = batch_axes(constants)
+
+    def world(p: Params, t: Trial, c: Constants) -> tuple[model.ModelFields, jax.Array]:
+        own = scene.with_constants(c)
+        return model.model_fields(own, p, t), control.commands(own, p, t)
+
+    def judge(t: Trace, i: jax.Array, c: Constants) -> Outcome:
+        return cost.outcome(scene.with_constants(c), t, i)
+
+    fields, ctrl = jax.vmap(world, in_axes=(0, 0, axes))(params, trials, constants)
     trace = engine.rollout(fields, ctrl, trajectory=trajectory)
     initial = invalid_start(scene, fields)
-    return jax.vmap(lambda t, i: cost.outcome(scene, t, i))(trace, initial), trace
+    return jax.vmap(judge, in_axes=(0, 0, axes))(trace, initial, constants), trace
 
 
-def evaluate(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Outcome:
+def evaluate(
+    scene: Scene,
+    engine: Engine,
+    params: Params,
+    trials: Trial,
+    *,
+    constants: Constants | None = None,
+) -> Outcome:
     """Evaluates all particles in all trials as one batch of particle * trial worlds.
 
     Args:
@@ -92,15 +141,24 @@ def evaluate(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Out
       params: Parameters with leading axis (particle,).
       trials: Trials with leading axis (trial,): common random numbers, every particle meets the
         same ones.
+      constants: Numbers instead of the scene's; leaves of shape () or (trial,).
 
     Returns:
       Outcomes, every array of shape (particle, trial).
+
+    Raises:
+      SceneError: See `simulate`.
     """
-    return evaluate_to_end(scene, engine, params, trials)[0]
+    return evaluate_to_end(scene, engine, params, trials, constants=constants)[0]
 
 
 def evaluate_to_end(
-    scene: Scene, engine: Engine, params: Params, trials: Trial
+    scene: Scene,
+    engine: Engine,
+    params: Params,
+    trials: Trial,
+    *,
+    constants: Constants | None = None,
 ) -> tuple[Outcome, jax.Array | None]:
     """As `evaluate`, with the states at the end, shape (particle, trial, nq + nv).
 
@@ -109,5 +167,6 @@ def evaluate_to_end(
     particles, count = params.length.shape[0], trials.yaw.shape[0]
     worlds_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
     worlds_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
-    result, trace = simulate(scene, engine, worlds_p, worlds_t)
+    tiled = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, constants)
+    result, trace = simulate(scene, engine, worlds_p, worlds_t, constants=tiled)
     return jax.tree.map(lambda v: v.reshape(particles, count, *v.shape[1:]), (result, trace.last))

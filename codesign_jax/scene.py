@@ -1,16 +1,20 @@
 """The scene: hand, objects, effects, phases, contact and discretization, frozen and hashable.
 
-A scene is static: changing it costs one compile; sweeping over parameters, seeds or masks costs
-none.
+A scene has two parts.  Its `structure` (effects, counts, kinds of shapes, time step and number of
+steps) is what programs are compiled for; its `Constants` are all other numbers of the scene, hand
+and object files, and may be traced: changing them compiles nothing.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 from codesign_jax import files, hand, keypaths, objects, schema
 from codesign_jax.schema import choice, quantity
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,13 +44,17 @@ class Effects:
 
 @dataclasses.dataclass(frozen=True)
 class Phases:
-    """End times of the phases of one grasp (paper Fig. 3) [s]."""
+    """End times of the phases of one grasp (paper Fig. 3) [s].
+
+    The number of time steps is structure: the end of the last phase may not be changed by
+    `Constants`.
+    """
 
     approach: float = quantity("s", 0.01, 60)
     inflate: float = quantity("s", 0.01, 60)
     lift: float = quantity("s", 0.01, 60)
     disturb: float = quantity("s", 0.01, 60)
-    ungrasp: float = quantity("s", 0.01, 60)
+    ungrasp: float = quantity("s", 0.01, 60, structure=True)
     deflate_time: float = quantity("s", 0.001, 60)
 
 
@@ -104,11 +112,11 @@ class Discretization:
     `hull_points` vertices, a multiple of four.
     """
 
-    timestep: float = quantity("s", 1e-5, 0.05)
-    links: int = quantity("", 1, 200)
-    spheres_per_link: int = quantity("", 1, 20)
-    hull_rings: int = quantity("", 1, 20, default=2)
-    hull_points: int = quantity("", 4, 80, default=8)
+    timestep: float = quantity("s", 1e-5, 0.05, structure=True)
+    links: int = quantity("", 1, 200, structure=True)
+    spheres_per_link: int = quantity("", 1, 20, structure=True)
+    hull_rings: int = quantity("", 1, 20, structure=True, default=2)
+    hull_points: int = quantity("", 4, 80, structure=True, default=8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,9 +126,9 @@ class Solver:
     The tolerance must not be zero: MuJoCo's line search may then return no step at all.
     """
 
-    iterations: int = quantity("", 1, 1000)
-    ls_iterations: int = quantity("", 1, 1000)
-    tolerance: float = quantity("", 1e-16, 1)
+    iterations: int = quantity("", 1, 1000, structure=True)
+    ls_iterations: int = quantity("", 1, 1000, structure=True)
+    tolerance: float = quantity("", 1e-16, 1, structure=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,15 +148,40 @@ class Limits:
     penetration: float = quantity("m", 1e-4, 1)
 
 
+class Constants(NamedTuple):
+    """The numbers of a scene, its hand and its objects that are not structure.
+
+    A pytree of nested named tuples whose names are the keys of the files, such as
+    `constants.hand.material.shear_modulus`, `constants.contact.friction_ratio` and
+    `constants.objects.object[0].mass`; arrays of tables are tuples.  Units and ranges are those of
+    the files.  Leaves are numbers, or arrays with a leading axis (world or trial) where a function
+    says so.  `codesign_jax.constants` checks and changes them.
+
+    What is not here: names, effects, counts, kinds of shapes, meshes, the time step, the end of the
+    last phase, the solver's limits, and the parameter table with its bounds, presets and pressure
+    limit, which describe a search and not a simulation.
+    """
+
+    hand: Any
+    objects: Any
+    gravity: Any
+    phases: Any
+    arm: Any
+    cost: Any
+    contact: Any
+    limits: Any
+    pneumatics: Any
+
+
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Everything static about a simulation; built by `load`, changed by `dataclasses.replace`."""
+    """A simulation's description; built by `load`, changed by `dataclasses.replace`."""
 
     name: str
     description: str
     hand: hand.Hand
     objects: objects.ObjectSet
-    gravity: float
+    gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
     effects: Effects
     phases: Phases
     arm: Arm
@@ -158,6 +191,43 @@ class Scene:
     solver: Solver
     limits: Limits
     pneumatics: Pneumatics = Pneumatics()
+
+    def constants(self) -> Constants:
+        """The numbers of the scene's files that are not structure."""
+        return Constants(**schema.numbers(self)._asdict())
+
+    def with_constants(self, constants: Constants) -> "Scene":
+        """The scene with other numbers, which may be arrays or traced, for functions to read.
+
+        Args:
+          constants: Numbers, of the structure of `constants()`; `codesign_jax.constants.check` says
+            what is wrong with others.
+
+        Returns:
+          A scene that reads as this one, has its `structure` and cannot be hashed.
+        """
+        values = schema.with_numbers(self, constants)
+        fields = {f.name: getattr(values, f.name) for f in dataclasses.fields(Scene)}
+        return _SceneWithConstants(**fields, described=self.structure)
+
+    @functools.cached_property
+    def structure(self) -> "Scene":
+        """The scene without what no program depends on: every number of `constants` is a fixed one.
+
+        Scenes of equal structure share model templates, traces and compiled programs.
+        """
+        step = self.discretization.timestep
+        last = ("approach", "inflate", "lift", "disturb", "ungrasp").index(self._last_phase)
+        ends = (self.num_steps * step * (i + 1) / (last + 1) for i in range(5))
+        fixed = schema.typical(self)
+        return dataclasses.replace(
+            fixed,
+            name="",
+            description="",
+            phases=Phases(*ends, deflate_time=step),
+            hand=hand.structure(fixed.hand),
+            objects=objects.structure(fixed.objects),
+        )
 
     @property
     def gravity_on(self) -> float:
@@ -177,9 +247,13 @@ class Scene:
     @property
     def end_time(self) -> float:
         """End of the last phase that is on [s]."""
+        return getattr(self.phases, self._last_phase)
+
+    @property
+    def _last_phase(self) -> str:
         if self.effects.ungrasp:
-            return self.phases.ungrasp
-        return self.phases.disturb if self.effects.disturb else self.phases.lift
+            return "ungrasp"
+        return "disturb" if self.effects.disturb else "lift"
 
     @property
     def window(self) -> tuple[float, float]:
@@ -188,6 +262,36 @@ class Scene:
             self.phases.inflate,
             self.phases.disturb if self.effects.disturb else self.phases.lift,
         )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _SceneWithConstants(Scene):
+    """A scene whose numbers may be arrays; see `Scene.with_constants`."""
+
+    described: Scene = dataclasses.field(kw_only=True, metadata={"in_file": False})
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def structure(self) -> Scene:  # type: ignore[override]
+        """That of the scene whose numbers were changed."""
+        return self.described
+
+    @property
+    def num_steps(self) -> int:
+        """That of the scene whose numbers were changed."""
+        return self.described.num_steps
+
+
+def by_structure(function: Callable[[Scene], T]) -> Callable[[Scene], T]:
+    """Evaluates a function of a scene once for each structure, with the fixed numbers."""
+    cached = functools.cache(function)
+
+    @functools.wraps(function)
+    def evaluate(scene: Scene) -> T:
+        return cached(scene.structure)
+
+    return evaluate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,17 +400,7 @@ def _beside(path: Path, name: str) -> str | Path:
 
 
 def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
-    p, h = scene.phases, scene.discretization.timestep
-    times = [("approach", p.approach), ("inflate", p.inflate), ("lift", p.lift)]
-    times += [("disturb", p.disturb), ("ungrasp", p.ungrasp)]
-    for (first, a), (second, b) in zip(times, times[1:], strict=False):
-        if not a < b:
-            problems.append(f"{where}.phases.{second} = {b:g} s must come after {first} = {a:g} s")
-    if p.ungrasp < p.disturb + p.deflate_time:
-        problems.append(
-            f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
-            f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
-        )
+    problems += check_together(scene, where)
     e = scene.effects
     if e.finger_finger and e.surface == "hull":
         problems.append(
@@ -323,9 +417,36 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
             f"{where}.discretization.hull_points = {scene.discretization.hull_points} "
             "must be a multiple of 4: every side of the section has as many"
         )
+
+
+def check_together(scene: "Scene | _SceneFile", where: str) -> list[str]:
+    """Returns what is wrong with numbers that are each in range, but do not go together.
+
+    Args:
+      scene: The scene, its numbers not traced.
+      where: Key path shown before those of the scene.
+    """
+    problems = []
+    p, h = scene.phases, scene.discretization.timestep
+    times = [("approach", p.approach), ("inflate", p.inflate), ("lift", p.lift)]
+    times += [("disturb", p.disturb), ("ungrasp", p.ungrasp)]
+    for (first, a), (second, b) in zip(times, times[1:], strict=False):
+        if not a < b:
+            problems.append(f"{where}.phases.{second} = {b:g} s must come after {first} = {a:g} s")
+    if p.ungrasp < p.disturb + p.deflate_time:
+        problems.append(
+            f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
+            f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
+        )
     if scene.contact.time_constant < 2 * h:
         problems.append(
             f"{where}.contact.time_constant = {scene.contact.time_constant:g} s "
             f"must be at least two time steps ({2 * h:g} s): "
             "a stiffer contact is unstable (MuJoCo's refsafe)"
         )
+    if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:
+        problems.append(
+            f"{where}.phases ends after {scene.end_time:g} s: the number of steps is structure, "
+            f"{scene.num_steps} of {h:g} s"
+        )
+    return problems

@@ -5,8 +5,10 @@ ranges and names and reports the key path, the value, the unit, the range and, w
 unit slip that would explain it.
 """
 
+import collections
 import dataclasses
 import difflib
+import functools
 import math
 import types
 import typing
@@ -38,9 +40,40 @@ class SceneError(ValueError):
         super().__init__("\n".join(self.problems))
 
 
-def quantity(unit: str, low: float, high: float, **kwargs: Any) -> Any:
-    """Declares a numeric dataclass field with its unit and closed range [low, high]."""
-    return dataclasses.field(metadata={"unit": unit, "low": low, "high": high}, **kwargs)
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Unit and closed range [low, high] of a number."""
+
+    unit: str
+    low: float
+    high: float
+
+
+def quantity(
+    unit: str,
+    low: float,
+    high: float,
+    *,
+    structure: bool = False,
+    typical: float | None = None,
+    **kwargs: Any,
+) -> Any:
+    """Declares a numeric dataclass field with its unit and closed range [low, high].
+
+    Args:
+      unit: Unit, for messages and files.
+      low: Smallest allowed value.
+      high: Largest allowed value.
+      structure: Whether compiled programs depend on the number; the others are traced values, see
+        `numbers`.
+      typical: A usual value, see `typical`; by default one well inside the range.
+      **kwargs: Further arguments of `dataclasses.field`.
+    """
+    if typical is None:
+        typical = math.sqrt(low * high) if low > 0 else 0.01 * high
+    metadata = {"unit": unit, "low": low, "high": high}
+    metadata |= {"structure": structure, "typical": typical}
+    return dataclasses.field(metadata=metadata, **kwargs)
 
 
 def choice(*options: str, **kwargs: Any) -> Any:
@@ -112,6 +145,75 @@ def parse(cls: type[T], table: Any, path: str, problems: list[str]) -> T | None:
     return cls(**values) if len(problems) == before else None
 
 
+def numbers(table: Any) -> Any:
+    """The numbers of a dataclass that are not structure, as nested named tuples.
+
+    Field names are those of the file; arrays of tables and of numbers are tuples. A table without
+    such numbers is left out.
+
+    Args:
+      table: A dataclass whose numeric fields are made by `quantity`.
+    """
+    return _collect(table, lambda field, value: value)
+
+
+def ranges(table: Any) -> Any:
+    """`Range` of every number, as nested as `numbers`."""
+    return _collect(table, lambda field, value: _range(field))
+
+
+def with_numbers(table: T, values: Any) -> T:
+    """The dataclass with other numbers.
+
+    Args:
+      table: A dataclass whose numeric fields are made by `quantity`.
+      values: Its numbers, nested as `numbers(table)`; may be arrays or traced.
+    """
+    changes = {}
+    for name, new in values._asdict().items():
+        old = getattr(table, name)
+        if dataclasses.is_dataclass(old):
+            new = with_numbers(old, new)
+        elif isinstance(old, tuple) and dataclasses.is_dataclass(old[0]):
+            new = tuple(with_numbers(o, n) for o, n in zip(old, new, strict=True))
+        changes[name] = new
+    return dataclasses.replace(table, **changes)  # type: ignore[type-var]
+
+
+def typical(table: T) -> T:
+    """The dataclass with a fixed value for every number that is not structure."""
+    return with_numbers(table, _collect(table, lambda field, value: field.metadata["typical"]))
+
+
+def _range(field: dataclasses.Field) -> Range:
+    return Range(*(field.metadata[key] for key in ("unit", "low", "high")))
+
+
+def _collect(table: Any, leaf: typing.Callable[[dataclasses.Field, Any], Any]) -> Any:
+    """Named tuples of leaf(field, value) of a dataclass' numbers; None if it has none."""
+    found = {}
+    for field in dataclasses.fields(table):
+        value, kind = getattr(table, field.name), field.metadata
+        if value is None or not kind.get("in_file", True) or kind.get("structure"):
+            continue
+        if "low" in kind:
+            many = isinstance(value, tuple)
+            found[field.name] = tuple(leaf(field, v) for v in value) if many else leaf(field, value)
+        elif dataclasses.is_dataclass(value):
+            found[field.name] = _collect(value, leaf)
+        elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+            rows = tuple(_collect(v, leaf) for v in value)
+            found[field.name] = None if None in rows else rows
+    found = {name: value for name, value in found.items() if value is not None}
+    return _named(type(table).__name__, tuple(found))(**found) if found else None
+
+
+@functools.cache
+def _named(name: str, fields: tuple[str, ...]) -> type:
+    """A named tuple type; equal tables share one, so that their trees have one structure."""
+    return collections.namedtuple(name, fields)
+
+
 def _required(field: dataclasses.Field) -> bool:
     missing = dataclasses.MISSING
     return field.default is missing and field.default_factory is missing
@@ -145,8 +247,7 @@ def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems
     if options and value not in options:
         problems.append(f"{path} = {value!r} is not valid; {nearest(value, options)}")
     if "low" in field.metadata:
-        m = field.metadata
-        problem = range_problem(path, value, m["unit"], m["low"], m["high"])
+        problem = range_problem(path, value, *dataclasses.astuple(_range(field)))
         if problem:
             problems.append(problem)
     return float(value) if hint is float else value

@@ -24,9 +24,9 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
       scene: The scene.
       fields: Model fields with leading axis (world,).
     """
-    bad = ~(depth(scene, fields) <= scene.limits.penetration)
-    every = [value.reshape(value.shape[0], -1) for value in fields if value is not None]
-    bad |= ~jnp.isfinite(jnp.concatenate(every, 1)).all(1)
+    bad = ~(depth(scene, fields) <= fields.constants.limits.penetration)
+    for value in jax.tree.leaves(fields):
+        bad |= ~jnp.isfinite(value.reshape(value.shape[0], -1)).all(1)
     moving = layout(scene).bodies.ravel()
     for value in (fields.body_mass[:, moving], fields.body_inertia[:, moving]):
         bad |= ~(value.reshape(value.shape[0], -1) > 0).all(1)

@@ -81,6 +81,8 @@ class Trial(NamedTuple):
       arm_tilt: Rotation of the arm frame: roll, pitch [rad], shape (2,).
       mass: Factor on the object's mass, shape ().
       size: Factor on the object's size, shape ().
+      friction: Factor on the friction of all contacts, shape (); None for 1.
+      stiffness: Factor on the fingers' shear modulus, shape (); None for 1.
     """
 
     shape: jax.Array
@@ -89,6 +91,8 @@ class Trial(NamedTuple):
     arm_tilt: jax.Array
     mass: jax.Array
     size: jax.Array
+    friction: jax.Array | None = None
+    stiffness: jax.Array | None = None
 
 
 class Trace(NamedTuple):

@@ -6,7 +6,7 @@ the lanes of a kernel alike.  None of them asks whether a number is finite, beca
 cannot: comparisons with a number that is not one are false.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,57 +19,77 @@ FAR = 3e38
 """Larger than any distance, and still a number in float32."""
 
 
-def window(scene: Scene) -> tuple[int, int]:
-    """The first step at which a lost object counts, and the first at which it no longer does."""
-    start, end = (round(t / scene.discretization.timestep) for t in scene.window)
-    return start, end
+class Bounds(NamedTuple):
+    """What decides a world: numbers, or arrays that broadcast to those of the worlds.
+
+    Attributes:
+      lost_distance: Distance from object centre to hand centre from which on the object is lost
+        [m].
+      start: The first time step at which a lost object counts.
+      end: The first time step at which it no longer does.
+      speed: Largest velocity of a world that has not failed [rad/s or m/s].
+      penetration: How far below the table the object's centre may be [m].
+    """
+
+    lost_distance: Any
+    start: Any
+    end: Any
+    speed: Any
+    penetration: Any
 
 
-def lost(scene: Scene, distance: Any, step: Any) -> Any:
+def bounds(scene: Scene) -> Bounds:
+    """The bounds of a scene, whose numbers may be arrays or traced."""
+    # Rounds numbers, NumPy and JAX arrays alike.
+    start, end = ((t / scene.discretization.timestep + 0.5) // 1 for t in scene.window)
+    limits = scene.limits
+    return Bounds(scene.cost.lost_distance, start, end, limits.speed, limits.penetration)
+
+
+def lost(bounds: Bounds, distance: Any, step: Any) -> Any:
     """Whether the object is lost: far from the hand, and within the window of the cost.
 
     Args:
-      scene: The scene.
+      bounds: What decides a world.
       distance: Object centre to hand centre [m].
       step: Index of the time step, broadcast against the distance.
     """
-    start, end = window(scene)
-    return (distance >= scene.cost.lost_distance) & (step >= start) & (step < end)
+    return (distance >= bounds.lost_distance) & (step >= bounds.start) & (step < bounds.end)
 
 
-def sound(scene: Scene, distance: Any, height: Any) -> Any:
+def sound(bounds: Bounds, distance: Any, height: Any) -> Any:
     """Whether a state consists of numbers and its object is not below the table.
 
     Args:
-      scene: The scene.
+      bounds: What decides a world.
       distance: Object centre to hand centre [m].
       height: Object centre above the table [m].
     """
-    return (distance <= FAR) & (height >= -scene.limits.penetration)
+    return (distance <= FAR) & (height >= -bounds.penetration)
 
 
-def slow(scene: Scene, speed: Any) -> Any:
+def slow(bounds: Bounds, speed: Any) -> Any:
     """Whether the largest absolute generalized velocity is a number and within the limit."""
-    return speed <= scene.limits.speed
+    return speed <= bounds.speed
 
 
 def goes_on(
-    scene: Scene, distance: Any, height: Any, speed: Any, step: Any, *, to_end: bool
+    bounds: Bounds, distance: Any, height: Any, speed: Any, step: Any, *, to_end: bool
 ) -> Any:
     """Whether a world whose state is so takes the next step; arguments as above.
 
     The step is kept if the state after it is `slow` as well, else the world stays where it was.
 
     Args:
-      scene: The scene.
+      bounds: What decides a world.
       distance: Object centre to hand centre [m].
       height: Object centre above the table [m].
       speed: Largest absolute generalized velocity.
       step: Index of the time step.
       to_end: Whether worlds that lost their object are simulated to the end all the same.
     """
-    good = sound(scene, distance, height) & slow(scene, speed)
-    return good if to_end else good & ~lost(scene, distance, step)
+    good = sound(bounds, distance, height) & slow(bounds, speed)
+    return good if to_end else good & ~lost(bounds, distance, step)
 
 
 def failures(scene: Scene, trace: Trace) -> jax.Array:

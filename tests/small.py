@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import parameters, rollout, scene
+from codesign_jax import parameters, rollout, scene, schema
 from codesign_jax.types import Trial
 
 DATA = Path(__file__).parent / "data"
@@ -44,10 +44,31 @@ def random_worlds(the_scene, seed, count):
     return params, rollout.sample_trials(the_scene, jax.random.key(seed), count)
 
 
+def random_constants(the_scene, seed, count=None):
+    """A scene's numbers, each up to 20 % larger or smaller, leaves of shape () or (count,).
+
+    They stay in their ranges, the phases in order, and the contact's time constant above two steps.
+    """
+    random = np.random.default_rng(seed)
+    shape = () if count is None else (count,)
+    ranges = scene.Constants(**schema.ranges(the_scene)._asdict())
+    found = jax.tree.map(
+        lambda v, r: np.clip(v * random.uniform(0.8, 1.2, shape), r.low, r.high),
+        the_scene.constants(),
+        ranges,
+    )
+    slow = jax.tree.map(lambda v: v * random.uniform(0.97, 1.03, shape), the_scene.constants())
+    contact = found.contact._replace(
+        time_constant=the_scene.contact.time_constant * random.uniform(1.0, 1.2, shape),
+        impedance=the_scene.contact.impedance * random.uniform(0.8, 1.05, shape),
+    )
+    return found._replace(contact=contact, phases=slow.phases)
+
+
 def still(shape=0):
     """A trial without noise, as NumPy arrays."""
     zero, one = np.zeros(()), np.ones(())
-    return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), one, one)
+    return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), one, one, one, one)
 
 
 def hand_world(the_scene, **changes):

@@ -64,7 +64,9 @@ def engine_contacts(kind, position, quat, centre):
         index = [s.type for s in paper.objects.object].index(kind)
         size = np.broadcast_to(np.array(SIZES[kind])[:, None, None], (3, 1, POSES))
         hand = SimpleNamespace(
-            object_size=jnp.asarray(size), shape=jnp.full((1, POSES), index, jnp.int32)
+            object_size=jnp.asarray(size),
+            object_id=jnp.full((1, POSES), index, jnp.int32),
+            cones=SimpleNamespace(hand_object=None),
         )
         frames = columns.reshape(POSES, 3, 3).transpose(2, 1, 0)[
             :, :, None

@@ -8,7 +8,7 @@ import pytest
 from scipy import integrate, optimize
 
 from codesign_jax import control, morphology
-from codesign_jax.engines.structured import collision, contact
+from codesign_jax.engines.structured import cones, contact
 from tests import small
 from tests.test_effects import inflated, setting
 
@@ -179,7 +179,7 @@ def some_contacts(friction, rng, count):
         point=jnp.asarray(0.05 * rng.normal(size=(3, 1, count))),
         normal=jnp.asarray(normal / np.linalg.norm(normal, axis=0)),
         distance=jnp.full((1, count), -1e-3),
-        cone=collision.make_cone(scene, 0.8, bodies=2),
+        cone=cones.make_cone(scene, 0.8, bodies=2),
     )
 
 

@@ -11,7 +11,7 @@ from codesign_jax import hull, model, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import hull as skin
-from codesign_jax.engines.structured.collision import make_cone
+from codesign_jax.engines.structured.cones import make_cone
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.kinematics import kinematics

@@ -64,7 +64,8 @@ class MjxEngine:
             return jax.vmap(lambda f, c: self._world(f, c, trajectory))(fields, ctrl)
 
     def _world(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
-        lay, scene = layout(self.scene), self.scene
+        lay = layout(self.scene)
+        bounds = verdict.bounds(self.scene.with_constants(fields.constants))
         weights = jnp.asarray(lay.centre_weights, ctrl.dtype)
 
         def body(carry: _Carry, x: tuple) -> tuple[_Carry, Trace]:
@@ -81,9 +82,9 @@ class MjxEngine:
             # The sum makes the speed not finite if any position is not.
             speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()
             goes_on = carry.alive & verdict.goes_on(
-                scene, distance, height, carry.speed, step, to_end=trajectory
+                bounds, distance, height, carry.speed, step, to_end=trajectory
             )
-            moved = goes_on & verdict.slow(scene, speed)
+            moved = goes_on & verdict.slow(bounds, speed)
             state = _Carry(new.qpos, new.qvel, new.qacc_warmstart, speed, moved)
             kept = carry._replace(speed=jnp.where(goes_on, speed, carry.speed), alive=moved)
             return jax.tree.map(lambda a, b: jnp.where(moved, a, b), state, kept), entry

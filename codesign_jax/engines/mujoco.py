@@ -87,6 +87,8 @@ class MujocoEngine:
         )
         series = (distance, height, speed, qpos, status)
         last = np.concatenate([fields.start, np.zeros((worlds, self.template.nv))], 1)
+        bounds = verdict.bounds(scene.with_constants(fields.constants))
+        bounds = verdict.Bounds(*(np.asarray(v)[:, None] for v in bounds))
         going = np.arange(worlds)
         chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
         for first in range(0, steps, chunk):
@@ -102,7 +104,8 @@ class MujocoEngine:
                 array[going, part] = np.asarray(values)
             full = batch.warning[:, _FULL, 0].any(1)[going]
             status[going[full], first + taken[full] - 1] |= int(Status.CONTACT_OVERFLOW)
-            entry, kept = _decisions(scene, new, first, to_end=trajectory)
+            mine = verdict.Bounds(*(v[going] for v in bounds))
+            entry, kept = _decisions(mine, new, first, to_end=trajectory)
             done = (entry < count) | stopped
             here = kept >= 0
             last[going[here]] = states[here, kept[here]]
@@ -115,7 +118,8 @@ class MujocoEngine:
             if not going.size:
                 break
         state = np.concatenate([batch.bind("qpos")[going], batch.bind("qvel")[going]], 1)
-        good = np.isfinite(state).all(1) & verdict.slow(scene, np.abs(state[:, nq:]).max(1))
+        slow = verdict.slow(verdict.Bounds(*(v[going] for v in bounds)), np.abs(state[:, nq:]))
+        good = np.isfinite(state).all(1) & slow.all(1)
         last[going[good]] = state[good]
         return Trace(*series, last)
 
@@ -153,12 +157,12 @@ class MujocoEngine:
 
 
 def _decisions(
-    scene: Scene, new: Trace, first: int, *, to_end: bool
+    bounds: verdict.Bounds, new: Trace, first: int, *, to_end: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """When worlds are decided within a chunk, and where they stay.
 
     Args:
-      scene: The scene.
+      bounds: Bounds of the worlds, of shape (world, 1).
       new: The chunk's trace, arrays of shape (world, step).
       first: Index of its first step.
       to_end: As in `verdict.goes_on`.
@@ -169,11 +173,11 @@ def _decisions(
     """
     count = new.speed.shape[1]
     entries = new.distance, new.height, new.speed
-    goes_on = verdict.goes_on(scene, *entries, first + np.arange(count), to_end=to_end)
+    goes_on = verdict.goes_on(bounds, *entries, first + np.arange(count), to_end=to_end)
     entry = np.where(goes_on.all(1), count, goes_on.argmin(1))
     at = np.minimum(entry, count - 1)[:, None]
     distance, speed = (np.take_along_axis(v, at, 1)[:, 0] for v in (new.distance, new.speed))
-    good = (entry < count) & verdict.slow(scene, speed) & (distance <= verdict.FAR)
+    good = (entry < count) & verdict.slow(bounds, speed[:, None])[:, 0] & (distance <= verdict.FAR)
     return entry, np.where(good, entry, entry - 1)
 
 
@@ -236,5 +240,11 @@ def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:
 
     model = copy.deepcopy(compile_template(scene))
     for name, value in fields.of_model.items():
-        getattr(model, name)[:] = np.asarray(value, np.float64)
+        value = np.asarray(value, np.float64)
+        if name == "opt.impratio":
+            model.opt.impratio = value.item()
+        elif name == "opt.gravity":
+            model.opt.gravity[:] = value
+        else:
+            getattr(model, name)[:] = value
     return model

@@ -7,26 +7,32 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import morphology
+from codesign_jax.constants import with_trial
 from codesign_jax.model.layout import (
     Layout,
+    contact_invweight,
     geom_bounds,
     layout,
     mounts,
     object_quat,
     object_size,
+    palm_points,
     wrist_springs,
 )
-from codesign_jax.model.spec import compile_template
-from codesign_jax.scene import Scene
+from codesign_jax.model.spec import SOLIMP, compile_template, palm_inertia
+from codesign_jax.scene import Constants, Scene, by_structure
 from codesign_jax.types import Params, Trial
 
 
 class ModelFields(NamedTuple):
-    """The fields of mjModel that depend on parameters and trial, and the start state.
+    """The fields of mjModel that depend on parameters, trial and constants, and the start state.
 
-    Every array has MuJoCo's name and shape for one world, but for two: `start` is the initial qpos,
-    shape (nq,), and `section` has height, wall and segment length of the fingers [m], shape
-    (finger, 3), with the effect `neo_hookean`; None without it.
+    Every array has MuJoCo's name and shape for one world, `gravity` and `impratio` those of
+    mjOption, but for three: `start` is the initial qpos, shape (nq,); `section` has height, wall,
+    segment length and width of the fingers [m], shape (finger, 4), with the effect `neo_hookean` or
+    the surface "hull", None without; and `constants` are the world's numbers with the trial's
+    factors, from which engines take what MuJoCo has no field for: limits, the cost's window, and
+    friction by pair of bodies.
     """
 
     body_pos: jax.Array
@@ -44,13 +50,23 @@ class ModelFields(NamedTuple):
     dof_armature: jax.Array
     dof_M0: jax.Array
     actuator_gainprm: jax.Array
+    actuator_biasprm: jax.Array
+    body_invweight0: jax.Array
+    pair_friction: jax.Array
+    pair_solref: jax.Array
+    pair_solimp: jax.Array
+    gravity: jax.Array
+    impratio: jax.Array
     start: jax.Array
+    constants: Constants
     section: jax.Array | None = None
 
     @property
     def of_model(self) -> dict[str, jax.Array]:
-        """The fields of mjModel, by name."""
-        return {k: v for k, v in self._asdict().items() if k not in ("start", "section")}
+        """The fields of mjModel by name, those of its mjOption as "opt.name"."""
+        others, options = ("start", "section", "constants"), ("gravity", "impratio")
+        fields = {k: v for k, v in self._asdict().items() if k not in others}
+        return {f"opt.{k}" if k in options else k: v for k, v in fields.items()}
 
 
 def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
@@ -65,7 +81,8 @@ def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     by_axis = {"bend": beam.bending, "lateral": beam.lateral, "twist": beam.torsion}
     finger = jnp.stack([by_axis[name] / segment for name in lay.axes], -1)
     finger = jnp.broadcast_to(finger[:, None, :], lay.dofs.shape).reshape(-1)
-    wrist, wrist_damping = (jnp.array(v, finger.dtype) for v in wrist_springs(scene))
+    springs = wrist_springs(scene)
+    wrist, wrist_damping = (jnp.stack([jnp.asarray(x, finger.dtype) for x in v]) for v in springs)
     free = jnp.zeros(6, finger.dtype)
     stiffness = jnp.concatenate([wrist, finger, free])
     return stiffness, jnp.concatenate([wrist_damping, hand.material.damping_time * finger, free])
@@ -75,13 +92,13 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     """Returns the batched model fields and the start state of one world; pure, vmap it for batches.
 
     Args:
-      scene: The scene (static).
+      scene: The scene; of `Scene.with_constants` if its numbers are traced.
       params: Parameters of the hand; all physics in the float type of these.
       trial: The trial's object and noise.
     """
-    template, lay = compile_template(scene), layout(scene)
+    template, lay, dtype = compile_template(scene), layout(scene), params.length.dtype
+    scene = with_trial(_in_type(scene, dtype), trial)
     beam = morphology.finger_beams(scene.hand, params)
-    dtype = params.length.dtype
 
     def base(name: str) -> jax.Array:
         return jnp.asarray(getattr(template, name), dtype)
@@ -95,20 +112,29 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     offsets = jnp.concatenate(
         [segment[:, None] / 2, jnp.broadcast_to(segment[:, None], masses[:, 2:].shape)], 1
     )
-    mass = base("body_mass").at[bodies].set(masses).at[lay.object].set(object_mass)
+    palm = scene.hand.palm
+    mass = base("body_mass").at[1].set(palm.mass).at[bodies].set(masses)
+    mass = mass.at[lay.object].set(object_mass)
     h = scene.discretization.timestep
     stiffness, damping = joint_springs(scene, params)
     implicit = damping + h * stiffness
     geom_size, rbound, aabb = _geom_fields(scene, params, size, base)
+    bias = base("actuator_biasprm").at[:6, 1].set(-stiffness[:6])
+    gain = base("actuator_gainprm").at[:6, 0].set(stiffness[:6])
+    friction, solref, solimp = _pairs(scene, dtype)
     return ModelFields(
         body_pos=base("body_pos").at[lay.stubs].set(mount_pos).at[lay.bodies, 0].set(offsets),
         body_quat=base("body_quat").at[lay.stubs].set(mount_quat),
-        body_ipos=_centres(base("body_ipos"), bodies, extents, params.height),
+        body_ipos=_centres(base("body_ipos"), bodies, extents, params.height)
+        .at[1, 2]
+        .set(palm.thickness / 2),
         body_mass=mass,
         body_subtreemass=_subtree_mass(lay, mass, masses, base("body_subtreemass")),
         body_inertia=_link_inertia(scene, params, base("body_inertia"), bodies, masses, extents)
         .at[lay.object]
-        .set(object_inertia),
+        .set(object_inertia)
+        .at[1]
+        .set(jnp.stack(palm_inertia(scene))),
         geom_pos=_sphere_positions(scene, params, extents, base("geom_pos")),
         geom_size=geom_size,
         geom_rbound=rbound,
@@ -119,16 +145,64 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         dof_armature=h * implicit,
         # MuJoCo takes the inertia of a free body from this constant; of other bodies it does not.
         dof_M0=base("dof_M0").at[-6:-3].set(object_mass).at[-3:].set(object_inertia),
-        actuator_gainprm=base("actuator_gainprm").at[6:, 0].set(beam.moment_per_pressure),
+        actuator_gainprm=gain.at[6:, 0].set(beam.moment_per_pressure),
+        actuator_biasprm=bias,
+        # Declared, not derived; see contact_invweight.  The world keeps zero.
+        body_invweight0=base("body_invweight0").at[1:].set(contact_invweight(scene)),
+        pair_friction=friction,
+        pair_solref=solref,
+        pair_solimp=solimp,
+        gravity=jnp.zeros(3, dtype).at[2].set(-scene.gravity_on),
+        impratio=scene.contact.friction_ratio,
         start=_start(scene, params, trial, rest),
+        constants=scene.constants(),
         section=_section(scene, params),
     )
 
 
+def _in_type(scene: Scene, dtype: Any) -> Scene:
+    """The scene with its numbers as arrays of a float type."""
+    return scene.with_constants(jax.tree.map(lambda v: jnp.asarray(v, dtype), scene.constants()))
+
+
 def _section(scene: Scene, params: Params) -> jax.Array | None:
-    if not scene.effects.neo_hookean:
+    if not (scene.effects.neo_hookean or scene.effects.surface == "hull"):
         return None
-    return jnp.stack([params.height, params.wall, params.length / layout(scene).links], -1)
+    width = scene.hand.section.width + 0 * params.height
+    return jnp.stack([params.height, params.wall, params.length / layout(scene).links, width], -1)
+
+
+@by_structure
+def _pair_kinds(scene: Scene) -> np.ndarray:
+    """Which friction each of the template's contact pairs has, an index into `_frictions`."""
+    template, lay = compile_template(scene), layout(scene)
+    shapes = len(scene.objects.object)
+    kinds = np.zeros(template.npair, int)
+    for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
+        touched = np.isin(lay.object_geoms, pair)
+        if 0 in pair:  # the table
+            kinds[i] = shapes if touched.any() else shapes + 1
+        else:
+            kinds[i] = np.argmax(touched) if touched.any() else shapes + 2
+    return kinds
+
+
+def _frictions(scene: Scene) -> jax.Array:
+    """Coefficients of the hand on each shape, table on object, table on hand, between fingers."""
+    shapes, c = [shape.friction for shape in scene.objects.object], scene.contact
+    rest = [scene.objects.table.friction, c.finger_table_friction, c.finger_finger_friction]
+    return jnp.stack([*shapes, *rest])
+
+
+def _pairs(scene: Scene, dtype: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """MuJoCo's friction (pair, 5), solref (pair, 2) and solimp (pair, 5) of the contact pairs."""
+    c, kinds = scene.contact, _pair_kinds(scene)
+    slide = _frictions(scene)[kinds]
+    spin, roll = (v + 0 * slide for v in (c.torsional_friction, c.rolling_friction))
+    solref = jnp.stack([c.time_constant, jnp.ones((), dtype)])
+    solimp = jnp.stack([c.impedance, c.impedance, *(jnp.asarray(v, dtype) for v in SOLIMP)])
+    solref, solimp = (jnp.broadcast_to(v, (len(kinds), v.size)) for v in (solref, solimp))
+    return jnp.stack([slide, slide, spin, roll, roll], -1), solref, solimp
 
 
 def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
@@ -147,9 +221,8 @@ def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
       Moments, shaped as `angles`.
     """
     assert fields.section is not None
-    height, wall, segment = (fields.section[..., i : i + 1] for i in range(3))
+    height, wall, segment, width = (fields.section[..., i : i + 1] for i in range(4))
     stiffness = fields.jnt_stiffness[..., layout(scene).dofs[..., 0]]
-    width = scene.hand.section.width
     return stiffness * angles * morphology.softening(angles / segment, height, wall, width=width)
 
 
@@ -193,8 +266,10 @@ def _subtree_mass(lay: Layout, mass: jax.Array, masses: jax.Array, subtree: jax.
 def _sphere_positions(
     scene: Scene, params: Params, extents: jax.Array, geom_pos: jax.Array
 ) -> jax.Array:
-    """Spheres spread evenly over each moving link, tangent to the bottom layer."""
+    """Spheres spread evenly over each moving link, tangent to the bottom layer, and the palm's."""
     lay = layout(scene)
+    if lay.palm.size:
+        geom_pos = geom_pos.at[lay.palm].set(palm_points(scene))
     if not lay.spheres.size:
         return geom_pos
     k = lay.spheres.shape[2]
@@ -208,6 +283,10 @@ def _geom_fields(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     lay = layout(scene)
     geom_size, rbound, aabb = base("geom_size"), base("geom_rbound"), base("geom_aabb")
+    if lay.palm.size:
+        radius = scene.hand.palm.contact_radius
+        geom_size, rbound = geom_size.at[lay.palm, 0].set(radius), rbound.at[lay.palm].set(radius)
+        aabb = aabb.at[lay.palm, 3:].set(radius)
     if lay.spheres.size:
         radius = jnp.broadcast_to(params.height[:, None, None] / 2, lay.spheres.shape)
         geom_size = geom_size.at[lay.spheres, 0].set(radius)

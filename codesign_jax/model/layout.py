@@ -4,8 +4,7 @@ Both ways to a model use it: `spec` compiles one hand with MuJoCo, `fields` comp
 them.
 """
 
-import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ import numpy as np
 
 from codesign_jax import morphology
 from codesign_jax.objects import Shape
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, by_structure
 from codesign_jax.types import Trial
 
 # An object body carries one geom for each shape of the set; those that a trial does not use shrink
@@ -38,6 +37,7 @@ class Layout(NamedTuple):
       dofs: Dof (and joint) ids of the finger hinges, shape (finger, N, axis).
       spheres: Geom ids of the finger spheres, shape (finger, N, k); empty without finger contacts.
       object_geoms: Geom ids of the object's shapes, shape (shape,).
+      palm: Geom ids of the palm's contact spheres, shape (sphere,); empty without palm contacts.
       centre_weights: Weight of each body in the hand centre, the mean position of the segments,
         (nbody,).
     """
@@ -50,6 +50,7 @@ class Layout(NamedTuple):
     dofs: np.ndarray
     spheres: np.ndarray
     object_geoms: np.ndarray
+    palm: np.ndarray
     centre_weights: np.ndarray
 
 
@@ -59,7 +60,7 @@ def joint_axes(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name in AXES if on[name])
 
 
-@functools.cache
+@by_structure
 def layout(scene: Scene) -> Layout:
     """Returns the index layout of a scene's model."""
     n, links, axes = scene.num_fingers, scene.discretization.links, joint_axes(scene)
@@ -69,13 +70,15 @@ def layout(scene: Scene) -> Layout:
     e = scene.effects
     touching = e.surface == "spheres" and (e.finger_object or e.finger_table or e.finger_finger)
     k = scene.discretization.spheres_per_link if touching else 0
-    first = 1 + (len(palm_points(scene)) if palm_touches(scene) else 0)
+    palm = 1 + np.arange(len(_PALM_RING) if palm_touches(scene) else 0)
+    first = 1 + len(palm)
     spheres = first + np.arange(n * links * k).reshape(n, links, k)
     shapes = first + n * links * k + np.arange(len(scene.objects.object))
     weights = np.zeros(3 + n * (links + 1))
     weights[bodies] = 1.0 / (n * links)
     weights[[*stubs, *bodies[:, -1]]] = 0.5 / (n * links)
-    return Layout(links, axes, stubs, bodies, len(weights) - 1, dofs, spheres, shapes, weights)
+    last = len(weights) - 1
+    return Layout(links, axes, stubs, bodies, last, dofs, spheres, shapes, palm, weights)
 
 
 # Implicit inertia of a wrist joint without compliance [kg, kg m^2]: forces of the hand, of at most
@@ -84,20 +87,20 @@ def layout(scene: Scene) -> Layout:
 RIGID = 1e9
 
 
-def wrist_springs(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Stiffness [N/m, N m/rad] and damping [N s/m, N m s/rad] of the wrist's joints, each (6,).
+def wrist_springs(scene: Scene) -> tuple[list[Any], list[Any]]:
+    """Stiffness [N/m, N m/rad] and damping [N s/m, N m s/rad] of the wrist's joints, six each.
 
     Without the effect `wrist` they are the limit in which the implicit spring ends every step where
     the arm frame is: (M + h^2 K) a = K (u - q - h v) gives q + h (v + h a) = u as K grows.
     """
     w = scene.hand.wrist
     if not scene.effects.wrist:
-        return np.full(6, RIGID / scene.discretization.timestep**2), np.zeros(6)
+        return [RIGID / scene.discretization.timestep**2] * 6, [0.0] * 6
     stiffness = [w.linear_stiffness] * 3 + [w.angular_stiffness] * 3
-    return np.array(stiffness), np.array([w.linear_damping] * 3 + [w.angular_damping] * 3)
+    return stiffness, [w.linear_damping] * 3 + [w.angular_damping] * 3
 
 
-def contact_invweight(scene: Scene) -> float:
+def contact_invweight(scene: Scene) -> Any:
     """Inverse weight declared for every body in contact [1/kg].
 
     MuJoCo's soft contact has normal stiffness k_n = k d / ((1 - d) sum(invweight)) with
@@ -115,36 +118,41 @@ def palm_touches(scene: Scene) -> bool:
     return scene.effects.palm_object or scene.effects.palm_table
 
 
-def palm_points(scene: Scene) -> np.ndarray:
+_PALM_RING = np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
+
+
+def palm_points(scene: Scene) -> jax.Array:
     """Centres of the palm's contact spheres in the palm frame, whose origin is on the underside."""
     p = scene.hand.palm
-    ring = p.contact_ring * np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
-    return np.column_stack([ring, np.full(len(ring), p.contact_radius)])
+    up = p.contact_radius * jnp.ones(len(_PALM_RING))
+    return jnp.column_stack([p.contact_ring * _PALM_RING, up])
 
 
 def mounts(scene: Scene, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Base position (finger, 3) and orientation (finger, 4) of the fingers in the palm frame."""
-    fingers = scene.hand.finger
-    azimuth = jnp.deg2rad(np.array([f.azimuth for f in fingers]))
-    azimuth = azimuth + np.array([f.spread for f in fingers]) * spread
-    radius, tilt = (np.array([getattr(f, k) for f in fingers]) for k in ("radius", "tilt"))
-    zero, tilt = jnp.zeros_like(azimuth), np.deg2rad(tilt)
+
+    def each(name: str) -> jax.Array:
+        return jnp.stack([jnp.asarray(getattr(f, name)) for f in scene.hand.finger])
+
+    azimuth = jnp.deg2rad(each("azimuth")) + each("spread") * spread
+    radius, tilt = each("radius"), jnp.deg2rad(each("tilt"))
+    zero = jnp.zeros_like(azimuth)
     position = jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), zero], -1)
     # Rotation about z by the azimuth, then about y by the tilt: x leaves the palm outwards and
     # down.
-    ca, sa, ct, st = jnp.cos(azimuth / 2), jnp.sin(azimuth / 2), np.cos(tilt / 2), np.sin(tilt / 2)
+    ca, sa, ct, st = (f(a / 2) for a in (azimuth, tilt) for f in (jnp.cos, jnp.sin))
     return position, jnp.stack([ca * ct, -sa * st, ca * st, sa * ct], -1)
 
 
 def object_size(scene: Scene, trial: Trial) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Geom sizes (shape, 3), mass, principal inertia (3,) and rest height of the object."""
     shapes = scene.objects.object
-    full = np.array([s.half_sizes for s in shapes])
+    full = jnp.stack([jnp.stack([jnp.asarray(v) for v in s.half_sizes]) for s in shapes])
     size = trial.size * full
-    mass = trial.mass * jnp.array([s.mass for s in shapes])[trial.shape]
+    mass = trial.mass * jnp.stack([jnp.asarray(s.mass) for s in shapes])[trial.shape]
     unit = jnp.stack([_unit_inertia(s, size[i], trial.size) for i, s in enumerate(shapes)])
     unit = unit[trial.shape]
-    height = trial.size * jnp.array([_rest_height(s) for s in shapes])[trial.shape]
+    height = trial.size * jnp.stack([jnp.asarray(_rest_height(s)) for s in shapes])[trial.shape]
     active = jnp.arange(len(shapes)) == trial.shape
     return jnp.where(active[:, None], size, INACTIVE * size), mass, mass * unit, height
 
@@ -157,7 +165,7 @@ def object_quat(scene: Scene, trial: Trial) -> jax.Array:
     return jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
 
 
-def _rest_height(shape: Shape) -> float:
+def _rest_height(shape: Shape) -> Any:
     """Height of an object's centre on the table [m]."""
     if shape.mesh:
         return shape.mesh.rest_height

@@ -3,12 +3,14 @@
 import contextlib
 import functools
 import itertools
+from typing import Any
 
 import jax
 import mujoco
 import numpy as np
 
-from codesign_jax import hull, morphology, parameters
+from codesign_jax import hull, morphology
+from codesign_jax.constants import with_trial
 from codesign_jax.model.layout import (
     AXES,
     RIGID,
@@ -23,7 +25,7 @@ from codesign_jax.model.layout import (
     wrist_springs,
 )
 from codesign_jax.morphology import Beam
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Constants, Scene, by_structure
 from codesign_jax.types import Params, Trial
 
 _GEOM = {
@@ -36,14 +38,22 @@ _GEOM = {
 }
 
 
-@functools.cache
+@by_structure
 def compile_template(scene: Scene) -> mujoco.MjModel:
-    """Compiles the scene's template model, once a scene."""
-    space, one = parameters.design_space(scene.hand), np.ones(())
-    with _float64():
-        params = jax.tree.map(np.asarray, jax.jit(lambda: space.params(space.default()))())
-    trial = Trial(np.int32(0), np.zeros(2), 0 * one, np.zeros(2), one, one)
-    return compile_model(scene, params, trial)
+    """Compiles the template model of a scene's structure, once.
+
+    Its numbers are those of `template_world` and mean nothing: `model_fields` has a world's, but
+    for the scale of the solver's tolerance, `stat.meaninertia`, which all worlds share.
+    """
+    return compile_model(scene, *template_world(scene))
+
+
+def template_world(scene: Scene) -> tuple[Params, Trial]:
+    """Parameters and trial of the template, as NumPy arrays."""
+    one = np.ones(scene.num_fingers)
+    params = Params(0.1 * one, 0.02 * one, 0.004 * one, np.zeros(()), np.zeros(6), 0.0 * one)
+    zero, unit = np.zeros(()), np.ones(())
+    return params, Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), unit, unit, unit, unit)
 
 
 @contextlib.contextmanager
@@ -75,8 +85,9 @@ def compile_model(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _numbers(scene: Scene, params: Params, trial: Trial) -> tuple:
+def _numbers(structure: Scene, constants: Constants, params: Params, trial: Trial) -> tuple:
     """Beams, mounts, and the object's size and orientation; one program, not one an operation."""
+    scene = structure.with_constants(constants)
     beams, place = morphology.finger_beams(scene.hand, params), mounts(scene, params.spread)
     return beams, place, object_size(scene, trial), object_quat(scene, trial)
 
@@ -86,13 +97,13 @@ def build_spec(
     scene: Scene, params: Params, trial: Trial, *, visual: bool = False
 ) -> mujoco.MjSpec:
     """Builds the MjSpec of one hand and one trial; arguments as `compile_model`."""
-    spec = mujoco.MjSpec()
+    spec, scene = mujoco.MjSpec(), with_trial(scene, jax.tree.map(np.asarray, trial))
     _options(scene, spec)
     world = spec.worldbody
     world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.05], **_PASSIVE)
     _add_palm(scene, spec, visual)
-    concrete = jax.tree.map(np.asarray, (params, trial))
-    beams, place, solid, quat = jax.tree.map(np.asarray, _numbers(scene, *concrete))
+    concrete = jax.tree.map(np.asarray, (scene.constants(), params, trial))
+    beams, place, solid, quat = jax.tree.map(np.asarray, _numbers(scene.structure, *concrete))
     for f in range(scene.num_fingers):
         beam = Beam(*(float(v[f]) for v in beams))
         _add_finger(scene, spec, params, f, beam, (place[0][f], place[1][f]), visual)
@@ -101,6 +112,8 @@ def build_spec(
     return spec
 
 
+SOLIMP = (0.001, 0.5, 2.0)
+"""Width, midpoint and power of MuJoCo's impedance, which is constant here: they do not matter."""
 _PASSIVE = {"contype": 0, "conaffinity": 0}  # contacts come from explicit pairs only
 _COLORS = {
     "object": (0.85, 0.55, 0.2, 1),
@@ -131,12 +144,18 @@ def _hinge(
     return body.add_joint(name=name, type=kind, axis=axis, pos=[0, 0, 0], **kwargs)
 
 
+def palm_inertia(scene: Scene) -> list[Any]:
+    """Principal inertia of the palm, a disc, about its centre [kg m^2]."""
+    p = scene.hand.palm
+    across = p.mass * (p.radius**2 / 4 + p.thickness**2 / 12)
+    return [across, across, p.mass * p.radius**2 / 2]
+
+
 def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
     p, h = scene.hand.palm, scene.discretization.timestep
     body = spec.worldbody.add_body(name="palm")
     body.explicitinertial, body.mass, body.ipos = True, p.mass, [0, 0, p.thickness / 2]
-    across = p.mass * (p.radius**2 / 4 + p.thickness**2 / 12)
-    body.inertia = [across, across, p.mass * p.radius**2 / 2]
+    body.inertia = palm_inertia(scene)
     axes = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
     axes |= {"roll": axes["x"], "yaw": axes["z"], "pitch": axes["y"]}
     for name, stiffness, damping in zip(WRIST, *wrist_springs(scene), strict=True):
@@ -150,7 +169,7 @@ def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         actuator.gainprm[0], actuator.biasprm[1] = stiffness, -stiffness
     if palm_touches(scene):
-        for i, point in enumerate(palm_points(scene)):
+        for i, point in enumerate(np.asarray(palm_points(scene))):
             _sphere(body, f"palm_{i}", point, p.contact_radius)
     if visual:
         kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, [p.radius, p.thickness / 2, 0]
@@ -269,7 +288,7 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
     """Explicit contact pairs: the contact list is the scene's, not a filter's."""
     e, c, lay = scene.effects, scene.contact, layout(scene)
     fingers = [f"finger_{f}_sphere_{i + 1}_{j}" for f, i, j in np.ndindex(lay.spheres.shape)]
-    palm = [f"palm_{i}" for i in range(len(palm_points(scene)))]
+    palm = [f"palm_{i}" for i in range(len(lay.palm))]
     condim = {"none": 1, "coulomb": 3, "full": 6}[e.friction]
 
     def add(first: str, second: str, friction: float) -> None:
@@ -277,7 +296,7 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
         spin, roll = c.torsional_friction, c.rolling_friction
         pair.friction = [friction, friction, spin, roll, roll]
         pair.solref = [c.time_constant, 1.0]
-        pair.solimp = [c.impedance, c.impedance, 0.001, 0.5, 2.0]
+        pair.solimp = [c.impedance, c.impedance, *SOLIMP]
 
     for i, shape in enumerate(scene.objects.object):
         if e.object_table:

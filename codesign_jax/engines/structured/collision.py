@@ -13,48 +13,9 @@ from codesign_jax.engines.structured.constants import WorldConstants, apply_colu
 from codesign_jax.engines.structured.contact import Cone, Contacts
 from codesign_jax.engines.structured.kinematics import Kinematics
 from codesign_jax.engines.structured.lanes import Stages, cross, dot
-from codesign_jax.model import contact_invweight
-from codesign_jax.model.layout import palm_points
 from codesign_jax.scene import Scene
 
 _TINY = 1e-12
-
-
-def make_cone(scene: Scene, friction: jax.Array | float, *, bodies: int) -> Cone:
-    """MuJoCo's contact parameters for constant impedance (its Computation chapter).
-
-    Args:
-      scene: The scene.
-      friction: Coulomb coefficient.
-      bodies: Bodies other than the world in the contact, whose declared inverse weights add.
-    """
-    c = scene.contact
-    regularizer = (1.0 - c.impedance) / c.impedance * contact_invweight(scene) * bodies
-    if scene.effects.friction == "none":
-        return Cone(1.0 / regularizer, None, None, None, *_reference(scene))
-    ratio = friction / np.sqrt(c.friction_ratio)
-    tangent = c.friction_ratio / regularizer
-    cone = Cone(1.0 / regularizer, tangent, friction, ratio, *_reference(scene))
-    if scene.effects.friction != "full":
-        return cone
-    least = jnp.maximum(friction, 1e-5)  # MuJoCo's mjMINMU
-    return cone._replace(spin=c.torsional_friction / least, roll=c.rolling_friction / least)
-
-
-def _reference(scene: Scene) -> tuple[float, float]:
-    """Spring and damper coefficients of aref."""
-    c = scene.contact
-    spring = 1.0 / (c.impedance * c.time_constant) ** 2 * c.impedance
-    return spring, 2.0 / (c.impedance * c.time_constant)
-
-
-def object_friction(scene: Scene, shape: jax.Array) -> jax.Array:
-    """Friction of each world's object with the hand, shape (1, world)."""
-    values = [s.friction for s in scene.objects.object]
-    friction = jnp.full(shape.shape, values[0])
-    for i, value in enumerate(values[1:], 1):
-        friction = jnp.where(shape == i, value, friction)
-    return friction
 
 
 def spheres_on_object(
@@ -84,8 +45,7 @@ def spheres_on_object(
 
     distance, gradient = run(measure, kin.object, kin.object_pos, centre)
     point, normal, gap = run(place, kin.object, centre, distance, gradient)
-    cone = make_cone(scene, object_friction(scene, hand.object_id), bodies=2)
-    return Contacts(point, normal, gap, cone)
+    return Contacts(point, normal, gap, hand.cones.hand_object)
 
 
 def in_object(columns: jax.Array, position: jax.Array, point: jax.Array) -> jax.Array:
@@ -115,16 +75,14 @@ def on_surface(
 
 
 def spheres_on_table(
-    scene: Scene, height: jax.Array, centre: jax.Array, radius: jax.Array | float
+    cone: Cone, height: jax.Array, centre: jax.Array, radius: jax.Array | float
 ) -> Contacts:
     """Contacts of spheres with the table; `height` is the palm's, the origin's, (1, world)."""
     gap = centre[2] + height - radius
     zero = jnp.zeros_like(gap)
     normal = jnp.stack([zero, zero, zero + 1.0])
     point = centre - normal * (radius + 0.5 * gap)
-    return Contacts(
-        point, normal, gap, make_cone(scene, scene.contact.finger_table_friction, bodies=1)
-    )
+    return Contacts(point, normal, gap, cone)
 
 
 def finger_spheres(hand: WorldConstants, kin: Kinematics) -> jax.Array:
@@ -132,10 +90,9 @@ def finger_spheres(hand: WorldConstants, kin: Kinematics) -> jax.Array:
     return kin.origin[:, :, None] + apply_columns(kin.link[:, :, :, None], hand.sphere)
 
 
-def palm_spheres(scene: Scene, kin: Kinematics) -> jax.Array:
+def palm_spheres(hand: WorldConstants, kin: Kinematics) -> jax.Array:
     """Centres of the palm spheres in the palm's frame, shape (3, sphere, world)."""
-    points = jnp.asarray(palm_points(scene).T[:, :, None], kin.palm.dtype)
-    return apply_columns(kin.palm, points)
+    return apply_columns(kin.palm, hand.palm_point)
 
 
 def signed_distance(
@@ -248,11 +205,10 @@ def object_on_table(
             arms = new if arms is None else jnp.where(mine, new, arms)
         return on_table(position, arms, height)
 
-    cone = make_cone(scene, scene.objects.table.friction, bodies=1)
     point, normal, gap = run(
         points, hand.object_size[:, 0], kin.object[:, :, 0], kin.object_pos, height
     )
-    return Contacts(point, normal, gap, cone)
+    return Contacts(point, normal, gap, hand.cones.object_table)
 
 
 def primitive_points(

@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from codesign_jax.engines.structured.cones import Cones, make_cones
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.mesh import MeshLanes, mesh_lanes
 from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
+from codesign_jax.verdict import Bounds, bounds
 
 
 class WorldConstants(NamedTuple):
@@ -34,6 +36,10 @@ class WorldConstants(NamedTuple):
       palm_mass: Mass of the palm with the half segments, shape (1, world).
       palm_centre: Its centre of mass in the palm frame, shape (3, 1, world).
       palm_inertia: Its inertia tensor about that centre, shape (3, 3, 1, world).
+      palm_point: Centres of the palm's contact spheres in the palm frame, shape (3, sphere, world);
+        empty without palm contacts.
+      palm_radius: Their radii, shape (sphere, world).
+      wrist_stiffness: Stiffness of the wrist's springs, shape (6, 1, world).
       wrist_damping: Damping with the implicit term, shape (6, 1, world).
       wrist_armature: Armature with the implicit terms, shape (6, 1, world).
       object_mass: Shape (1, world).
@@ -41,8 +47,11 @@ class WorldConstants(NamedTuple):
       object_size: Sizes of the object's shape, shape (3, 1, world).
       object_id: Index of the object's shape, shape (1, world).
       mesh: Meshes of the worlds; None if the scene has none.
-      section: Height, wall and segment length of the fingers, shape (3, finger, world); None
-        without the effect `neo_hookean`.
+      cones: Parameters of the contacts.
+      bounds: When a world is decided, of shape (1, world) each.
+      gravity: Magnitude of gravity [m/s^2], shape (1, world); None without the effect.
+      section: Height, wall, segment length and width of the fingers, shape (4, finger, world); None
+        without the effect `neo_hookean` and the surface "hull".
     """
 
     mount: jax.Array
@@ -61,6 +70,9 @@ class WorldConstants(NamedTuple):
     palm_mass: jax.Array
     palm_centre: jax.Array
     palm_inertia: jax.Array
+    palm_point: jax.Array
+    palm_radius: jax.Array
+    wrist_stiffness: jax.Array
     wrist_damping: jax.Array
     wrist_armature: jax.Array
     object_mass: jax.Array
@@ -68,6 +80,9 @@ class WorldConstants(NamedTuple):
     object_size: jax.Array
     object_id: jax.Array
     mesh: MeshLanes | None
+    cones: Cones
+    bounds: Bounds
+    gravity: jax.Array | None = None
     section: jax.Array | None = None
 
 
@@ -113,6 +128,7 @@ def world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
     picked = jnp.take_along_axis(sizes, shape[:, None, None], axis=1)[:, 0]
     object_size = last(picked)[:, None]
     no_spheres = lay.spheres.size == 0
+    numbers = scene.with_constants(jax.tree.map(lambda v: v[None], fields.constants))
     return WorldConstants(
         mount=mount,
         base=base,
@@ -130,6 +146,9 @@ def world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
         palm_mass=palm[0],
         palm_centre=palm[1],
         palm_inertia=palm[2],
+        palm_point=jnp.moveaxis(last(fields.geom_pos[:, lay.palm]), 0, 1),
+        palm_radius=last(fields.geom_size[:, lay.palm, 0]),
+        wrist_stiffness=last(fields.actuator_gainprm[:, :6, 0])[:, None],
         wrist_damping=last(fields.dof_damping[:, :6])[:, None],
         wrist_armature=last(fields.dof_armature[:, :6])[:, None],
         object_mass=last(fields.body_mass[:, lay.object])[None],
@@ -137,6 +156,9 @@ def world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
         object_size=object_size,
         object_id=shape[None],
         mesh=mesh_lanes(scene, shape[None], object_size),
+        cones=make_cones(numbers, shape[None]),
+        bounds=bounds(numbers),
+        gravity=-fields.gravity[None, :, 2] if scene.effects.gravity else None,
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
     )
 

@@ -16,7 +16,7 @@ from codesign_jax.engines.structured.lanes import cross, dot
 
 
 class Cone(NamedTuple):
-    """MuJoCo's contact parameters, as numbers of the scene or arrays broadcasting to the contacts.
+    """MuJoCo's contact parameters, as numbers or arrays that broadcast to the contacts.
 
     What a friction model does not need is None: it has no place in the program.
 
@@ -35,8 +35,8 @@ class Cone(NamedTuple):
     tangent: jax.Array | float
     friction: jax.Array | float
     ratio: jax.Array | float
-    spring: float
-    damper: float
+    spring: jax.Array | float
+    damper: jax.Array | float
     spin: jax.Array | float | None = None
     roll: jax.Array | float | None = None
 

@@ -169,7 +169,7 @@ class StructuredEngine:
         """Contacts that the scene's effects call for, by pair of bodies."""
         scene, e, found = self.scene, self.scene.effects, {}
         on_object = partial(collision.spheres_on_object, scene, hand, kin)
-        on_table = partial(collision.spheres_on_table, scene, height)
+        on_table = partial(collision.spheres_on_table, hand.cones.hand_table, height)
         if hand.sphere.size:
             spheres = run(collision.finger_spheres, hand, kin)
             if e.finger_object:
@@ -177,7 +177,9 @@ class StructuredEngine:
             if e.finger_table:
                 found["finger_table"] = on_table(spheres, hand.radius)
             if e.finger_finger and self.scene.num_fingers > 1:
-                found["finger_finger"] = finger_pairs.contacts(run, scene, spheres, hand.radius)
+                found["finger_finger"] = finger_pairs.contacts(
+                    run, hand.cones.finger_finger, spheres, hand.radius
+                )
         if e.surface == "hull" and (e.finger_object or e.finger_table):
             skin = run(lambda h, k: hull.vertices(scene, h, k), hand, kin)
             if e.finger_object:
@@ -185,7 +187,7 @@ class StructuredEngine:
             if e.finger_table:
                 found["hull_table"] = hull.attach(run, on_table(skin.point, 0.0), skin)
         if palm_touches(scene):
-            palm, radius = collision.palm_spheres(scene, kin), scene.hand.palm.contact_radius
+            palm, radius = collision.palm_spheres(hand, kin), hand.palm_radius
             if e.palm_object:
                 found["palm_object"] = on_object(run, palm, radius)
             if e.palm_table:
@@ -290,7 +292,8 @@ class StructuredEngine:
     def _batch(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool, states: bool
     ) -> tuple[Trace, Path | None]:
-        hand, scene = world_constants(self.scene, fields), self.scene
+        hand = world_constants(self.scene, fields)
+        bounds = verdict.Bounds(*(v[0] for v in hand.bounds))
 
         def body(carry, x):
             state, speed, alive = carry
@@ -301,10 +304,10 @@ class StructuredEngine:
             status = self._status(jnp.where(alive, info.residual[0], 0.0), info.overflow)
             qpos = self.qpos(state)
             entry = Trace(distance, height, speed, qpos if trajectory else qpos[:, :0], status)
-            goes_on = verdict.goes_on(scene, distance, height, speed, t, to_end=trajectory)
+            goes_on = verdict.goes_on(bounds, distance, height, speed, t, to_end=trajectory)
             goes_on &= alive & ~failed(status)
             new_speed = self.speed(new)
-            moved = goes_on & verdict.slow(scene, new_speed)
+            moved = goes_on & verdict.slow(bounds, new_speed)
             path = Path(qpos, self.qvel(state), self.flat_acc(info.acc), moved) if states else None
             state = jax.tree.map(lambda a, b: jnp.where(moved, a, b), new, state)
             return (state, jnp.where(goes_on, new_speed, speed), moved), (entry, path)

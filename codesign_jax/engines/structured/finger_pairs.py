@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.collision import make_cone
 from codesign_jax.engines.structured.contact import (
+    Cone,
     Contacts,
     Ends,
     Line,
@@ -23,7 +23,6 @@ from codesign_jax.engines.structured.contact import (
     slopes,
 )
 from codesign_jax.engines.structured.lanes import Stages, dot, sum_items, total
-from codesign_jax.scene import Scene
 
 BLOCK = 8
 """Slots that are done at a time."""
@@ -44,12 +43,12 @@ def slots(candidates: int) -> int:
     return BLOCK * -(-candidates // (BLOCK * SHARE))
 
 
-def contacts(run: Stages, scene: Scene, centre: jax.Array, radius: jax.Array) -> Contacts:
+def contacts(run: Stages, cone: Cone, centre: jax.Array, radius: jax.Array) -> Contacts:
     """Contacts of the pairs of spheres that touch.
 
     Args:
       run: Runs the stages.
-      scene: The scene.
+      cone: Their parameters.
       centre: Sphere centres, shape (3, link, k, finger, world).
       radius: Radii [m], shape (link, k, finger, world).
     """
@@ -67,7 +66,6 @@ def contacts(run: Stages, scene: Scene, centre: jax.Array, radius: jax.Array) ->
     found = run.only_if(touching.any())(place, centre, radius, ends, used)
     point, normal, gap = (x[..., None, :] for x in found)
     link = (ends // (k * fingers)) * fingers + ends % fingers
-    cone = make_cone(scene, scene.contact.finger_finger_friction, bodies=2)
     return Contacts(point, normal, gap, cone, ends=Ends(link[:, :, None], touching))
 
 

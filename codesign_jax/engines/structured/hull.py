@@ -61,13 +61,13 @@ def places(scene: Scene, hand: WorldConstants) -> tuple[jax.Array, jax.Array, ja
       that is shifted to the row's joint [m], shape (3, row, k, finger, world); and `Vertices`'
       weight and share.
     """
-    s, width, dtype = hull.slots(scene), scene.hand.section.width, hand.offset.dtype
+    s, dtype = hull.slots(scene), hand.offset.dtype
     along, across, up, weight, *area = (
         jnp.asarray(v[..., None, None], dtype) for v in (s.along, s.across, s.up, s.weight, *s.area)
     )
-    # The first joint stands half a segment from the base; centres lie at half the height.
-    segment, height = 2.0 * hand.offset[0], 2.0 * hand.centre[2, 0]
-    local = jnp.stack([along * segment, across * width + 0.0 * segment + 0.0 * along, up * height])
+    assert hand.section is not None
+    height, _, segment, width = hand.section
+    local = jnp.stack([along * segment, across * width + 0.0 * along, up * height])
     surface = area[0] * segment * width + area[1] * segment * height + area[2] * width * height
     return local, weight, surface / width**2
 

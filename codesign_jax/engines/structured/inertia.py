@@ -52,19 +52,20 @@ class Body(NamedTuple):
             rows.append(jnp.stack([skew[j][i] for j in range(3)] + moving))
         return jnp.stack(rows)
 
-    def smooth_force(self, vel: jax.Array, bias: jax.Array, gravity: float) -> jax.Array:
+    def smooth_force(self, vel: jax.Array, bias: jax.Array, gravity: jax.Array | None) -> jax.Array:
         """External minus inertial force at zero joint acceleration, shape (6, ...).
 
         Args:
           vel: Spatial velocities.
           bias: Spatial accelerations that velocities alone cause.
-          gravity: Magnitude of gravity, along -z [m/s^2].
+          gravity: Magnitude of gravity, along -z [m/s^2]; None without the effect.
         """
         omega, alpha = vel[:3], bias[:3]
         point_vel = vel[3:] + cross(omega, self.centre)
         acc = bias[3:] + cross(alpha, self.centre) + cross(omega, point_vel)
-        # A sum with no gravity would still be in the program.
-        force = -self.mass * (jnp.stack([acc[0], acc[1], acc[2] + gravity]) if gravity else acc)
+        if gravity is not None:
+            acc = jnp.stack([acc[0], acc[1], acc[2] + gravity])
+        force = -self.mass * acc
         spin = apply_columns(self.tensor, omega)
         moment = -apply_columns(self.tensor, alpha) - cross(omega, spin)
         return spatial(moment + cross(self.centre, force), force)
@@ -112,7 +113,7 @@ def turned_tensor(frame: jax.Array, tensor: jax.Array) -> jax.Array:
     return jnp.stack([apply_columns(frame, half[j]) for j in range(3)])
 
 
-def object_force(body: Body, vel: jax.Array, gravity: float) -> jax.Array:
+def object_force(body: Body, vel: jax.Array, gravity: jax.Array | None) -> jax.Array:
     """`Body.smooth_force` of the object, from its spatial velocity, shape (6, ...)."""
     # The object's coordinates are its own velocity components: no acceleration is left at zero.
     spin = jnp.concatenate([jnp.zeros_like(vel[:3])] * 2)
@@ -142,11 +143,9 @@ def bodies(run: Stages, hand: WorldConstants, kin: Kinematics) -> Bodies:
     )
 
 
-def softening_moment(
-    section: jax.Array, stiffness: jax.Array, angle: jax.Array, width: float
-) -> jax.Array:
-    """As `model.softening_moments`: of a section (3, finger, world), stiffness and bend angles."""
-    height, wall, segment = section
+def softening_moment(section: jax.Array, stiffness: jax.Array, angle: jax.Array) -> jax.Array:
+    """As `model.softening_moments`: of a section (4, finger, world), stiffness and bend angles."""
+    height, wall, segment, width = section
     return stiffness * angle * softening(angle / segment, height, wall, width=width)
 
 
@@ -170,19 +169,18 @@ def smooth_forces(
       ctrl: Controls: arm pose and pressures, shape (nu, world).
       scene: The scene.
     """
-    w, g = scene.hand.wrist, scene.gravity_on
+    g = hand.gravity
     arm, pressure = ctrl[:6, None], ctrl[6:]
     if not scene.effects.wrist:
         wrist = jnp.zeros_like(state.wrist)
     else:
-        stiffness = jnp.array([w.linear_stiffness] * 3 + [w.angular_stiffness] * 3, ctrl.dtype)
-        wrist = stiffness[:, None, None] * (arm - state.wrist)
+        wrist = hand.wrist_stiffness * (arm - state.wrist)
         wrist = wrist - hand.wrist_damping * state.wrist_vel
     finger = -hand.stiffness * state.finger - hand.damping * state.finger_vel
     bend = finger[:, :1] + hand.gain * pressure
-    if hand.section is not None:
-        width, angle = scene.hand.section.width, state.finger[:, :1]
-        bend = bend + softening_moment(hand.section, hand.stiffness[:, :1], angle, width)
+    if scene.effects.neo_hookean:
+        assert hand.section is not None
+        bend = bend + softening_moment(hand.section, hand.stiffness[:, :1], state.finger[:, :1])
     finger = jnp.concatenate([bend, finger[:, 1:]], 1)
     links = run(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
     return Smooth(

@@ -9,7 +9,6 @@ memory by itself: `locate` finds a point's cell, the caller reads the distances 
 `corners`, and `interpolate` makes distance and gradient of them.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.lanes import dot
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, by_structure
 from codesign_jax.schema import SceneError
 
 # Grids begin at multiples of this index, which a float32 holds exactly up to 2^31.
@@ -53,7 +52,7 @@ class Tables(NamedTuple):
     support: np.ndarray
 
 
-@functools.cache
+@by_structure
 def tables(scene: Scene) -> Tables | None:
     """Builds the grids of a scene's meshes; None without any.
 

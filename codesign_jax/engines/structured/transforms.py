@@ -147,7 +147,9 @@ def _reverse_scan(
     cotangent: Trace,
 ) -> tuple[ModelFields, jax.Array]:
     scene, nq, like = engine.scene, path.qpos.shape[-1], engine.reset(fields)
-    _, rebuild = _numbers(world_constants(scene, fields))
+    hand = world_constants(scene, fields)
+    _, rebuild = _numbers(hand)
+    bounds = verdict.Bounds(*(v[0] for v in hand.bounds))
     numbers, pull_fields = jax.vjp(lambda f: _numbers(world_constants(scene, f))[0], fields)
     assert cotangent.last is not None
 
@@ -170,7 +172,7 @@ def _reverse_scan(
 
         _, pull = jax.vjp(step, numbers, here.qpos, here.qvel, u)
         # The entry after a failed step shows the speed of a state that was not kept.
-        shown = jnp.where(verdict.slow(scene, top), bar.speed, 0.0)
+        shown = jnp.where(verdict.slow(bounds, top), bar.speed, 0.0)
         after = jnp.where(moved, qpos_bar, 0.0), jnp.where(moved, qvel_bar, 0.0)
         own, dq, dv, du = pull((*after, bar.distance, bar.height, shown))
         own, (dq, dv, du) = _finite(own, moved.T), _finite((dq, dv, du), moved)

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import collision, contact
-from codesign_jax.engines.structured.contact import Contacts, Line
+from codesign_jax.engines.structured.cones import which_cone
+from codesign_jax.engines.structured.contact import Cone, Contacts, Line
 from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.memory import (
     MemoryLayout,
@@ -22,8 +23,14 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.solver import along
 from codesign_jax.scene import Scene
 
-# Rows of a contact's cone and numbers of its line, by friction model.
+# Rows of a contact's jar and numbers of its line, by friction model.
 ROWS = {"none": (3, 2), "coulomb": (3, 5), "full": (6, 5)}
+# Numbers of a cone, by friction model.
+CONE = {
+    "none": ("normal", "spring", "damper"),
+    "coulomb": ("normal", "tangent", "friction", "ratio", "spring", "damper"),
+    "full": Cone._fields,
+}
 
 
 def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
@@ -61,37 +68,37 @@ class ContactSet:
         fields = {"point": 3, "normal": 3, "gap": 1, "jar": rows, "step": rows, "ray": ray}
         return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in fields.items()}
 
-    def bind(self, table: MemoryLayout, ref: Any, friction: Lanes) -> "BoundContacts":
-        """The set in a kernel's memory; friction is that of each world's object."""
-        return BoundContacts(self, table, ref, friction)
+    def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundContacts":
+        """The set in a kernel's memory; `read` reads constants of the worlds by name."""
+        return BoundContacts(self, table, ref, self.cone(read))
 
-    def cone(self, friction: jax.Array) -> contact.Cone:
-        """Contact parameters; friction of the object, shape (1, world)."""
-        make = collision.make_cone
-        if self.on_object:
-            return make(self.scene, friction, bodies=2)
-        table = self.scene.objects.table.friction
-        if self.name != "object_table":
-            table = self.scene.contact.finger_table_friction
-        return make(self.scene, table, bodies=1)
+    def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+        """The set's part of the table of the worlds' constants."""
+        return {f"cone.{which_cone(self.name)}": (1, (len(CONE[self.scene.effects.friction]),))}
 
-    def contacts(self, place: tuple, friction: jax.Array) -> Contacts:
+    def cone(self, read: Callable[[str], Lanes]) -> Cone:
+        """Contact parameters, lanes of a world each; `read` as in `bind`."""
+        numbers, names = read(f"cone.{which_cone(self.name)}"), CONE[self.scene.effects.friction]
+        found: dict[str, Any] = dict.fromkeys(Cone._fields)
+        return Cone(**found | {name: numbers[i] for i, name in enumerate(names)})
+
+    def contacts(self, place: tuple, cone: Cone) -> Contacts:
         """Contacts of (point, normal, gap), and what else the set keeps of them."""
         point, normal, gap = place
-        return Contacts(point, normal, gap[0], self.cone(friction))
+        return Contacts(point, normal, gap[0], cone)
 
-    def of_line(self, gap: tuple, friction: jax.Array) -> Contacts:
+    def of_line(self, gap: tuple, cone: Cone) -> Contacts:
         """What a line search needs of contacts: their gaps and cones."""
         (gap,) = gap
-        return Contacts(gap, gap, gap[0], self.cone(friction))
+        return Contacts(gap, gap, gap[0], cone)
 
 
 class BoundContacts:
     """A contact set with its memory; every method works on one item."""
 
-    def __init__(self, of: ContactSet, table: MemoryLayout, ref: Any, friction: Lanes):
+    def __init__(self, of: ContactSet, table: MemoryLayout, ref: Any, cone: Cone):
         """See `ContactSet.bind`."""
-        self.set, self.table, self.ref, self.friction = of, table, ref, friction
+        self.set, self.table, self.ref, self.cone = of, table, ref, cone
 
     def read(self, field: str, item: Any) -> Lanes:
         """A field of the item's contacts, shape (component, k, finger, world)."""
@@ -111,7 +118,7 @@ class BoundContacts:
 
     def if_touching(self, item: Any, compute: Callable, shapes: list[tuple]) -> list[Lanes]:
         """compute() where a lane touches, zeros of wide shapes elsewhere."""
-        like = jnp.zeros((self.set.size,), self.friction.dtype)
+        like = jnp.zeros((self.set.size,), self.ref.dtype)
         empty = [zeros(shape, like) for shape in shapes]
         none, rebuild = solid(empty, self.set.size)
 
@@ -133,12 +140,12 @@ class BoundContacts:
     def begin(self, place: tuple, motion: Lanes, velocity: Lanes) -> dict[str, Lanes]:
         """What is kept of new contacts, by field, for relative motions of their bodies."""
 
-        def jar(place, friction, motion, velocity):
-            c = self.set.contacts(place, friction)
+        def jar(place, cone, motion, velocity):
+            c = self.set.contacts(place, cone)
             reference = c.reference(c.relative(velocity[:, None]))
             return c.relative(motion[:, None]) - reference
 
-        value = lanewise(jar, place, self.friction, motion, velocity)
+        value = lanewise(jar, place, self.cone, motion, velocity)
         fields = dict(zip(self.set.places, place, strict=True))
         return {**fields, "jar": value, "step": lanewise(jnp.zeros_like, value)}
 
@@ -153,8 +160,8 @@ class BoundContacts:
         return full(triangle), wrench
 
     def _push(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        def response(place, friction, jar):
-            c = self.set.contacts(place, friction)
+        def response(place, cone, jar):
+            c = self.set.contacts(place, cone)
             r = contact.respond(c, jar)
             matrix = contact.contact_inertia(c, r.hessian)
             return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
@@ -162,7 +169,7 @@ class BoundContacts:
         jar, step = self.read("jar", item), self.read("step", item)
         jar = lanewise(along, alpha, jar, step)
         self.write("jar", jar, item)
-        matrix, wrench = lanewise(response, self.place(item), self.friction, jar)
+        matrix, wrench = lanewise(response, self.place(item), self.cone, jar)
         return [upper(matrix), wrench]
 
     def aim(self, item: Any, step: Lanes) -> Lanes:
@@ -170,15 +177,15 @@ class BoundContacts:
         return self.if_touching(item, lambda: [self._aim(item, step)], [()])[0]
 
     def _aim(self, item: Any, step: Lanes) -> Lanes:
-        def ray(place, friction, jar, step):
-            c = self.set.contacts(place, friction)
+        def ray(place, cone, jar, step):
+            c = self.set.contacts(place, cone)
             change = c.relative(step[:, None])
             line = contact.line(c, jar, change)
             first, _ = contact.slopes(c, line, 0.0)
             return change, jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
 
         jar = self.read("jar", item)
-        change, line, slope = lanewise(ray, self.place(item), self.friction, jar, step)
+        change, line, slope = lanewise(ray, self.place(item), self.cone, jar, step)
         self.write("step", change, item)
         self.write("ray", line, item)
         return slope
@@ -188,14 +195,14 @@ class BoundContacts:
         return self.if_touching(item, lambda: self._slopes(item, alpha), [(), ()])
 
     def _slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        def both(gap, friction, ray, alpha):
-            c = self.set.of_line(gap, friction)
+        def both(gap, cone, ray, alpha):
+            c = self.set.of_line(gap, cone)
             line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             first, second = contact.slopes(c, line, alpha)
             return [sum_axis(first, 0), sum_axis(second, 0)]
 
         gap = tuple(self.read(field, item) for field in self.set.of_lines)
-        return lanewise(both, gap, self.friction, self.read("ray", item), alpha)
+        return lanewise(both, gap, self.cone, self.read("ray", item), alpha)
 
 
 def sphere_on_object(
@@ -233,9 +240,9 @@ def sphere_on_object(
     return lanewise(place, columns, centre, radius, distance, gradient)
 
 
-def sphere_on_table(scene: Scene, height, centre, radius):
+def sphere_on_table(height, centre, radius):
     """Point, normal and gap of spheres (3, k, ...) against the table."""
-    c = collision.spheres_on_table(scene, height, centre, radius)
+    c = collision.spheres_on_table(None, height, centre, radius)  # type: ignore[arg-type]
     return c.point, c.normal, c.distance[None]
 
 

@@ -27,7 +27,7 @@ from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanewise import lanes
 from codesign_jax.model import layout
-from codesign_jax.model.layout import palm_points, palm_touches
+from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
 
 PACKAGE = Path(__file__).parents[3]
@@ -70,7 +70,7 @@ class Program:
         self.num_fingers, self.block = n, max(1, width // self.fingers)
         self.size = self.fingers * self.block
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
-        self.palm_groups = -(-len(palm_points(scene)) // self.fingers)
+        self.palm_groups = -(-self.lay.palm.size // self.fingers)
         self.meshes = bool(collision.mesh_indices(scene))
         self.sets = self._sets()
         self.slotted = any(isinstance(s, SlotSet) for s in self.sets)
@@ -113,7 +113,7 @@ class Program:
                 "palm_radius": (self.palm_groups, (1,)),
             }
         if self.scene.effects.neo_hookean:
-            more |= {"section": (1, (3,))}
+            more |= {"section": (1, (4,))}
         if self.slotted:
             more |= hull.fields(self.scene)
         support, grid = objects.tables(self.scene, self.fingers)
@@ -134,6 +134,13 @@ class Program:
             **more,
             **support,
         )
+        some: dict[str, tuple[int, tuple[int, ...]]] = {}
+        for contacts in self.sets:
+            some |= contacts.cone_rows()
+        if self.scene.effects.gravity:
+            some |= {"gravity": (1, one)}
+        if self.scene.effects.wrist:
+            some |= {"wrist_stiffness": (1, (6,))}
         self.world = MemoryLayout(
             False,
             palm_mass=(1, one),
@@ -147,6 +154,8 @@ class Program:
             object_id=(1, one),
             alive=(1, one),
             **grid,
+            **dict.fromkeys(verdict.Bounds._fields, (1, one)),
+            **some,
         )
         self.finger_state = MemoryLayout(
             True, finger=(n, (a,)), finger_vel=(n, (a,)), acc=(n, (a,))
@@ -184,11 +193,14 @@ class Program:
             k: jnp.moveaxis(v, 1, 0) if k in links_first and v.size else v
             for k, v in hand._asdict().items()
         }
+        arrays |= hand.bounds._asdict()
+        for name, cone in hand.cones._asdict().items():
+            arrays[f"cone.{name}"] = jnp.stack([v for v in cone if v is not None])
         # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
         share = jnp.ones((self.links + 1, *lane), dtype)
         arrays["share"] = share.at[jnp.array([0, self.links])].set(0.5)
         if palm_touches(self.scene):
-            arrays |= self._palm_slots(worlds, dtype)
+            arrays |= self._palm_slots(hand)
         if hand.section is not None:
             arrays["section"] = hand.section[None]
         if self.slotted:
@@ -218,18 +230,15 @@ class Program:
         pad = [(0, 0)] * (array.ndim - 2) + [(0, self.fingers - array.shape[-2]), (0, 0)]
         return jnp.pad(array, pad, mode="edge")
 
-    def _palm_slots(self, worlds: int, dtype: Any) -> dict[str, jax.Array]:
+    def _palm_slots(self, hand: WorldConstants) -> dict[str, jax.Array]:
         """The palm's contact spheres, shared out among the lanes."""
-        points, f, g = palm_points(self.scene), self.fingers, self.palm_groups
-        padded = np.zeros((g * f, 3))
-        padded[: len(points)] = points
-        radius = np.full(g * f, -1e3)
-        radius[: len(points)] = self.scene.hand.palm.contact_radius
-        place = jnp.asarray(padded.reshape(g, f, 3).transpose(0, 2, 1), dtype)[:, :, None, :, None]
-        size = jnp.asarray(radius.reshape(g, 1, f, 1), dtype)
+        f, g, worlds = self.fingers, self.palm_groups, hand.palm_radius.shape[1]
+        missing = (0, g * f - len(hand.palm_radius))
+        place = jnp.pad(hand.palm_point, [(0, 0), missing, (0, 0)]).reshape(3, g, 1, f, worlds)
+        size = jnp.pad(hand.palm_radius, [missing, (0, 0)], constant_values=-1e3)
         return {
-            "palm_point": jnp.broadcast_to(place, (g, 3, 1, f, worlds)),
-            "palm_radius": jnp.broadcast_to(size, (g, 1, f, worlds)),
+            "palm_point": jnp.moveaxis(place, 0, 1),
+            "palm_radius": size.reshape(g, 1, f, worlds),
         }
 
     def pack_state(self, state: State) -> tuple[jax.Array, jax.Array]:
@@ -315,7 +324,7 @@ class Program:
             out = call(*inputs)
         else:
             code = cache.sources(PACKAGE, UNRELATED)
-            origin = repr((self.scene, self.limits, trajectory, states, code))
+            origin = repr((self.scene.structure, self.limits, trajectory, states, code))
             kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
             out = launch(call, inputs, outputs, kernel)
         trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
@@ -388,6 +397,11 @@ class Program:
         own = block.world
         _copy(finger_state0, finger_state, self.finger_state.rows)
         _copy(world_state0, world_state, self.world_state.rows, own)
+        bounds = verdict.Bounds(
+            *(self.world.read(world, n, 0, own).lane for n in verdict.Bounds._fields)
+        )
+        start, end = (v.astype(jnp.int32) for v in (bounds.start, bounds.end))
+        bounds = bounds._replace(start=start, end=end)
         alive = self.world.read(world, "alive", 0, own).lane
 
         def record(t: jax.Array) -> None:
@@ -400,7 +414,7 @@ class Program:
             t, alive, speed = carry
 
             def judge(distance: jax.Array, height: jax.Array) -> jax.Array:
-                return verdict.goes_on(self.scene, distance, height, speed, t, to_end=to_end)
+                return verdict.goes_on(bounds, distance, height, speed, t, to_end=to_end)
 
             record(t)
             commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)

@@ -10,8 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import contact
-from codesign_jax.engines.structured.contact import Contacts
+from codesign_jax.engines.structured.contact import Cone, Contacts
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, full, solid
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -48,9 +47,9 @@ class SlotSet(ContactSet):
     more: dict[str, int] = {}
     """Components of further fields of a slot."""
 
-    def bind(self, table: MemoryLayout, ref: Any, friction: Lanes) -> "BoundSlots":
+    def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundSlots":
         """See `ContactSet`."""
-        return BoundSlots(self, table, ref, friction)
+        return BoundSlots(self, table, ref, self.cone(read))
 
 
 class HullSet(SlotSet):
@@ -60,20 +59,21 @@ class HullSet(SlotSet):
     places = ("point", "normal", "gap", "lever", "share")
     of_lines = ("gap", "share")
 
-    def contacts(self, place: tuple, friction: jax.Array) -> Contacts:
+    def contacts(self, place: tuple, cone: Cone) -> Contacts:
         """See `ContactSet`."""
         point, normal, gap, lever, share = place
-        return Contacts(point, normal, gap[0], self._soft(friction, share[0]), lever)
+        return Contacts(point, normal, gap[0], _soft(cone, share[0]), lever)
 
-    def of_line(self, gap: tuple, friction: jax.Array) -> Contacts:
+    def of_line(self, gap: tuple, cone: Cone) -> Contacts:
         """See `ContactSet`."""
         distance, share = (x[0] for x in gap)
-        return Contacts(gap[0], gap[0], distance, self._soft(friction, share))
+        return Contacts(gap[0], gap[0], distance, _soft(cone, share))
 
-    def _soft(self, friction: jax.Array, share: jax.Array) -> contact.Cone:
-        cone = self.cone(friction)
-        tangent = None if cone.tangent is None else cone.tangent * share
-        return cone._replace(normal=cone.normal * share, tangent=tangent)
+
+def _soft(cone: Cone, share: jax.Array) -> Cone:
+    """The cone of a vertex, which has a share of the stiffness."""
+    tangent = None if cone.tangent is None else cone.tangent * share
+    return cone._replace(normal=cone.normal * share, tangent=tangent)
 
 
 class BoundSlots(BoundContacts):
@@ -83,7 +83,7 @@ class BoundSlots(BoundContacts):
 
     def clear(self, row: Any) -> None:
         """Empties a row."""
-        none = jnp.zeros((self.set.size,), self.friction.dtype)
+        none = jnp.zeros((self.set.size,), self.ref.dtype)
         self.write("count", lanes([none], (), wide=True), row)
 
     def used(self, row: Any) -> jax.Array:
@@ -97,7 +97,7 @@ class BoundSlots(BoundContacts):
         def worst(row: jax.Array, most: jax.Array) -> jax.Array:
             return jnp.maximum(most, self.read("count", row).lane)
 
-        none = jnp.zeros((self.set.size,), self.friction.dtype)
+        none = jnp.zeros((self.set.size,), self.ref.dtype)
         most = jax.lax.fori_loop(0, self.set.rows, worst, none)
         return jnp.where(most > self.set.slots, 1.0, 0.0).astype(none.dtype)
 
@@ -164,7 +164,7 @@ class BoundSlots(BoundContacts):
         return self.fold(item, add, self._zeros((), ()))
 
     def _zeros(self, *shapes: tuple[int, ...]) -> list[Lanes]:
-        like = jnp.zeros((self.set.size,), self.friction.dtype)
+        like = jnp.zeros((self.set.size,), self.ref.dtype)
         return [zeros(shape, like) for shape in shapes]
 
 

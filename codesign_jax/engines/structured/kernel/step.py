@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import verdict
 from codesign_jax.engines.structured import collision, inertia
 from codesign_jax.engines.structured import kinematics as kin
 from codesign_jax.engines.structured.constants import apply_columns
@@ -36,7 +35,6 @@ from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.problem import next_motion, object_motion, palm_motion
-from codesign_jax.scene import Scene
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.program import Program
@@ -61,9 +59,17 @@ class Step:
         self.finger_state, self.world_state, self.scratch = finger_state, world_state, scratch
         self.grid = grid
 
+    def constant(self, name: str) -> Lanes:
+        """A constant of the worlds."""
+        return self.p.world.read(self.world, name, 0, self.block.world)
+
     def constants(self, *names: str) -> list[Lanes]:
-        """Constants of worlds."""
-        return [self.p.world.read(self.world, n, 0, self.block.world) for n in names]
+        """Constants of the worlds."""
+        return [self.constant(n) for n in names]
+
+    def gravity(self) -> Lanes | None:
+        """Magnitude of gravity; None without the effect."""
+        return self.constant("gravity") if "gravity" in self.p.world.groups else None
 
     def advance(self, arm: Lanes, pressure: Lanes, judge: Callable, waiting: Any, speed: Any):
         """Advances the block.
@@ -87,11 +93,7 @@ class Step:
         geometry = self._palm(state, arm)
         hand, world = (p.hand, self.hand), (p.world, self.world)
         thing = objects.read(scene, self.block, world, hand, self.grid)
-        friction = lanewise(
-            lambda s: collision.object_friction(scene, s.astype(jnp.int32)).astype(s.dtype),
-            thing.shape,
-        )
-        bound = {c.name: c.bind(p.scratch, self.scratch, friction) for c in p.sets}
+        bound = {c.name: c.bind(p.scratch, self.scratch, self.constant) for c in p.sets}
         memory = Memory(
             p.hand, self.hand, p.finger_state, self.finger_state, p.scratch, self.scratch, bound
         )
@@ -119,21 +121,22 @@ class Step:
 
     def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
         """Kinematics, inertia and smooth forces of palm, wrist and object."""
-        w, g = self.p.scene.hand.wrist, self.p.scene.gravity_on
         names = ("palm_mass", "palm_centre", "palm_inertia", "wrist_damping", "wrist_armature")
         constants = self.constants(*names, "object_mass", "object_inertia")
+        constants += [self.constant("wrist_stiffness") if self.p.scene.effects.wrist else None]
+        constants += [self.gravity()]
         wrist, h = self.p.scene.effects.wrist, self.p.scene.discretization.timestep
 
-        def compute(state: dict, arm, mass, centre, tensor, damping, armature, obj, principal):
+        def compute(state, arm, mass, centre, tensor, damping, armature, obj, principal, k, g):
             frame, axes, vel, bias = kin._wrist(state["wrist"], state["wrist_vel"])
             s = State(**{k: state.get(k) for k in State._fields})
             columns, position, object_vel = kin._object(s)
             turned = inertia.turned_tensor(frame, tensor)
             palm = Body(mass, apply_columns(frame, centre), turned)
             thing = Body(obj, position, inertia.principal_tensor(columns, principal))
-            stiffness = [w.linear_stiffness] * 3 + [w.angular_stiffness] * 3
-            error = arm - state["wrist"]
-            spring = jnp.stack([stiffness[i] * error[i] for i in range(6)])
+            spring = -damping * state["wrist_vel"]
+            if k is not None:
+                spring = k * (arm - state["wrist"]) + spring
             acc = state["acc_wrist"], state["acc_object"]
             if not wrist:
                 acc = rigid_arm(arm, state["wrist"], state["wrist_vel"], h), acc[1]
@@ -150,7 +153,7 @@ class Step:
                     thing,
                     palm.smooth_force(vel, bias, g),
                     inertia.object_force(thing, object_vel, g),
-                    spring - damping * state["wrist_vel"],
+                    spring,
                     armature,
                     axes,
                     position,
@@ -172,7 +175,7 @@ class Step:
         )
         frame, origin = lanewise(kin._mount, at["frame"], mount, base)
         weight = lanewise(lambda f, s, share: share * apply_columns(f, s), at["frame"], stub, share)
-        wide = zeros((6,), like)
+        wide, gravity = zeros((6,), like), self.gravity()
         vel, bias, motion = (
             lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
         )
@@ -187,18 +190,17 @@ class Step:
             gain = p.hand.read(self.hand, "gain")
             soft = p.scene.effects.neo_hookean
             section = p.hand.read(self.hand, "section") if soft else None
+            forces = gain, pressure, section, gravity
             joint = [
                 p.finger_state.read(self.finger_state, n, i)
                 for n in ("finger", "finger_vel", "acc")
             ]
             out = lanewise(
-                partial(_link, p.scene, self.p.lay.axes),
+                partial(_link, self.p.lay.axes),
                 (origin, frame, vel, bias, motion),
                 constants,
                 joint,
-                gain,
-                pressure,
-                section,
+                forces,
             )
             carry, stored = out
             stored |= {"step_acc": zeros((p.axes,), like), "step_motion": wide}
@@ -248,7 +250,7 @@ class Step:
             place = at["columns"], at["palm"].position
             return sphere_on_object(scene, thing, *place, centre, radius)
         height = self.p.world_state.read(self.world_state, "wrist", 0, self.block.world)[2]
-        return lanewise(partial(sphere_on_table, scene), height, centre, radius)
+        return lanewise(sphere_on_table, height, centre, radius)
 
     def _slot_contacts(self, state: dict, at: dict, m: Memory, thing: WorldObject) -> None:
         p, now = self.p, at["now"]
@@ -325,7 +327,8 @@ class Step:
         like = jnp.zeros((p.size,), self.finger_state.dtype)
         fingers = loop(p.links, link, zeros((), like), p.size).lane
         largest = _worse(size.lane, self.block.fold(fingers, _worse))
-        good = goes_on & verdict.slow(p.scene, largest)
+        limit = self.constant("speed").lane
+        good = goes_on & (largest <= limit)
         acc = {"acc_wrist": now.wrist, "acc_object": now.object}
         for name, value in {**new, **acc}.items():
             kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
@@ -343,8 +346,9 @@ class Step:
         return jnp.where(goes_on, largest, speed), good
 
 
-def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, pressure, section):
+def _link(names: tuple[str, ...], parent, constants, joint, forces):
     """A link's kinematics, inertia and forces."""
+    gain, pressure, section, gravity = forces
     origin, frame, vel, bias, motion = parent
     offset, mass, centre, principal, stiffness, damping = constants
     q, rate, acc = joint
@@ -360,15 +364,14 @@ def _link(scene: Scene, names: tuple[str, ...], parent, constants, joint, gain, 
     tau = -stiffness * q - damping * rate
     bend = tau[:1] + gain * pressure
     if section is not None:
-        width = scene.hand.section.width
-        bend = bend + inertia.softening_moment(section, stiffness[:1], q[:1], width)
+        bend = bend + inertia.softening_moment(section, stiffness[:1], q[:1])
     tau = jnp.concatenate([bend, tau[1:]])
     stored = {
         "axes": axes,
         "body_centre": body.centre,
         "tensor": triangle(body.tensor),
         "motion": motion,
-        "smooth": body.smooth_force(vel, bias, scene.gravity_on),
+        "smooth": body.smooth_force(vel, bias, gravity),
         "tau": tau,
     }
     return (origin, frame, vel, bias, motion), stored

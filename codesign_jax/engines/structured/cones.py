@@ -1,0 +1,79 @@
+"""Parameters of the friction cones of every world, from the scene's numbers, once a rollout."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.contact import Cone
+from codesign_jax.model import contact_invweight
+from codesign_jax.scene import Scene
+
+
+class Cones(NamedTuple):
+    """Cones by what touches; their numbers have shape (1, world).
+
+    Attributes:
+      hand_object: Fingers, hull or palm on the object.
+      hand_table: Fingers, hull or palm on the table.
+      object_table: The object on the table.
+      finger_finger: Fingers on one another.
+    """
+
+    hand_object: Cone
+    hand_table: Cone
+    object_table: Cone
+    finger_finger: Cone
+
+
+def which_cone(pair: str) -> str:
+    """The field of `Cones` for a pair of bodies, which is named as in `problem.relative`."""
+    if pair in Cones._fields:
+        return pair
+    return "hand_object" if pair.endswith("_object") else "hand_table"
+
+
+def make_cone(scene: Scene, friction: Any, *, bodies: int) -> Cone:
+    """MuJoCo's contact parameters for constant impedance (its Computation chapter).
+
+    Args:
+      scene: The scene; its numbers may be arrays.
+      friction: Coulomb coefficient.
+      bodies: Bodies other than the world in the contact, whose declared inverse weights add.
+    """
+    c = scene.contact
+    regularizer = (1.0 - c.impedance) / c.impedance * contact_invweight(scene) * bodies
+    if scene.effects.friction == "none":
+        return Cone(1.0 / regularizer, None, None, None, *_reference(scene))
+    ratio = friction / jnp.sqrt(c.friction_ratio)
+    tangent = c.friction_ratio / regularizer
+    cone = Cone(1.0 / regularizer, tangent, friction, ratio, *_reference(scene))
+    if scene.effects.friction != "full":
+        return cone
+    least = jnp.maximum(friction, 1e-5)  # MuJoCo's mjMINMU
+    return cone._replace(spin=c.torsional_friction / least, roll=c.rolling_friction / least)
+
+
+def make_cones(scene: Scene, shape: jax.Array) -> Cones:
+    """The cones of a batch.
+
+    Args:
+      scene: The scene, its numbers of shape (1, world).
+      shape: Index of each world's object, shape (1, world).
+    """
+    on_object = scene.objects.object[0].friction
+    for i, other in enumerate(scene.objects.object[1:], 1):
+        on_object = jnp.where(shape == i, other.friction, on_object)
+    return Cones(
+        hand_object=make_cone(scene, on_object, bodies=2),
+        hand_table=make_cone(scene, scene.contact.finger_table_friction, bodies=1),
+        object_table=make_cone(scene, scene.objects.table.friction, bodies=1),
+        finger_finger=make_cone(scene, scene.contact.finger_finger_friction, bodies=2),
+    )
+
+
+def _reference(scene: Scene) -> tuple[Any, Any]:
+    """Spring and damper coefficients of aref."""
+    c = scene.contact
+    spring = 1.0 / (c.impedance * c.time_constant) ** 2 * c.impedance
+    return spring, 2.0 / (c.impedance * c.time_constant)

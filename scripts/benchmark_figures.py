@@ -146,8 +146,8 @@ Read from these tables:
 
 * The structured engine's kernel does 16 times the grasps of MuJoCo C on both cores, at 60 and at
   360 worlds; 19 and 21 times in other runs, as the virtual machine's speed changes by half between
-  hours and not alike for both. Same verdicts on all 360 grasps. Its own batch form (`unison`), in
-  which hull and meshes run, was measured in a faster hour.
+  hours and not alike for both. Same verdicts on all 360 grasps. Its own batch form (`unison`) was
+  measured in a faster hour.
 * Stock MJX steps 64 worlds a second: two thousand times fewer.
 * Linear in links and in fingers.
 * Compiling: most is Python that traces the kernel. A new process that finds its machine code and

@@ -61,11 +61,15 @@ def pinch(**settings) -> Scene:
     return scene.load("paper", hand_name=small.DATA / "pinch.toml", overrides=overrides)
 
 
-@functools.cache
+@functools.lru_cache(maxsize=8)
 def bench(
     base: Scene, engine: str, step: float, precision: str, tolerance: float = 1e-6
 ) -> "Bench":
-    """One bench for each scene, engine, time step and precision: it is compiled once."""
+    """The bench of a scene, engine, time step and precision; compiled once while in use.
+
+    Only the last few are kept: XLA's programs take 1,200 memory maps each, of 65,530 that Linux
+    gives a process, and at the limit XLA aborts (docs/notes/structured-engine.md).
+    """
     return Bench(refined(base, step), engine, precision, tolerance)
 
 

@@ -8,6 +8,7 @@ A change of the kernel counts as done for GPUs when this ran with it on one.
 import argparse
 import json
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,6 @@ from codesign_jax import scene as scenes
 from codesign_jax.benchmark import measure, work
 from codesign_jax.engines.structured import StructuredEngine
 
-SEPARATE = {"effects": {"surface": "spheres", "finger_finger": False}}
-"""Scenes whose rates are measured start from this one."""
 RATES: dict[str, dict[str, Any]] = {
     "spheres": {},
     "spheres, float64": {"dtype": np.float64, "worlds": 4096},
@@ -59,10 +58,10 @@ def rate(name: str, values: dict[str, Any]) -> dict[str, Any]:
     values = dict(values)
     dtype, worlds = values.pop("dtype", np.float32), values.pop("worlds", WORLDS)
     objects = values.pop("objects", None)
-    overrides = {k: {**SEPARATE.get(k, {}), **values.get(k, {})} for k in {*SEPARATE, *values}}
-    scene = scenes.load("paper", object_set=objects, overrides=overrides)
-    # Start states are those of MuJoCo C, which has no meshes: the primitives' states serve.
-    plain = scenes.load("paper", overrides=overrides)
+    scene = scenes.load("paper", object_set=objects, overrides=values)
+    # Start states are those of MuJoCo C, which has neither hull nor meshes: those of spheres serve.
+    values.pop("effects", None)
+    plain = scenes.load("paper", overrides=values)
     starts, ctrl = work.window(plain, DISTINCT, STEPS, distinct=DISTINCT)
     made, _ = work.inputs(scene, work.make_worlds(scene, DISTINCT))
     fields = made._replace(start=starts.start)
@@ -108,12 +107,16 @@ def main() -> int:
         try:
             rates.append(rate(name, values))
         except Exception as error:  # one case must not hide the others
+            traceback.print_exc()
             rates.append({"case": name, "failed": f"{type(error).__name__}: {error}"[:500]})
             code = 1
         print(rates[-1], flush=True)
         write()
     if "tests" in arguments.parts:
-        options = ["-m", "gpu", "-q", "-p", "no:cacheprovider", "tests"]
+        # Only files with such tests, so that the others' dependencies need not be there.
+        paths = sorted(Path("tests").glob("test_*.py"))
+        files = [str(p) for p in paths if "pytest.mark.gpu" in p.read_text(encoding="utf-8")]
+        options = ["-m", "gpu", "-q", "-p", "no:cacheprovider", *files]
         code |= int(pytest.main(options, plugins=[recorder]))
     write()
     return code

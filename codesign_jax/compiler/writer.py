@@ -264,8 +264,8 @@ class Writer:
     def loop(self, equation: Any, args: list) -> list:
         """A scan without inputs and outputs: a loop of fixed length."""
         p = equation.params
-        split = p["num_consts"]
-        if split + p["num_carry"] != len(args) or len(equation.outvars) != p["num_carry"]:
+        split, carried, each_round = scan_parts(p)
+        if each_round or len(equation.outvars) != carried:
             raise NotImplementedError(
                 "a kernel's scan has no inputs or outputs of each round: use memory instead"
             )
@@ -416,6 +416,18 @@ class Writer:
 
 
 RULES_FILE = "codesign_jax/compiler/rules.py"
+
+
+def scan_parts(params: dict[str, Any]) -> tuple[int, int, int]:
+    """How many operands of a scan are constants, carried, and inputs of each round.
+
+    JAX up to 0.10 has numbers for it, later versions a tree of the operands.
+    """
+    if "num_consts" in params:
+        consts, carried = params["num_consts"], params["num_carry"]
+        return consts, carried, len(params["jaxpr"].jaxpr.invars) - consts - carried
+    consts, carried, each_round = (len(part) for part in params["ft_in"].unpack())
+    return consts, carried, each_round
 
 
 def counters(jaxpr: Any, consts: int) -> list[int]:

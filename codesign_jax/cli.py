@@ -64,8 +64,10 @@ class Optimize:
     """Further trials that test each final particle; the paper's 36 in 2d, 72 otherwise; 0: none."""
     seed: int = 0
     """Root of all random numbers."""
+    seeds: Text = None
+    """Several seeds, such as 0-9 or 1,3,5: a run of each, one after another, and a comparison."""
     out: File = None
-    """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED."""
+    """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED. With --seeds a folder of run folders."""
     fresh: Flag = False
     """Delete an earlier run in the folder and start anew."""
     dry_run: Flag = False

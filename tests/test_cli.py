@@ -276,6 +276,10 @@ WRONG = {
         ["--set", "hand.section.width=18", "--set", "objects.nois.position=0.01"],
         ["width = 18 is outside [0.005, 0.1] m", "did you mean 'noise'?"],
     ),
+    "seeds that are none": (["--seeds", "0-"], ["--seeds '0-' must be seeds such as 0-9 or 1,3,5"]),
+    "seeds backwards": (["--seeds", "9-0"], ["must be seeds such as"]),
+    "too many seeds": (["--seeds", "0-99999"], ["names more than 1000 runs"]),
+    "seed and seeds": (["--seeds", "0-1", "--seed", "1"], ["--seed and --seeds exclude"]),
     "no value": (["--set", "gravity"], ["--set 'gravity' must be KEY=VALUE"]),
     "all at once": (
         [
@@ -405,6 +409,23 @@ def test_more_episodes_extend_a_run_bit_for_bit(tmp_path, capsys):
     assert command(*RUN, "--episodes", "4", "--out", grown) == 2
     assert "a run can be extended, not shortened" in capsys.readouterr().err
     assert snapshot(grown) == before
+
+
+def test_seeds_are_runs_of_their_own_and_compared(tmp_path, capsys):
+    short = ["--episodes", "2"]
+    base = [a for a in RUN if a not in ("--seed", "3")]
+    assert command(*RUN, *short, "--out", tmp_path / "alone") == 0
+    capsys.readouterr()
+    assert command(*base, *short, "--seeds", "2-3", "--out", tmp_path / "both") == 0
+    output = capsys.readouterr().out
+    assert output.count("compiled in") == 1
+    assert_same_run(tmp_path / "both" / "seed-3", tmp_path / "alone")
+    assert stored(tmp_path / "both" / "seed-2") != stored(tmp_path / "alone")
+    table = output.split("best test cost")[1]
+    rows = [line.split() for line in table.splitlines()]
+    assert [row[0] for row in rows if row[-1:] == ["particles"]] == ["2", "3"]
+    assert "of 2 runs have a particle below the limit of success" in table
+    assert "% of such runs (95 % interval)" in table
 
 
 def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsys):

@@ -1,5 +1,6 @@
 """`codesign optimize`."""
 
+import dataclasses
 import sys
 from itertools import chain
 from pathlib import Path
@@ -11,7 +12,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, engines, keypaths, runs
 from codesign_jax import scene as scenes
-from codesign_jax.commands import common
+from codesign_jax.commands import common, seeds
 from codesign_jax.parameters import design_space
 from codesign_jax.runs import AllFailed, Plan, RunResult, Settings, rates
 from codesign_jax.runs.progress import duration
@@ -31,28 +32,42 @@ def main(options: "Optimize") -> int:
     """
     common.use_compilation_cache()
     scene, settings = resolve(options)
-    # Everything that speaks against the run, before anything that takes time.
+    chosen = [settings.seed] if options.seeds is None else seeds.parse(options.seeds)
+    # Everything that speaks against the runs, before anything that takes time.
     plan = runs.prepare(scene, settings)
-    folder = options.out or _default_folder(scene, settings)
-    runs.check_folder(folder, scene, settings, fresh=options.fresh)
+    folders = {seed: _folder(options, scene, settings, seed) for seed in chosen}
+    for seed, folder in folders.items():
+        asked = dataclasses.replace(settings, seed=seed)
+        runs.check_folder(folder, scene, asked, fresh=options.fresh)
     notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
-        _dry_run(scene, settings)
+        _dry_run(scene, settings, len(chosen))
         return 0
+    results: dict[int, RunResult | None] = {}
+    for seed, folder in folders.items():
+        result = results[seed] = _run(runs.with_seed(plan, seed), folder, options.fresh)
+        if result is not None and result.signum:
+            return 128 + result.signum
+    if options.seeds is not None:
+        seeds.compare(results, Console(highlight=False, soft_wrap=True))
+    return int(any(result is None for result in results.values()))
+
+
+def _run(plan: Plan, folder: Path, fresh: bool) -> RunResult | None:
+    """Runs one optimisation and says how it ended; None if it failed."""
     try:
-        result = runs.optimize(plan, folder, sys.argv, fresh=options.fresh)
+        result = runs.optimize(plan, folder, sys.argv, fresh=fresh)
     except (AllFailed, OSError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
+        return None
     timing = result.timing
-    if timing.grasps:
+    if timing.grasps and timing.compile_seconds:  # not a program that an earlier seed compiled
         rate = timing.grasps / timing.seconds
-        rates.record(rates.work(scene, settings), rate, timing.compile_seconds)
-    if result.signum:
-        return 128 + result.signum
-    _summarize(plan, result, folder)
-    return 0
+        rates.record(rates.work(plan.scene, plan.settings), rate, timing.compile_seconds)
+    if not result.signum:
+        _summarize(plan, result, folder)
+    return result
 
 
 def resolve(options: "Optimize") -> tuple[Scene, Settings]:
@@ -83,15 +98,19 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         episodes=options.episodes,
         test_trials=options.test_trials,
     )
+    if options.seeds is not None and options.seed != 0:
+        problems.append("--seed and --seeds exclude each other")
     problems += runs.check(settings, scene.hand if scene else None)
     if problems or scene is None:
         raise SceneError(problems)
     return scene, settings
 
 
-def _default_folder(scene: Scene, settings: Settings) -> Path:
-    name = f"{scene.hand.name}-{settings.preset}-{settings.schedule}-{settings.seed}"
-    return Path("runs") / name
+def _folder(options: "Optimize", scene: Scene, settings: Settings, seed: int) -> Path:
+    """Folder of one run: --out, with a folder inside for each of --seeds."""
+    if options.out is not None:
+        return options.out if options.seeds is None else options.out / f"seed-{seed}"
+    return Path("runs") / f"{scene.hand.name}-{settings.preset}-{settings.schedule}-{seed}"
 
 
 def _preflight(scene: Scene, settings: Settings) -> list[str]:
@@ -110,14 +129,16 @@ def _preflight(scene: Scene, settings: Settings) -> list[str]:
     return common.preflight_notes(scene, space, dict(zip(names, projected, strict=True)))
 
 
-def _dry_run(scene: Scene, settings: Settings) -> None:
-    """Prints scene, settings, grasps and what they will take; see `runs.rates`."""
+def _dry_run(scene: Scene, settings: Settings, count: int) -> None:
+    """Prints scene, settings, grasps and what this many runs will take; see `runs.rates`."""
     for name, text in scene_texts(scene).items():
         print(f"# ---- {name}\n{text}")
     print(f"# ---- settings\n{settings}\n")
     space = design_space(scene.hand, settings.preset)
     batch = settings.particles * settings.trials
     print(f"grasps: {settings.grasps} and at least {batch} to find the seed")
+    if count > 1:
+        print(f"runs: {count}, one after another; grasps and disk are those of each")
     row = 40 + 12 * space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
@@ -125,7 +146,7 @@ def _dry_run(scene: Scene, settings: Settings) -> None:
     if found is None:
         print("time: unknown, as no run was measured on such a device with this engine yet")
         return
-    grasping = (settings.grasps + batch) / found.grasps_per_second
+    grasping = count * (settings.grasps + batch) / found.grasps_per_second
     compiling = found.compile_seconds
     if compiling is None:
         print(f"time: about {duration(grasping)}, and compiling")

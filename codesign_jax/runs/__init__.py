@@ -4,7 +4,15 @@ The numerical modules know nothing of files; this package knows nothing of physi
 """
 
 from codesign_jax.runs.directory import check_folder, read_run
-from codesign_jax.runs.loop import AllFailed, Plan, RunResult, load_record, optimize, prepare
+from codesign_jax.runs.loop import (
+    AllFailed,
+    Plan,
+    RunResult,
+    load_record,
+    optimize,
+    prepare,
+    with_seed,
+)
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, check, make_settings
 from codesign_jax.runs.tables import describe, status_counts, status_names
@@ -26,4 +34,5 @@ __all__ = [
     "read_run",
     "status_counts",
     "status_names",
+    "with_seed",
 ]

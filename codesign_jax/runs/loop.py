@@ -1,5 +1,6 @@
 """The optimisation of one run: seed, episodes, final test; saved after every step and resumable."""
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +30,10 @@ class AllFailed(RuntimeError):
 
 
 class Plan(NamedTuple):
-    """A run that was checked and can start; see `prepare`."""
+    """A run that was checked and can start; see `prepare`.
+
+    `compiled` keeps the episode's program for runs that differ in their seed only.
+    """
 
     scene: Scene
     settings: Settings
@@ -38,6 +42,7 @@ class Plan(NamedTuple):
     optimizer: ParticleFilter
     mask: np.ndarray
     key: jax.Array
+    compiled: dict[str, EpisodeFunction]
 
 
 class Timing(NamedTuple):
@@ -79,7 +84,14 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
     """
     space, mask = design_space(scene.hand, settings.preset), masks_of(scene, settings)
     engine, optimizer = make_engine(settings.engine, scene), codesign.make_filter(space)
-    return Plan(scene, settings, engine, space, optimizer, mask, jax.random.key(settings.seed))
+    key = jax.random.key(settings.seed)
+    return Plan(scene, settings, engine, space, optimizer, mask, key, {})
+
+
+def with_seed(plan: Plan, seed: int) -> Plan:
+    """The same run from another seed; it shares the program, which whoever runs first compiles."""
+    settings = dataclasses.replace(plan.settings, seed=seed)
+    return plan._replace(settings=settings, key=jax.random.key(seed))
 
 
 def optimize(plan: Plan, folder: Path, command: list[str], *, fresh: bool = False) -> RunResult:
@@ -209,6 +221,8 @@ class _Loop:
     def _compile(self) -> EpisodeFunction:
         """Compiles the episode apart, so that its time is not an episode's."""
         plan, n = self.plan, self.plan.settings.particles
+        if "episode" in plan.compiled:
+            return plan.compiled["episode"]
         episode = codesign.make_episode(
             plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
         )
@@ -217,6 +231,7 @@ class _Loop:
             compiled = self.interrupts.call(lambda: episode.lower(state, plan.mask[0]).compile())  # type: ignore[attr-defined]
         self.timing = Timing(watch.seconds)
         self._say(f"compiled in {watch.seconds:.1f} s (engine {plan.engine.name})")
+        plan.compiled["episode"] = compiled
         return compiled
 
     def _test(self, record: Record, episode: EpisodeFunction) -> None:

@@ -1,0 +1,77 @@
+"""`codesign optimize --seeds`: several runs of one program, and how they compare."""
+
+import re
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from codesign_jax import codesign, statistics
+from codesign_jax.runs import RunResult
+from codesign_jax.schema import SceneError
+
+MOST = 1000
+"""Most runs of one command: a guard against a slip such as 0-99999."""
+
+
+def parse(text: str) -> list[int]:
+    """Reads seeds such as "0-9" or "1,3,5-7", in ascending order.
+
+    Raises:
+      SceneError: If the text is none, or names too many.
+    """
+    found: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+        if last < first or last >= 2**31:
+            raise SceneError([f"--seeds {text!r} must be seeds such as 0-9 or 1,3,5"])
+        if last - first >= MOST or len(found) > MOST:
+            raise SceneError([f"--seeds {text!r} names more than {MOST} runs"])
+        found |= set(range(first, last + 1))
+    return sorted(found)
+
+
+def compare(results: dict[int, RunResult | None], console: Console) -> None:
+    """Prints a row for each run and the share of successful ones.
+
+    Args:
+      results: Each run by its seed; None for one that could not finish.
+      console: Where to print.
+    """
+    head = ("seed", "converged", "best test cost", "kept", "successful")
+    table = Table(*head, box=box.SIMPLE)
+    solved = []
+    for seed, result in results.items():
+        table.add_row(str(seed), *_row(result))
+        if result is not None and result.test is not None:
+            solved.append(bool(np.asarray(result.test.success).any()))
+    console.print(table)
+    if solved:
+        share = statistics.wilson(sum(solved), len(solved))
+        console.print(
+            f"{sum(solved)} of {len(solved)} runs have a particle below the limit of success, "
+            f"{codesign.SUCCESS_COST}: {100 * share.low:.0f} to {100 * share.high:.0f} % of such "
+            "runs (95 % interval)"
+        )
+
+
+def _row(result: RunResult | None) -> tuple[str, ...]:
+    """Convergence, best particle's test cost and trials kept, and successful particles."""
+    if result is None or result.record is None:
+        return ("failed", "", "", "")
+    episode = codesign.convergence_episode(result.record.history.cost.mean(1))
+    converged = "no" if episode is None else f"episode {episode + 1}"
+    if result.test is None:
+        return (converged, "", "", "")
+    cost, trials = np.asarray(result.test.cost), np.asarray(result.test.trials.cost)
+    best = int(cost.argmin())
+    kept = int((trials[best] < codesign.SUCCESS_COST).sum())
+    good = int(np.asarray(result.test.success).sum())
+    return (
+        converged,
+        f"{cost[best]:.4f}",
+        f"{kept} of {trials.shape[1]} trials",
+        f"{good} of {cost.size} particles",
+    )

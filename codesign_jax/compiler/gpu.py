@@ -38,6 +38,8 @@ _OLDEST_DRIVER = 12_000  # cuLibraryLoadData and launches by CUkernel
 _LOG_BUFFER, _LOG_SIZE = 5, 6  # CU_JIT_ERROR_LOG_BUFFER and its size [bytes]
 _LOG_BYTES, _MESSAGE_BYTES = 4096, 512
 
+_lent: list[Any] = []  # memory that the driver may write to whenever it translates for another GPU
+
 
 def device_code(jaxpr: Any, layout: Layout) -> str:
     """PTX of a kernel with the entry point `ENTRY`.
@@ -114,6 +116,7 @@ def load(driver: Driver, text: str, device: int) -> int:
     options = (ctypes.c_int * 2)(_LOG_BUFFER, _LOG_SIZE)
     values = (ctypes.c_void_p * 2)(ctypes.addressof(log), _LOG_BYTES)
     code = ctypes.create_string_buffer(text.encode())
+    _lent.append((log, options, values))
     try:
         none = ctypes.c_uint(0)
         driver(

@@ -82,7 +82,13 @@ def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) 
 
 
 def make_evaluate(
-    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    num_trials: int,
+    *,
+    trajectory: bool = False,
+    cost: rollout.CostFunction | None = None,
 ) -> EvaluateFunction:
     """Returns a function (population, key) -> outcomes of shape (particle, trial); one program.
 
@@ -95,13 +101,17 @@ def make_evaluate(
       engine: Engine that simulates.
       space: Design space of the population.
       num_trials: Trials of each particle.
+      trajectory: As in `rollout.simulate`.
+      cost: As in `rollout.simulate`.
     """
 
     @jax.jit
     def simulate(population: jax.Array, key: jax.Array, constants: Constants | None) -> Outcome:
         trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
-        return rollout.evaluate(scene, engine, hands, trials, constants=constants)
+        return rollout.evaluate(
+            scene, engine, hands, trials, trajectory=trajectory, cost=cost, constants=constants
+        )
 
     def evaluate(
         population: jax.Array, key: jax.Array, constants: Constants | None = None
@@ -118,6 +128,9 @@ def make_episode(
     space: DesignSpace,
     optimizer: ParticleFilter,
     num_trials: int,
+    *,
+    trajectory: bool = False,
+    cost: rollout.CostFunction | None = None,
 ) -> EpisodeFunction:
     """Returns the jitted function (state, mask) -> (state, info) that runs one episode.
 
@@ -133,6 +146,8 @@ def make_episode(
       space: Design space of the particles.
       optimizer: Particle filter over the same space.
       num_trials: Trials of each particle in an episode.
+      trajectory: As in `rollout.simulate`.
+      cost: As in `rollout.simulate`.
     """
 
     @jax.jit
@@ -143,12 +158,54 @@ def make_episode(
         numbers = rollout.numbers(scene, constants)
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=numbers)
         hands = jax.vmap(space.params)(population)
-        trials, last = rollout.evaluate_to_end(scene, engine, hands, noise, constants=numbers)
+        trials, last = rollout.evaluate_to_end(
+            scene, engine, hands, noise, trajectory=trajectory, cost=cost, constants=numbers
+        )
         costs = particle_cost(scene.with_constants(numbers), trials)
         new, selection = optimizer.tell(state, population, costs)
         return new, EpisodeInfo(population, trials, selection, last)
 
     return episode
+
+
+def make_run(
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    optimizer: ParticleFilter,
+    num_trials: int,
+    *,
+    trajectory: bool = False,
+    cost: rollout.CostFunction | None = None,
+) -> EpisodeFunction:
+    """Returns the jitted function (state, masks, constants) -> (state, info) of a whole run.
+
+    The loop over the episodes is a `jax.lax.scan`: the same numbers as a loop in Python over
+    `make_episode`'s function, without a way to stop in between.  The masks, one for each episode,
+    have shape (episode, parameter), and the info's arrays get a leading axis (episode,).
+    `jax.vmap` over the state runs many seeds in one batch, see `optimize.State`, and over constants
+    (`Scene.constants`, by default the scene's own) many worlds' physics.
+
+    Args:
+      scene: The scene.
+      engine: Engine that simulates; with `jax.vmap` it has to be one that composes, as the default.
+      space: Design space of the particles.
+      optimizer: Particle filter over the same space.
+      num_trials: Trials of each particle in an episode.
+      trajectory: As in `rollout.simulate`.
+      cost: As in `rollout.simulate`.
+    """
+    episode = make_episode(
+        scene, engine, space, optimizer, num_trials, trajectory=trajectory, cost=cost
+    )
+
+    @jax.jit
+    def run(
+        state: State, masks: jax.typing.ArrayLike, constants: Constants | None = None
+    ) -> tuple[State, EpisodeInfo]:
+        return jax.lax.scan(lambda s, m: episode(s, m, constants), state, jnp.asarray(masks))
+
+    return run
 
 
 def episode_trials(

@@ -1,16 +1,27 @@
 """Particles x trials in one batch: noise, commands, model fields, engine and cost put together."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import control, cost, model, parameters, schema
+from codesign_jax import control, model, parameters, schema
 from codesign_jax.constants import batch_axes, check
+from codesign_jax.cost import outcome
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.start import invalid_start
-from codesign_jax.types import Outcome, Params, Trace, Trial
+from codesign_jax.types import Outcome, Params, Trace, Trial, failed
+
+CostFunction = Callable[[Scene, Trace, jax.Array], jax.Array]
+"""A cost of one's own: from the scene, the trace of one world (arrays of shape (time,) and qpos of
+shape (time, nq), empty unless a trajectory is asked for) and its controls (time, nu) to a number.
+
+Whether a world failed, and when it lost its object, is told by the scene's rule all the same; a
+failed trial shows the scene's `cost.maximum`, and `cost.particle_cost` leaves it out or scores it
+with that.  A cost that reads the trace behind the loss of the object needs the trajectory.
+"""
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
 _LATER = 1
@@ -87,6 +98,7 @@ def simulate(
     trials: Trial,
     *,
     trajectory: bool = False,
+    cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> tuple[Outcome, Trace]:
     """Simulates a batch of worlds; jit it, with scene and engine closed over.
@@ -96,7 +108,9 @@ def simulate(
       engine: The engine.
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
-      trajectory: Whether the trace holds qpos of every step.
+      trajectory: Whether the trace holds qpos of every step, and goes on to the end of the grasp
+        where the object is lost before; see `Trace`.
+      cost: A cost of one's own in place of the scene's, see `CostFunction`.
       constants: Numbers instead of the scene's, see `Scene.constants`; leaves of shape () or
         (world,). The engine may be that of any scene of the same structure.
 
@@ -116,13 +130,28 @@ def simulate(
         own = scene.with_constants(c)
         return model.model_fields(own, p, t), control.commands(own, p, t)
 
-    def judge(t: Trace, i: jax.Array, c: Constants) -> Outcome:
-        return cost.outcome(scene.with_constants(c), t, i)
+    def judge(t: Trace, u: jax.Array, i: jax.Array, c: Constants) -> Outcome:
+        return _outcome(scene.with_constants(c), cost, t, u, i)
 
     fields, ctrl = jax.vmap(world, in_axes=(0, 0, axes))(params, trials, constants)
     trace = engine.rollout(fields, ctrl, trajectory=trajectory)
     initial = invalid_start(scene, fields)
-    return jax.vmap(judge, in_axes=(0, 0, axes))(trace, initial, constants), trace
+    every = trace, ctrl, initial, constants
+    return jax.vmap(judge, in_axes=(0, 0, 0, axes))(*every), trace
+
+
+def _outcome(
+    scene: Scene, own: CostFunction | None, trace: Trace, ctrl: jax.Array, initial: jax.Array
+) -> Outcome:
+    """Outcome of one world, by the scene's cost or by one's own."""
+    result = outcome(scene, trace, initial)
+    if own is None:
+        return result
+    value = jnp.asarray(own(scene, trace, ctrl))
+    if value.shape:
+        raise ValueError(f"a cost is one number for each world, not an array {value.shape}")
+    value = jnp.where(failed(result.status), scene.cost.maximum, value)
+    return result._replace(cost=value.astype(result.cost.dtype))
 
 
 def evaluate(
@@ -131,6 +160,8 @@ def evaluate(
     params: Params,
     trials: Trial,
     *,
+    trajectory: bool = False,
+    cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> Outcome:
     """Evaluates all particles in all trials as one batch of particle * trial worlds.
@@ -141,6 +172,8 @@ def evaluate(
       params: Parameters with leading axis (particle,).
       trials: Trials with leading axis (trial,): common random numbers, every particle meets the
         same ones.
+      trajectory: As in `simulate`; for a cost that reads what happens after the object is lost.
+      cost: As in `simulate`.
       constants: Numbers instead of the scene's; leaves of shape () or (trial,).
 
     Returns:
@@ -149,7 +182,9 @@ def evaluate(
     Raises:
       SceneError: See `simulate`.
     """
-    return evaluate_to_end(scene, engine, params, trials, constants=constants)[0]
+    return evaluate_to_end(
+        scene, engine, params, trials, trajectory=trajectory, cost=cost, constants=constants
+    )[0]
 
 
 def evaluate_to_end(
@@ -158,6 +193,8 @@ def evaluate_to_end(
     params: Params,
     trials: Trial,
     *,
+    trajectory: bool = False,
+    cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> tuple[Outcome, jax.Array | None]:
     """As `evaluate`, with the states at the end, shape (particle, trial, nq + nv).
@@ -168,5 +205,7 @@ def evaluate_to_end(
     worlds_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
     worlds_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
     tiled = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, constants)
-    result, trace = simulate(scene, engine, worlds_p, worlds_t, constants=tiled)
+    result, trace = simulate(
+        scene, engine, worlds_p, worlds_t, trajectory=trajectory, cost=cost, constants=tiled
+    )
     return jax.tree.map(lambda v: v.reshape(particles, count, *v.shape[1:]), (result, trace.last))

@@ -1,5 +1,7 @@
 """Whether a world may start: sound model fields, and no bodies deep inside one another."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -24,6 +26,7 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
       scene: The scene.
       fields: Model fields with leading axis (world,).
     """
+    fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
     bad = ~(depth(scene, fields) <= fields.constants.limits.penetration)
     for value in jax.tree.leaves(fields):
         bad |= ~jnp.isfinite(value.reshape(value.shape[0], -1)).all(1)
@@ -35,13 +38,14 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     return jnp.where(bad, int(Status.INVALID_START), 0).astype(jnp.int32)
 
 
+@partial(jax.jit, static_argnums=0)
 def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     """Deepest overlap of any contact at the start [m], shape (world,).
 
     The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
     are straight.
     """
-    engine = StructuredEngine(scene)
+    engine = StructuredEngine(scene, kernel=False)
     state, hand = engine.reset(fields), world_constants(scene, fields)
     contacts = engine.contacts(Stages(None), hand, straight(hand, state), state.wrist[2])
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in contacts.values()]

@@ -4,13 +4,16 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import control, cost, model
-from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax import codesign, control, cost, model, parameters, rollout
+from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small
+from codesign_jax.optimize import schedule
+from codesign_jax.types import WARNINGS
+from tests import small, toy
 
 # A grasp in 1.2 s with few contacts: what is tested here does not depend on them.
 SHORT = {
@@ -135,3 +138,80 @@ def test_a_trajectory_changes_no_outcome(decided):
     for name in ("kernel", "batch", "mujoco"):
         for a, b in zip(outcomes[name, False], outcomes[name, True], strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+# --- a whole optimisation as one program ---------------------------------------------------------
+
+
+def test_a_run_is_the_loop_of_its_episodes_and_vmaps_over_seeds():
+    """By the kernel, bit for bit; each seed of a batch as alone, with its own schedule.
+
+    One episode alone maps as well.
+    """
+    scene = small.pinch("sphere", **SHORT)
+    space = parameters.design_space(scene.hand, "2d")
+    optimizer, engine = codesign.make_filter(space), StructuredEngine(scene)
+    episode = codesign.make_episode(scene, engine, space, optimizer, 2)
+    run = codesign.make_run(scene, engine, space, optimizer, 2)
+    seeds = [(0, (0.1, 0.05), "concurrent"), (7, (0.09, 0.03), "control")]
+    starts = [optimizer.init(jax.random.key(k), np.array(d), 3) for k, d, _ in seeds]
+    masks = np.stack([schedule(n, np.array(space.is_morphology), 2) for *_, n in seeds])
+    batch = jax.tree.map(lambda *v: jnp.stack(v), *starts)
+    ends, infos = jax.jit(jax.vmap(run))(batch, masks)
+    for k, state in enumerate(starts):
+        end, info = run(state, masks[k])
+        for e in range(2):
+            state, want = episode(state, masks[k, e])
+            for a, b in zip(jax.tree.leaves(info), jax.tree.leaves(want), strict=True):
+                np.testing.assert_array_equal(a[e], b)
+        np.testing.assert_array_equal(end.particles, state.particles)
+        np.testing.assert_array_equal(ends.particles[k], end.particles)
+        for a, b in zip(jax.tree.leaves(infos), jax.tree.leaves(info), strict=True):
+            np.testing.assert_array_equal(a[k], b)
+    _, firsts = jax.jit(jax.vmap(episode))(batch, masks[:, 0])
+    np.testing.assert_array_equal(firsts.trials.cost, infos.trials.cost[:, 0])
+    assert np.ptp(infos.trials.cost) > 0.1 and (infos.trials.status & ~int(WARNINGS) == 0).any()
+
+
+# --- a cost of one's own -------------------------------------------------------------------------
+
+
+def final_height(scene, trace, ctrl):
+    """How far below 0.2 m the object is at the end; what the arm does is no part of it."""
+    assert trace.qpos.shape[-1] > 0 and ctrl.shape[0] == trace.height.shape[0]
+    return jnp.maximum(0.2 - trace.qpos[-1, -5], 0.0)
+
+
+def test_a_cost_of_ones_own_sees_the_end_of_the_trace():
+    """MuJoCo's own simulation gives the object's final height, far behind its loss."""
+    scene = small.pinch("sphere", **SHORT)
+    hand, trial = small.hand_world(scene, pressure=0.0)
+    hand, trial = (jax.tree.map(lambda v: jnp.asarray(v)[None], x) for x in (hand, trial))
+    engine = MujocoEngine(scene, num_threads=1)
+    result = jax.jit(
+        lambda p, t: rollout.evaluate(scene, engine, p, t, trajectory=True, cost=final_height)
+    )(hand, trial)
+    fields = model.model_fields(scene, *(small.nth(x, 0) for x in (hand, trial)))
+    data = mujoco.MjData(compiled := world_model(scene, fields))
+    data.qpos[:] = fields.start
+    commands = control.commands(scene, *(small.nth(x, 0) for x in (hand, trial)))
+    for u in np.asarray(commands)[:-1]:
+        data.ctrl[:] = u
+        mujoco.mj_step(compiled, data)
+    assert np.isfinite(result.lost_time).all()  # the hand does not close
+    np.testing.assert_allclose(result.cost, 0.2 - data.qpos[-5], rtol=1e-5)
+
+
+def test_failed_trials_do_not_ask_ones_own_cost():
+    """They show the scene's maximum; a cost that is no number for each world is refused."""
+    scene, space, engine = toy.tiny()
+    engine.failing = [1]
+    params = jax.tree.map(lambda v: jnp.stack([v] * 3), space.params(jnp.array([0.05, 0.0])))
+    trial = jax.tree.map(lambda v: v[None], rollout.nominal_trial(scene))
+    evaluate = jax.jit(
+        lambda p, t, c: rollout.evaluate(scene, engine, p, t, cost=c), static_argnums=2
+    )
+    result = evaluate(params, trial, lambda s, t, u: t.height[-1])
+    np.testing.assert_array_equal(result.cost[:, 0], [0.5, scene.cost.maximum, 0.5])
+    with pytest.raises(ValueError, match="one number for each world"):
+        evaluate(params, trial, lambda s, t, u: t.height)

@@ -90,7 +90,7 @@ def test_kernel_equals_the_engine(grasp):
 
 @pytest.mark.parametrize("effects", [{}, {"friction": "full", "neo_hookean": True, "wrist": False}])
 def test_kernel_becomes_ptx(effects, monkeypatch):
-    """Every operation of the kernel has its instruction, with each effect and a trajectory."""
+    """Every operation of the kernel has its instruction; with effects in float64."""
     texts = []
 
     def register(origin, trace, layout):
@@ -100,19 +100,22 @@ def test_kernel_becomes_ptx(effects, monkeypatch):
     monkeypatch.setattr(gpu, "register", register)
     monkeypatch.setattr(launch, "available", lambda platform: None)
     scene = small.pinch("cylinder", links=2, **{f"effects__{k}": v for k, v in effects.items()})
-    params, trials = small.random_worlds(scene, 3, 3)
-    fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
-    ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :20]
     program, engine = Program(scene, Limits(8, 8, 1e-6)), StructuredEngine(scene)
 
-    def run(f, c):
+    def run(params, trials):
+        f = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
+        c = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :20]
         return program.simulate(
             world_constants(scene, f), engine.reset(f), c, trajectory=bool(effects)
         )
 
-    text = jax.jit(run).trace(fields, ctrl).lower(lowering_platforms=("cuda",)).as_text()
+    with jax.enable_x64(bool(effects)):
+        worlds = small.random_worlds(scene, 3, 3)
+        text = jax.jit(run).trace(*worlds).lower(lowering_platforms=("cuda",)).as_text()
     (code,) = texts
-    assert "@registered" in text and f".entry {gpu.ENTRY}(" in code and "fma.rn.f32" in code
+    used, other = ("f64", "f32") if effects else ("f32", "f64")
+    assert "@registered" in text and f".entry {gpu.ENTRY}(" in code
+    assert f"fma.rn.{used}" in code and f".{other}" not in code
 
 
 def test_machine_code_equals_the_engine(grasp):

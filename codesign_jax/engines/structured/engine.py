@@ -70,9 +70,9 @@ class StructuredEngine:
           iterations: Largest number of Newton iterations a step.
           evaluations: Line-search evaluations an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
-          kernel: Whether one kernel runs a rollout where it can: scenes of `in_kernel`, on a GPU in
-            float32. Without it all worlds step in unison. By default where kernels can run;
-            elsewhere a warning says why not.
+          kernel: Whether one kernel runs a rollout where it can: scenes of `in_kernel`. Without it
+            all worlds step in unison. By default where kernels can run; elsewhere a warning says
+            why not.
 
         Raises:
           KernelUnavailable: If `kernel` is true and kernels cannot run here.
@@ -261,7 +261,7 @@ class StructuredEngine:
           The trace, and what a derivative reads of it if states are asked for, else None.
         """
         record = {"trajectory": trajectory, "states": states}
-        if self.kernel and (self.conditional or ctrl.dtype == jnp.float32):
+        if self.kernel:
             try:
                 return self._one_kernel(fields, ctrl, **record)
             except launch.KernelUnavailable as error:

@@ -1,4 +1,4 @@
-"""Which designs start deep inside the table or an object, told before anything is simulated."""
+"""Which designs start deep inside the table, an object or themselves, before any simulation."""
 
 import functools
 
@@ -10,7 +10,7 @@ from codesign_jax import model, rollout
 from codesign_jax.model.layout import palm_points
 from codesign_jax.objects import Shape
 from codesign_jax.scene import Scene
-from codesign_jax.start import depth
+from codesign_jax.start import depth, depth_between
 from codesign_jax.types import Params
 
 
@@ -27,10 +27,21 @@ def overlaps(scene: Scene, designs: Params) -> np.ndarray:
     shapes = scene.objects.object
     top = max(_height(shape) for shape in shapes)
     low = [lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
-    # Fingers that touch one another may overlap at any height.
-    if min(low) >= top and not scene.effects.finger_finger:
+    if min(low) >= top:
         return np.zeros((len(shapes), len(low)))
     return np.asarray(_depths(scene, Params(*(v.astype(np.float32) for v in designs))))
+
+
+def between_fingers(scene: Scene, designs: Params) -> np.ndarray:
+    """Deepest overlap of two fingers at each design's start [m], shape (design,).
+
+    Args:
+      scene: The scene.
+      designs: Parameters with leading axis (design,), NumPy arrays.
+    """
+    if not scene.effects.finger_finger:
+        return np.zeros(designs.length.shape[0])
+    return np.asarray(_between(scene, Params(*(v.astype(np.float32) for v in designs))))
 
 
 def lowest_point(scene: Scene, params: Params) -> float:
@@ -80,6 +91,12 @@ def _about(axis: int, angle: float) -> np.ndarray:
     matrix[[i, j], [i, j]] = np.cos(angle)
     matrix[i, j], matrix[j, i] = -np.sin(angle), np.sin(angle)
     return matrix
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _between(scene: Scene, designs: Params) -> jax.Array:
+    trial = rollout.nominal_trial(scene)
+    return depth_between(scene, jax.vmap(lambda p: model.model_fields(scene, p, trial))(designs))
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -197,7 +197,7 @@ def _reach(scene: Scene, one: Params, name: str) -> list[str]:
 
 
 def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
-    """Refuses designs that start deep inside the table or an object, without noise."""
+    """Refuses designs that start deep inside the table, an object or themselves, without noise."""
     found, limit = [], scene.limits.penetration
     depths = clearance.overlaps(scene, designs)
     for shape, row in zip(scene.objects.object, depths, strict=True):
@@ -208,6 +208,14 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
                     f"(limits.penetration = {1e3 * limit:g} mm); raise arm.start_height = "
                     f"{scene.arm.start_height:g} m"
                 )
+    between = clearance.between_fingers(scene, designs)
+    for name, deep in zip(names, between, strict=True):
+        if not deep <= limit:
+            found.append(
+                f"{name}: fingers start {1e3 * deep:.0f} mm inside one another "
+                f"(limits.penetration = {1e3 * limit:g} mm); spread them, mount them further "
+                "apart, or set effects.finger_finger = false"
+            )
     return found
 
 

@@ -402,16 +402,11 @@ def _beside(path: Path, name: str) -> str | Path:
 def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
     problems += check_together(scene, where)
     e = scene.effects
-    if e.finger_finger and e.surface == "hull":
+    if e.surface == "hull" and e.friction == "full":
         problems.append(
-            f"{where}.effects.finger_finger is between spheres: it needs surface = 'spheres'"
+            f"{where}.effects.surface = 'hull' needs friction = 'coulomb' or 'none', not 'full': "
+            "a vertex has no patch of its own, its neighbours resist turning"
         )
-    for name, on in (("surface", e.surface == "hull"), ("finger_finger", e.finger_finger)):
-        if on and e.friction != "coulomb":
-            problems.append(
-                f"{where}.effects.{name} = {getattr(e, name)!r} needs friction = 'coulomb', "
-                f"not {e.friction!r}"
-            )
     if scene.discretization.hull_points % 4:
         problems.append(
             f"{where}.discretization.hull_points = {scene.discretization.hull_points} "

@@ -1,12 +1,14 @@
 """Whether a world may start: sound model fields, and no bodies deep inside one another."""
 
+import dataclasses
+import itertools
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.constants import apply_columns, world_constants
 from codesign_jax.engines.structured.kinematics import straight
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
@@ -27,7 +29,8 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
       fields: Model fields with leading axis (world,).
     """
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
-    bad = ~(depth(scene, fields) <= fields.constants.limits.penetration)
+    deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
+    bad = ~(deep <= fields.constants.limits.penetration)
     for value in jax.tree.leaves(fields):
         bad |= ~jnp.isfinite(value.reshape(value.shape[0], -1)).all(1)
     moving = layout(scene).bodies.ravel()
@@ -40,13 +43,45 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
 
 @partial(jax.jit, static_argnums=0)
 def depth(scene: Scene, fields: ModelFields) -> jax.Array:
-    """Deepest overlap of any contact at the start [m], shape (world,).
+    """Deepest overlap of a finger, the palm or the object with another of them or the table [m].
 
     The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
-    are straight.
+    are straight; how deep they stand in one another says `depth_between`.
+
+    Args:
+      scene: The scene.
+      fields: Model fields with leading axis (world,).
+
+    Returns:
+      Shape (world,).
     """
-    engine = StructuredEngine(scene, kernel=False)
-    state, hand = engine.reset(fields), world_constants(scene, fields)
+    alone = dataclasses.replace(scene.effects, finger_finger=False)
+    engine = StructuredEngine(dataclasses.replace(scene, effects=alone), kernel=False)
+    state, hand = engine.reset(fields), world_constants(engine.scene, fields)
     contacts = engine.contacts(Stages(None), hand, straight(hand, state), state.wrist[2])
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in contacts.values()]
     return jnp.stack(found).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of two straight fingers that may touch [m], shape (world,).
+
+    As spheres around the links' middles, as high as the section: the vertices of two hulls in one
+    and the same place would not stand inside one another.
+    """
+    worlds, count = fields.start.shape[0], scene.num_fingers
+    if not scene.effects.finger_finger or count == 1:
+        return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
+    state, hand = (
+        StructuredEngine(scene, kernel=False).reset(fields),
+        world_constants(scene, fields),
+    )
+    kin, up = straight(hand, state), hand.centre[2]
+    middle = kin.origin + apply_columns(kin.link, hand.centre)
+    deepest = []
+    for a, b in itertools.combinations(range(count), 2):
+        away = middle[:, :, None, a] - middle[:, None, :, b]
+        reach = up[:, None, a] + up[None, :, b]
+        deepest.append((reach - jnp.sqrt((away**2).sum(0))).reshape(-1, worlds).max(0))
+    return jnp.stack(deepest).max(0)

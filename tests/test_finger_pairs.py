@@ -11,7 +11,6 @@ from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.structured import StructuredEngine, finger_pairs
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.lanes import Stages
-from codesign_jax.schema import SceneError
 from codesign_jax.types import Status
 from tests import small
 from tests.test_structured import lanes_state
@@ -142,11 +141,6 @@ def test_more_contacts_than_slots_are_an_overflow():
     engine = StructuredEngine(the_scene)
     assert engine._status(jnp.zeros(1), overflow)[0] == Status.CONTACT_OVERFLOW
     assert engine._status(jnp.zeros(1), ~overflow)[0] == Status.OK
-
-
-def test_not_with_the_hull():
-    with pytest.raises(SceneError, match="finger_finger is between spheres"):
-        small.pinch("sphere", effects__surface="hull", **SETTINGS)
 
 
 @pytest.mark.slow  # a minute of compiling

@@ -150,6 +150,8 @@ class Dense:
         self.smooth = data.qfrc_smooth.copy()
         self.rows = []  # (Jacobian (3, nv), reference (3,), R of normal and tangent, friction)
         for c in data.contact:
+            if c.efc_address < 0:  # apart
+                continue
             rows = slice(c.efc_address, c.efc_address + 3)
             jac = data.efc_J.reshape(-1, oracle.nv)[rows]
             self.rows.append((jac, data.efc_aref[rows], 1 / data.efc_D[rows][:2], c.friction[0]))

@@ -69,12 +69,25 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout) -> str:
     name = cache.key("cpu", origin, layout, *host.identity())
 
     def build() -> bytes:
-        return host.compile(block_code(trace(), layout) + handler_code(name, layout))
+        text = block_code(trace(), layout) + handler_code(name, layout)
+        return host.compile(_declared_once(text))
 
     with host.LOCK:
         if not host.known(name):
             host.register(name, host.Loaded(cache.kept(name, build)), "cpu")
     return name
+
+
+def _declared_once(text: str) -> str:
+    """A program without repeated declarations: block and handler may use the same function."""
+    lines = text.splitlines()
+    repeated, seen = set(), set()
+    for number, line in enumerate(lines):
+        if line.startswith("declare"):
+            if line in seen:
+                repeated.add(number)
+            seen.add(line)
+    return "\n".join(line for k, line in enumerate(lines) if k not in repeated) + "\n"
 
 
 def _work(layout: Layout) -> str:

@@ -15,7 +15,6 @@ import os
 import jax
 
 from codesign_jax import files
-from codesign_jax.engines.structured.engine import in_kernel
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.runs.settings import Settings
 from codesign_jax.scene import Scene
@@ -102,7 +101,7 @@ _REFERENCE = (
 def work(scene: Scene, settings: Settings) -> Work:
     """What an episode of a run is, on this machine."""
     texts = "".join(scene_texts(scene).values())
-    kernel = settings.engine == "structured" and in_kernel(scene)
+    kernel = settings.engine == "structured"
     return Work(
         settings.engine,
         _device(settings.engine),

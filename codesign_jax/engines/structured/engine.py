@@ -27,6 +27,7 @@ from codesign_jax.engines.structured.transforms import Path
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
+from codesign_jax.schema import SceneError
 from codesign_jax.types import Status, Trace, failed
 
 
@@ -70,9 +71,8 @@ class StructuredEngine:
           iterations: Largest number of Newton iterations a step.
           evaluations: Line-search evaluations an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
-          kernel: Whether one kernel runs a rollout where it can: scenes of `in_kernel`. Without it
-            all worlds step in unison. By default where kernels can run; elsewhere a warning says
-            why not.
+          kernel: Whether one kernel runs a rollout. Without it all worlds step in unison. By
+            default where kernels can run; elsewhere a warning says why not.
 
         Raises:
           KernelUnavailable: If `kernel` is true and kernels cannot run here.
@@ -84,7 +84,7 @@ class StructuredEngine:
         self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
         self.conditional = jax.default_backend() == "cpu"  # see Stages
         self.demanded = bool(kernel)
-        wanted = kernel is not False and in_kernel(scene)
+        wanted = kernel is not False
         self.kernel = wanted and _has_kernel(self.demanded)
 
     def reset(self, fields: ModelFields) -> State:
@@ -206,7 +206,11 @@ class StructuredEngine:
           state: Their states.
           ctrl: Controls, shape (nu, world).
           iterations: As in the engine, by default its own; 0 takes the warm start for the solution.
+
+        Raises:
+          SceneError: If the batch form cannot do what the scene asks for.
         """
+        refuse_batch(self.scene)
         # The compiler does not know that a shape's index is never negative.
         run = Stages(hand.object_id[0, 0] >= 0 if self.conditional else None)
         problem, velocity = self.problem(run, hand, state, ctrl)
@@ -351,6 +355,18 @@ def _has_kernel(demanded: bool) -> bool:
     return reason is None
 
 
-def in_kernel(scene: Scene) -> bool:
-    """Whether the kernel simulates a scene; the batch form simulates all."""
-    return not scene.effects.finger_finger
+def refuse_batch(scene: Scene) -> None:
+    """Checks that the batch form, which has derivatives, can do what a scene asks for.
+
+    Raises:
+      SceneError: If it cannot.
+    """
+    e = scene.effects
+    if e.finger_finger and scene.num_fingers > 1 and (e.surface == "hull" or e.friction == "full"):
+        raise SceneError(
+            [
+                "effects.finger_finger with surface = 'hull' or friction = 'full' runs in the "
+                "kernel only, which has no derivative: use surface = 'spheres' and friction = "
+                "'coulomb' or 'none', or an engine with the kernel"
+            ]
+        )

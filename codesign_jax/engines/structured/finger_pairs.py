@@ -162,7 +162,7 @@ def blocks(c: Contacts) -> jax.Array:
 def each_block(c: Contacts, function: Callable, each: tuple, start: Any) -> Any:
     """Folds function(carry, block's first slot, contacts, *each) over the blocks in use."""
     # Planes to the compiler, as in `lanes.scan_links`.
-    every = (c.point, c.normal, c.distance, ends_of(c).link, *each)
+    every, structure = jax.tree.flatten((c.point, c.normal, c.distance, ends_of(c).link, each))
     planes = [x.reshape(-1, x.shape[-3], x.shape[-1]) for x in every]
 
     def body(i: jax.Array, carry: Any) -> Any:
@@ -172,10 +172,10 @@ def each_block(c: Contacts, function: Callable, each: tuple, start: Any) -> Any:
             )
             for p, x in zip(planes, every, strict=True)
         ]
-        part = c._replace(
-            point=cut[0], normal=cut[1], distance=cut[2], ends=ends_of(c)._replace(link=cut[3])
-        )
-        return function(carry, BLOCK * i, part, *cut[4:])
+        point, normal, distance, link, own = jax.tree.unflatten(structure, cut)
+        ends = ends_of(c)._replace(link=link)
+        part = c._replace(point=point, normal=normal, distance=distance, ends=ends)
+        return function(carry, BLOCK * i, part, *own)
 
     return jax.lax.fori_loop(0, blocks(c), body, start)
 

@@ -103,7 +103,8 @@ def attach(run: Stages, contacts: Contacts, skin: Vertices) -> Contacts:
     touching = run.only_if(contacts.active.any())
     point, normal, distance, lever, share = touching(ordered, contacts, skin)
     cone = contacts.cone
-    cone = cone._replace(normal=cone.normal * share, tangent=cone.tangent * share)
+    tangent = None if cone.tangent is None else cone.tangent * share
+    cone = cone._replace(normal=cone.normal * share, tangent=tangent)
     return Contacts(point, normal, distance, cone, lever)
 
 
@@ -158,19 +159,21 @@ def _sum_vertices(
       c: The contacts.
       function: From the arrays of one vertex of each row, shape (..., row, finger, world), to
         arrays of shape (size, row, finger, world).
-      each: Arrays of shape (..., row, k, finger, world).
+      each: Arrays of shape (..., row, k, finger, world), or None.
       sizes: The sizes.
     """
     rows, k, *lanes = c.distance.shape
+    arrays, structure = jax.tree.flatten(each)
     # Rows and planes to the compiler, as in `scan_links`.
-    planes = [x.reshape(-1, k, lanes[0] * lanes[1]) for x in each]
+    planes = [x.reshape(-1, k, lanes[0] * lanes[1]) for x in arrays]
 
     def add(i: jax.Array, sums: tuple) -> tuple:
         vertex = [
             jax.lax.dynamic_index_in_dim(p, i, 1, keepdims=False).reshape(*x.shape[:-3], *lanes)
-            for p, x in zip(planes, each, strict=True)
+            for p, x in zip(planes, arrays, strict=True)
         ]
-        return tuple(s + v for s, v in zip(sums, run(function, *vertex), strict=True))
+        new = run(function, *jax.tree.unflatten(structure, vertex))
+        return tuple(s + v for s, v in zip(sums, new, strict=True))
 
     zero = tuple(jnp.zeros((n, rows, *lanes), c.distance.dtype) for n in sizes)
     return jax.lax.fori_loop(0, c.active.sum(1).max(), add, zero)

@@ -177,15 +177,21 @@ class BoundContacts:
         return self.if_touching(item, lambda: [self._aim(item, step)], [()])[0]
 
     def _aim(self, item: Any, step: Lanes) -> Lanes:
-        def ray(place, cone, jar, step):
+        def relative(place, cone, step):
+            return self.set.contacts(place, cone).relative(step[:, None])
+
+        return self.line(item, lanewise(relative, self.place(item), self.cone, step))
+
+    def line(self, item: Any, change: Lanes) -> Lanes:
+        """Stores the line along a change of jar; returns the cost's slope at 0."""
+
+        def ray(place, cone, jar, change):
             c = self.set.contacts(place, cone)
-            change = c.relative(step[:, None])
             line = contact.line(c, jar, change)
             first, _ = contact.slopes(c, line, 0.0)
-            return change, jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
+            return jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
 
-        jar = self.read("jar", item)
-        change, line, slope = lanewise(ray, self.place(item), self.cone, jar, step)
+        line, slope = lanewise(ray, self.place(item), self.cone, self.read("jar", item), change)
         self.write("step", change, item)
         self.write("ray", line, item)
         return slope

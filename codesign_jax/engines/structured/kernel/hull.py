@@ -43,14 +43,15 @@ class Side(NamedTuple):
 def fields(scene: Scene) -> dict[str, tuple[int, tuple[int, ...]]]:
     """The hull's part of the hand's table: vertices (place, weight, share) and balls."""
     k = scene.discretization.hull_rings * scene.discretization.hull_points
-    return {"vertex": (KINDS * k, (5,)), "ball": (KINDS, (2,))}
+    return {"vertex": (KINDS * k, (5,)), "ball": (KINDS, (2,)), "section_box": (1, (3,))}
 
 
 def pack(scene: Scene, hand: WorldConstants) -> dict[str, jax.Array]:
     """Arrays of `fields`, (item, component, finger, world).
 
     A ball is a radius and a height: around the point of that height above the joint, on the link
-    behind it, all vertices of a straight row are within the radius.
+    behind it, all vertices of a straight row are within the radius.  The section's box is half the
+    width, the height and a segment.
     """
     local, weight, share = hull.places(scene, hand)
     rows = np.array([max(local.shape[1] - KINDS, 0), local.shape[1] - 2, local.shape[1] - 1])
@@ -60,7 +61,11 @@ def pack(scene: Scene, hand: WorldConstants) -> dict[str, jax.Array]:
     away = local[:, rows] - jnp.stack([0 * up, 0 * up, up])[:, None, None]
     radius = jnp.sqrt(dot(away, away)).max(1)
     ball = jnp.stack([radius, jnp.broadcast_to(up, radius.shape)], 1)
-    return {"vertex": jnp.moveaxis(vertex, 0, 2).reshape(-1, 5, *up.shape), "ball": ball}
+    vertex = jnp.moveaxis(vertex, 0, 2).reshape(-1, 5, *up.shape)
+    assert hand.section is not None
+    height, _, segment, width = hand.section
+    box = 0.5 * jnp.stack([width, height, segment])
+    return {"vertex": vertex, "ball": ball, "section_box": box[None]}
 
 
 def kind_of(row: Any, links: int) -> Any:
@@ -90,7 +95,7 @@ class Skin:
         kind = kind_of(row, self.links)
         moves = {c.set.name: self._moves(c.set.name, before, after) for c in self.sets}
         ball = self.step.p.hand.read(self.step.hand, "ball", kind)
-        centre, reach = lanewise(_ball, joint, before.frame, after.frame, ball)
+        centre, reach = lanewise(ball_around, joint, before.frame, after.frame, ball)
         for slots in self.sets:
             slots.clear(row)
             _, _, gap = self.step.geometry(slots.set.name, centre, reach, self.at, self.thing)
@@ -106,7 +111,7 @@ class Skin:
 
     def _vertex(self, row, item, slots, joint, before, after, moves) -> None:
         vertex = self.step.p.hand.read(self.step.hand, "vertex", item)
-        place = lanewise(_place, vertex, joint, before.frame, after.frame)
+        place = lanewise(placed, vertex, joint, before.frame, after.frame)
         point, image, weight, share = place
         name = slots.set.name
         where, normal, gap = self.step.geometry(name, point, 0.0, self.at, self.thing)
@@ -139,7 +144,7 @@ def across(before: jax.Array, after: jax.Array, obj: jax.Array | None) -> jax.Ar
     return jnp.concatenate([first, after[:3] - before[:3]])
 
 
-def _ball(joint, before, after, ball):
+def ball_around(joint, before, after, ball):
     """Centre (3, 1, ...) and radius (1, ...) of a ball around a row's vertices.
 
     The link before the joint holds the straight row's centre somewhere else: the radius grows by
@@ -151,7 +156,7 @@ def _ball(joint, before, after, ball):
     return centre[:, None], radius + jnp.sqrt(dot(apart, apart))[None]
 
 
-def _place(vertex, joint, before, after):
+def placed(vertex, joint, before, after):
     """Place (3, 1, ...), image (3, 1, ...), weight (1, ...) and share (1, 1, ...) of a vertex."""
     local, weight, share = vertex[:3], vertex[3], vertex[4]
     image = apply_columns(after, local)

@@ -11,6 +11,7 @@ from codesign_jax.engines.structured import newton, solver
 from codesign_jax.engines.structured.inertia import Body
 from codesign_jax.engines.structured.kernel import hull
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, direct, zeros
+from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.memory import (
     Block,
     MemoryLayout,
@@ -21,8 +22,9 @@ from codesign_jax.engines.structured.kernel.memory import (
     solid,
     upper,
 )
+from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
-from codesign_jax.engines.structured.lanes import dot, total
+from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.problem import Forces, Matrices, object_acceleration
 
@@ -117,7 +119,8 @@ class Newton:
           rigid: Whether the wrist's accelerations are known, see `Problem.arm`.
         """
         self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
-        self.fingers = [c for n, c in m.contacts.items() if n.startswith("finger")]
+        self.pairs: BoundPairs | None = m.contacts.get("finger_finger")  # type: ignore[assignment]
+        self.fingers = [m.contacts[n] for n in ("finger_object", "finger_table") if n in m.contacts]
         self.skin = [c for n, c in m.contacts.items() if n.startswith("hull_")]
         self.slots = [c for n, c in m.contacts.items() if not n.startswith(("finger", "hull_"))]
         self.like = jnp.zeros((block.size,), palm.armature.dtype)
@@ -150,7 +153,24 @@ class Newton:
         """Arguments of `make_body` for a link."""
         return self.read("mass", "body_centre", "tensor", item=item)
 
-    def backward(self, alpha: Lanes) -> el.Quadratic:
+    def pair_push(self, i: Any) -> tuple[Lanes, Lanes | None]:
+        """Forces of the contacts between fingers on a link and on the joint before it."""
+        assert self.pairs is not None
+        push = self.pairs.pushed(i + 1)[:6]
+        return push, self.pairs.pushed(i)[6:] if self.pairs.set.skin else None
+
+    def add_first(self, r: Lanes) -> Lanes:
+        """Adds the contacts between fingers that act on the palm, those of the first joints."""
+        assert self.pairs is not None
+        if not self.pairs.set.skin:
+            return r
+        return lanewise(jnp.add, r, self.pairs.pushed(0)[:6])
+
+    def widened(self, motion: Lanes) -> Lanes:
+        """What belongs to a world, on all fingers."""
+        return lanewise(jnp.add, motion, zeros(motion.shape[:-2], self.like))
+
+    def backward(self, alpha: Lanes) -> tuple[el.Quadratic, Lanes]:
         """Eliminates the fingers from their tips.
 
         Args:
@@ -158,35 +178,53 @@ class Newton:
             they are read once an iteration.
 
         Returns:
-          The sum over the fingers.
+          The sum over the fingers, and the product of their forces with the step so far.
         """
+        if self.pairs:
+            self.pairs.respond(alpha)
 
-        def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes, terms):
+        def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes, terms, pairs):
             link = make_body(*body)
-            push = smooth - link.times(motion)
+            push, tau = smooth - link.times(motion), tau - arm * acc
+            if pairs is not None:
+                wrench, turned = pairs
+                push = push + wrench
+                tau = tau if turned is None else tau + contract(axes[:, :3], turned[None], 1)
             node = newton.add_link(node, newton.link_terms(link.matrix(), push, pushes))
-            return el.eliminate(direct, node, axes, arm, tau - arm * acc, terms)
+            y = contract(axes, node.r[None], 1) + tau
+            node, kept = el.eliminate_and_keep(direct, node, axes, arm, tau, terms)
+            if terms is not None:
+                y = y + terms.y
+            return node, kept, dot(y, kept.factors.z)
 
-        def step(i: Any, node: el.Quadratic) -> el.Quadratic:
+        def step(i: Any, carry: tuple) -> tuple:
+            node, work = carry
             acc, motion = self.move("acc", i, alpha), self.move("motion", i, alpha)
             pushes = {c.set.name: c.push(i, alpha) for c in self.fingers}
             smooth, tau, axes, arm = self.read("smooth", "tau", "axes", "armature", item=i)
             node = node._replace(p=full(node.p), q=full(node.q))
             rows = [self.row(c, i, axes, alpha) for c in self.skin]
             terms = add_terms([r.terms for r in rows]) if rows else None
-            node, factors = lanewise(
-                eliminate, node, self.body_of(i), motion, smooth, tau, axes, arm, acc, pushes, terms
-            )
-            for name, value in zip(("w", "g", "z"), factors, strict=True):
+            pairs = self.pair_push(i) if self.pairs else None
+            forces = (motion, smooth, tau, axes, arm, acc, pushes, terms, pairs)
+            node, kept, more = lanewise(eliminate, node, self.body_of(i), *forces)
+            for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
                 self.write(name, value, i)
-            return self.add_rows(node._replace(p=upper(node.p), q=upper(node.q)), rows)
+            if self.pairs:
+                self.write("inverse", kept.inverse, i)
+                work = lanewise(jnp.add, work, more)
+            node = self.add_rows(node._replace(p=upper(node.p), q=upper(node.q)), rows)
+            return node, work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         tip = [self.row(c, self.links, None, alpha) for c in self.skin]
         node = self.add_rows(el.Quadratic(*empty), tip)
-        node = loop(self.links, step, node, self.block.size, reverse=True)
+        start = node, zeros((), self.like)
+        node, work = loop(self.links, step, start, self.block.size, reverse=True)
+        if self.pairs:
+            node, work = node._replace(r=self.add_first(node.r)), self.block.sum(work)
         node = self.block.sum(node)
-        return node._replace(p=full(node.p), q=full(node.q))
+        return node._replace(p=full(node.p), q=full(node.q)), work
 
     def row(self, slots: BoundSlots, row: Any, axes: Lanes | None, alpha: Lanes) -> "Row":
         """What a row of the hull adds to the elimination, see `hull.row_terms`.
@@ -240,10 +278,10 @@ class Newton:
             pushes[c.set.name] = (full(triangle), wrench)
         return pushes
 
-    def at_palm(self, now: Iterate, node: el.Quadratic, slots: dict) -> Iterate:
+    def at_palm(self, now: Iterate, node: el.Quadratic, slots: dict) -> tuple[Iterate, Eliminated]:
         """Solves for wrist and object; slots: what `slot_pushes` returns."""
 
-        def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> Iterate:
+        def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> tuple:
             force = Forces(
                 palm.smooth_palm - palm.palm.times(now.palm_motion),
                 None,  # type: ignore[arg-type]
@@ -256,18 +294,47 @@ class Newton:
             if self.rigid:
                 obj = el.solve_object(direct, node.q, node.r_object)
                 none = jnp.zeros_like(obj)
-                return Iterate(none, object_acceleration(obj, palm.position), none, obj)
-            arm = palm.armature
-            node, hinges = el.eliminate(direct, node, palm.axes, arm[3:], force.wrist[3:])
-            slide_axes = newton.wrist_slides(arm)
-            node, slides = el.eliminate(direct, node, slide_axes, arm[:3], force.wrist[:3])
+                step = Iterate(none, object_acceleration(obj, palm.position), none, obj)
+                return step, Eliminated(None, None, node.q, dot(node.r_object, obj))
+            arm, work = palm.armature, []
+            axes = (palm.axes, newton.wrist_slides(arm))
+            kept = []
+            for subspace, inertia, twist in zip(
+                axes, (arm[3:], arm[:3]), (force.wrist[3:], force.wrist[:3]), strict=True
+            ):
+                y = contract(subspace, node.r[None], 1) + twist
+                node, new = el.eliminate_and_keep(direct, node, subspace, inertia, twist)
+                kept.append(new)
+                work.append(dot(y, new.factors.z))
             obj = el.solve_object(direct, node.q, node.r_object)
-            first, motion = el.substitute(slide_axes, slides, jnp.zeros_like(obj), obj)
-            second, motion = el.substitute(palm.axes, hinges, motion, obj)
+            first, motion = el.substitute(axes[1], kept[1].factors, jnp.zeros_like(obj), obj)
+            second, motion = el.substitute(axes[0], kept[0].factors, motion, obj)
             at_centre = object_acceleration(obj, palm.position)
-            return Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
+            step = Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
+            work = total([*work, dot(node.r_object, obj)])
+            return step, Eliminated(kept[0], kept[1], node.q, work)
 
         return lanewise(solve, now, self.palm, node, slots)
+
+    def direction(self, now: Iterate, last: Lanes, idle: jax.Array) -> Iterate:
+        """Newton's step: the fingers' factors, and the step of wrist and object.
+
+        Args:
+          now: The iterate.
+          last: Length of the last step, see `backward`.
+          idle: Lanes of worlds whose step is of no use.
+        """
+        node, work = self.backward(last)
+        step, done = self.at_palm(now, node, self.slot_pushes(last))
+        pairs = self.pairs
+        if pairs is None:
+            return step
+        done = done._replace(work=lanewise(jnp.add, done.work, work))
+
+        def correct() -> Iterate:
+            return Coupling(self, pairs, done).correct(step, idle)
+
+        return choose(pairs.touching_now(), correct, step, self.block.size)
 
     def forward(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
         """Substitutes back and prepares the line search.
@@ -298,6 +365,8 @@ class Newton:
             )
             self.write("step_acc", a, i)
             self.write("step_motion", moved, i)
+            if self.pairs:
+                self.pairs.put("motion", moved, i + 1)
             terms = [touch]
             for contacts in self.fingers:
                 rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
@@ -308,12 +377,15 @@ class Newton:
             return moved, slope, curvature, touch
 
         none = zeros((), self.like)
-        parent = lanewise(jnp.add, step.palm_motion, zeros((6,), self.like))
+        parent = self.widened(step.palm_motion)
+        if self.pairs:
+            self.pairs.put("motion", parent, 0)
         last, slope, curvature, touch = loop(
             self.links, one, (parent, none, none, none), self.block.size
         )
         tip = self.aim_row(self.links, last, last, step)
-        touch = lanewise(lambda t: total(t), [touch, *tip])
+        between = [self.pairs.aim_all()] if self.pairs else []
+        touch = lanewise(lambda t: total(t), [touch, *tip, *between])
         for contacts in self.slots:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
@@ -379,6 +451,8 @@ class Newton:
                     sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
             for c in self.slots:
                 sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
+            if self.pairs:
+                sums = self.pairs.slopes_of_all(alpha, sums)
             one, two = self.block.sum(sums)
             return lanewise(
                 lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
@@ -423,7 +497,7 @@ class Newton:
 
         def body(carry: list) -> list:
             count, (now, before, last) = carry[0], rebuild(carry[1:])
-            step = self.at_palm(now, self.backward(last), self.slot_pushes(last))
+            step = self.direction(now, last, ~waiting | (before.lane <= tolerance))
             slope, curvature, first = self.forward(now, step)
             residual, scale = lanewise(_residual, slope, first, self.palm, now.object_motion)
             floor = LINE_TOLERANCE * tolerance * scale.lane

@@ -19,9 +19,10 @@ from codesign_jax.compiler import cache
 from codesign_jax.compiler.launch import Kernel, block_lanes, launch
 from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured.constants import WorldConstants
-from codesign_jax.engines.structured.kernel import hull, objects
+from codesign_jax.engines.structured.kernel import fingers, hull, objects
 from codesign_jax.engines.structured.kernel.contacts import ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, anywhere
+from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_slots
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kinematics import Acc, State
@@ -94,6 +95,9 @@ class Program:
         on = {"hull_object": e.finger_object, "hull_table": e.finger_table}
         if e.surface == "hull":
             sets += [self._skin(name) for name in on if on[name]]
+        if e.finger_finger and self.num_fingers > 1:
+            block, slots = (self.fingers, self.block), pair_slots(self.scene)
+            sets.append(PairSet(self.scene, block, self.links, slots))
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
         on_table = [make("object_table", -(-4 // self.fingers), 1)] if e.object_table else []
@@ -114,7 +118,7 @@ class Program:
             }
         if self.scene.effects.neo_hookean:
             more |= {"section": (1, (4,))}
-        if self.slotted:
+        if self.scene.effects.surface == "hull":
             more |= hull.fields(self.scene)
         support, grid = objects.tables(self.scene, self.fingers)
         self.hand = MemoryLayout(
@@ -182,6 +186,8 @@ class Program:
         }
         for contacts in self.sets:
             fields |= contacts.groups()
+        if any(isinstance(s, PairSet) for s in self.sets):
+            fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))} | fingers.fields(n, self.k)
         self.scratch = MemoryLayout(True, **fields)
 
     def pack_hand(self, hand: WorldConstants) -> tuple[jax.Array, jax.Array]:
@@ -203,7 +209,7 @@ class Program:
             arrays |= self._palm_slots(hand)
         if hand.section is not None:
             arrays["section"] = hand.section[None]
-        if self.slotted:
+        if self.scene.effects.surface == "hull":
             arrays |= hull.pack(self.scene, hand)
         if hand.mesh is not None:
             arrays |= objects.rows(hand.mesh, self.fingers, dtype)

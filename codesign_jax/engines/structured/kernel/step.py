@@ -19,6 +19,7 @@ from codesign_jax.engines.structured.kernel.contacts import (
     sphere_on_table,
     zeros,
 )
+from codesign_jax.engines.structured.kernel.fingers import Search
 from codesign_jax.engines.structured.kernel.hull import Side, Skin
 from codesign_jax.engines.structured.kernel.memory import Block, loop
 from codesign_jax.engines.structured.kernel.newton import (
@@ -30,6 +31,7 @@ from codesign_jax.engines.structured.kernel.newton import (
     triangle,
 )
 from codesign_jax.engines.structured.kernel.objects import WorldObject
+from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
@@ -180,6 +182,10 @@ class Step:
             lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
         )
 
+        pairs = m.contacts.get("finger_finger")
+        search = Search(self, pairs) if isinstance(pairs, BoundPairs) else None
+        if search:
+            search.start(motion, vel, frame, origin)
         skin = Skin(self, at, m, thing) if any(n.startswith("hull_") for n in m.contacts) else None
 
         def link(i: Any, carry: tuple) -> tuple:
@@ -209,6 +215,8 @@ class Step:
             share = p.hand.read(self.hand, "share", i + 1)
             middle = lanewise(lambda m, c, s: m + s * c, middle, stored["body_centre"], share)
             self._finger_contacts(i, carry, at, m, thing)
+            if search:
+                search.link(i, carry[4], carry[2], carry[1], carry[0])
             if skin:
                 skin.row(i, carry[0], before, Side(carry[1], carry[4], carry[2]))
             return (*carry, middle)
@@ -218,6 +226,8 @@ class Step:
         if skin:
             tip = Side(frame, motion, vel)
             skin.row(p.links, origin, tip, tip)
+        if search:
+            search.find()
         self._slot_contacts(state, at, m, thing)
         count = p.num_fingers * p.links
         middle = self.block.sum(middle)

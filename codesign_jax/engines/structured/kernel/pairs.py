@@ -1,0 +1,277 @@
+"""Contacts between fingers in a kernel: both fingers' lanes keep every contact, each its own side.
+
+Fingers pair up by an exclusive or of their numbers with 1, 2, and so on, which reaches every pair
+of fingers; a row of slots is one such number.  Both lanes of a pair fill the same slot with the
+same contact, so that what one of them needs of the other's side stands in the same row of memory.
+A side is a joint's row as in `codesign_jax.engines.structured.hull`, and the link before it is what
+a sphere follows.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import contact
+from codesign_jax.engines.structured.contact import Contacts
+from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, zeros
+from codesign_jax.engines.structured.kernel.hull import across
+from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet
+from codesign_jax.engines.structured.lanes import dot, sum_axis
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.solver import along
+from codesign_jax.scene import Scene
+
+
+def pair_slots(scene: Scene) -> int:
+    """Slots of a pair of fingers; a world in which more touch is a failed one."""
+    d = scene.discretization
+    if scene.effects.surface == "hull":
+        return 8 * (d.links + 1) * max(1, d.hull_rings * d.hull_points // 16)
+    return min(4 * d.links * d.spheres_per_link, (d.links * d.spheres_per_link) ** 2)
+
+
+class PairSet(HullSet):
+    """Contacts between fingers; a row is a pairing of all fingers."""
+
+    def __init__(self, scene: Scene, block: tuple[int, int], links: int, slots: int):
+        """Prepares the set.
+
+        Args:
+          scene: The scene.
+          block: Fingers, a power of two, and worlds of a block.
+          links: Moving links of a finger.
+          slots: Slots of a pairing, on each lane.
+        """
+        fingers, worlds = block
+        super().__init__(scene, "finger_finger", fingers - 1, slots, fingers * worlds)
+        self.block, self.links = block, links
+        self.skin = scene.effects.surface == "hull"
+        if not self.skin:
+            self.places, self.of_lines = ContactSet.places, ContactSet.of_lines
+        n = ROWS[scene.effects.friction][0]
+        self.more = {"row": 1, "hessian": n * (n + 1) // 2}
+        self.more |= {field: n for field in ("own", "first", "left", "along", "moved", "sum")}
+        if self.skin:
+            self.more |= HullSet.more
+
+    @property
+    def components(self) -> int:
+        """Components of a side's motion and wrench."""
+        return 9 if self.skin else 6
+
+    def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+        """See `ContactSet`; and the sides of all fingers, from the palm to the tips."""
+        sides = {"motion": 6, "vel": 6, "push": self.components}
+        rows = {f"side.{name}": (self.links + 1, (n,)) for name, n in sides.items()}
+        return super().groups() | rows
+
+    def contacts(self, place: tuple, cone: contact.Cone) -> Contacts:
+        """See `ContactSet`; a lever is that of the lane's own side."""
+        kind = HullSet if self.skin else ContactSet
+        return kind.contacts(self, place, cone)
+
+    def of_line(self, gap: tuple, cone: contact.Cone) -> Contacts:
+        """See `ContactSet`."""
+        return (HullSet if self.skin else ContactSet).of_line(self, gap, cone)
+
+    def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundPairs":
+        """See `ContactSet`."""
+        return BoundPairs(self, table, ref, self.cone(read))
+
+
+class BoundPairs(BoundSlots):
+    """Contacts between fingers with their memory."""
+
+    set: PairSet  # type: ignore[assignment]
+
+    def __init__(self, of: PairSet, table: MemoryLayout, ref: Any, cone: contact.Cone):
+        """See `ContactSet.bind`."""
+        super().__init__(of, table, ref, cone)
+        self.block = Block(*of.block)
+
+    def partner(self, row: Any) -> jax.Array:
+        """Lane of the finger that each lane's finger is paired with, shape (lane,)."""
+        number = jnp.zeros_like(self.block.finger) + (row + 1)
+        other = jax.lax.bitwise_xor(self.block.finger, number.astype(jnp.int32))
+        return other * self.set.block[1] + self.block.world
+
+    def theirs(self, field: str, item: Any, partner: jax.Array) -> Lanes:
+        """A field of the partners' slots."""
+        return self.table.gather(self.ref, f"{self.set.name}.{field}", item, partner)
+
+    def side(self, name: str, row: Any, lane: jax.Array) -> Lanes:
+        """Motion of rows, (6 or 9, ...): of the link before a joint, and the joint's turning."""
+        before = self.table.gather(self.ref, f"side.{name}", row, lane)
+        if not self.set.skin:
+            return before
+        after = self.table.gather(
+            self.ref, f"side.{name}", jnp.minimum(row + 1, self.set.links), lane
+        )
+        return lanewise(lambda a, b: across(a, b, None), before, after)
+
+    def put(self, name: str, value: Lanes, row: Any) -> None:
+        """Stores what a row's link before its joint does; row 0 is the palm's."""
+        self.table.write(self.ref, f"side.{name}", value, row)
+
+    def pushed(self, row: Any) -> Lanes:
+        """Wrench of all contacts of a row's own side, (6 or 9, ...)."""
+        return self.table.read(self.ref, "side.push", row)
+
+    def rows(self) -> int:
+        """Number of a finger's rows."""
+        return self.set.links + 1
+
+    # Slots
+
+    def enter(self, row: Any, which: jax.Array, owner: jax.Array, mine: dict, other: dict) -> None:
+        """Gives contacts a slot on both of their lanes.
+
+        Args:
+          row: The pairing.
+          which: Lanes that have found a contact, a part of `owner`.
+          owner: Lanes that look for contacts, one of each pair of lanes.
+          mine: What the finder keeps, by field.
+          other: What its partner keeps.
+        """
+        count = self.read("count", row).lane.astype(jnp.int32)
+        # Beyond what any lane has filled: a place to hand the partner's part over.
+        free = row * (self.set.slots + 1) + jnp.minimum(jnp.max(count), self.set.slots)
+        gap = lanewise(
+            lambda w, g: jnp.where(w, g, 1.0), lanes([which], (), wide=True), other["gap"]
+        )
+        for field, value in (other | {"gap": gap}).items():
+            self.write(field, value, free)
+        partner = self.partner(row)
+        side = lanes([owner], (), wide=True)
+        fields = {
+            field: lanewise(jnp.where, side, value, self.theirs(field, free, partner))
+            for field, value in mine.items()
+        }
+        touch = which | (~owner & (fields["gap"].lane < 0))
+        self.add(row, touch, fields, self.block.lane)
+
+    def each(self, body: Callable, start: Any) -> Any:
+        """Folds body(item, partner's lanes, tree of lanes) over all slots in use."""
+
+        def pairing(row: Any, carry: Any) -> Any:
+            partner = self.partner(row)
+            return self.fold(row, lambda item, c: body(item, partner, c), carry)
+
+        return loop(self.set.rows, pairing, start, self.set.size)
+
+    def do(self, body: Callable) -> None:
+        """Runs body(item, partner's lanes), which stores something, over all slots in use."""
+
+        def one(item: Any, partner: jax.Array, carry: list) -> list:
+            body(item, partner)
+            return carry
+
+        self.each(one, [])
+
+    def touching_now(self) -> jax.Array:
+        """Whether any slot is in use, a scalar."""
+
+        def most(row: Any, found: jax.Array) -> jax.Array:
+            return jnp.maximum(found, self.used(row))
+
+        return jax.lax.fori_loop(0, self.set.rows, most, jnp.int32(0)) > 0
+
+    # One side's part of a contact
+
+    def own_motion(self) -> None:
+        """Leaves in every slot how the links' motion moves its own side."""
+
+        def store(item: Any, partner: jax.Array) -> None:
+            row = self.read("row", item).lane.astype(jnp.int32)
+            motion = self.side("motion", row, self.block.lane)
+            self.write("own", lanewise(self._moved, self.place(item), self.cone, motion), item)
+
+        self.do(store)
+
+    def _moved(self, place, cone, motion):
+        return self.set.contacts(place, cone).relative(motion[:, None])
+
+    def relative(self, item: Any, partner: jax.Array) -> Lanes:
+        """How the sides move to each other, after `own_motion`."""
+        return lanewise(jnp.subtract, self.read("own", item), self.theirs("own", item, partner))
+
+    def rest(self) -> None:
+        """Takes all wrenches off the sides."""
+        like = jnp.zeros((self.set.size,), self.ref.dtype)
+
+        def clear(row: Any, x: jax.Array) -> jax.Array:
+            self.put("push", zeros((self.set.components,), like), row)
+            return x
+
+        jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
+
+    def load(self, item: Any, force: Lanes) -> None:
+        """Adds a slot's force to its own side's wrench."""
+
+        def wrench(place, cone, force):
+            return sum_axis(contact.contact_wrench(self.set.contacts(place, cone), force), 1)
+
+        row, lane = self.read("row", item).lane.astype(jnp.int32), self.block.lane
+        more = lanewise(wrench, self.place(item), self.cone, force)
+        sums = lanewise(jnp.add, self.table.gather(self.ref, "side.push", row, lane), more)
+        self.table.scatter(self.ref, "side.push", sums, row, lane)
+
+    def load_all(self, field: str) -> None:
+        """Wrenches of forces that a field of the slots has."""
+        self.rest()
+        self.do(lambda item, _: self.load(item, self.read(field, item)))
+
+    # Newton's method
+
+    def respond(self, alpha: Lanes) -> None:
+        """Moves jar along the last line; Hessians to the slots, wrenches to the sides."""
+        self.rest()
+
+        def response(place, cone, jar):
+            found = contact.respond(self.set.contacts(place, cone), jar)
+            return found.hessian, found.force
+
+        def store(item: Any, partner: jax.Array) -> None:
+            jar = lanewise(along, alpha, self.read("jar", item), self.read("step", item))
+            self.write("jar", jar, item)
+            hessian, force = lanewise(response, self.place(item), self.cone, jar)
+            self.write("hessian", hessian, item)
+            self.load(item, force)
+
+        self.do(store)
+
+    def stiff(self, item: Any, change: Lanes) -> Lanes:
+        """The slot's Hessian times a relative motion."""
+        return lanewise(_times, self.read("hessian", item), change)
+
+    def aim_all(self) -> Lanes:
+        """Stores the lines along the links' motion; returns the sum of the slopes at 0."""
+        self.own_motion()
+
+        def add(item: Any, partner: jax.Array, sums: Lanes) -> Lanes:
+            slope = self.line(item, self.relative(item, partner))
+            return lanewise(lambda s, f: s + 0.5 * f, sums, slope)  # both lanes have it
+
+        return self.each(add, self._zeros(())[0])
+
+    def slopes_of_all(self, alpha: Lanes, sums: list[Lanes]) -> list[Lanes]:
+        """Adds first and second derivative of the cost along the line."""
+
+        def add(item: Any, partner: jax.Array, sums: list[Lanes]) -> list[Lanes]:
+            new = self._slopes(item, alpha)
+            return lanewise(
+                lambda a, b: [x + 0.5 * y for x, y in zip(a, b, strict=True)], sums, new
+            )
+
+        return self.each(add, sums)
+
+
+def _times(triangle: jax.Array, x: jax.Array) -> jax.Array:
+    """A symmetric matrix, given by its upper triangle row by row, times a vector."""
+    n = x.shape[0]
+    place = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(n) for j in range(i, n))}
+    rows = [jnp.stack([triangle[place[min(i, j), max(i, j)]] for j in range(n)]) for i in range(n)]
+    return jnp.stack([dot(row, x) for row in rows])

@@ -1,0 +1,159 @@
+"""Contacts between fingers inside the rollout kernel, in float64: MuJoCo C and dense solves."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from codesign_jax import hull
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.model import layout
+from tests import small
+from tests import test_hull_contact as oracle
+from tests.test_finger_pairs import SETTINGS, curled, kinds
+
+
+def one_step(scene, limits=None):
+    """The compiled step of worlds from qpos and qvel under ctrl: qvel after it, and the trace."""
+    engine = StructuredEngine(scene)
+    program = Program.here(scene, limits or Limits(100, 40, 1e-24), np.float64)
+
+    @jax.jit
+    def run(fields, qpos, qvel, ctrl):
+        start = engine.place(engine.reset(fields), qpos, qvel)
+        trace, end = program.simulate(world_constants(scene, fields), start, ctrl[:, None])
+        return engine.qvel(end), trace
+
+    return run
+
+
+def batched(worlds):
+    """Fields, qpos, qvel and ctrl of several (model, data, fields)."""
+    fields = jax.tree.map(lambda *x: jnp.concatenate(x), *(f for _, _, f in worlds))
+    data = [d for _, d, _ in worlds]
+    return fields, *(np.stack([getattr(d, n) for d in data]) for n in ("qpos", "qvel", "ctrl"))
+
+
+SLOW = pytest.mark.slow  # half a minute of compiling each
+
+
+@pytest.mark.parametrize(
+    "friction", ["coulomb", pytest.param("none", marks=SLOW), pytest.param("full", marks=SLOW)]
+)
+def test_accelerations_equal_mujoco_on_curled_hands(friction):
+    """Six states: fingers touch one another and the object, sliding at up to a metre a second."""
+    with jax.enable_x64(True):
+        scene = small.pinch("sphere", effects__friction=friction, **SETTINGS)
+        worlds = [curled(scene, s, bend=0.75 + 0.05 * s, height=0.07) for s in range(6)]
+        for model, data, _ in worlds:
+            mujoco.mj_forward(model, data)
+        inputs = batched(worlds)
+        run = one_step(scene)
+        qvel, trace = run(*inputs)
+        acc = (np.asarray(qvel) - inputs[2]) / scene.discretization.timestep
+        for k, (model, data, _) in enumerate(worlds):
+            between, held = kinds(model, data)
+            assert between > 5 and held > 5
+            error = np.linalg.norm(acc[k] - data.qacc) / np.linalg.norm(data.qacc)
+            # As the batch form: a difference of velocities, and MuJoCo's own rounding.
+            assert error < 1e-8, (k, between, held, error)
+        order = np.array([3, 1, 5, 0, 2, 4])
+        again, _ = run(*jax.tree.map(lambda x: x[order], inputs))
+        np.testing.assert_array_equal(again, qvel[order])
+        assert not trace["overflow"].any() and trace["residual"].max() < 1e-20
+
+
+class Dense(oracle.Dense):
+    """A step's problem with the contacts of the hulls of different fingers."""
+
+    def __init__(self, scene, model, data, hand):
+        super().__init__(scene, model, data, hand)
+        self.pairs = 0
+        for f, other in np.ndindex(scene.num_fingers, scene.num_fingers):
+            if f != other:
+                self._add_vertices(scene, model, data, hand, f, other)
+
+    def _add_vertices(self, scene, model, data, hand, f, other):
+        """Vertices of one finger in the sections of another one."""
+        s, lay, width = hull.slots(scene), layout(scene), scene.hand.section.width
+        segment, height = hand.length[f] / lay.links, hand.height[f]
+        bodies = [lay.stubs[f], *lay.bodies[f]]
+        for row, k in np.ndindex(s.along.shape):
+            pair = bodies[row], bodies[min(row + 1, lay.links)]
+            v = np.array(
+                [s.along[row, k] * segment, s.across[row, k] * width, s.up[row, k] * height]
+            )
+            step = 0 if row == lay.links else segment / 2 if row == 0 else segment
+            w = s.weight[row, k]
+            images = [
+                data.xpos[b] + data.xmat[b].reshape(3, 3) @ p
+                for b, p in zip(pair, (v + [step, 0, 0], v), strict=True)
+            ]
+            area = s.area[:, row, k] @ [segment * width, segment * height, width * height]
+            point = (1 - w) * images[0] + w * images[1]
+            for j in range(lay.links):
+                found = self._section(scene, data, hand, other, j, point)
+                if found is None:
+                    continue
+                gap, normal, at, share = found
+                arm = -normal * gap / 2
+                jac = self._jac(model, data, [x + arm for x in images], pair, w)
+                behind = lay.stubs[other] + j, lay.stubs[other] + j + 1
+                base = self._jac(model, data, [point + arm], behind[:1], 1.0)
+                turned = [self._jac(model, data, [at + arm], (body,), 1.0) for body in behind]
+                jac = jac - base - share * (turned[1] - turned[0])
+                friction = scene.contact.finger_finger_friction
+                self._add(scene, data, jac, normal, gap, friction, 0.5 * area / width**2, 2)
+                self.pairs += 1
+
+    @staticmethod
+    def _section(scene, data, hand, f, row, point):
+        """Gap and normal of a point in a finger's row, its material point, and its weight."""
+        links, width = scene.discretization.links, scene.hand.section.width
+        half, up = hand.length[f] / links / 2, hand.height[f] / 2
+        body = layout(scene).stubs[f] + row
+        frames = [data.xmat[b].reshape(3, 3) for b in (body, body + 1)]
+        joint = data.xpos[body + 1]
+        first, second = (frame.T @ (point - joint) for frame in frames)
+        start, end, last = first[0] + half, half - second[0], row == links - 1
+        if start < 0 or (end <= 0 and not last) or start + end <= 0:
+            return None
+        w = np.clip(start / (start + end), 0, 1)
+        local, turned = (1 - w) * first + w * second, (1 - w) * frames[0] + w * frames[1]
+        edge = 0.5 * min(width / 2, up)
+        depth = np.array(
+            [-end if last else -half, abs(local[1]) - width / 2, abs(local[2] - up) - up]
+        )
+        outside = np.maximum(depth + edge, 0)
+        distance = np.linalg.norm(outside)
+        gap = (distance if distance > 0 else (depth + edge).max()) - edge
+        if gap >= 0:
+            return None
+        slope = outside if distance > 0 else np.eye(3)[depth.argmax()]
+        normal = turned @ (slope * np.sign([1, local[1], local[2] - up]))
+        return gap, normal / np.linalg.norm(normal), joint + frames[1] @ local, w
+
+
+def test_hulls_equal_a_dense_solve():
+    """Curled fingers whose hulls touch: vertices in the other finger's sections, both ways."""
+    with jax.enable_x64(True):
+        settings = {"effects__finger_finger": True, "effects__surface": "hull"}
+        density = {"discretization__hull_rings": 2, "discretization__hull_points": 8}
+        scene = small.pinch("sphere", links=2, **settings, **density)
+        hand, _ = small.hand_world(scene, length=0.1)
+        bends = [(1, 0.8), (3, 1.0), (3, 1.2), (7, 0.8)]
+        worlds = [curled(scene, seed, bend, height=0.07) for seed, bend in bends]
+        inputs = batched(worlds)
+        qvel, trace = one_step(scene)(*inputs)
+        acc, most = (np.asarray(qvel) - inputs[2]) / scene.discretization.timestep, 0
+        for k, (model, data, _) in enumerate(worlds):
+            mujoco.mj_forward(model, data)
+            dense = Dense(scene, model, data, hand)
+            expected = dense.solve()
+            error = np.linalg.norm(acc[k] - expected) / np.linalg.norm(expected)
+            assert error < 1e-8, (k, dense.pairs, dense.num_hull, error)  # as the batch form
+            most = max(most, dense.pairs)
+        assert most > 5

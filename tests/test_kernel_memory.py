@@ -64,11 +64,12 @@ def test_gather(numbers, computed, stored):
             at = places[0, :]
             out[0, :] = table[(at,)].astype(computed) + 2 * table[(at + 1,)].astype(computed)
             out[1, :] = x[rows[0, :], lane()]
-            out[2, :] = x[jnp.int32(3), (lane() * 3) & 7 | rows[0, :] & 0]  # columns, computed
+            row = jnp.maximum(jnp.max(rows[0, :]).astype(jnp.int64), 3)  # the same on all lanes
+            out[2, :] = x[row, (lane() * 3) & 7 | rows[0, :] & 0]  # columns, computed
             picked = codes[rows[1, :], lane()]
             out[3, :] = picked.astype(computed)
             # An index computed from floats, clamped by the kernel: nothing else checks it.
-            far = (1e3 * x[0, :]).astype(jnp.int32)
+            far = (1e3 * x[0, :]).astype(jnp.int64)
             out[4, :] = x[jnp.minimum(jnp.maximum(far, 0), ROWS - 1), lane()]
 
         (got,) = run("gather", kernel, (x, table, codes, rows, places), x)
@@ -81,7 +82,7 @@ def test_gather(numbers, computed, stored):
     want = [
         table[0].astype(computed)[at] + 2 * table[0].astype(computed)[at + 1],
         pick(x, rows[:, 0]),
-        x[:, 3, np.arange(LANES) * 3 & 7],
+        x[np.arange(BLOCKS), np.maximum(rows[:, 0].max(1), 3)][:, np.arange(LANES) * 3 & 7],
         pick(codes, rows[:, 1]),
         pick(x, np.clip(np.trunc(1e3 * x[:, 0]).astype(int), 0, ROWS - 1)),
     ]

@@ -20,7 +20,8 @@ SMALLEST, LARGEST = 0.005, 0.5  # longest side of the bounding box [m]
 class Solid:
     """A closed mesh in its own frame: origin at the centre of mass, axes principal.
 
-    Two are equal if they come from the same bytes in the same way, wherever the file lies.
+    Two are equal if they come from the same bytes in the same way, wherever the file lies; the same
+    holds for their representations, by which compiled kernels are kept.
 
     Attributes:
       path: The file.
@@ -35,10 +36,10 @@ class Solid:
       repairs: What a repair changed.
     """
 
-    path: Path
+    path: Path = dataclasses.field(repr=False)
     digest: str
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray = dataclasses.field(repr=False)
+    faces: np.ndarray = dataclasses.field(repr=False)
     volume: float
     inertia: tuple[float, ...]
     upright: tuple[float, ...]

@@ -70,7 +70,10 @@ class Writer:
         raise NotImplementedError
 
     def load(self, ref: Ref, indices: list[Value]) -> Value:
-        """Reads an element, or one for each lane."""
+        """Reads an element, or one for each lane.
+
+        Nothing checks that an index lies within the array: a kernel clamps what it computes.
+        """
         raise NotImplementedError
 
     def store(self, ref: Ref, indices: list[Value], value: Value) -> None:

@@ -250,6 +250,8 @@ def test_estimates_scale_the_most_similar_measurement(tmp_path, monkeypatch):
     assert (found.grasps_per_second, found.compile_seconds) == (12.5, 60.0)
     assert "scaled to this run's" in found.basis
     assert rates.estimate(dataclasses.replace(asked, engine="mjx", device="tpu x1")) is None
+    hull = rates.work(tiny(effects={"surface": "hull"})[0], settings())
+    assert hull.contacts == "hull" and rates.estimate(hull) is None, "not the rate of spheres"
 
 
 @pytest.mark.parametrize("content", ["", "[{}]", '[{"work": {}}]', "7"])

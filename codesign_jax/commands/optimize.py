@@ -144,7 +144,7 @@ def _dry_run(scene: Scene, settings: Settings, count: int) -> None:
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     found = rates.estimate(rates.work(scene, settings))
     if found is None:
-        print("time: unknown, as no run was measured on such a device with this engine yet")
+        print("time: unknown; a short run with these effects and this engine measures the rate")
         return
     grasping = count * (settings.grasps + batch) / found.grasps_per_second
     compiling = found.compile_seconds

@@ -29,7 +29,8 @@ class Work:
     Attributes:
       engine: Engine.
       device: What it computes on, e.g. "cpu x2".
-      form: "kernel", or "batch" for scenes that the structured engine runs without its kernel.
+      contacts: The kinds of contact that cost differently: "spheres" or "hull" of the fingers,
+        "+fingers" with contact between them, "+meshes" with mesh objects.
       steps: Time steps of a grasp.
       links: Links of all fingers.
       grasps: Grasps simulated at once.
@@ -38,7 +39,7 @@ class Work:
 
     engine: str
     device: str
-    form: str
+    contacts: str
     steps: int
     links: int
     grasps: int
@@ -81,31 +82,29 @@ class Estimate:
 _ELSEWHERE = "measured on another machine, docs/performance.md"
 
 
-def _shipped(
-    engine: str, device: str, form: str, grasps: int, rate: float, seconds: float | None
-) -> Rate:
-    return Rate(Work(engine, device, form, 900, 40, grasps), rate, seconds, _ELSEWHERE)
+def _shipped(engine: str, device: str, grasps: int, rate: float, seconds: float | None) -> Rate:
+    return Rate(Work(engine, device, "spheres", 900, 40, grasps), rate, seconds, _ELSEWHERE)
 
 
 # Two cores of an AMD EPYC and one H200: docs/performance.md has the same numbers and how they were
 # measured.
 _REFERENCE = (
-    _shipped("structured", "cpu x2", "kernel", 60, 129.3, 10.0),
-    _shipped("structured", "cpu x2", "batch", 60, 10.5, 17.2),
-    _shipped("mujoco", "cpu x2", "batch", 60, 7.9, 2.7),
-    _shipped("mjx", "cpu x2", "batch", 12, 0.07, None),
-    _shipped("structured", "gpu x1", "kernel", 1728, 7154.0, 10.3),
+    _shipped("structured", "cpu x2", 60, 129.3, 10.0),
+    _shipped("mujoco", "cpu x2", 60, 7.9, 2.7),
+    _shipped("mjx", "cpu x2", 12, 0.07, None),
+    _shipped("structured", "gpu x1", 1728, 7154.0, 10.3),
 )
 
 
 def work(scene: Scene, settings: Settings) -> Work:
     """What an episode of a run is, on this machine."""
     texts = "".join(scene_texts(scene).values())
-    kernel = settings.engine == "structured"
+    e, meshes = scene.effects, any(shape.mesh for shape in scene.objects.object)
+    parts = [str(e.surface), *["fingers"] * bool(e.finger_finger), *["meshes"] * meshes]
     return Work(
         settings.engine,
         _device(settings.engine),
-        "kernel" if kernel else "batch",
+        "+".join(parts),
         scene.num_steps,
         scene.num_fingers * scene.discretization.links,
         settings.particles * settings.trials,
@@ -141,7 +140,7 @@ def measured() -> list[Rate]:
 
 
 def estimate(work: Work) -> Estimate | None:
-    """Scales the most similar measurement; None if the engine was never measured in this form.
+    """Scales the most similar measurement; None if nothing like it was ever measured.
 
     Rates go with the steps and the links of a grasp (docs/performance.md has exponents near one),
     on CPUs with the cores, and on a GPU with the grasps at once up to the measured number.
@@ -174,7 +173,7 @@ def _at(rate: Rate) -> str:
 
 
 def _alike(a: Work, b: Work) -> bool:
-    return (a.engine, a.form) == (b.engine, b.form)
+    return (a.engine, a.contacts) == (b.engine, b.contacts)
 
 
 def _program(work: Work) -> tuple:

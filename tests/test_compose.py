@@ -11,6 +11,7 @@ import pytest
 from codesign_jax import codesign, control, cost, model, parameters, rollout
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.unstack import unstacked
 from codesign_jax.optimize import schedule
 from codesign_jax.types import WARNINGS
 from tests import small, toy
@@ -215,3 +216,81 @@ def test_failed_trials_do_not_ask_ones_own_cost():
     np.testing.assert_array_equal(result.cost[:, 0], [0.5, scene.cost.maximum, 0.5])
     with pytest.raises(ValueError, match="one number for each world"):
         evaluate(params, trial, lambda s, t, u: t.height)
+
+
+# --- gradients -----------------------------------------------------------------------------------
+
+# Nothing touches and nothing falls: a derivative compiles in half a minute, with contacts in two.
+FREE = SHORT | {
+    "effects__finger_object": False,
+    "effects__object_table": False,
+    "effects__gravity": False,
+    "effects__wrist": False,
+    "effects__twist": False,
+    "effects__lateral_bending": False,
+}
+
+
+def bent(scene, engine, world, x, broken):
+    """A number of a whole grasp from factors on length, pressure and Young's modulus.
+
+    The object is lost as the window opens, and with `broken` the world fails before: what the
+    trace repeats from then on counts.
+    """
+    hand, trial = jax.tree.map(
+        lambda v: jnp.asarray(v, x.dtype if v.dtype.kind == "f" else None), world
+    )
+    hand = hand._replace(length=x[0] * hand.length, pressure=x[1] * hand.pressure)
+    fields = model.model_fields(scene, hand, trial)
+    fields = fields._replace(jnt_stiffness=x[2] * fields.jnt_stiffness)
+    ctrl = control.commands(scene, hand, trial)
+    ctrl = ctrl.at[40:, 6].set(jnp.where(broken, jnp.nan, ctrl[40:, 6]))
+    trace = engine.rollout(jax.tree.map(lambda v: v[None], fields), ctrl[None])
+    random = np.random.default_rng(0)
+    weights = random.normal(size=trace.last.shape[1]), random.normal(size=trace.distance.shape[1])
+    return trace.last[0] @ weights[0] + trace.distance[0] @ weights[1]
+
+
+def test_gradients_by_the_kernel_equal_central_differences():
+    """`vmap` of `grad` in float64, of a world that is lost and of one that fails."""
+    scene = small.pinch("sphere", **FREE)
+    engine = StructuredEngine(scene, iterations=60, tolerance=1e-22)
+    with jax.enable_x64(True):
+        value = partial(bent, scene, engine, small.hand_world(scene, pressure=50e3))
+        x, broken = jnp.array([[1.0, 1.0, 1.0], [0.9, 1.1, 1.2]]), jnp.array([False, True])
+        slope = jax.jit(jax.vmap(jax.grad(value)), compiler_options=QUICK)(x, broken)
+        step = 1e-5 * jnp.eye(3)
+        sides = jnp.stack([x[:, None] + step, x[:, None] - step])
+        run = jax.vmap(jax.vmap(value, in_axes=(0, None)))
+        high, low = np.asarray(jax.jit(jax.vmap(run, in_axes=(0, None)))(sides, broken))
+    assert np.isfinite(slope).all() and (np.abs(slope) > 1e-3).all()
+    # A step of 1e-5 loses 1e-10 to truncation and 1e-11 to rounding.
+    np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
+
+
+def test_what_has_no_derivative_says_so():
+    """Forward mode and second derivatives, before anything is compiled."""
+    scene = small.pinch("sphere", **FREE)
+    engine, x = StructuredEngine(scene), jnp.ones(3)
+    value = partial(bent, scene, engine, small.hand_world(scene), broken=False)
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jvp(value, (x,), (x,))
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.eval_shape(jax.grad(lambda x: jax.grad(value)(x).sum()), x)
+
+
+def test_components_from_one_unstack():
+    """The same values and the same derivative, and no slice of the operand is left in it."""
+
+    def component_wise(a, b):
+        return jnp.stack([a[0] * b[1] - a[1] * b[0], jnp.sin(a[2]) * b[:, 1].sum(), a[-1] ** 2 * 3])
+
+    a, b = np.random.default_rng(0).normal(size=(2, 3, 3, 4))
+    again = unstacked(component_wise)
+    np.testing.assert_array_equal(jax.jit(again)(a, b), jax.jit(component_wise)(a, b))
+    slopes = [jax.grad(lambda *x, f=f: (f(*x) ** 2).sum(), (0, 1)) for f in (again, component_wise)]
+    for got, want in zip(*(s(a, b) for s in slopes), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
+    assert "pad" in str(jax.make_jaxpr(slopes[1])(a, b))
+    names = str(jax.make_jaxpr(slopes[0])(a, b))
+    assert "pad" not in names and "stack" in names

@@ -11,6 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.unstack import unstacked
+
 
 class Stages:
     """Runs parts of a program so that XLA computes each result once.
@@ -31,7 +33,7 @@ class Stages:
         if self.predicate is None:
             return jax.lax.optimization_barrier(function(*args))
         # Traced once for both the shapes and the branch: tracing is most of a cached compile.
-        traced = jax.jit(function, inline=True)
+        traced = jax.jit(unstacked(function), inline=True)
         shapes = jax.eval_shape(traced, *args)
 
         def never(*_: Any) -> Any:
@@ -80,7 +82,7 @@ def scan_links(
             for x, like in zip(planes, middle, strict=True)
         ]
         link = jax.tree.unflatten(treedef, own), jax.tree.unflatten(inner_def, others)
-        carry, out = step(carry, link)
+        carry, out = unstacked(step)(carry, link)
         out_shapes[:] = [x.shape for x in jax.tree.leaves(out)]
         return carry, jax.tree.map(lambda x: x.reshape(-1), out)
 

@@ -88,7 +88,14 @@ def test_kernel_equals_the_engine(grasp):
     assert float(got["residual"].max()) < 1e-6
 
 
-@pytest.mark.parametrize("effects", [{}, {"friction": "full", "neo_hookean": True, "wrist": False}])
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {},
+        {"friction": "full", "neo_hookean": True, "wrist": False},
+        {"surface": "hull", "finger_finger": True},
+    ],
+)
 def test_kernel_becomes_ptx(effects, monkeypatch):
     """Every operation of the kernel has its instruction; with effects in float64."""
     texts = []

@@ -41,7 +41,8 @@ class ThreadWriter(Writer):
         self.growth: dict[str, int] = {}  # of integers [1] and addresses [bytes], in each round
         self.born: dict[str, int] = {}  # line behind an address
         self.found: list[dict[tuple, Any]] = [{}]  # computed already, one scope a region
-        self.ahead: list[dict[str, Ahead]] = []  # one a loop: its reads, by address
+        # The loops around: line at which a body begins, and its reads by address.
+        self.ahead: list[tuple[int, dict[str, Ahead]]] = []
         self.spans: set[int] = set()  # numbers of rows that are asked for at once
 
     def type(self, kind: str, wide: bool) -> str:
@@ -141,9 +142,8 @@ class ThreadWriter(Writer):
         base, offset, place = self._address(ref, indices)
         wide, kind = any(i.wide for i in indices), LLVM_TYPES[ref.kind]
         text = self.emit(f"load {kind}, ptr addrspace(1) {place}, align {SIZES[ref.kind]}")
-        if ref.shape[-1] == self.lanes and self.ahead and self.growth.get(base):
-            here = self.ahead[-1].setdefault(base, Ahead(self.born[base], []))
-            here.offsets.append(offset)
+        if ref.shape[-1] == self.lanes and self.growth.get(base):
+            self._read_ahead(base, offset)
         return Value(ref.kind, wide, text)
 
     def store(self, ref: Ref, indices: list[Value], value: Value) -> None:
@@ -220,10 +220,17 @@ class ThreadWriter(Writer):
             self.growth[result.text] = total
         return result
 
+    def _read_ahead(self, base: str, offset: int) -> None:
+        """Notes a read for the innermost loop in which its address is computed."""
+        line = self.born[base]
+        for first, reads in reversed(self.ahead):
+            if first <= line:
+                reads.setdefault(base, Ahead(line, [])).offsets.append(offset)
+                return
+
     def begin_loop(self, counters: list[str]) -> None:
         """See `Writer`."""
-        self.ahead.append({})
-        self.first = len(self.lines)
+        self.ahead.append((len(self.lines), {}))
         self.growth |= {name: 1 for name in counters}
 
     def end_loop(self) -> None:
@@ -232,8 +239,8 @@ class ThreadWriter(Writer):
         Without it every round waits for memory: a kernel of this size leaves room for two warps on
         a scheduler, which cannot hide it.
         """
-        reads = self.ahead.pop()
-        rounds = -(-AHEAD // max(1, len(self.lines) - self.first))
+        first, reads = self.ahead.pop()
+        rounds = -(-AHEAD // max(1, len(self.lines) - first))
         for address, (line, offsets) in sorted(reads.items(), key=lambda r: -r[1].line):
             behind, self.lines = self.lines[line:], self.lines[:line]
             for offset, rows in adjacent(sorted(set(offsets)), 4 * LANES):

@@ -32,6 +32,10 @@ RATES: dict[str, dict[str, Any]] = {
     "hull and fingers": {"effects": {"surface": "hull", "finger_finger": True}},
     "household meshes": {"objects": "household"},
 }
+RATES |= {
+    f"{name}, whole grasps": {**RATES[name], "whole": True, "worlds": 1728}
+    for name in ("spheres", "hull", "hull and fingers", "household meshes")
+}
 WORLDS, STEPS, DISTINCT = 16384, 50, 24
 
 
@@ -52,23 +56,28 @@ class Recorder:
 
 
 def rate(name: str, values: dict[str, Any]) -> dict[str, Any]:
-    """World-steps a second of short rollouts in contact.
+    """World-steps a second of short rollouts in contact, or of whole grasps.
 
     Args:
       name: Name of the case.
-      values: Its overrides of the scene, object set, dtype and number of worlds.
+      values: Its overrides of the scene, object set, dtype, number of worlds, whether grasps are
+        whole.
     """
     values = dict(values)
     dtype, worlds = values.pop("dtype", np.float32), values.pop("worlds", WORLDS)
-    objects = values.pop("objects", None)
+    objects, whole = values.pop("objects", None), values.pop("whole", False)
     scene = scenes.load("paper", object_set=objects, overrides=values)
-    # Start states are those of MuJoCo C, which has neither hull nor meshes: those of spheres serve.
-    values.pop("effects", None)
-    plain = scenes.load("paper", overrides=values)
-    starts, ctrl = work.window(plain, DISTINCT, STEPS, distinct=DISTINCT)
-    made, _ = work.inputs(scene, work.make_worlds(scene, DISTINCT))
-    fields = made._replace(start=starts.start)
-    index = np.arange(worlds) % DISTINCT
+    if whole:
+        fields, ctrl = work.inputs(scene, work.make_worlds(scene, worlds))
+        index = np.arange(worlds)
+    else:
+        # Start states are those of MuJoCo C, which has neither hull nor meshes: spheres' serve.
+        apart = {"finger_finger": values.pop("effects", {}).get("finger_finger", False)}
+        plain = scenes.load("paper", overrides={**values, "effects": apart})
+        starts, ctrl = work.window(plain, DISTINCT, STEPS, distinct=DISTINCT)
+        made, _ = work.inputs(scene, work.make_worlds(scene, DISTINCT))
+        fields = made._replace(start=starts.start)
+        index = np.arange(worlds) % DISTINCT
     fields, ctrl = jax.tree.map(lambda x: jax.numpy.asarray(x, dtype)[index], (fields, ctrl))
     engine = StructuredEngine(scene)
     run = jax.jit(lambda f, c: engine.rollout(f, c).distance[:, -1])
@@ -82,8 +91,9 @@ def rate(name: str, values: dict[str, Any]) -> dict[str, Any]:
         jax.block_until_ready(compiled(fields, ctrl))
         times.append(time.perf_counter() - begin)
     median = float(np.median(times))
-    found = {"case": name, "worlds": worlds, "steps": STEPS, "median_s": median}
-    return {**found, "compile_s": round(built, 2), "world_steps_per_s": worlds * STEPS / median}
+    steps = ctrl.shape[1]
+    found = {"case": name, "worlds": worlds, "steps": steps, "median_s": median}
+    return {**found, "compile_s": round(built, 2), "world_steps_per_s": worlds * steps / median}
 
 
 def in_a_process_of_its_own(name: str) -> dict[str, Any]:

@@ -294,6 +294,30 @@ def test_text_is_valid_for_both_targets():
         assert (bits == 64) or ("max.NaN.f32" in ptx and "div.full.f32" in ptx)
 
 
+def test_lanes_meet_where_they_read_what_others_wrote():
+    """A GPU's threads see each other's stores only behind a barrier; own columns need none."""
+
+    def kernel(x, out):
+        lane = jax.lax.broadcasted_iota(jnp.int32, (32,), 0)
+        out[0, :] = x[0, :] + 1
+        out[1, :] = out[0, jax.lax.bitwise_xor(lane, jnp.int32(8))] + out[0, lane]
+
+    spec = pl.BlockSpec((None, 2, 32), lambda i: (i, 0, 0))
+    shape = jax.ShapeDtypeStruct((1, 2, 32), jnp.float32)
+    call = pl.pallas_call(kernel, grid=(1,), in_specs=[spec], out_specs=spec, out_shape=shape)
+    (equation,) = jax.make_jaxpr(call)(shape).eqns
+    blocks = [((2, 32), np.float32)] * 2
+    text = thread.write(equation.params["jaxpr"], blocks, [False] * 2, "test")
+    lines = [line for line in text.splitlines() if " load " in line or "bar.warp" in line]
+    assert ["bar.warp" in line for line in lines if "declare" not in line] == [
+        False,
+        True,
+        False,
+        True,
+        False,
+    ]
+
+
 def loop_text(reverse, rows=32, count=8):
     """A loop that reads rows 2 k + 3 and 2 k + 4 in round k."""
 

@@ -141,7 +141,12 @@ class ThreadWriter(Writer):
         """See `Writer`."""
         base, offset, place = self._address(ref, indices)
         wide, kind = any(i.wide for i in indices), LLVM_TYPES[ref.kind]
+        foreign = self._is_foreign(ref, indices)
+        if foreign:
+            self._meet()
         text = self.emit(f"load {kind}, ptr addrspace(1) {place}, align {SIZES[ref.kind]}")
+        if foreign:
+            self._meet()
         if ref.shape[-1] == self.lanes and self.growth.get(base):
             self._read_ahead(base, offset)
         return Value(ref.kind, wide, text)
@@ -219,6 +224,16 @@ class ThreadWriter(Writer):
         if total:
             self.growth[result.text] = total
         return result
+
+    def _is_foreign(self, ref: Ref, indices: list[Value]) -> bool:
+        """Whether lanes read what other lanes may have written in columns of their own."""
+        *_, lane = indices
+        return ref.shape[-1] == self.lanes and lane.wide and lane != self.lane
+
+    def _meet(self) -> None:
+        """What every thread of the warp has stored before is seen by the others behind this."""
+        self.declared.add("declare void @llvm.nvvm.bar.warp.sync(i32)")
+        self.lines.append(f"call void @llvm.nvvm.bar.warp.sync({_ALL})")
 
     def _read_ahead(self, base: str, offset: int) -> None:
         """Notes a read for the innermost loop in which its address is computed."""

@@ -44,7 +44,7 @@ EFFECTS: Mapping[str, Effect] = {
     "finger_table": Effect("fingers touch the table"),
     "palm_table": Effect("the palm touches the table"),
     "object_table": Effect("the object rests on the table"),
-    "finger_finger": Effect("spheres of different fingers touch"),
+    "finger_finger": Effect("fingers touch one another"),
     "surface": Effect(
         "the fingers' contact points: spheres, or the vertices of the skinned hull",
         {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},

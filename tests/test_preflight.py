@@ -4,9 +4,9 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from small import pinch, random_worlds, still
+from small import hand_world, pinch, random_worlds, still
 
-from codesign_jax import clearance, model, parameters, preflight
+from codesign_jax import clearance, model, parameters, preflight, scene
 from codesign_jax.types import Params
 
 
@@ -88,3 +88,18 @@ def test_numbers_that_are_no_hand_are_refused(change, part):
     designs = jax.vmap(space.params)(space.default()[None])
     wrong = designs._replace(**{k: 0 * getattr(designs, k) + v for k, v in change.items()})
     assert any(part in problem for problem in preflight.check(scene, wrong).refusals)
+
+
+@pytest.mark.parametrize("surface", ["spheres", "hull"])
+def test_fingers_inside_one_another_are_refused(surface):
+    """Without a spread two pairs of the paper's fingers stand in one place: 20 mm deep."""
+    effects = {"surface": surface, "finger_finger": True}
+    the_scene = scene.load("paper", overrides={"effects": effects})
+    both = [hand_world(the_scene, spread=np.deg2rad(x))[0] for x in (0.0, 60.0)]
+    designs = Params(*(np.stack(v) for v in zip(*both, strict=True)))
+    refusals = preflight.check(the_scene, designs, ["together", "apart"]).refusals
+    assert len(refusals) == 1 and refusals[0].startswith(
+        "together: fingers start 20 mm inside one another (limits.penetration = 10 mm)"
+    )
+    alone = scene.load("paper", overrides={"effects": {"surface": surface}})
+    assert not preflight.check(alone, designs).refusals

@@ -108,7 +108,8 @@ class Search:
                 def enter() -> None:
                     one, other = lanewise(_between, mine, theirs)
                     rows = tuple(jax.lax.div(v, jnp.asarray(self.p.k, v.dtype)) + 1 for v in (j, i))
-                    self._enter(row, partner, which, owner, one, other, rows)
+                    moves = self._moves(rows, partner)
+                    self._enter(row, which, owner, (one, other), rows, moves)
 
                 any_of(which, enter)
 
@@ -158,13 +159,14 @@ class Search:
                     )
 
                     def vertices() -> None:
-                        each(count, lambda v: vertex(j, own, kind * count + v))
+                        moves = self._moves((j, i), partner)
+                        each(count, lambda v: vertex(j, own, moves, kind * count + v))
 
                     any_of(near & (apart.lane < 0), vertices)
 
                 any_of(near, boxes)
 
-            def vertex(j: Any, own: tuple, item: Any) -> None:
+            def vertex(j: Any, own: tuple, moves: list, item: Any) -> None:
                 constants = self.p.hand.read(self.step.hand, "vertex", item)
                 end = lanes([last], (), wide=True)
                 one, other = lanewise(_inside, constants, own, theirs, size, end)
@@ -174,10 +176,8 @@ class Search:
                     def way(turn: Any) -> None:
                         owner = there & (side == turn)
                         found = which & owner
-                        any_of(
-                            found,
-                            lambda: self._enter(row, partner, found, owner, one, other, (j, i)),
-                        )
+                        ends = (one, other), (j, i), moves
+                        any_of(found, lambda: self._enter(row, found, owner, *ends))
 
                     each(2, way)
 
@@ -187,22 +187,25 @@ class Search:
 
         each(links, outer)
 
-    def _enter(
-        self,
-        row: Any,
-        partner: jax.Array,
-        which: jax.Array,
-        owner: jax.Array,
-        one: tuple,
-        other: tuple,
-        rows: tuple,
-    ) -> None:
-        """Gives contacts a slot; one and other: places on either side; rows: of the sides."""
+    def _moves(self, rows: tuple, partner: jax.Array) -> list[tuple[Lanes, Lanes]]:
+        """Accelerations and velocities of the lanes' own row and of their partners' row."""
         pairs, lane = self.pairs, self.block.lane
-        moves = [
+        return [
             (pairs.side(name, rows[0], lane), pairs.side(name, rows[1], partner))
             for name in ("motion", "vel")
         ]
+
+    def _enter(
+        self,
+        row: Any,
+        which: jax.Array,
+        owner: jax.Array,
+        ends: tuple,
+        rows: tuple,
+        moves: list[tuple[Lanes, Lanes]],
+    ) -> None:
+        """Gives contacts a slot; places on either side, the sides' rows, and how they move."""
+        pairs = self.pairs
 
         def jar(one, other, cone, motion, vel):
             a, b = (pairs.set.contacts(place, cone) for place in (one, other))
@@ -213,13 +216,15 @@ class Search:
             value = relative(motion) - a.reference(relative(vel))
             return value, -value, jnp.zeros_like(value)
 
-        mine, theirs, none = lanewise(jar, one, other, pairs.cone, *moves)
-        kept = []
-        for place, value, number in ((one, mine, rows[0]), (other, theirs, rows[1])):
-            found = dict(zip(pairs.set.places, place, strict=True))
-            side = lanes([self.like + number.astype(self.like.dtype)], (1, 1), wide=True)
-            kept.append(found | {"jar": value, "step": none, "row": side})
-        pairs.enter(row, which, owner, *kept)
+        mine, theirs, none = lanewise(jar, *ends, pairs.cone, *moves)
+        kept = [
+            dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
+            for place, value in zip(ends, (mine, theirs), strict=True)
+        ]
+        numbers = [v.astype(self.like.dtype) for v in rows]
+        side = jnp.where(owner, self.like + numbers[0], self.like + numbers[1])
+        alike = {"row": lanes([side], (1, 1), wide=True), "step": none}
+        pairs.enter(row, which, owner, *kept, alike)
 
 
 def each(count: int, body: Callable[[Any], None]) -> None:

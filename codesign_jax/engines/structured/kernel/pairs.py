@@ -126,7 +126,9 @@ class BoundPairs(BoundSlots):
 
     # Slots
 
-    def enter(self, row: Any, which: jax.Array, owner: jax.Array, mine: dict, other: dict) -> None:
+    def enter(
+        self, row: Any, which: jax.Array, owner: jax.Array, mine: dict, other: dict, alike: dict
+    ) -> None:
         """Gives contacts a slot on both of their lanes.
 
         Args:
@@ -135,6 +137,7 @@ class BoundPairs(BoundSlots):
           owner: Lanes that look for contacts, one of each pair of lanes.
           mine: What the finder keeps, by field.
           other: What its partner keeps.
+          alike: What every lane knows of its own side.
         """
         count = self.read("count", row).lane.astype(jnp.int32)
         # Beyond what any lane has filled: a place to hand the partner's part over.
@@ -151,7 +154,7 @@ class BoundPairs(BoundSlots):
             for field, value in mine.items()
         }
         touch = which | (~owner & (fields["gap"].lane < 0))
-        self.add(row, touch, fields, self.block.lane)
+        self.add(row, touch, fields | alike, self.block.lane)
 
     def each(self, body: Callable, start: Any) -> Any:
         """Folds body(item, partner's lanes, tree of lanes) over all slots in use."""

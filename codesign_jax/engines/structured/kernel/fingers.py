@@ -216,7 +216,7 @@ class Search:
             value = relative(motion) - a.reference(relative(vel))
             return value, -value, jnp.zeros_like(value)
 
-        mine, theirs, none = lanewise(jar, *ends, pairs.cone, *moves)
+        mine, theirs, none = lanewise(jar, ends[0], ends[1], pairs.cone, moves[0], moves[1])
         kept = [
             dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
             for place, value in zip(ends, (mine, theirs), strict=True)
@@ -224,7 +224,7 @@ class Search:
         numbers = [v.astype(self.like.dtype) for v in rows]
         side = jnp.where(owner, self.like + numbers[0], self.like + numbers[1])
         alike = {"row": lanes([side], (1, 1), wide=True), "step": none}
-        pairs.enter(row, which, owner, *kept, alike)
+        pairs.enter(row, which, owner, kept[0], kept[1], alike)
 
 
 def each(count: int, body: Callable[[Any], None]) -> None:

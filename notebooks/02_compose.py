@@ -26,7 +26,7 @@ import os
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import PartitionSpec
+from jax.sharding import Mesh, PartitionSpec
 
 from codesign_jax import codesign, parameters, rollout, scene
 from codesign_jax.engines import make_engine
@@ -92,7 +92,7 @@ for d, s in zip(value, slope, strict=False):
 # Worlds do not depend on each other, so devices can share them; here all that there are.
 
 # %%
-mesh = jax.make_mesh((len(jax.devices()),), ("device",))
+mesh = Mesh(np.array(jax.devices()), ("device",))
 shared = jax.shard_map(
     jax.vmap(lambda t: distance(designs[0], t)),
     mesh=mesh,

@@ -71,7 +71,7 @@ def lowest_point(scene: Scene, params: Params) -> float:
     # The skin is a box between the layer that bends and the back; contact spheres fill its height.
     skin = np.minimum(params.height * back, 0.0) - section.width / 2 * np.abs(across)
     spheres = params.height / 2 * (back - 1.0)
-    palm_low = (palm_points(scene) @ up).min() - palm.contact_radius
+    palm_low = (np.asarray(palm_points(scene)) @ up).min() - palm.contact_radius
     lowest = min(float((ends + np.minimum(skin, spheres)).min()), float(palm_low))
     return scene.arm.start_height + lowest
 

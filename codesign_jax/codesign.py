@@ -117,7 +117,9 @@ def make_evaluate(
         population: jax.Array, key: jax.Array, constants: Constants | None = None
     ) -> Outcome:
         space.refuse_unit_slips(population)
-        return simulate(population, key, rollout.numbers(scene, constants))
+        numbers = rollout.numbers(scene, constants)
+        # Python's floats would be traced apart from arrays.
+        return simulate(population, key, jax.tree.map(lambda v: jnp.asarray(v, float), numbers))
 
     return evaluate
 

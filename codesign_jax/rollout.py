@@ -122,8 +122,8 @@ def simulate(
         parameter is out of its range by a factor between units, such as millimetres given for
         metres; of traced ones no values are known.
     """
-    parameters.refuse_unit_slips(params)
     constants = numbers(scene, constants)
+    parameters.refuse_unit_slips(params)
     axes = batch_axes(constants)
 
     def world(p: Params, t: Trial, c: Constants) -> tuple[model.ModelFields, jax.Array]:

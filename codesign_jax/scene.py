@@ -121,7 +121,11 @@ class Discretization:
 
 @dataclasses.dataclass(frozen=True)
 class Solver:
-    """Limits of the contact solver: Newton and line-search iterations, scaled tolerance.
+    """MuJoCo's options of its contact solver, which the engines `mujoco` and `mjx` read.
+
+    Largest numbers of Newton iterations and of line-search iterations, and MuJoCo's tolerance: the
+    improvement or gradient of the cost, scaled by the model's inertia.  The engine `structured`
+    measures convergence otherwise: see `Newton`.
 
     The tolerance must not be zero: MuJoCo's line search may then return no step at all.
     """
@@ -132,12 +136,28 @@ class Solver:
 
 
 @dataclasses.dataclass(frozen=True)
+class Newton:
+    """Limits of the contact solver of the engine `structured`.
+
+    Largest numbers of Newton iterations of a step and of line-search evaluations of an iteration,
+    and the relative Newton decrement at which a world has converged, a share of the cost's scale;
+    a step that ends above it sets SOLVER_CAP.  Where no kernel runs a line search has at most six
+    evaluations.
+    """
+
+    iterations: int = quantity("", 1, 1000, structure=True, default=24)
+    evaluations: int = quantity("", 1, 1000, structure=True, default=14)
+    decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-6)
+
+
+@dataclasses.dataclass(frozen=True)
 class Accuracy:
     """Values of a preset of accuracy; docs/accuracy.md has its measured errors and cost."""
 
     description: str
     discretization: dict
     solver: dict
+    newton: dict = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +201,6 @@ class Scene:
     description: str
     hand: hand.Hand
     objects: objects.ObjectSet
-    gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
     effects: Effects
     phases: Phases
     arm: Arm
@@ -191,6 +210,8 @@ class Scene:
     solver: Solver
     limits: Limits
     pneumatics: Pneumatics = Pneumatics()
+    newton: Newton = Newton()
+    gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
 
     def constants(self) -> Constants:
         """The numbers of the scene's files that are not structure."""
@@ -311,6 +332,7 @@ class _SceneFile:
     solver: Solver
     limits: Limits
     pneumatics: Pneumatics = Pneumatics()
+    newton: Newton = Newton()
     gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
 
 
@@ -391,7 +413,11 @@ def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str,
     except schema.SceneError as error:
         problems += error.problems
         return {}
-    return {"discretization": preset.discretization, "solver": preset.solver}
+    return {
+        "discretization": preset.discretization,
+        "solver": preset.solver,
+        "newton": preset.newton,
+    }
 
 
 def _beside(path: Path, name: str) -> str | Path:

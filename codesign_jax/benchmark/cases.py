@@ -250,7 +250,7 @@ def quality(case: Case) -> dict:
 
     worlds = case.values["worlds"][0]
     engine: Any = peers.build(case.engine, case.setting, case.scene)
-    limits = (engine.iterations, max(engine.evaluations, 14), engine.tolerance)
+    limits = (engine.iterations, engine.kernel_evaluations, engine.tolerance)
     short = partial(work.window, case.scene, worlds, case.values["steps"])
     if engine.kernel:
         whole = partial(work.make_worlds, case.scene, worlds)

@@ -97,7 +97,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
       trial: The trial's object and noise.
     """
     template, lay, dtype = compile_template(scene), layout(scene), params.length.dtype
-    scene = with_trial(_in_type(scene, dtype), trial)
+    scene = _in_type(with_trial(scene, trial), dtype)
     beam = morphology.finger_beams(scene.hand, params)
 
     def base(name: str) -> jax.Array:

@@ -118,14 +118,14 @@ def palm_touches(scene: Scene) -> bool:
     return scene.effects.palm_object or scene.effects.palm_table
 
 
-_PALM_RING = np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
+_PALM_RING = ((0, 0), (1, 0), (0, 1), (-1, 0), (0, -1))
 
 
 def palm_points(scene: Scene) -> jax.Array:
     """Centres of the palm's contact spheres in the palm frame, whose origin is on the underside."""
     p = scene.hand.palm
-    up = p.contact_radius * jnp.ones(len(_PALM_RING))
-    return jnp.column_stack([p.contact_ring * _PALM_RING, up])
+    ring, up = jnp.asarray(p.contact_ring), jnp.asarray(p.contact_radius)
+    return jnp.stack([jnp.stack([x * ring, y * ring, up]) for x, y in _PALM_RING])
 
 
 def mounts(scene: Scene, spread: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -76,9 +76,10 @@ def load(path: Path) -> Failure:
     try:
         with np.load(path, allow_pickle=False) as stored:
             values = {k: stored[k] for k in stored.files}
-        trial = Trial(**{k: values[f"trial_{k}"] for k in Trial._fields})
+        of_trial = {k.removeprefix("trial_"): v for k, v in values.items() if k[:6] == "trial_"}
+        trial = Trial(**{k: of_trial[k] for k in of_trial if k in Trial._fields})
         place = tuple(int(v) for v in values["place"])
         status, bad_step = int(values["status"]), int(values["bad_step"])
         return Failure(values["design"], trial, values["state"], status, bad_step, place)  # type: ignore[arg-type]
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise SceneError([f"{path} is not a failed world of a run: {error}"]) from error

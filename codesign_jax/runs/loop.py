@@ -306,7 +306,10 @@ def _check_failures(status: np.ndarray, folder: Path) -> None:
     )
 
 
-_UNSTABLE = "A smaller discretization.timestep or more solver.iterations may help."
+_UNSTABLE = (
+    "A smaller discretization.timestep may help, or more iterations: newton.iterations with engine "
+    "structured, solver.iterations with MuJoCo's."
+)
 _ADVICE = {
     Status.NONFINITE | Status.SPEED: _UNSTABLE,
     Status.PENETRATION: "The object falls through the table: contact.normal_stiffness is too low "

@@ -59,17 +59,18 @@ class StructuredEngine:
         self,
         scene: Scene,
         *,
-        iterations: int = 24,
-        evaluations: int = 6,
-        tolerance: float = 1e-6,
+        iterations: int | None = None,
+        evaluations: int | None = None,
+        tolerance: float | None = None,
         kernel: bool | None = None,
     ):
         """Prepares the engine.
 
         Args:
           scene: The scene.
-          iterations: Largest number of Newton iterations a step.
-          evaluations: Line-search evaluations an iteration.
+          iterations: Largest number of Newton iterations a step instead of the scene's, see
+            `scene.Newton`.
+          evaluations: Line-search evaluations an iteration; 14 at least in the kernel.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
           kernel: Whether one kernel runs a rollout. Without it all worlds step in unison. By
             default where kernels can run; elsewhere a warning says why not.
@@ -81,7 +82,13 @@ class StructuredEngine:
         effects.refuse(scene.effects, self.name)
         mesh.tables(scene)
         self.scene = scene
-        self.iterations, self.evaluations, self.tolerance = iterations, evaluations, tolerance
+        newton = scene.newton
+        self.iterations = newton.iterations if iterations is None else iterations
+        self.tolerance = newton.decrement if tolerance is None else tolerance
+        # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
+        most, few = newton.evaluations, min(newton.evaluations, 6)
+        self.evaluations = few if evaluations is None else evaluations
+        self.kernel_evaluations = most if evaluations is None else max(evaluations, 14)
         self.conditional = jax.default_backend() == "cpu"  # see Stages
         self.demanded = bool(kernel)
         wanted = kernel is not False
@@ -280,8 +287,7 @@ class StructuredEngine:
     ) -> tuple[Trace, Path | None]:
         from codesign_jax.engines.structured.kernel import Limits, Program
 
-        # The kernel's line search ends when it is exact: more evaluations are a cap, not a cost.
-        limits = Limits(self.iterations, max(self.evaluations, 14), self.tolerance)
+        limits = Limits(self.iterations, self.kernel_evaluations, self.tolerance)
         program = Program.here(self.scene, limits, ctrl.dtype)
         hand, start = world_constants(self.scene, fields), self.reset(fields)
         found, end = program.simulate(hand, start, ctrl, trajectory=trajectory, states=states)

@@ -1,0 +1,294 @@
+"""Numbers of scene, hand and objects are data: nothing compiles, files and constants agree."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small import hand_world, nth, pinch, random_constants, random_worlds
+
+from codesign_jax import model, rollout, scene, schema
+from codesign_jax.compiler import launch
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.constants import world_constants
+
+SHORT = dict(  # 30 steps, with every phase
+    phases__approach=0.1,
+    phases__inflate=0.15,
+    phases__lift=0.2,
+    phases__disturb=0.25,
+    phases__ungrasp=0.3,
+    phases__deflate_time=0.02,
+)
+
+
+def short(**settings):
+    return pinch("sphere", links=2, **SHORT, **settings)
+
+
+def named(tree):
+    """Leaves of a pytree by key."""
+    pairs = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in pairs}
+
+
+def with_leaf(tree, key, change):
+    """The pytree with one leaf changed."""
+    flat, structure = jax.tree_util.tree_flatten_with_path(tree)
+    keys = [jax.tree_util.keystr(path).lstrip(".") for path, _ in flat]
+    assert key in keys
+    leaves = [change(v) if k == key else v for k, (_, v) in zip(keys, flat, strict=True)]
+    return jax.tree.unflatten(structure, leaves)
+
+
+def in_float32(constants):
+    """Arrays of one type: JAX traces again for another, and for Python's floats."""
+    return jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), constants)
+
+
+def as_file(the_scene, constants):
+    """A scene whose files have these numbers; names and descriptions differ as well."""
+    changed = the_scene.with_constants(jax.tree.map(float, constants))
+    fields = {f.name: getattr(changed, f.name) for f in dataclasses.fields(scene.Scene)}
+    other = scene.Scene(**fields)
+    return dataclasses.replace(other, name="other", hand=dataclasses.replace(other.hand, name="x"))
+
+
+def test_every_number_is_a_leaf_with_the_name_of_its_key():
+    """All numbers of the three files, but those that say how much is compiled."""
+    constants = scene.load("paper").constants()
+    assert constants.hand.material.shear_modulus == 56e3
+    assert constants.contact.friction_ratio == 3.0
+    assert constants.objects.object[0].mass == 0.1
+    keys = set(named(constants))
+    assert {"gravity", "hand.finger[3].tilt", "objects.object[1].size[0]"} <= keys
+    tables = {key.split(".")[0] for key in keys}
+    assert not tables & {"discretization", "solver", "newton", "effects"}
+    assert "phases.ungrasp" not in keys
+
+
+def test_scenes_that_differ_in_numbers_share_their_structure():
+    the_scene = short()
+    other = as_file(the_scene, random_constants(the_scene, 1))
+    assert other != the_scene and other.structure == the_scene.structure
+    assert model.compile_template(other) is model.compile_template(the_scene)
+    assert model.layout(other) is model.layout(the_scene)
+    assert the_scene.structure.structure == the_scene.structure
+    for more in (short(discretization__timestep=0.005), pinch("box", links=2, **SHORT)):
+        assert more.structure != the_scene.structure
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(the_scene.with_constants(the_scene.constants()))
+
+
+def test_changing_any_number_compiles_nothing(monkeypatch):
+    """Neither XLA's program nor the kernel, for a number of each table and for all at once."""
+    the_scene, compiled = short(), []
+    engine, original = make_engine("structured", the_scene), launch.launch
+
+    def counting(call, inputs, outputs, kernel):
+        compiled.append(kernel.origin)
+        return original(call, inputs, outputs, kernel)
+
+    monkeypatch.setattr("codesign_jax.engines.structured.kernel.program.launch", counting)
+    world = in_float32(hand_world(the_scene))
+    params, trials = jax.tree.map(lambda v: jnp.broadcast_to(v, (2, *v.shape)), world)
+    trials = trials._replace(shape=jnp.zeros(2, jnp.int32))
+
+    @jax.jit
+    def height(constants):
+        outcome, trace = rollout.simulate(the_scene, engine, params, trials, constants=constants)
+        return trace.height[:, -1], outcome.cost
+
+    constants = in_float32(the_scene.constants())
+    first = height(constants)
+    # One number of each table alone, then all of them.
+    for key in sorted({key.rsplit(".", 1)[0]: key for key in named(constants)}.values()):
+        height(with_leaf(constants, key, lambda v: v * 1.01 + 1e-3))
+    other = in_float32(random_constants(the_scene, 2))
+    changed = height(other)
+    assert height._cache_size() == 1 and len(compiled) == 1
+    assert not np.allclose(first[0], changed[0])
+    # A scene read from other files asks for the same kernel.
+    again = as_file(the_scene, other)
+    rollout.simulate(again, make_engine("structured", again), params, trials)
+    assert len(compiled) == 2 and len(set(compiled)) == 1
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "engine", ["mujoco", *(pytest.param(name, marks=SLOW) for name in ("structured", "mjx"))]
+)
+def test_constants_equal_a_scene_file_with_those_numbers(engine):
+    """The programs differ in what XLA folds and fuses; MuJoCo C gets fields in float32."""
+    the_scene, wide = short(), engine != "mujoco"
+    constants = random_constants(the_scene, 3)
+    other = as_file(the_scene, constants)
+    world = hand_world(the_scene)
+    worlds = jax.tree.map(lambda v: np.broadcast_to(v, (2, *v.shape)), world)
+
+    def run(s, **more):
+        batch = engine == "structured"
+        made = StructuredEngine(s, kernel=False) if batch else make_engine(engine, s)
+        result = jax.jit(lambda p, t: rollout.simulate(s, made, p, t, **more))(*worlds)
+        return jax.tree.map(np.asarray, result)
+
+    with jax.enable_x64(wide):
+        changed, read = run(the_scene, constants=constants), run(other)
+    tolerance = 1e-9 if wide else 1e-4
+    for a, b in zip(jax.tree.leaves(changed), jax.tree.leaves(read), strict=True):
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+
+
+def test_numbers_of_a_batch_equal_those_of_single_worlds():
+    """Every world of a batch has its own numbers, in MuJoCo's fields and in the lanes."""
+    the_scene = short(effects__friction="full", effects__neo_hookean=True)
+    constants = random_constants(the_scene, 5, 3)
+
+    def fields_of(p, t, c):
+        return model.model_fields(the_scene.with_constants(c), p, t)
+
+    def lanes(*world):
+        fields = jax.vmap(fields_of)(*world)
+        return fields, world_constants(the_scene, fields)
+
+    with jax.enable_x64(True):
+        params, trials = random_worlds(the_scene, 1, 3)
+        run = jax.jit(lanes)
+        fields, hand = run(params, trials, constants)
+        one = jax.tree.map(lambda v: np.asarray(v)[1:2], (params, trials, constants))
+        alone, mine = jax.jit(lanes)(*one)
+    second = nth(fields, slice(1, 2))
+    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(second), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-15)
+    for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(hand), strict=True):
+        np.testing.assert_allclose(a[..., 0], b[..., 1], rtol=1e-12, atol=1e-15)
+    friction = np.asarray(hand.cones.hand_object.friction)[0]
+    wanted = constants.objects.object[0].friction * np.asarray(trials.friction)
+    np.testing.assert_allclose(friction, wanted, rtol=1e-6)
+
+
+def test_mujoco_worlds_with_own_friction_equal_separate_runs():
+    """A batch of three frictions against three runs of one each: bit for bit, as before."""
+    the_scene = short()
+    engine = make_engine("mujoco", the_scene)
+    params, trial = jax.tree.map(jnp.asarray, hand_world(the_scene))
+    worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (3, *v.shape)), (params, trial))
+    constants = random_constants(the_scene, 6, 3)
+
+    @jax.jit
+    def run(params, trials, constants):
+        result = rollout.simulate(the_scene, engine, params, trials, constants=constants)
+        return result[1].distance
+
+    together = run(*worlds, constants)
+    for i in range(3):
+        alone = run(*nth((*worlds, constants), slice(i, i + 1)))
+        np.testing.assert_allclose(alone[0], together[i], rtol=1e-6)
+    assert not np.allclose(together[0], together[1])
+
+
+def test_derivatives_equal_differences():
+    """Of every number that the engine reads, with respect to all constants, along a line."""
+    the_scene = short(effects__friction="full", effects__neo_hookean=True)
+    random = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        params, trial = jax.tree.map(jnp.asarray, hand_world(the_scene))
+        start = jax.tree.map(jnp.asarray, random_constants(the_scene, 7))
+        # Each number moves by a share of its range, that is of its own size.
+        way = jax.tree.map(lambda v: v * random.uniform(-1, 1), start)
+
+        def numbers(c):
+            fields = model.model_fields(the_scene.with_constants(c), params, trial)
+            hand = world_constants(the_scene, jax.tree.map(lambda v: v[None], fields))
+            leaves = [x for x in jax.tree.leaves((fields, hand)) if x.dtype == float and x.size]
+            return jnp.concatenate([x.ravel() for x in leaves])
+
+        size = jnp.abs(numbers(start)) + 1e-6
+
+        @jax.jit
+        def total(c):
+            return jnp.sum(numbers(c) / size)
+
+        slopes = jax.grad(total)(start)
+        assert all(np.isfinite(v) for v in jax.tree.leaves(slopes))
+        products = jax.tree.map(lambda a, b: a * b, slopes, way)
+        # A central difference's error is of order h^2, and of 1e-16 / 1e-6 / h by rounding, in each
+        # of some 700 numbers, whose slopes partly cancel.
+        h = 1e-4
+        moved = [total(jax.tree.map(lambda v, w, s=s: v + s * h * w, start, way)) for s in (1, -1)]
+        found = sum(jax.tree.leaves(products))
+        np.testing.assert_allclose(found, (moved[0] - moved[1]) / (2 * h), rtol=1e-5)
+
+
+def test_later_noise_leaves_earlier_draws_alone():
+    """Friction and stiffness draw from keys of their own; without noise their factors are 1."""
+    the_scene, key = scene.load("paper"), jax.random.key(3)
+    plain = rollout.sample_trials(the_scene, key, 5)
+    np.testing.assert_array_equal(plain.friction, 1.0)
+    np.testing.assert_array_equal(plain.stiffness, 1.0)
+    z = jnp.stack([jax.random.normal(jax.random.fold_in(key, t), (7,)) for t in range(5)])
+    np.testing.assert_allclose(plain.mass, 1 + 0.05 * z[:, 5], rtol=1e-6)
+    c = the_scene.constants()
+    noise = c.objects.noise._replace(friction=0.3, stiffness=0.1)
+    noisy = c._replace(objects=c.objects._replace(noise=noise))
+    drawn = rollout.sample_trials(the_scene, key, 2000, constants=noisy)
+    np.testing.assert_array_equal(drawn.mass[:5], plain.mass)
+    # Standard deviations of 2000 draws scatter by 1.6 %.
+    friction, stiffness = np.asarray(drawn.friction), np.asarray(drawn.stiffness)
+    assert abs(np.log(friction).std() - 0.3) < 0.03
+    assert abs(np.log(stiffness).std() - 0.1) < 0.01
+    params, _ = jax.tree.map(jnp.asarray, hand_world(the_scene))
+    fields, one = (
+        jax.jit(lambda p, t: model.model_fields(the_scene, p, t))(params, nth(trials, 1))
+        for trials in (drawn, plain)
+    )
+    materials = fields.constants.hand.material.shear_modulus / 56e3
+    np.testing.assert_allclose(materials, stiffness[1], rtol=1e-6)
+    ratio = fields.pair_friction[:, 0] / one.pair_friction[:, 0]
+    np.testing.assert_allclose(ratio, friction[1], rtol=1e-6)
+    dofs = model.layout(the_scene).dofs
+    stiffer = (fields.jnt_stiffness / one.jnt_stiffness)[dofs]
+    np.testing.assert_allclose(stiffer, stiffness[1], rtol=1e-6)
+
+
+BAD = {
+    "constants.contact.friction_ratio = nan is outside [0.01, 1000]": {
+        "contact.friction_ratio": np.nan
+    },
+    "constants.hand.palm.mass = 250.0 is outside [0.01, 10] kg; did you mean 0.25?": {
+        "hand.palm.mass": 250.0
+    },
+    "constants.objects.object[0].mass has shape (2, 2)": {
+        "objects.object[0].mass": np.ones((2, 2))
+    },
+    "constants.gravity = 'down' must be a number": {"gravity": "down"},
+    "constants.phases.inflate = 0.05 s must come after approach = 0.1 s": {"phases.inflate": 0.05},
+    "constants.contact.time_constant = 0.01 s must be at least two time steps": {
+        "contact.time_constant": 0.01
+    },
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_numbers_are_named_before_anything_runs(message):
+    the_scene = short()
+    constants = the_scene.constants()
+    for key, value in BAD[message].items():
+        constants = with_leaf(constants, key, lambda _, value=value: value)
+    with pytest.raises(schema.SceneError) as error:
+        rollout.simulate(the_scene, None, None, None, constants=constants)  # type: ignore[arg-type]
+    assert message in str(error.value)
+
+
+def test_constants_of_another_scene_are_refused():
+    """Other fingers, other shapes: the keys that are missing and those that are too many."""
+    the_scene, paper = short(), scene.load("paper")
+    with pytest.raises(schema.SceneError) as error:
+        rollout.sample_trials(the_scene, jax.random.key(0), 1, constants=paper.constants())
+    assert "constants.hand.finger[2].azimuth is no number of this scene" in str(error.value)
+    with pytest.raises(schema.SceneError, match=r"constants.hand.finger\[2\].azimuth is missing"):
+        rollout.sample_trials(paper, jax.random.key(0), 1, constants=the_scene.constants())

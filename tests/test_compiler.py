@@ -300,7 +300,8 @@ def test_lanes_meet_where_they_read_what_others_wrote():
     def kernel(x, out):
         lane = jax.lax.broadcasted_iota(jnp.int32, (32,), 0)
         out[0, :] = x[0, :] + 1
-        out[1, :] = out[0, jax.lax.bitwise_xor(lane, jnp.int32(8))] + out[0, lane]
+        other = jax.lax.bitwise_xor(lane, jnp.int32(8))
+        out[1, :] = out[0, other] + out[1, other] + out[0, lane]
 
     spec = pl.BlockSpec((None, 2, 32), lambda i: (i, 0, 0))
     shape = jax.ShapeDtypeStruct((1, 2, 32), jnp.float32)
@@ -313,6 +314,7 @@ def test_lanes_meet_where_they_read_what_others_wrote():
         False,
         True,
         False,
+        False,  # one group
         True,
         False,
     ]

@@ -43,6 +43,7 @@ class ThreadWriter(Writer):
         self.found: list[dict[tuple, Any]] = [{}]  # computed already, one scope a region
         # The loops around: line at which a body begins, and its reads by address.
         self.ahead: list[tuple[int, dict[str, Ahead]]] = []
+        self.meeting = False  # between the loads of a group, before which the threads have met
         self.spans: set[int] = set()  # numbers of rows that are asked for at once
 
     def type(self, kind: str, wide: bool) -> str:
@@ -142,11 +143,13 @@ class ThreadWriter(Writer):
         base, offset, place = self._address(ref, indices)
         wide, kind = any(i.wide for i in indices), LLVM_TYPES[ref.kind]
         foreign = self._is_foreign(ref, indices)
-        if foreign:
+        if foreign and not self.meeting:
             self._meet()
         text = self.emit(f"load {kind}, ptr addrspace(1) {place}, align {SIZES[ref.kind]}")
         if foreign:
-            self._meet()
+            self.meeting = not self.last_of_group
+            if self.last_of_group:
+                self._meet()
         if ref.shape[-1] == self.lanes and self.growth.get(base):
             self._read_ahead(base, offset)
         return Value(ref.kind, wide, text)

@@ -36,6 +36,7 @@ class Writer:
       lanes: Number of lanes of a block.
       lines: The instructions written so far.
       declared: Declarations of the functions that they call.
+      last_of_group: Whether a load is the last of several from the same array at the same lanes.
     """
 
     def __init__(self, lanes: int):
@@ -44,6 +45,8 @@ class Writer:
         self.lines: list[str] = []
         self.declared: set[str] = set()
         self.count, self.here = 0, "entry"
+        self.following: list[Any] = []  # operations behind the present one
+        self.last_of_group = True
         self.read: set[Any] = set()  # variables that some operation needs
         self.scalar_of: dict[str, Value] = {}  # what was spread over the lanes, by its new name
 
@@ -358,6 +361,16 @@ class Writer:
                 )
         return found
 
+    def _reads_on(self, equation: Any) -> bool:
+        """Whether the same array is read next at the same lanes, but for indices in between."""
+        for other in self.following:
+            if other.primitive.name == "get":
+                same = other.invars[0] is equation.invars[0]
+                return same and other.invars[-1] is equation.invars[-1]
+            if other.primitive.name not in ("add", "mul", "convert_element_type", *_SAME):
+                return False
+        return False
+
     def _one_a_lane(self, equation: Any) -> None:
         shape = equation.outvars[0].aval.shape
         if shape not in ((), (self.lanes,)):
@@ -385,7 +398,8 @@ class Writer:
         values.update(zip(jaxpr.invars, args, strict=True))
         atoms = [a for e in jaxpr.eqns for a in e.invars] + list(jaxpr.outvars)
         self.read |= {a for a in atoms if not isinstance(a, core.Literal)}
-        for equation in jaxpr.eqns:
+        for k, equation in enumerate(jaxpr.eqns):
+            self.following = jaxpr.eqns[k + 1 :]
             results = self.equation(equation, [read(v) for v in equation.invars])
             values.update(zip(equation.outvars, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
@@ -404,6 +418,7 @@ class Writer:
         if name in ("get", "swap"):
             self._one_a_lane(equation)
         if name == "get":
+            self.last_of_group = not self._reads_on(equation)
             return [self.load(args[0], self.indices(args[0], equation, args[1:]))]
         if name == "swap":
             place = self.indices(args[0], equation, args[2:])

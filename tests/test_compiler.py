@@ -320,7 +320,7 @@ def test_lanes_meet_where_they_read_what_others_wrote():
     ]
 
 
-def loop_text(reverse, rows=32, count=8):
+def loop_text(reverse, rows=128, count=60):
     """A loop that reads rows 2 k + 3 and 2 k + 4 in round k."""
 
     def kernel(x, out):
@@ -350,6 +350,6 @@ def test_a_loop_asks_for_what_it_reads_later(reverse):
     )
     reads = [k for k, line in enumerate(lines) if " load " in line and begin < k < end]
     assert len(reads) == 2 and rounds == int(rounds) >= 1 and asked < reads[0]
-    assert rounds * (end - begin) >= thread.AHEAD > (rounds - 1) * (end - begin - 10)
+    assert rounds == thread.rounds_ahead(end - begin, 60) == 12
     # Two rows: lane 0 asks for the first one, all others for the second one.
     assert any("umin.i32(i32 %lane, i32 1)" in line for line in lines)

@@ -41,8 +41,8 @@ class ThreadWriter(Writer):
         self.growth: dict[str, int] = {}  # of integers [1] and addresses [bytes], in each round
         self.born: dict[str, int] = {}  # line behind an address
         self.found: list[dict[tuple, Any]] = [{}]  # computed already, one scope a region
-        # The loops around: line at which a body begins, and its reads by address.
-        self.ahead: list[tuple[int, dict[str, Ahead]]] = []
+        # The loops around: line at which a body begins, rounds, and its reads by address.
+        self.ahead: list[tuple[int, int, dict[str, Ahead]]] = []
         self.meeting = False  # between the loads of a group, before which the threads have met
         self.spans: set[int] = set()  # numbers of rows that are asked for at once
 
@@ -241,14 +241,14 @@ class ThreadWriter(Writer):
     def _read_ahead(self, base: str, offset: int) -> None:
         """Notes a read for the innermost loop in which its address is computed."""
         line = self.born[base]
-        for first, reads in reversed(self.ahead):
+        for first, _, reads in reversed(self.ahead):
             if first <= line:
                 reads.setdefault(base, Ahead(line, [])).offsets.append(offset)
                 return
 
-    def begin_loop(self, counters: list[str]) -> None:
+    def begin_loop(self, counters: list[str], length: int) -> None:
         """See `Writer`."""
-        self.ahead.append((len(self.lines), {}))
+        self.ahead.append((len(self.lines), length, {}))
         self.growth |= {name: 1 for name in counters}
 
     def end_loop(self) -> None:
@@ -257,8 +257,10 @@ class ThreadWriter(Writer):
         Without it every round waits for memory: a kernel of this size leaves room for two warps on
         a scheduler, which cannot hide it.
         """
-        first, reads = self.ahead.pop()
-        rounds = -(-AHEAD // max(1, len(self.lines) - first))
+        first, length, reads = self.ahead.pop()
+        rounds = rounds_ahead(len(self.lines) - first, length)
+        if not rounds:
+            return
         for address, (line, offsets) in sorted(reads.items(), key=lambda r: -r[1].line):
             behind, self.lines = self.lines[line:], self.lines[:line]
             for offset, rows in adjacent(sorted(set(offsets)), 4 * LANES):
@@ -275,6 +277,19 @@ class ThreadWriter(Writer):
         self.lines.append(
             f'call void asm sideeffect "prefetch.global.L1 [$0];", "l"(ptr addrspace(1) {place}) #1'
         )
+
+
+def rounds_ahead(lines: int, length: int) -> int:
+    """How many rounds before it is read a loop asks for a row.
+
+    As many as memory takes, but few against the loop's length: what is asked for in the last rounds
+    lies behind the rows that the loop reads.
+
+    Args:
+      lines: Lines of the loop's body.
+      length: Its number of rounds.
+    """
+    return min(-(-AHEAD // max(1, lines)), max(1, length // 5))
 
 
 def adjacent(offsets: list[int], row: int) -> list[tuple[int, int]]:

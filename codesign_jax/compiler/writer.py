@@ -99,8 +99,8 @@ class Writer:
         """Called with each sum, difference or product of integers; returns the result."""
         return result
 
-    def begin_loop(self, counters: list[str]) -> None:
-        """Called before the body of a loop, with the names of what grows by one in every round."""
+    def begin_loop(self, counters: list[str], length: int) -> None:
+        """Called before the body of a loop of some length; counters grow by one in every round."""
 
     def end_loop(self) -> None:
         """Called behind the body of a loop."""
@@ -285,7 +285,7 @@ class Writer:
         values, lines = self._phis([Value("i32", False, None, 0), *start], source)
         inner = p["jaxpr"]
         grown = [values[1 + k].text for k in counters(inner.jaxpr, split)]
-        self.begin_loop(grown)  # type: ignore[arg-type]
+        self.begin_loop(grown, p["length"])  # type: ignore[arg-type]
         new = self._carried(variables, self.run(inner.jaxpr, inner.consts, [*consts, *values[1:]]))
         operands = [self.operand(v) for v in new]
         self.end_loop()

@@ -312,6 +312,7 @@ def by_structure(function: Callable[[Scene], T]) -> Callable[[Scene], T]:
     def evaluate(scene: Scene) -> T:
         return cached(scene.structure)
 
+    evaluate.cache_clear = cached.cache_clear  # type: ignore[attr-defined]
     return evaluate
 
 

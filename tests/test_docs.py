@@ -24,6 +24,8 @@ def examples(program):
     for page in PAGES:
         blocks = re.findall(r"^```(?:bash|sh)?\n(.*?)^```", page.read_text(), re.S | re.M)
         for line in "".join(blocks).replace("\\\n", " ").splitlines():
+            if not re.match(rf"([A-Z_]+=\S*\s+)*{program}\b", line):
+                continue  # a tree of folders, for example
             words = shlex.split(line, comments=True)
             while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
                 words = words[1:]  # variables of the environment

@@ -125,7 +125,7 @@ def test_other_engines_refuse_the_hull(engine):
 
 
 def test_bad_settings_are_refused():
-    with pytest.raises(SceneError, match="'hull' needs friction = 'coulomb', not 'full'"):
+    with pytest.raises(SceneError, match="'hull' needs friction = 'coulomb' or 'none', not 'full'"):
         small.pinch("box", effects__surface="hull", effects__friction="full")
     with pytest.raises(SceneError, match="hull_points = 6 must be a multiple of 4"):
         hull_scene(points=6)

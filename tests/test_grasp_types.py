@@ -8,6 +8,7 @@ from codesign_jax import parameters, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.experiments import figures, grasp_types
 from codesign_jax.report import animation
+from codesign_jax.types import Outcome
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +137,7 @@ def test_videos_are_of_grasps_that_hold(setup, tmp_path, monkeypatch):
         trial = animation.Replay
         return lambda s, e, params, trials: (
             [
-                trial(params, None, rollout.cost.Outcome(np.float32(cost), 0, 0, 0), None)  # type: ignore[arg-type]
+                trial(params, None, Outcome(np.float32(cost), 0, 0, 0), None)  # type: ignore[arg-type]
             ]
             * len(trials.yaw)
         )

@@ -111,8 +111,10 @@ class MujocoEngine:
             last[going[here]] = states[here, kept[here]]
             for world, at, state in zip(going[done], entry[done], kept[done], strict=True):
                 rest = slice(first + at, None)
-                for array in (distance, height, qpos, status):
+                for array in (distance, height, qpos):
                     array[world, rest] = array[world, max(first + state, 0)]
+                # What MuJoCo told of the deciding step stays, also where its state does not.
+                status[world, rest] = status[world, first + at if at < count else first + state]
                 speed[world, rest] = speed[world, first + at] if at < count else np.nan
             going = going[~done]
             if not going.size:

@@ -62,11 +62,13 @@ def lowest_point(scene: Scene, params: Params) -> float:
     azimuth = np.deg2rad([f.azimuth for f in fingers])
     azimuth = azimuth + np.array([f.spread for f in fingers]) * float(params.spread)
     tilt = np.deg2rad([f.tilt for f in fingers])
-    outwards = np.cos(azimuth) * up[0] + np.sin(azimuth) * up[1]
-    across = -np.sin(azimuth) * up[0] + np.cos(azimuth) * up[1]
+    cosine, sine = np.cos(azimuth), np.sin(azimuth)
+    outwards = cosine * up[0] + sine * up[1]
+    across = -sine * up[0] + cosine * up[1]
     along = np.cos(tilt) * outwards - np.sin(tilt) * up[2]
     back = np.sin(tilt) * outwards + np.cos(tilt) * up[2]
-    base = np.array([f.radius for f in fingers]) * outwards
+    points = [f.base_point(c, s) for f, c, s in zip(fingers, cosine, sine, strict=True)]
+    base = np.array(points) @ up[:2]
     ends = np.minimum(base, base + params.length * along)
     # The skin is a box between the layer that bends and the back; contact spheres fill its height.
     skin = np.minimum(params.height * back, 0.0) - section.width / 2 * np.abs(across)

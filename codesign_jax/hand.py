@@ -45,14 +45,39 @@ PARAMETERS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Finger:
-    """Mount of a finger, which leaves the palm at azimuth + spread * gamma, tilted downwards."""
+    """Mount of a finger, which leaves the palm at azimuth + spread * gamma, tilted downwards.
+
+    Its base point is the middle of the inextensible layer's edge, on the palm's underside. It is
+    given either as `base`, (x, y) in the palm's frame, which stays where it is when the spread
+    gamma turns the finger's direction; or as `radius` of a circle around the palm's centre, on
+    which it moves with the direction. The other one is None.
+    """
 
     azimuth: float = quantity("deg", -360, 360)
     spread: float = quantity("", -1, 1)
-    radius: float = quantity("m", 0, 0.2)
     tilt: float = quantity("deg", -90, 90)
+    radius: float | None = quantity("m", 0, 0.2, default=None)
+    base: tuple[float, ...] | None = quantity("m", -0.2, 0.2, default=None)
+
+    def base_point(self, cosine: Any, sine: Any) -> tuple[Any, Any]:
+        """Base point (x, y) in the palm's frame [m].
+
+        Args:
+          cosine: Cosine of azimuth + spread * gamma, of any shape; may be traced.
+          sine: Its sine.
+        """
+        if self.base is not None:
+            return self.base[0], self.base[1]
+        return self.radius * cosine, self.radius * sine
+
+    @property
+    def base_distance(self) -> Any:
+        """Distance of the base point from the palm's centre [m], at any spread."""
+        if self.base is not None:
+            return (self.base[0] ** 2 + self.base[1] ** 2) ** 0.5
+        return self.radius
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,6 +207,7 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
     keypaths.apply(table, keypaths.flatten(overrides or {}), path.name, problems)
     hand = schema.parse(Hand, table, path.name, problems)
     if hand is not None:
+        _check_mounts(hand, path.name, problems)
         _check_table(hand, path.name, problems)
         _check_presets(hand, path.name, problems)
         if not problems:
@@ -189,6 +215,26 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
     if problems or hand is None:
         raise schema.SceneError(problems)
     return hand
+
+
+def _check_mounts(hand: Hand, where: str, problems: list[str]) -> None:
+    for i, finger in enumerate(hand.finger):
+        path = f"{where}.finger[{i}]"
+        if finger.base is None and finger.radius is None:
+            problems.append(
+                f"{path} has no base point: give base = [x, y] in the palm's frame (unit m), "
+                "or the radius of the circle on which the base point lies (unit m)"
+            )
+        elif finger.base is not None and finger.radius is not None:
+            problems.append(
+                f"{path} gives its base point twice: leave out base = {list(finger.base)} "
+                f"or radius = {finger.radius:g}"
+            )
+        if finger.base is not None and len(finger.base) != 2:
+            problems.append(
+                f"{path}.base = {list(finger.base)} must have two entries, x and y in the palm's "
+                f"frame [m], not {len(finger.base)}"
+            )
 
 
 def _check_table(hand: Hand, where: str, problems: list[str]) -> None:

@@ -186,7 +186,7 @@ def _reach(scene: Scene, one: Params, name: str) -> list[str]:
     tilt = np.deg2rad([f.tilt for f in scene.hand.finger])
     lowest = float((palm - one.length * np.sin(tilt)).min())
     # An arm that is turned may bring a finger lower, by no more than its whole length.
-    turned = float(palm - one.length.max() - max(f.radius for f in scene.hand.finger))
+    turned = float(palm - one.length.max() - max(f.base_distance for f in scene.hand.finger))
     top = max(2 * shape.radius for shape in scene.objects.object)
     if turned > top:
         return [

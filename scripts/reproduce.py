@@ -40,6 +40,11 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("experiment", choices=[*plan.PAPER, "types", "figures"])
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
+    parser.add_argument(
+        "--scene",
+        default="paper_spheres",
+        help="built-in scene or file; by default that of docs/data/reproduction",
+    )
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
     parser.add_argument("--preset", dest="size", choices=list(plan.OVERRIDES), help="as --size")
     parser.add_argument("--engine", choices=NAMES, default="structured")
@@ -64,7 +69,7 @@ def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], in
     """Returns the experiment, the settings its state must belong to, and its grasps."""
     the_plan = plan.experiment(args.experiment, args.size)
     overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
-    the_scene = scene.load("paper", overrides=overrides)
+    the_scene = scene.load(args.scene, overrides=overrides)
     space = parameters.design_space(the_scene.hand, the_plan.preset)
     devices = args.devices or jax.device_count()
     chunk, calls = chunking(the_plan.worlds, args.chunk, devices)
@@ -117,7 +122,7 @@ def find_types(args: argparse.Namespace) -> int:
     if grid is None:
         sys.exit(f"error: {args.data} holds no landscape.npz")
     overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
-    the_scene = scene.load("paper", overrides=overrides)
+    the_scene = scene.load(args.scene, overrides=overrides)
     space = parameters.design_space(the_scene.hand, "2d")
     engine = make_engine(args.engine, the_scene)
     found = statistics.load(args.data, "types")

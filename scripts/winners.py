@@ -87,7 +87,7 @@ def simulate(args: argparse.Namespace) -> int:
     settings = {
         "size": args.size,
         "particles": "the best of each run first",
-        "scene_sha256": record.scene_hash(scene.load("paper")),
+        "scene_sha256": record.scene_hash(scene.load("paper_spheres")),
         "set": list(args.set),
     }
     made = winners_files.read(args.out)[2] if args.out.exists() else []

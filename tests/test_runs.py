@@ -89,7 +89,7 @@ def test_resolved_scene_names_units(tmp_path):
     assert "timestep = 0.01  # s\n" in (tmp_path / "scene.toml").read_text()
     hand = (tmp_path / "hand.toml").read_text()
     assert "shear_modulus = 56000.0  # Pa\n" in hand
-    assert "finger = [  # azimuth in deg, radius in m, tilt in deg\n" in hand
+    assert "finger = [  # azimuth in deg, tilt in deg, radius in m, base in m\n" in hand
     assert "size = [  # m\n" in (tmp_path / "objects.toml").read_text()
 
 

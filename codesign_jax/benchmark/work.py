@@ -55,7 +55,8 @@ def variant(
 def _with_fingers(chosen: Scene, count: int) -> Scene:
     first = chosen.hand.finger[0]
     azimuths = 45.0 + np.arange(count) * 360.0 / count
-    mounts = tuple(hand.Finger(float(a), 0.0, first.radius, first.tilt) for a in azimuths)
+    ring = {"spread": 0.0, "radius": first.base_distance, "tilt": first.tilt}
+    mounts = tuple(hand.Finger(azimuth=float(a), **ring) for a in azimuths)
     changed = dataclasses.replace(chosen.hand, name=f"{chosen.hand.name}-{count}", finger=mounts)
     return dataclasses.replace(chosen, hand=changed)
 

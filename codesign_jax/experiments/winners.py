@@ -51,13 +51,13 @@ class Variant:
     blocks: int | None = None
 
     def scene(self, more: Sequence[str] = ()) -> Scene:
-        """The paper's scene, changed.
+        """The scene that the winners were designed in, `paper_spheres`, changed.
 
         Args:
           more: Further overrides, which come first.
         """
         table = keypaths.parse([*more, *self.overrides])
-        base = scenes.load("paper", object_set=self.objects, overrides=table)
+        base = scenes.load("paper_spheres", object_set=self.objects, overrides=table)
         return scaled(base, self.friction, self.stiffness)
 
 

@@ -135,9 +135,11 @@ def mounts(scene: Scene, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jnp.stack([jnp.asarray(getattr(f, name)) for f in scene.hand.finger])
 
     azimuth = jnp.deg2rad(each("azimuth")) + each("spread") * spread
-    radius, tilt = each("radius"), jnp.deg2rad(each("tilt"))
-    zero = jnp.zeros_like(azimuth)
-    position = jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), zero], -1)
+    tilt = jnp.deg2rad(each("tilt"))
+    around = zip(jnp.cos(azimuth), jnp.sin(azimuth), strict=True)
+    points = [f.base_point(c, s) for f, (c, s) in zip(scene.hand.finger, around, strict=True)]
+    x, y = (jnp.stack([jnp.asarray(p[i], azimuth.dtype) for p in points]) for i in (0, 1))
+    position = jnp.stack([x, y, jnp.zeros_like(azimuth)], -1)
     # Rotation about z by the azimuth, then about y by the tilt: x leaves the palm outwards and
     # down.
     ca, sa, ct, st = (f(a / 2) for a in (azimuth, tilt) for f in (jnp.cos, jnp.sin))

@@ -201,11 +201,18 @@ case(*turned[:3], unit=turned[3])(mirrored)
 case(*turned[:3], unit=turned[3], engine="mujoco", quick=((1.0, "float64"),))(mirrored)
 
 
+def scaled_mount(finger, s):
+    """The mount with its base point s times as far from the palm's centre."""
+    if finger.base is None:
+        return dataclasses.replace(finger, radius=s * finger.radius)
+    return dataclasses.replace(finger, base=tuple(s * v for v in finger.base))
+
+
 def scaled_scene(base, s):
     """The scene s times as large, gravity the same: forces s^3, stresses s, times s^(1/2)."""
     t = np.sqrt(s)
     h, o, c = base.hand, base.objects, base.contact
-    fingers = tuple(dataclasses.replace(f, radius=s * f.radius) for f in h.finger)
+    fingers = tuple(scaled_mount(f, s) for f in h.finger)
     w = h.wrist
     wrist = hand.Wrist(
         s**2 * w.linear_stiffness,

@@ -89,11 +89,18 @@ class Section:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """Silicone of the fingers: shear modulus, density and Kelvin-Voigt damping time beta."""
+    """Silicone of the fingers: shear modulus, density and Kelvin-Voigt damping time beta.
+
+    The two factors scale the stiffness that `morphology` derives for bending sideways and for
+    torsion: for the former the fabric's side is the neutral line, which is an upper bound; for the
+    latter walls are thin, which is a lower one.
+    """
 
     shear_modulus: float = quantity("Pa", 1e3, 1e7)
     density: float = quantity("kg/m^3", 100, 10000)
     damping_time: float = quantity("s", 0, 1)
+    lateral_factor: float = quantity("", 0.05, 20, default=1.0)
+    torsion_factor: float = quantity("", 0.05, 20, default=1.0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -72,12 +72,17 @@ def beam(
 
 def finger_beams(hand: Hand, params: Params) -> Beam:
     """Returns the beam properties of every finger of a hand, shape (finger,)."""
-    return beam(
+    material = hand.material
+    found = beam(
         params.height,
         params.wall,
         width=hand.section.width,
-        shear_modulus=hand.material.shear_modulus,
-        density=hand.material.density,
+        shear_modulus=material.shear_modulus,
+        density=material.density,
+    )
+    return found._replace(
+        lateral=material.lateral_factor * found.lateral,
+        torsion=material.torsion_factor * found.torsion,
     )
 
 

@@ -26,7 +26,7 @@ demo: $(STAMP)
 	$(BIN)/python scripts/demo.py
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=10
 
 # Everything that needs a GPU; GPU=docs/data/gpu_suite_h200.json keeps what it found.
 GPU ?= runs/gpu_suite.json

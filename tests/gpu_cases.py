@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from codesign_jax import control, cost, model, rollout
+from codesign_jax import cost, rollout
 from codesign_jax import scene as scenes
 from codesign_jax.benchmark import work
 from codesign_jax.engines.structured import StructuredEngine
@@ -44,8 +44,7 @@ WHOLE = {"spheres": {}, "hull and fingers": EFFECTS["hull and fingers"]}
 def inputs(scene, count):
     """Model fields and controls of random worlds."""
     params, trials = small.random_worlds(scene, 3, count)
-    fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
-    return fields, jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)
+    return small.batch_inputs(scene, params, trials)
 
 
 def short_scene(name):

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import parameters, rollout, scene, schema
+from codesign_jax import control, model, parameters, rollout, scene, schema
+from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.types import Trial
 
 DATA = Path(__file__).parent / "data"
@@ -34,14 +35,37 @@ def random_designs(space, seed, count):
     """Uniform designs inside the bounds and under the pressure limit, (count, parameter)."""
     low, high = np.array(space.low), np.array(space.high)
     designs = low + (high - low) * np.random.default_rng(seed).random((count, len(low)))
-    return jax.vmap(space.project)(jnp.asarray(designs))
+    return jax.jit(jax.vmap(space.project))(jnp.asarray(designs))
 
 
 def random_worlds(the_scene, seed, count):
     """Params and trials of random hands, both with leading axis (world,)."""
     space = parameters.design_space(the_scene.hand)
-    params = jax.vmap(space.params)(random_designs(space, seed, count))
-    return params, rollout.sample_trials(the_scene, jax.random.key(seed), count)
+    params = jax.jit(jax.vmap(space.params))(random_designs(space, seed, count))
+    return params, _trials(the_scene, jax.random.key(seed), count)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2))
+def _trials(the_scene, key, count):
+    return rollout.sample_trials(the_scene, key, count)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def world_inputs(the_scene, params, trial):
+    """Model fields and controls of one world; operation by operation they compile for 15 s."""
+    return model.model_fields(the_scene, params, trial), control.commands(the_scene, params, trial)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def batch_inputs(the_scene, params, trials):
+    """Model fields and controls of worlds, with a leading axis (world,)."""
+    return jax.vmap(lambda p, t: world_inputs(the_scene, p, t))(params, trials)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def lanes(the_scene, fields):
+    """`world_constants` of worlds, in one program."""
+    return world_constants(the_scene, fields)
 
 
 def random_constants(the_scene, seed, count=None):

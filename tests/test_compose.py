@@ -34,10 +34,7 @@ SHORT = {
 def batch():
     """A short grasp, fields and controls of four random worlds."""
     scene = small.pinch("sphere", **SHORT)
-    both = jax.jit(
-        jax.vmap(lambda p, t: (model.model_fields(scene, p, t), control.commands(scene, p, t)))
-    )
-    return scene, *both(*small.random_worlds(scene, 3, 4))
+    return scene, *small.batch_inputs(scene, *small.random_worlds(scene, 3, 4))
 
 
 def test_vmap_is_a_larger_batch(batch):
@@ -81,9 +78,7 @@ def decided():
     scene = small.pinch("sphere", **SHORT, effects__finger_object=False, effects__twist=False)
     with jax.enable_x64(True):
         params, trials = small.random_worlds(scene, 3, 3)
-        fields, ctrl = jax.vmap(
-            lambda p, t: (model.model_fields(scene, p, t), control.commands(scene, p, t))
-        )(params, trials)
+        fields, ctrl = small.batch_inputs(scene, params, trials)
         ctrl = ctrl.at[0, :, 2].set(jnp.linspace(0.3, 0.4, ctrl.shape[1]))
         ctrl = ctrl.at[2, 10:, 6].set(jnp.nan)
         fields = fields._replace(start=fields.start.at[1, -5].set(-0.05))
@@ -192,10 +187,9 @@ def test_a_cost_of_ones_own_sees_the_end_of_the_trace():
     result = jax.jit(
         lambda p, t: rollout.evaluate(scene, engine, p, t, trajectory=True, cost=final_height)
     )(hand, trial)
-    fields = model.model_fields(scene, *(small.nth(x, 0) for x in (hand, trial)))
+    fields, commands = small.world_inputs(scene, *(small.nth(x, 0) for x in (hand, trial)))
     data = mujoco.MjData(compiled := world_model(scene, fields))
     data.qpos[:] = fields.start
-    commands = control.commands(scene, *(small.nth(x, 0) for x in (hand, trial)))
     for u in np.asarray(commands)[:-1]:
         data.ctrl[:] = u
         mujoco.mj_step(compiled, data)

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from small import hand_world, nth, pinch, random_worlds, stack, still
+from small import batch_inputs, hand_world, nth, pinch, random_worlds, stack, still, world_inputs
 
-from codesign_jax import cli, control, cost, model, rollout, runs, start
+from codesign_jax import cli, cost, model, rollout, runs, start
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.types import Status, Trace, failed
@@ -25,12 +25,7 @@ GOOD, SUDDEN, NEIGHBOUR = range(3)
 
 def both(the_scene, params, trials):
     """Fields and controls of a batch."""
-    make = jax.jit(
-        jax.vmap(
-            lambda p, t: (model.model_fields(the_scene, p, t), control.commands(the_scene, p, t))
-        )
-    )
-    return make(params, trials)
+    return batch_inputs(the_scene, params, trials)
 
 
 @pytest.fixture(scope="module")
@@ -219,14 +214,10 @@ def test_the_depth_is_mujocos(starting):
     for p, deep in zip(params, ours, strict=True):
         compiled = model.compile_model(the_scene, p, still())
         data = mujoco.MjData(compiled)
-        data.qpos[:] = model.model_fields(the_scene, *map(jnp_tree, (p, still()))).start
+        data.qpos[:] = world_inputs(the_scene, p, still())[0].start
         mujoco.mj_fwdPosition(compiled, data)
         # float32 positions of 0.2 m.
         assert deep == pytest.approx(-data.contact.dist.min(), abs=1e-6)
-
-
-def jnp_tree(tree):
-    return jax.tree.map(jnp.asarray, tree)
 
 
 def test_an_invalid_start_is_in_the_outcome(starting):

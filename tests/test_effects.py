@@ -51,10 +51,9 @@ def setting(effects, shape="box", **changes):
     """Scene, MuJoCo C's model, fields and controls of a pinch grasp, in float64."""
     scene = small.pinch(shape, **{f"effects__{k}": v for k, v in effects.items()})
     world, trial = small.hand_world(scene, **changes)
-    world = jax.tree.map(jnp.asarray, world)
     trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
-    fields = model.model_fields(scene, world, trial)
-    ctrl = np.asarray(control.commands(scene, world, trial))
+    fields, ctrl = small.world_inputs(scene, world, trial)
+    ctrl = np.asarray(ctrl)
     oracle = world_model(scene, fields)
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
     return scene, oracle, fields, ctrl
@@ -75,7 +74,7 @@ def test_steps_equal_mujocos(name):
     with jax.enable_x64(True):
         scene, oracle, fields, ctrl = setting(SETTINGS[name])
         engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand = world_constants(scene, jax.tree.map(lambda x: jnp.asarray(x)[None], fields))
+        hand = small.lanes(scene, jax.tree.map(lambda x: jnp.asarray(x)[None], fields))
         step, data, most = jax.jit(engine.step, compiler_options=QUICK), mujoco.MjData(oracle), 0
         data.qpos[:] = fields.start
         for k in range(420):
@@ -319,7 +318,7 @@ def test_without_contacts_a_step_is_that_of_beams_alone():
     """A separately written simulation of beams and a falling body: its numbers, and its program."""
     scene, _, fields, ctrl = setting(dict.fromkeys(CONTACTS, False))
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-    engine, hand = StructuredEngine(scene), world_constants(scene, batch)
+    engine, hand = StructuredEngine(scene), small.lanes(scene, batch)
     random, start = np.random.default_rng(0), engine.reset(batch)
     size = len(fields.start)
     qpos = fields.start + 0.1 * random.normal(size=size) * (np.arange(size) < size - 7)
@@ -423,8 +422,7 @@ def check_combination(values, shape):
         engine = make_engine(name, scene)
         if name == "mujoco":
             world, trial = (small.stack(v) for v in small.hand_world(scene))
-            fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(world, trial)
-            ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(world, trial)
+            fields, ctrl = small.batch_inputs(scene, world, trial)
             trace = engine.rollout(fields, ctrl[:, :2])
             assert np.isfinite(trace.speed).all() and np.isfinite(trace.distance).all()
         elif name == "structured" and between and (hull or full):

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from small import nth, pinch, stack, still
+from small import batch_inputs, nth, pinch, stack, still, world_inputs
 
-from codesign_jax import control, cost, model, parameters, schema
+from codesign_jax import cost, model, parameters, schema
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
@@ -43,8 +43,7 @@ class Steps:
         )
         with jax.enable_x64(True):
             params, trial = world(self.scene, HOLDING[shape], pressure=190e3)
-            self.fields = model.model_fields(self.scene, params, trial)
-            ctrl = np.asarray(control.commands(self.scene, params, trial))
+            self.fields, ctrl = jax.device_get(world_inputs(self.scene, params, trial))
             self.engine = MjxEngine(self.scene)
         compiled = world_model(self.scene, self.fields)
         data = mujoco.MjData(compiled)
@@ -141,15 +140,10 @@ def hurried():
     the_scene = pinch("sphere", **HURRIED)
     worlds = [world(the_scene, HOLDING["sphere"]) for _ in range(6)]
     worlds[OTHER] = world(the_scene, (0.11, 0.02))
-    both = jax.jit(
-        jax.vmap(
-            lambda p, t: (model.model_fields(the_scene, p, t), control.commands(the_scene, p, t))
-        )
-    )
-    good = both(*stack(*worlds))
+    good = batch_inputs(the_scene, *stack(*worlds))
     worlds[LENGTH] = world(the_scene, HOLDING["sphere"], length=jnp.nan)
     worlds[PRESSURE] = world(the_scene, HOLDING["sphere"], pressure=1e12)
-    fields, ctrl = both(*stack(*worlds))
+    fields, ctrl = batch_inputs(the_scene, *stack(*worlds))
     ctrl = ctrl.at[CONTROL, NAN_FROM:, 6].set(jnp.nan)
     # Inflated from the first step on, so that the failure is sudden.
     ctrl = ctrl.at[PRESSURE, :, 6:].set(1e12)

@@ -168,7 +168,7 @@ def test_two_devices_give_the_bits_of_one(tmp_path):
     for count in (1, 2):
         path = tmp_path / f"{count}.npz"
         paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-        flags = f"--xla_force_host_platform_device_count={count}"
+        flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
         changed = {"XLA_FLAGS": flags, "PYTHONPATH": ":".join(paths), "JAX_PLATFORMS": "cpu"}
         command = [sys.executable, "-c", TWO_DEVICES, str(path)]
         subprocess.run(command, check=True, env=os.environ | changed)

@@ -21,7 +21,7 @@ SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 
 def curled(the_scene, seed, bend, height):
     """Model, data and lanes of a hand with random joint angles about a bend, object between."""
     hand, trial = small.hand_world(the_scene, length=0.1)
-    fields = model.model_fields(the_scene, jax.tree.map(jnp.asarray, hand), trial)
+    fields, _ = small.world_inputs(the_scene, hand, trial)
     oracle = model.compile_model(the_scene, hand, trial)
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
     data, random = mujoco.MjData(oracle), np.random.default_rng(seed)

@@ -87,7 +87,7 @@ def test_velocities_are_derivatives_of_positions():
         the_scene = hull_scene()
         _, data = bent(the_scene)
         hand, trial = small.hand_world(the_scene, length=LENGTH, height=HEIGHT)
-        fields = model.model_fields(the_scene, jax.tree.map(jnp.asarray, hand), trial)
+        fields, _ = small.world_inputs(the_scene, hand, trial)
         fields = jax.tree.map(lambda x: x[None], fields)
         engine, lanes = StructuredEngine(the_scene), world_constants(the_scene, fields)
         rate = np.random.default_rng(1).normal(size=data.qvel.shape)

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from codesign_jax import control, hull, model
+from codesign_jax import hull, model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
 from tests import small
 from tests.test_structured import lanes_state
 
@@ -26,10 +25,8 @@ def world(scene, **params):
     """Parameters, trial, model fields, oracle model and commands of one hand, in float64."""
     hand, trial = small.hand_world(scene, **params)
     trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
-    params = jax.tree.map(jnp.asarray, hand)
-    fields = model.model_fields(scene, params, trial)
-    ctrl = np.asarray(control.commands(scene, params, trial))
-    return hand, trial, fields, world_model(scene, fields), ctrl
+    fields, ctrl = small.world_inputs(scene, hand, trial)
+    return hand, trial, fields, world_model(scene, fields), np.asarray(ctrl)
 
 
 class Driven:
@@ -39,7 +36,7 @@ class Driven:
         self.engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
         self.scene = scene
         self.fields = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-        self.hand, self.step = world_constants(scene, self.fields), jax.jit(self.engine.step)
+        self.hand, self.step = small.lanes(scene, self.fields), jax.jit(self.engine.step)
 
     def state(self, qpos, qvel):
         return lanes_state(self.engine, self.scene, self.fields, qpos, qvel)

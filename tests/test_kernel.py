@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import control, model
 from codesign_jax.compiler import gpu, launch, vector
 from codesign_jax.engines.structured import StructuredEngine, elimination
 from codesign_jax.engines.structured.constants import world_constants
@@ -67,8 +66,7 @@ def grasp():
     """A pinch scene, three random worlds of it and 230 steps of their controls."""
     scene = small.pinch("cylinder", links=2)
     params, trials = small.random_worlds(scene, 3, 3)
-    fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
-    ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)
+    fields, ctrl = small.batch_inputs(scene, params, trials)
     return scene, fields, ctrl[:, :230]
 
 
@@ -110,10 +108,9 @@ def test_kernel_becomes_ptx(effects, monkeypatch):
     program, engine = Program(scene, Limits(8, 8, 1e-6)), StructuredEngine(scene)
 
     def run(params, trials):
-        f = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
-        c = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :20]
+        f, c = small.batch_inputs(scene, params, trials)
         return program.simulate(
-            world_constants(scene, f), engine.reset(f), c, trajectory=bool(effects)
+            world_constants(scene, f), engine.reset(f), c[:, :20], trajectory=bool(effects)
         )
 
     with jax.enable_x64(bool(effects)):
@@ -130,8 +127,8 @@ def test_machine_code_equals_the_engine(grasp):
     scene, *_ = grasp
     with jax.enable_x64(True):
         params, trials = small.random_worlds(scene, 3, 5)
-        fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
-        ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :300]
+        fields, ctrl = small.batch_inputs(scene, params, trials)
+        ctrl = ctrl[:, :300]
         settings = dict(iterations=60, evaluations=30, tolerance=1e-18)
         got, want = (
             jax.jit(StructuredEngine(scene, kernel=kernel, **settings).rollout)(fields, ctrl)
@@ -159,8 +156,8 @@ def test_machine_code_has_the_effects(name):
     scene = small.pinch("cylinder", links=2, **EFFECTS[name])
     with jax.enable_x64(True):
         params, trials = small.random_worlds(scene, 3, 3)
-        fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(params, trials)
-        ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(params, trials)[:, :200]
+        fields, ctrl = small.batch_inputs(scene, params, trials)
+        ctrl = ctrl[:, :200]
         settings = dict(iterations=60, evaluations=30, tolerance=1e-18)
         got, want = (
             jax.jit(

@@ -1,6 +1,7 @@
 """The structured engine against MuJoCo C: one step in contact, and free motion step by step."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,16 +9,20 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import control, cost, model, rollout
+from codesign_jax import cost, rollout
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
 from tests import small
+
+
+@functools.lru_cache(maxsize=4)
+def _placing(engine):
+    return jax.jit(lambda fields, qpos, qvel: engine.place(engine.reset(fields), qpos, qvel))
 
 
 def lanes_state(engine, scene, fields, qpos, qvel):
     """The engine's state, one world, from MuJoCo's coordinates, with a cold start."""
-    return engine.place(engine.reset(fields), jnp.asarray(qpos)[None], jnp.asarray(qvel)[None])
+    return _placing(engine)(fields, jnp.asarray(qpos)[None], jnp.asarray(qvel)[None])
 
 
 def setting(shape, **params):
@@ -25,12 +30,11 @@ def setting(shape, **params):
     scene = small.pinch(shape)
     world, trial = small.hand_world(scene, **params)
     trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
-    fields = model.model_fields(scene, jax.tree.map(jnp.asarray, world), trial)
-    ctrl = np.asarray(control.commands(scene, jax.tree.map(jnp.asarray, world), trial))
+    fields, ctrl = small.world_inputs(scene, world, trial)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
     oracle = world_model(scene, fields)
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
-    return scene, oracle, np.asarray(fields.start), batch, ctrl
+    return scene, oracle, np.asarray(fields.start), batch, np.asarray(ctrl)
 
 
 @pytest.mark.parametrize("shape", small.SHAPES)
@@ -39,7 +43,7 @@ def test_accelerations_equal_mujoco_along_a_grasp(shape):
     with jax.enable_x64(True):
         scene, oracle, start, fields, ctrl = setting(shape)
         engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand, step = world_constants(scene, fields), jax.jit(engine.step)
+        hand, step = small.lanes(scene, fields), jax.jit(engine.step)
         data, touched = mujoco.MjData(oracle), 0
         data.qpos[:] = start
         for k in range(420):
@@ -66,7 +70,7 @@ def test_free_motion_equals_mujoco_step_by_step():
         scene, oracle, start, fields, ctrl = setting("box")
         oracle.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand, step = world_constants(scene, fields), jax.jit(engine.step)
+        hand, step = small.lanes(scene, fields), jax.jit(engine.step)
         data = mujoco.MjData(oracle)
         data.qpos[:] = start
         # Lift the object off the table: it falls for 20 steps without reaching it.
@@ -90,7 +94,7 @@ def test_float32_is_close_to_float64():
             dtype = jnp.float64 if wide else jnp.float32
             fields = jax.tree.map(lambda x, t=dtype: x.astype(t), fields)
             engine = StructuredEngine(scene, iterations=60, evaluations=12, tolerance=1e-10)
-            hand = world_constants(scene, fields)
+            hand = small.lanes(scene, fields)
             # The palm at 60 mm presses the straight fingers onto the table.
             qpos = np.array(start)
             qpos[2] = 0.06

@@ -78,6 +78,11 @@ def layout(scene: Scene) -> Layout:
     weights[bodies] = 1.0 / (n * links)
     weights[[*stubs, *bodies[:, -1]]] = 0.5 / (n * links)
     last = len(weights) - 1
+    # One width in every precision: JAX keeps what it made of a NumPy array, and an array of int64
+    # that was met with jax_enable_x64 is an error without.
+    stubs, bodies, dofs, spheres, shapes, palm = (
+        v.astype(np.int32) for v in (stubs, bodies, dofs, spheres, shapes, palm)
+    )
     return Layout(links, axes, stubs, bodies, last, dofs, spheres, shapes, palm, weights)
 
 

@@ -26,7 +26,7 @@ from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.types import Trace, failed
 
-SCENE = scene.load("paper")
+SCENE = scene.load("paper_spheres")
 SPACE = parameters.design_space(SCENE.hand, "2d")
 TRIALS = 6
 LIMITS = [(100, 40, 1e-9), (24, 14, 1e-4), (24, 14, 1e-5), (24, 14, 1e-6), (50, 20, 1e-6)]

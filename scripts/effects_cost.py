@@ -54,7 +54,7 @@ def main() -> None:
 
 def _measure(path: Path, parts: list[str], minutes: float, *, quick: bool) -> None:
     overrides = {"discretization": {"links": 3}} if quick else None
-    base = scene.load("paper", overrides=overrides)
+    base = scene.load("paper_spheres", overrides=overrides)
     everything = {AS_IT_IS: base, **effects.variants(base)}
     results: dict[str, Any] = {"effects": {}}
     if path.exists():

@@ -27,7 +27,7 @@ def finger_scene(links: int, timestep: float) -> scene.Scene:
         "effects": dict.fromkeys(OFF, False),
         "discretization": {"links": links, "timestep": timestep},
     }
-    loaded = scene.load("paper", overrides=overrides)
+    loaded = scene.load("paper_spheres", overrides=overrides)
     hand = dataclasses.replace(loaded.hand, finger=loaded.hand.finger[:1])
     return dataclasses.replace(loaded, hand=hand)
 

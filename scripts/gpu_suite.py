@@ -66,14 +66,14 @@ def rate(name: str, values: dict[str, Any]) -> dict[str, Any]:
     values = dict(values)
     dtype, worlds = values.pop("dtype", np.float32), values.pop("worlds", WORLDS)
     objects, whole = values.pop("objects", None), values.pop("whole", False)
-    scene = scenes.load("paper", object_set=objects, overrides=values)
+    scene = scenes.load("paper_spheres", object_set=objects, overrides=values)
     if whole:
         fields, ctrl = work.inputs(scene, work.make_worlds(scene, worlds))
         index = np.arange(worlds)
     else:
         # Start states are those of MuJoCo C, which has neither hull nor meshes: spheres' serve.
         apart = {"finger_finger": values.pop("effects", {}).get("finger_finger", False)}
-        plain = scenes.load("paper", overrides={**values, "effects": apart})
+        plain = scenes.load("paper_spheres", overrides={**values, "effects": apart})
         starts, ctrl = work.window(plain, DISTINCT, STEPS, distinct=DISTINCT)
         made, _ = work.inputs(scene, work.make_worlds(scene, DISTINCT))
         fields = made._replace(start=starts.start)

@@ -42,7 +42,7 @@ class Case:
         """Prepares scene and worlds, one a shape."""
         density = {"hull_rings": rings, "hull_points": points}
         overrides = {"effects": {"surface": "hull"}, "discretization": density}
-        self.scene = scene.load("paper", overrides=overrides)
+        self.scene = scene.load("paper_spheres", overrides=overrides)
         space = parameters.design_space(self.scene.hand, "2d")
         shapes = range(len(self.scene.objects.object))
         trials = [rollout.nominal_trial(self.scene, i) for i in shapes]

@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--commit", help="where there is no repository to ask")
     parser.add_argument("--json", type=Path, required=True)
     args = parser.parse_args()
-    the_scene = scene.load("paper")
+    the_scene = scene.load("paper_spheres")
     space = parameters.design_space(the_scene.hand)
     engine = StructuredEngine(
         the_scene, iterations=args.iterations, evaluations=args.evaluations, tolerance=1e-6

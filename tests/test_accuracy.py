@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[1]
 
 def test_the_standard_preset_is_the_scene_and_the_study_s_default():
     assert scene.load("paper", accuracy="standard") == scene.load("paper")
-    assert STANDARD.scene() == scene.load("paper")
+    assert STANDARD.scene() == scene.load("paper_spheres")
 
 
 def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():

@@ -26,7 +26,7 @@ MARKERS = {
     "several": "^",
 }
 REFUSED = "refused or failed"
-GRASP = load_scene("paper").phases.ungrasp
+GRASP = load_scene("paper_spheres").phases.ungrasp
 """Simulated time of a grasp [s]."""
 
 

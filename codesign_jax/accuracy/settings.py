@@ -95,7 +95,7 @@ class Setting:
         Raises:
           SceneError: If the scene refuses the setting.
         """
-        return scenes.load("paper", overrides=merge(self.overrides(), more or {}), **names)
+        return scenes.load("paper_spheres", overrides=merge(self.overrides(), more or {}), **names)
 
     def make(self, scene: Scene) -> Engine:
         """Builds the engine for a scene at this setting."""

@@ -109,7 +109,7 @@ def decisions(records: Records) -> Grasps:
 
     Not a number where a trial failed.
     """
-    scene, parts = load_scene("paper"), {}
+    scene, parts = load_scene("paper_spheres"), {}
     for r in measured(records, "decision"):
         cost = decision.costs(scene, r)
         each = np.split(cost, len(r["populations"]))

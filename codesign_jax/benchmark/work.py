@@ -35,7 +35,7 @@ def variant(
     spheres: int | None = None,
     solver: dict[str, Any] | None = None,
 ) -> Scene:
-    """The paper's scene with parts of it changed.
+    """The scene `paper_spheres` with parts of it changed.
 
     Args:
       hand_name: Another hand file.
@@ -47,7 +47,9 @@ def variant(
     sizes = {"links": links, "spheres_per_link": spheres}
     table = {k: v for k, v in sizes.items() if v is not None}
     chosen = scene.load(
-        "paper", hand_name=hand_name, overrides={"discretization": table, "solver": solver or {}}
+        "paper_spheres",
+        hand_name=hand_name,
+        overrides={"discretization": table, "solver": solver or {}},
     )
     return chosen if fingers is None else _with_fingers(chosen, fingers)
 

@@ -57,8 +57,12 @@ def parse() -> argparse.Namespace:
     wave.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     wave.add_argument("--after", type=Path, nargs="+", metavar="SCORES", help="earlier waves")
     wave.add_argument("--keep", type=int, default=40, help="sets to go on from at the least")
-    wave.add_argument("--like", type=Path, metavar="SCORES", help="take the sets of this wave")
-    wave.add_argument("--best", type=int, help="with --like: only the best sets")
+    wave.add_argument(
+        "--like", type=Path, metavar="SCORES", help="take the first --sets sets of this wave"
+    )
+    wave.add_argument(
+        "--best", type=int, help="with --like: only the best of its first --sets sets"
+    )
     wave.add_argument("--seed", type=int, default=0)
     wave.add_argument("--minutes", type=float, help="save and stop after this time")
     wave.add_argument("--every", type=int, help="calls between saves; by default 20 s")
@@ -92,8 +96,10 @@ def chosen_sets(args: argparse.Namespace, count: int) -> tuple[np.ndarray, str]:
         raise SceneError(["--best needs --like"])
     if args.like:
         [earlier] = files.read_scores([args.like])
-        index = score.best(earlier.data["distances"], args.best or len(earlier.data["units"]))
-        return earlier.data["units"][index], f"{len(index)} sets of {earlier.name}"
+        units = earlier.data["units"][: args.sets]
+        if args.best:
+            units = units[score.best(earlier.data["distances"][: args.sets], args.best)]
+        return units, f"{len(units)} sets of {earlier.name}"
     if args.after:
         return files.next_sets(files.read_scores(args.after), count, args.seed, args.keep)
     return sets.space_filling(count, args.seed), "a space-filling design"

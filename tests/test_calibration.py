@@ -1,5 +1,6 @@
 """History matching: sets of constants, landscapes with known regions, the filter on landscapes."""
 
+import argparse
 import dataclasses
 import importlib.util
 import itertools
@@ -485,6 +486,20 @@ def test_the_next_wave_goes_on_from_the_best(scored):
     waves = files.read_scores([folder / "one_scores.npz"])
     units, text = files.next_sets(waves, 50, seed=0, keep=4)
     assert units.shape == (50, len(sets.OPEN)) and "4 best of 12" in text
+
+
+def test_sets_of_another_wave_are_taken_in_its_order_or_the_best(scored):
+    folder, calibrate = scored
+    path = folder / "one_scores.npz"
+    [one] = files.read_scores([path])
+    ask = argparse.Namespace(after=None, like=path, best=None, sets=5, seed=0, keep=4)
+    units, _ = calibrate.chosen_sets(ask, 99)
+    np.testing.assert_array_equal(units, one.data["units"][:5])
+    ask.best = 2
+    units, text = calibrate.chosen_sets(ask, 99)
+    worst = one.data["distances"][:5].max(-1)
+    found = [int(np.argmax((one.data["units"] == u).all(1))) for u in units]
+    assert worst[found].max() <= np.sort(worst)[1] and text == "2 sets of one"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 from codesign_jax import model, rollout
 from codesign_jax.model.layout import palm_points
 from codesign_jax.objects import Shape
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Constants, Scene
 from codesign_jax.start import depth, depth_between
 from codesign_jax.types import Params
 
@@ -29,7 +29,7 @@ def overlaps(scene: Scene, designs: Params) -> np.ndarray:
     low = [lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
     if min(low) >= top:
         return np.zeros((len(shapes), len(low)))
-    return np.asarray(_depths(scene, Params(*(v.astype(np.float32) for v in designs))))
+    return np.asarray(_depths(*_arguments(scene, designs)))
 
 
 def between_fingers(scene: Scene, designs: Params) -> np.ndarray:
@@ -41,7 +41,7 @@ def between_fingers(scene: Scene, designs: Params) -> np.ndarray:
     """
     if not scene.effects.finger_finger:
         return np.zeros(designs.length.shape[0])
-    return np.asarray(_between(scene, Params(*(v.astype(np.float32) for v in designs))))
+    return np.asarray(_between(*_arguments(scene, designs)))
 
 
 def lowest_point(scene: Scene, params: Params) -> float:
@@ -95,18 +95,25 @@ def _about(axis: int, angle: float) -> np.ndarray:
     return matrix
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _between(scene: Scene, designs: Params) -> jax.Array:
-    trial = rollout.nominal_trial(scene)
-    return depth_between(scene, jax.vmap(lambda p: model.model_fields(scene, p, trial))(designs))
+def _arguments(scene: Scene, designs: Params) -> tuple[Scene, Constants, Params]:
+    """What the programs below take: scenes of one structure share them."""
+    numbers = jax.tree.map(np.float32, scene.constants())
+    return scene.structure, numbers, Params(*(v.astype(np.float32) for v in designs))
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _depths(scene: Scene, designs: Params) -> jax.Array:
+def _between(scene: Scene, numbers: Constants, designs: Params) -> jax.Array:
+    own, trial = scene.with_constants(numbers), rollout.nominal_trial(scene)
+    return depth_between(scene, jax.vmap(lambda p: model.model_fields(own, p, trial))(designs))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _depths(scene: Scene, numbers: Constants, designs: Params) -> jax.Array:
     """`start.depth` of designs with every object, shape (object, design); one program for all."""
+    own = scene.with_constants(numbers)
 
     def of_shape(index: jax.Array) -> jax.Array:
         trial = rollout.nominal_trial(scene)._replace(shape=index)
-        return depth(scene, jax.vmap(lambda p: model.model_fields(scene, p, trial))(designs))
+        return depth(scene, jax.vmap(lambda p: model.model_fields(own, p, trial))(designs))
 
     return jax.lax.map(of_shape, jnp.arange(len(scene.objects.object)))

@@ -4,8 +4,9 @@ Source: Deimel, Irmisch, Wall, Brock (2017), section VI.1 and Fig. 5; the measur
 section VI.4.  Everything here is a pure function of arrays; files and progress are the caller's.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import Info, ParticleFilter, Space, State, rejection_sample
 from codesign_jax.parameters import DesignSpace
+from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.types import Outcome, Trial
 
@@ -69,6 +71,16 @@ class FinalTest(NamedTuple):
     success: jax.Array
 
 
+@dataclasses.dataclass(frozen=True)
+class _Projection:
+    """`DesignSpace.project`, equal for equal spaces, so that their filters share programs."""
+
+    space: DesignSpace
+
+    def __call__(self, design: jax.Array) -> jax.Array:
+        return self.space.project(design)
+
+
 def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) -> ParticleFilter:
     """Returns the particle filter over a design space, by default with the paper's constants.
 
@@ -77,7 +89,7 @@ def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) 
       sigma: Standard deviation of a move as a fraction of the parameter's range.
       alpha: Cost offset of the weight 1 / (alpha + cost).
     """
-    box = Space(np.asarray(space.low), np.asarray(space.high), space.project)
+    box = Space(np.asarray(space.low), np.asarray(space.high), _Projection(space))
     return ParticleFilter(box, sigma=sigma, alpha=alpha)
 
 
@@ -93,8 +105,8 @@ def make_evaluate(
     """Returns a function (population, key) -> outcomes of shape (particle, trial); one program.
 
     All particles meet the same trials: common random numbers compare designs, not luck.  As a third
-    argument it takes `Constants` instead of the scene's, leaves of shape () or (trial,): other
-    numbers compile nothing.
+    argument it takes `Constants` instead of the scene's, leaves of shape () or (trial,): neither
+    other numbers nor another scene of the same structure compile anything, see `programs`.
 
     Args:
       scene: The scene.
@@ -104,24 +116,34 @@ def make_evaluate(
       trajectory: As in `rollout.simulate`.
       cost: As in `rollout.simulate`.
     """
+    program = Program(scene, _evaluation(scene, engine, space, num_trials, trajectory, cost))
 
-    @jax.jit
-    def simulate(population: jax.Array, key: jax.Array, constants: Constants | None) -> Outcome:
+    def evaluate(
+        population: jax.Array, key: jax.Array, constants: Constants | None = None
+    ) -> Outcome:
+        space.refuse_unit_slips(population)
+        return program(population, key, constants)
+
+    return evaluate
+
+
+@shared
+def _evaluation(
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    num_trials: int,
+    trajectory: bool,
+    cost: rollout.CostFunction | None,
+) -> Callable[..., Outcome]:
+    def simulate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
         trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
         return rollout.evaluate(
             scene, engine, hands, trials, trajectory=trajectory, cost=cost, constants=constants
         )
 
-    def evaluate(
-        population: jax.Array, key: jax.Array, constants: Constants | None = None
-    ) -> Outcome:
-        space.refuse_unit_slips(population)
-        numbers = rollout.numbers(scene, constants)
-        # Python's floats would be traced apart from arrays.
-        return simulate(population, key, jax.tree.map(lambda v: jnp.asarray(v, float), numbers))
-
-    return evaluate
+    return simulate
 
 
 def make_episode(
@@ -133,12 +155,13 @@ def make_episode(
     *,
     trajectory: bool = False,
     cost: rollout.CostFunction | None = None,
-) -> EpisodeFunction:
+) -> Program:
     """Returns the jitted function (state, mask) -> (state, info) that runs one episode.
 
-    The mask, bool of shape (parameter,), is data: every schedule shares one compile.  So are
-    `Constants` instead of the scene's, an optional third argument, leaves of shape () or (trial,)
-    but for `cost.maximum`, which is one number.  The noise of
+    The mask, bool of shape (parameter,), is data: every schedule shares one compile, and so does
+    every scene of one structure, see `programs`.  An optional third argument are `Constants`
+    instead of the scene's, leaves of shape () or (trial,) but for `cost.maximum`, which is one
+    number.  The noise of
     trial t derives from (root key, stream, episode, t), so that it depends neither on the number
     of particles nor on where a run was resumed.
 
@@ -151,19 +174,32 @@ def make_episode(
       trajectory: As in `rollout.simulate`.
       cost: As in `rollout.simulate`.
     """
+    program = _episode(scene, engine, space, num_trials, trajectory, cost)
+    return Program(scene, program, optimizer)
 
-    @jax.jit
+
+@shared
+def _episode(
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    num_trials: int,
+    trajectory: bool,
+    cost: rollout.CostFunction | None,
+) -> EpisodeFunction:
     def episode(
-        state: State, mask: jax.typing.ArrayLike, constants: Constants | None = None
+        state: State,
+        mask: jax.typing.ArrayLike,
+        constants: Constants,
+        optimizer: ParticleFilter,
     ) -> tuple[State, EpisodeInfo]:
         population = optimizer.ask(state, mask)
-        numbers = rollout.numbers(scene, constants)
-        noise = episode_trials(scene, state.key, state.episode, num_trials, constants=numbers)
+        noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
         trials, last = rollout.evaluate_to_end(
-            scene, engine, hands, noise, trajectory=trajectory, cost=cost, constants=numbers
+            scene, engine, hands, noise, trajectory=trajectory, cost=cost, constants=constants
         )
-        costs = particle_cost(scene.with_constants(numbers), trials)
+        costs = particle_cost(scene.with_constants(constants), trials)
         new, selection = optimizer.tell(state, population, costs)
         return new, EpisodeInfo(population, trials, selection, last)
 
@@ -179,7 +215,7 @@ def make_run(
     *,
     trajectory: bool = False,
     cost: rollout.CostFunction | None = None,
-) -> EpisodeFunction:
+) -> Program:
     """Returns the jitted function (state, masks, constants) -> (state, info) of a whole run.
 
     The loop over the episodes is a `jax.lax.scan`: the same numbers as a loop in Python over
@@ -197,15 +233,22 @@ def make_run(
       trajectory: As in `rollout.simulate`.
       cost: As in `rollout.simulate`.
     """
-    episode = make_episode(
-        scene, engine, space, optimizer, num_trials, trajectory=trajectory, cost=cost
-    )
+    return Program(scene, _run(scene, engine, space, num_trials, trajectory, cost), optimizer)
 
-    @jax.jit
+
+@shared
+def _run(scene: Scene, *how: Any) -> EpisodeFunction:
+    episode = _episode(scene, *how)
+
     def run(
-        state: State, masks: jax.typing.ArrayLike, constants: Constants | None = None
+        state: State,
+        masks: jax.typing.ArrayLike,
+        constants: Constants,
+        optimizer: ParticleFilter,
     ) -> tuple[State, EpisodeInfo]:
-        return jax.lax.scan(lambda s, m: episode(s, m, constants), state, jnp.asarray(masks))
+        return jax.lax.scan(
+            lambda s, m: episode(s, m, constants, optimizer), state, jnp.asarray(masks)
+        )
 
     return run
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import schema
-from codesign_jax.hand import PARAMETERS, UNITS, Hand, Parameter, Preset
+from codesign_jax.hand import PARAMETERS, UNITS, Hand, Parameter, Preset, structure
 from codesign_jax.types import Params
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
@@ -25,7 +25,8 @@ class DesignSpace:
     """The free parameters of a preset and how they fill the full vector.
 
     Attributes:
-      hand: The hand.
+      hand: The hand's parameter table and pressure limit, without its other numbers: hands that
+        differ in those have equal spaces.
       names: Names of the free parameters, e.g. "length[2]" or "length" where tied.
       units: Units in which the hand file states them.
       scale: Factor from that unit to SI, shape (parameter,).
@@ -124,6 +125,12 @@ class DesignSpace:
         return np.asarray(design, float) * np.asarray(self.scale)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def params_of(space: DesignSpace, designs: np.typing.ArrayLike) -> Params:
+    """Named parameters of designs [SI], shape (design, parameter); one program a space."""
+    return jax.vmap(space.params)(designs)
+
+
 def unflatten(hand: Hand, full: jax.Array) -> Params:
     """Splits a full vector [SI], shape (full,), into named parameters."""
     n, offsets = len(hand.finger), _offsets(hand)
@@ -189,7 +196,15 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
             columns.append((name, row.unit, factor, low * factor, high * factor, morphology))
     names, units, scale, low, high, domain = zip(*columns, strict=True)
     return DesignSpace(
-        hand, names, units, scale, low, high, domain, tuple(base), tuple(source.tolist())
+        _table_alone(hand),
+        names,
+        units,
+        scale,
+        low,
+        high,
+        domain,
+        tuple(base),
+        tuple(source.tolist()),
     )
 
 
@@ -221,6 +236,14 @@ def _slips(name: str, row: str, values: np.ndarray) -> list[str]:
             problem = schema.range_problem(name, float(value), kind.unit, kind.low, kind.high)
             return [f"{problem}; Python takes SI units and radians"]
     return []
+
+
+def _table_alone(hand: Hand) -> Hand:
+    return dataclasses.replace(
+        structure(schema.typical(hand)),
+        parameter=hand.parameter,
+        pressure_limit=hand.pressure_limit,
+    )
 
 
 def _width(hand: Hand, row: Parameter) -> int:

@@ -125,14 +125,15 @@ class Solver:
 
     Largest numbers of Newton iterations and of line-search iterations, and MuJoCo's tolerance: the
     improvement or gradient of the cost, scaled by the model's inertia.  The engine `structured`
-    measures convergence otherwise: see `Newton`.
+    measures convergence otherwise, see `Newton`, and refuses other values than a preset's where
+    `[newton]` is not set as well.
 
     The tolerance must not be zero: MuJoCo's line search may then return no step at all.
     """
 
-    iterations: int = quantity("", 1, 1000, structure=True)
-    ls_iterations: int = quantity("", 1, 1000, structure=True)
-    tolerance: float = quantity("", 1e-16, 1, structure=True)
+    iterations: int = quantity("", 1, 1000, structure=True, default=30)
+    ls_iterations: int = quantity("", 1, 1000, structure=True, default=20)
+    tolerance: float = quantity("", 1e-16, 1, structure=True, default=1e-8)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -64,7 +64,7 @@ def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
 
 def test_the_command_line_takes_a_preset(capsys):
     found, _ = optimize.resolve(
-        cli.Optimize(accuracy="fast", overrides=(("solver.iterations=7",),))
+        cli.Optimize(accuracy="fast", engine="mujoco", overrides=(("solver.iterations=7",),))
     )
     assert found.discretization == scene.Discretization(0.01, 5, 2)
     assert found.solver.iterations == 7

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from toy import TINY
@@ -117,6 +118,33 @@ def test_run_folder_is_complete(finished):
     assert provenance["settings"]["seed"] == 3
     assert set(provenance["environment"]["versions"]) >= {"jax", "mujoco", "codesign-jax"}
     assert len((finished / "episodes.csv").read_text().splitlines()) == EPISODES + 1
+
+
+def test_another_hand_compiles_nothing(finished, tmp_path):
+    """Neither a run nor an evaluation, once a hand of the same structure was simulated."""
+    text = (TINY.parent / "pinch.toml").read_text()
+    softer = text.replace("56e3", "53e3").replace("density = 1070.0", "density = 1100.0")
+    (tmp_path / "softer.toml").write_text(softer)
+    run = [*RUN, "--episodes", "2", "--out", tmp_path / "run"]
+    evaluate = ["evaluate", "--scene", TINY, "--engine", "mujoco", "--trials", "1"]
+    assert command(*evaluate) == 0
+    compiled = []
+
+    def listen(event, seconds, **details):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(details)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for arguments in (run, evaluate):
+            assert command(*arguments, "--hand", tmp_path / "softer.toml") == 0
+        assert not compiled
+        # One more trial is another program: what the count would have seen.
+        assert command(*evaluate[:-1], "2") == 0
+        assert compiled
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert stored(tmp_path / "run") != stored(finished)
 
 
 def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
@@ -280,6 +308,10 @@ WRONG = {
     "seeds backwards": (["--seeds", "9-0"], ["must be seeds such as"]),
     "too many seeds": (["--seeds", "0-99999"], ["names more than 1000 runs"]),
     "seed and seeds": (["--seeds", "0-1", "--seed", "1"], ["--seed and --seeds exclude"]),
+    "MuJoCo's solver": (
+        ["--set", "solver.tolerance=1e-9", "--set", "gravity=1000"],
+        ["engine structured: --set solver.tolerance=1e-09", "newton.decrement", "gravity = 1000"],
+    ),
     "no value": (["--set", "gravity"], ["--set 'gravity' must be KEY=VALUE"]),
     "all at once": (
         [
@@ -446,6 +478,7 @@ def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsy
         (["--design", "length"], "must be a number in mm"),
         (["--trials", "0"], "--trials = 0 is outside"),
         (["--engine", "c"], "--engine"),
+        (["--set", "solver.iterations=50"], "set newton.iterations, which limits the solver"),
         (["--render", "grasp.mp4"], "must end in .gif"),
         (["--run", "nowhere"], "nowhere is not a run folder"),
         (["--run", "nowhere", "--design", "length=100"], "own; leave out --design"),

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from small import batch_inputs, nth, pinch, stack, still, world_inputs
 
-from codesign_jax import cost, model, parameters, schema
-from codesign_jax.engines import make_engine
+from codesign_jax import cost, model, parameters, scene, schema
+from codesign_jax.engines import make_engine, solver_problems
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.types import Status
@@ -290,3 +290,16 @@ def test_batches_do_not_depend_on_order_or_size(hurried):
 def test_unknown_engine_names_the_nearest():
     with pytest.raises(schema.SceneError, match="did you mean 'mujoco'"):
         make_engine("mujocco", pinch())
+
+
+def test_mujocos_solver_table_is_refused_where_it_has_no_effect():
+    """Unless a preset wrote it, or [newton] is set as well: then the scene serves all engines."""
+    with pytest.raises(schema.SceneError) as error:
+        make_engine("structured", pinch(solver__iterations=31, solver__tolerance=1e-9))
+    iterations, tolerance = error.value.problems
+    assert "solver.iterations = 31" in iterations and "set newton.iterations" in iterations
+    assert "solver.tolerance = 1e-09" in tolerance and "set newton.decrement" in tolerance
+    make_engine("mujoco", pinch(solver__iterations=31))
+    make_engine("structured", pinch(solver__iterations=31, newton__iterations=30))
+    assert not solver_problems(scene.load("paper", accuracy="reference"))
+    assert not solver_problems(scene.load("paper"))

@@ -6,8 +6,17 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 
-from codesign_jax import codesign, files, preflight, schema, statistics, types
-from codesign_jax.parameters import DesignSpace
+from codesign_jax import (
+    codesign,
+    engines,
+    files,
+    keypaths,
+    preflight,
+    schema,
+    statistics,
+    types,
+)
+from codesign_jax.parameters import DesignSpace, params_of
 from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
 
@@ -57,6 +66,25 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
     return np.clip(space.from_units(np.array(list(values.values()))), space.low, space.high)
 
 
+def solver_problems(pairs: Sequence[str], engine: str) -> list[str]:
+    """Refuses values of the [solver] table given to an engine that does not read it.
+
+    Args:
+      pairs: Values as KEY=VALUE.
+      engine: The engine's name.
+
+    Raises:
+      SceneError: If a pair is not KEY=VALUE.
+    """
+    if engine != "structured":
+        return []
+    given = {path: value for path, value in keypaths.parse(pairs).items() if path[0] == "solver"}
+    return [
+        engines.solver_problem(f"--set {'.'.join(path)}={value}", path[1] if path[1:] else "")
+        for path, value in given.items()
+    ]
+
+
 def mesh_notes(scene: Scene) -> list[str]:
     """What a user should know about the scene's meshes: their repairs and their distances' errors.
 
@@ -89,7 +117,7 @@ def preflight_notes(
       SceneError: If a design must not be simulated.
     """
     stacked = np.array([*designs.values()], np.float32)
-    params = jax.jit(jax.vmap(space.params))(stacked)
+    params = params_of(space, stacked)
     report = preflight.check(scene, params, [*designs])
     if report.refusals:
         raise SceneError(report.refusals)

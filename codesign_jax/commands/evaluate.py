@@ -67,6 +67,7 @@ def _check(options: "Evaluate", engine: str) -> None:
         )
     if options.render and options.render.suffix not in (".gif", ".png"):
         problems.append(f"--render {options.render} must end in .gif or .png")
+    problems += common.solver_problems([*chain.from_iterable(options.overrides)], engine)
     if problems:
         raise SceneError(problems)
 

@@ -78,6 +78,9 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     """
     problems, scene = [], None
     try:
+        problems += common.solver_problems(
+            [*chain.from_iterable(options.overrides)], options.engine or engines.DEFAULT
+        )
         scene = scenes.load(
             options.scene,
             hand_name=options.hand,
@@ -124,7 +127,7 @@ def _preflight(scene: Scene, settings: Settings) -> list[str]:
     space = design_space(scene.hand, settings.preset)
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}
     stacked = np.array([*ends.values()], np.float32)
-    projected = np.asarray(jax.jit(jax.vmap(space.project))(stacked))
+    projected = np.asarray(jax.vmap(space.project)(stacked))
     names = [f"design of the space's {n}" for n in ends]
     return common.preflight_notes(scene, space, dict(zip(names, projected, strict=True)))
 

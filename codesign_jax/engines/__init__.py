@@ -1,8 +1,10 @@
 """Engines by name; each advances batches of worlds behind the interface in `base`."""
 
-from codesign_jax import schema
+import functools
+
+from codesign_jax import files, schema
 from codesign_jax.engines.base import Engine
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Newton, Scene, Solver, load_accuracy
 
 NAMES = ("structured", "mujoco", "mjx")
 DEFAULT = "structured"
@@ -16,7 +18,8 @@ def make_engine(name: str, scene: Scene) -> Engine:
       scene: The scene.
 
     Raises:
-      SceneError: if there is no such engine.
+      SceneError: If there is no such engine, or it does not do what the scene asks for: effects,
+        meshes, or a [solver] table that it does not read, see `solver_problems`.
     """
     if name == "mjx":
         from codesign_jax.engines.mjx import MjxEngine
@@ -29,8 +32,54 @@ def make_engine(name: str, scene: Scene) -> Engine:
     if name == "structured":
         from codesign_jax.engines.structured import StructuredEngine
 
+        if problems := solver_problems(scene):
+            raise schema.SceneError(problems)
         return StructuredEngine(scene)
     raise schema.SceneError([f"engine {name!r} unknown; {schema.nearest(name, NAMES)}"])
 
 
-__all__ = ["DEFAULT", "NAMES", "Engine", "make_engine"]
+_INSTEAD = {"iterations": "iterations", "ls_iterations": "evaluations", "tolerance": "decrement"}
+"""Key of the [newton] table for each key of [solver]; tolerances are measured otherwise."""
+
+
+def solver_problems(scene: Scene) -> list[str]:
+    """Why engine structured must not simulate a scene: its own limits of [solver] have no effect.
+
+    MuJoCo's [solver] table stands beside structured's [newton]. Values that no preset of accuracy
+    has were written by somebody who wants them to act; with a [newton] table of its own as well the
+    scene is one for all engines.
+
+    Args:
+      scene: The scene.
+    """
+    if scene.newton != Newton() or scene.solver in _usual_solvers():
+        return []
+    return [
+        solver_problem(f"solver.{key} = {getattr(scene.solver, key):g}", key)
+        for key in _INSTEAD
+        if getattr(scene.solver, key) != getattr(Solver(), key)
+    ]
+
+
+def solver_problem(given: str, key: str = "") -> str:
+    """Says that a value of the [solver] table has no effect in engine structured.
+
+    Args:
+      given: The value, as the user gave it.
+      key: Its key in the table; none names the table as a whole.
+    """
+    instead = f"newton.{_INSTEAD[key]}" if key in _INSTEAD else "the table [newton]"
+    return (
+        f"not supported by engine structured: {given} (MuJoCo's own solver); set {instead}, which "
+        "limits the solver of engine structured, or use engine mujoco or mjx"
+    )
+
+
+@functools.cache
+def _usual_solvers() -> tuple[Solver, ...]:
+    """The defaults and what the presets of accuracy set, each with its [newton] table."""
+    presets = (load_accuracy(name).solver for name in files.available("accuracy"))
+    return Solver(), *(Solver(**values) for values in presets)
+
+
+__all__ = ["DEFAULT", "NAMES", "Engine", "make_engine", "solver_problem", "solver_problems"]

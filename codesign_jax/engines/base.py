@@ -13,6 +13,9 @@ from codesign_jax.types import Trace
 class Engine(Protocol):
     """Steps batches of worlds; engines solve the same discrete equations and differ in how.
 
+    An engine serves every scene of the structure of its own. Engines that are equal, as two of one
+    kind with the same settings, for scenes of one structure, share compiled programs.
+
     Attributes:
       name: Name on the command line and in results.
     """
@@ -33,6 +36,21 @@ class Engine(Protocol):
           shows of worlds that are decided before the end.
         """
         ...
+
+
+class Equal:
+    """Equality and hash of engines by their kind and what `_key` returns."""
+
+    def _key(self) -> tuple:
+        raise NotImplementedError
+
+    def __eq__(self, other: object) -> bool:
+        """Whether the other engine runs the same program."""
+        return type(self) is type(other) and self._key() == other._key()  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        """As equality asks for."""
+        return hash((type(self), self._key()))
 
 
 def refuse_meshes(scene: Scene, engine: str) -> None:

@@ -13,7 +13,7 @@ with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
 from codesign_jax import effects, verdict
-from codesign_jax.engines.base import refuse_meshes
+from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
@@ -29,7 +29,7 @@ class _Carry(NamedTuple):
     alive: jax.Array
 
 
-class MjxEngine:
+class MjxEngine(Equal):
     """Steps every world with `mjx.step` under vmap and scan."""
 
     name = "mjx"
@@ -41,6 +41,9 @@ class MjxEngine:
         self.scene = scene
         self.template = mjx.put_model(compile_template(scene))
         self.data = mjx.make_data(self.template)
+
+    def _key(self) -> tuple:
+        return self.scene.structure, self.data.qpos.dtype
 
     def model(self, fields: ModelFields) -> mjx.Model:
         """Returns the template with the fields of one world."""

@@ -8,7 +8,7 @@ import mujoco.batch
 import numpy as np
 
 from codesign_jax import effects, verdict
-from codesign_jax.engines.base import refuse_meshes
+from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status, Trace
@@ -20,7 +20,7 @@ _TIME = int(mujoco.mjtState.mjSTATE_TIME)
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
-class MujocoEngine:
+class MujocoEngine(Equal):
     """Runs worlds with MuJoCo C, whatever the float type of the caller.
 
     Worlds that are decided, see `verdict`, are not simulated further.
@@ -42,6 +42,9 @@ class MujocoEngine:
         self.num_threads = num_threads
         self._batches: dict[int, mujoco.batch.Batch] = {}
         self._lock = threading.Lock()  # a Batch must not be used from several threads
+
+    def _key(self) -> tuple:
+        return self.scene.structure, self.num_threads
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`."""

@@ -228,7 +228,7 @@ class _Loop:
         )
         state = plan.optimizer.init(plan.key, np.array(plan.space.low), n)  # for its shapes
         with self.progress.busy("compiling") as watch:
-            compiled = self.interrupts.call(lambda: episode.lower(state, plan.mask[0]).compile())  # type: ignore[attr-defined]
+            compiled = self.interrupts.call(episode.compile, state, plan.mask[0])
         self.timing = Timing(watch.seconds)
         self._say(f"compiled in {watch.seconds:.1f} s (engine {plan.engine.name})")
         plan.compiled["episode"] = compiled

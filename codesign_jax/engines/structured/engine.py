@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from codesign_jax import effects, verdict
 from codesign_jax.compiler import launch
+from codesign_jax.engines.base import Equal
 from codesign_jax.engines.structured import (
     collision,
     finger_pairs,
@@ -50,7 +51,7 @@ class StepInfo(NamedTuple):
     overflow: jax.Array | None = None
 
 
-class StructuredEngine:
+class StructuredEngine(Equal):
     """Newton on MuJoCo's own problem by elimination along the fingers; cost linear in the links."""
 
     name = "structured"
@@ -93,6 +94,10 @@ class StructuredEngine:
         self.demanded = bool(kernel)
         wanted = kernel is not False
         self.kernel = wanted and _has_kernel(self.demanded)
+
+    def _key(self) -> tuple:
+        limits = self.iterations, self.tolerance, self.evaluations, self.kernel_evaluations
+        return self.scene.structure, limits, self.kernel, self.demanded
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""

@@ -1,0 +1,79 @@
+"""Jitted programs that every scene of one structure shares within a process.
+
+A program takes the scene's numbers (`Scene.constants`) and the particle filter as arguments, so
+that neither JAX nor XLA sees what hand, objects or bounds they come from: another file of the same
+structure traces and compiles nothing, and a new process finds the program in JAX's cache on disk.
+"""
+
+import functools
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax import rollout
+from codesign_jax.engines import Engine
+from codesign_jax.parameters import DesignSpace
+from codesign_jax.scene import Constants, Scene
+
+_KEPT = 32
+"""Programs of each kind that are kept for the next scene of their structure."""
+
+
+class Program:
+    """A jitted function of two arguments that gets a scene's numbers, or others, as its third.
+
+    `jax.jit`, `jax.vmap` and so on work on it as on a function.
+    """
+
+    def __init__(self, scene: Scene, jitted: Any, *more: Any):
+        """Joins a program with what a scene passes to it.
+
+        Args:
+          scene: The scene whose numbers are the default.
+          jitted: Function of the two arguments, the constants and `more`.
+          *more: Further arguments, the same in every call.
+        """
+        self._scene, self._jitted, self._more = scene, jitted, more
+
+    def __call__(self, first: Any, second: Any, constants: Constants | None = None) -> Any:
+        """Calls the program; `constants` are checked and replace the scene's.
+
+        Raises:
+          SceneError: If the constants do not fit the scene, see `constants.check`.
+        """
+        return self._jitted(first, second, self._numbers(constants), *self._more)
+
+    def compile(self, first: Any, second: Any) -> Callable[..., Any]:
+        """Compiles the program ahead for arguments like these; a function to call it by."""
+        numbers = self._numbers(None)
+        compiled = self._jitted.lower(first, second, numbers, *self._more).compile()
+        return lambda first, second: compiled(first, second, numbers, *self._more)
+
+    def _numbers(self, constants: Constants | None) -> Constants:
+        numbers = rollout.numbers(self._scene, constants)
+        # Python's floats would be traced apart from arrays.
+        return jax.tree.map(lambda v: jnp.asarray(v, float), numbers)
+
+
+def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
+    """Jits what `build` returns once for each structure, engine, design space and further argument.
+
+    Args:
+      build: Function (scene, engine, space, *arguments) that returns a function to jit, which reads
+        numbers from its constants alone; the last argument is a cost of one's own or None.
+    """
+    jitted = lambda *arguments: jax.jit(build(*arguments))  # noqa: E731
+    kept = functools.lru_cache(maxsize=_KEPT)(jitted)
+
+    @functools.wraps(build)
+    def find(scene: Scene, engine: Engine, space: DesignSpace, *arguments: Any) -> Callable:
+        if arguments[-1] is not None:
+            # A cost of one's own may read names and whatever else is no number of the scene.
+            return jitted(scene, engine, space, *arguments)
+        if not isinstance(engine, Hashable):
+            return jitted(scene.structure, engine, space, *arguments)
+        return kept(scene.structure, engine, space, *arguments)
+
+    return find

@@ -175,7 +175,7 @@ def make_episode(
       cost: As in `rollout.simulate`.
     """
     program = _episode(scene, engine, space, num_trials, trajectory, cost)
-    return Program(scene, program, optimizer)
+    return Program(scene, program, optimizer, np.int32(0))
 
 
 @shared
@@ -192,7 +192,11 @@ def _episode(
         mask: jax.typing.ArrayLike,
         constants: Constants,
         optimizer: ParticleFilter,
+        count: jax.typing.ArrayLike,
     ) -> tuple[State, EpisodeInfo]:
+        # A choice that XLA cannot make ahead: what depends on the numbers alone would be computed
+        # before a loop over episodes, fused and so rounded in another way than in an episode alone.
+        constants = jax.tree.map(lambda v: jnp.where(count >= 0, v, jnp.nan), constants)
         population = optimizer.ask(state, mask)
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
@@ -246,9 +250,11 @@ def _run(scene: Scene, *how: Any) -> EpisodeFunction:
         constants: Constants,
         optimizer: ParticleFilter,
     ) -> tuple[State, EpisodeInfo]:
-        return jax.lax.scan(
-            lambda s, m: episode(s, m, constants, optimizer), state, jnp.asarray(masks)
-        )
+        def one(state: State, x: tuple) -> tuple[State, EpisodeInfo]:
+            return episode(state, x[0], constants, optimizer, x[1])
+
+        masks = jnp.asarray(masks)
+        return jax.lax.scan(one, state, (masks, jnp.arange(masks.shape[0], dtype=jnp.int32)))
 
     return run
 

@@ -91,7 +91,9 @@ def batch_axes(constants: Constants) -> Constants:
 
 
 def with_trial(scene: Scene, trial: Trial) -> Scene:
-    """The scene with a trial's factors on its numbers: friction of all contacts, shear modulus.
+    """The scene with a trial's factors on its numbers.
+
+    Those are the friction of all contacts, the shear modulus and the masses of fingers and palm.
 
     Args:
       scene: The scene.
@@ -99,19 +101,24 @@ def with_trial(scene: Scene, trial: Trial) -> Scene:
     """
     c = scene.constants()
     if trial.stiffness is not None:
-        material = c.hand.material
-        softer = material._replace(shear_modulus=material.shear_modulus * trial.stiffness)
-        c = c._replace(hand=c.hand._replace(material=softer))
+        material = _scaled(c.hand.material, trial.stiffness, "shear_modulus")
+        c = c._replace(hand=c.hand._replace(material=material))
+    if trial.hand_mass is not None:
+        material = _scaled(c.hand.material, trial.hand_mass, "density")
+        palm = _scaled(c.hand.palm, trial.hand_mass, "mass")
+        c = c._replace(hand=c.hand._replace(material=material, palm=palm))
     if trial.friction is not None:
         c = _with_friction(c, trial.friction)
     return scene.with_constants(c)
 
 
 def _with_friction(c: Constants, factor: Any) -> Constants:
-    def scaled(table: Any, *names: str) -> Any:
-        return table._replace(**{name: factor * getattr(table, name) for name in names})
+    shapes = tuple(_scaled(shape, factor, "friction") for shape in c.objects.object)
+    table = _scaled(c.objects.table, factor, "friction")
+    names = "finger_table_friction", "finger_finger_friction"
+    contact = _scaled(c.contact, factor, *names)
+    return c._replace(objects=c.objects._replace(object=shapes, table=table), contact=contact)
 
-    shapes = tuple(scaled(shape, "friction") for shape in c.objects.object)
-    objects = c.objects._replace(object=shapes, table=scaled(c.objects.table, "friction"))
-    contact = scaled(c.contact, "finger_table_friction", "finger_finger_friction")
-    return c._replace(objects=objects, contact=contact)
+
+def _scaled(table: Any, factor: Any, *names: str) -> Any:
+    return table._replace(**{name: factor * getattr(table, name) for name in names})

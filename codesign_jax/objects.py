@@ -21,7 +21,8 @@ class Noise:
     """Standard deviations of a trial's Gaussian noise; z is a draw of the standard normal.
 
     Mass and size of the object have factors 1 + sigma z, which the upper bounds keep positive.  The
-    friction of all contacts and the shear modulus of the fingers have factors exp(sigma z) [ours].
+    friction of all contacts, the shear modulus of the fingers and the masses of fingers and palm
+    have factors exp(sigma z) [ours].
     """
 
     position: float = quantity("m", 0, 0.1)
@@ -30,6 +31,7 @@ class Noise:
     size: float = quantity("", 0, 0.15)
     friction: float = quantity("", 0, 1, default=0.0)
     stiffness: float = quantity("", 0, 1, default=0.0)
+    hand_mass: float = quantity("", 0, 1, default=0.0)
 
 
 @dataclasses.dataclass(frozen=True)

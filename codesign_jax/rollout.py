@@ -24,7 +24,7 @@ with that.  A cost that reads the trace behind the loss of the object needs the 
 """
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
-_LATER = 1
+_LATER, _HAND_MASS = 1, 2
 
 
 def sample_trials(
@@ -49,6 +49,7 @@ def sample_trials(
         own = jax.random.fold_in(key, t)
         z = jax.random.normal(own, (7,))
         later = jax.random.normal(jax.random.fold_in(own, _LATER), (2,))
+        hand_mass = jax.random.normal(jax.random.fold_in(own, _HAND_MASS))
         angles = jnp.deg2rad(noise.orientation) * z[2:5]
         return Trial(
             shape=t % len(scene.objects.object),
@@ -59,6 +60,7 @@ def sample_trials(
             size=1.0 + noise.size * z[6],
             friction=jnp.exp(noise.friction * later[0]),
             stiffness=jnp.exp(noise.stiffness * later[1]),
+            hand_mass=jnp.exp(noise.hand_mass * hand_mass),
         )
 
     return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(index, noises)
@@ -88,7 +90,7 @@ def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
         raise schema.SceneError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
     index = names.index(shape) if isinstance(shape, str) else shape
     zero, one = jnp.zeros(()), jnp.ones(())
-    return Trial(jnp.int32(index), jnp.zeros(2), zero, jnp.zeros(2), one, one, one, one)
+    return Trial(jnp.int32(index), jnp.zeros(2), zero, jnp.zeros(2), one, one, one, one, one)
 
 
 def simulate(

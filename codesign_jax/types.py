@@ -83,6 +83,7 @@ class Trial(NamedTuple):
       size: Factor on the object's size, shape ().
       friction: Factor on the friction of all contacts, shape (); None for 1.
       stiffness: Factor on the fingers' shear modulus, shape (); None for 1.
+      hand_mass: Factor on the masses of fingers and palm, shape (); None for 1.
     """
 
     shape: jax.Array
@@ -93,6 +94,7 @@ class Trial(NamedTuple):
     size: jax.Array
     friction: jax.Array | None = None
     stiffness: jax.Array | None = None
+    hand_mass: jax.Array | None = None
 
 
 class Trace(NamedTuple):

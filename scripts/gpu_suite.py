@@ -2,16 +2,21 @@
 
 python scripts/gpu_suite.py --json docs/data/gpu_suite_h200.json
 
-A change of the kernel counts as done for GPUs when this ran with it on one.
+A change of the kernel counts as done for GPUs when this ran with it on one.  Nearly all of the time
+is compiling, on the host's cores: every rate and every test has a process that compiles by itself,
+rates wait for their turn, and the GPU is given to one rate after the other once no test runs.  The
+file is written again after each test and each rate, so that what was found before an interruption
+is kept.
 """
 
 import argparse
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 import time
-import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +42,19 @@ RATES |= {
     for name in ("spheres", "hull", "hull and fingers", "household meshes")
 }
 WORLDS, STEPS, DISTINCT = 16384, 50, 24
+REPETITIONS, ENOUGH_SECONDS = 5, 2.0
+"""Runs of a rate, fewer if they have taken long enough together: they differ by about 1 %."""
+LIMIT_SECONDS = 240
+"""Wait for one rate: the longest takes 20 s, but a first one may still be compiling."""
 
 
 class Recorder:
     """Remembers how each test ended."""
 
-    def __init__(self) -> None:
-        """Starts empty."""
+    def __init__(self, write: Callable[[], None]) -> None:
+        """Starts empty; `write` is called after each test."""
         self.tests: dict[str, dict[str, Any]] = {}
+        self._write = write
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Called by pytest for each phase of a test."""
@@ -53,15 +63,17 @@ class Recorder:
                 "outcome": report.outcome,
                 "seconds": round(report.duration, 2),
             }
+            self._write()
 
 
-def rate(name: str, values: dict[str, Any]) -> dict[str, Any]:
+def rate(name: str, values: dict[str, Any], wait: Callable[[], Any]) -> dict[str, Any]:
     """World-steps a second of short rollouts in contact, or of whole grasps.
 
     Args:
       name: Name of the case.
       values: Its overrides of the scene, object set, dtype, number of worlds, whether grasps are
         whole.
+      wait: Called when everything is compiled; returns when the GPU is free.
     """
     values = dict(values)
     dtype, worlds = values.pop("dtype", np.float32), values.pop("worlds", WORLDS)
@@ -84,26 +96,60 @@ def rate(name: str, values: dict[str, Any]) -> dict[str, Any]:
     begin = time.perf_counter()
     compiled = run.lower(fields, ctrl).compile()
     built = time.perf_counter() - begin
+    wait()
     jax.block_until_ready(compiled(fields, ctrl))
-    times = []
-    for _ in range(5):
+    times: list[float] = []
+    while len(times) < REPETITIONS and sum(times) < ENOUGH_SECONDS:
         begin = time.perf_counter()
         jax.block_until_ready(compiled(fields, ctrl))
         times.append(time.perf_counter() - begin)
     median = float(np.median(times))
     steps = ctrl.shape[1]
     found = {"case": name, "worlds": worlds, "steps": steps, "median_s": median}
-    return {**found, "compile_s": round(built, 2), "world_steps_per_s": worlds * steps / median}
+    found |= {"repetitions": len(times), "compile_s": round(built, 2)}
+    return found | {"world_steps_per_s": worlds * steps / median}
 
 
-def in_a_process_of_its_own(name: str) -> dict[str, Any]:
-    """The rate of a case in float64, which is a setting of the whole process."""
-    environment = {"JAX_ENABLE_X64": "1", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    command = [sys.executable, __file__, "--case", name]
-    done = subprocess.run(
-        command, env={**os.environ, **environment}, stdout=subprocess.PIPE, text=True, check=True
-    )
-    return json.loads(done.stdout.splitlines()[-1])
+class Rate:
+    """A process that measures one case: it compiles at once, and runs when told to."""
+
+    def __init__(self, name: str, worlds: int | None):
+        """Starts the process."""
+        double = RATES[name].get("dtype") == np.float64
+        environment = {**os.environ, "JAX_ENABLE_X64": str(int(double))}
+        command = [sys.executable, __file__, "--case", name]
+        command += ["--worlds", str(worlds)] if worlds else []
+        self.name = name
+        self._process = subprocess.Popen(
+            command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def measure(self) -> dict[str, Any]:
+        """Lets it run, and waits for the rate."""
+        try:
+            output, _ = self._process.communicate("run\n", timeout=LIMIT_SECONDS)
+        except subprocess.TimeoutExpired:
+            self.stop()
+            return {"case": self.name, "failed": f"no rate in {LIMIT_SECONDS} s"}
+        if status := self._process.returncode:
+            return {"case": self.name, "failed": f"exit status {status}, see its messages"}
+        return json.loads(output.splitlines()[-1])
+
+    def stop(self) -> None:
+        """Ends the process."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def run_tests(recorder: Recorder, processes: int) -> int:
+    """Runs the tests that need a GPU, several at once; pytest's exit status."""
+    # Only files with such tests, so that the others' dependencies need not be there.
+    paths = sorted(Path("tests").glob("test_*.py"))
+    files = [str(p) for p in paths if "pytest.mark.gpu" in p.read_text(encoding="utf-8")]
+    options = ["-m", "gpu", "-q", "-p", "no:cacheprovider", *files]
+    if processes > 1 and importlib.util.find_spec("xdist"):
+        options += ["-n", str(processes), "--dist", "worksteal"]
+    return int(pytest.main(options, plugins=[recorder]))
 
 
 def main() -> int:
@@ -112,39 +158,50 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--json", type=Path, default=Path("runs/gpu_suite.json"))
-    parser.add_argument("--case", choices=RATES, help="print the rate of one case, nothing else")
+    parser.add_argument("--case", choices=RATES, help="measure one case when a line is entered")
+    parser.add_argument("--rates", nargs="*", choices=RATES, default=[*RATES], metavar="CASE")
+    parser.add_argument("--worlds", type=int, help="worlds of every rate, to try the suite itself")
+    parser.add_argument("--processes", type=int, default=12, help="tests that run at once")
     parser.add_argument("--commit", help="commit of the code, for a machine without its repository")
     parser.add_argument(
         "--parts", nargs="+", choices=("rates", "tests"), default=["rates", "tests"]
     )
     arguments = parser.parse_args()
+    # Many processes share the GPU's memory.
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     if arguments.case:
-        print(json.dumps(rate(arguments.case, RATES[arguments.case])))
+        values = dict(RATES[arguments.case])
+        values |= {"worlds": arguments.worlds} if arguments.worlds else {}
+        print(json.dumps(rate(arguments.case, values, wait=sys.stdin.readline)))
         return 0
-    begin, recorder, rates, code = time.monotonic(), Recorder(), [], 0
+    return suite(arguments)
+
+
+def suite(arguments: argparse.Namespace) -> int:
+    """Runs the chosen parts and writes the file; the exit status."""
+    begin, rates = time.monotonic(), []
     provenance = measure.provenance(commit=arguments.commit)
 
     def write() -> None:
         result = {"provenance": provenance, "seconds": round(time.monotonic() - begin, 1)}
         result |= {"rates": rates, "tests": recorder.tests}
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
+        arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
-    for name, values in RATES.items() if "rates" in arguments.parts else ():
-        try:
-            double = values.get("dtype") == np.float64
-            rates.append(in_a_process_of_its_own(name) if double else rate(name, values))
-        except Exception as error:  # one case must not hide the others
-            traceback.print_exc()
-            rates.append({"case": name, "failed": f"{type(error).__name__}: {error}"[:500]})
-            code = 1
-        print(rates[-1], flush=True)
-        write()
-    if "tests" in arguments.parts:
-        # Only files with such tests, so that the others' dependencies need not be there.
-        paths = sorted(Path("tests").glob("test_*.py"))
-        files = [str(p) for p in paths if "pytest.mark.gpu" in p.read_text(encoding="utf-8")]
-        options = ["-m", "gpu", "-q", "-p", "no:cacheprovider", *files]
-        code |= int(pytest.main(options, plugins=[recorder]))
+    recorder, code = Recorder(write), 0
+    chosen = arguments.rates if "rates" in arguments.parts else []
+    waiting = [Rate(name, arguments.worlds) for name in chosen]
+    try:
+        if "tests" in arguments.parts:
+            code = run_tests(recorder, arguments.processes)
+            print(f"tests: {time.monotonic() - begin:.0f} s", flush=True)
+        while waiting:
+            rates.append(waiting.pop(0).measure())
+            code |= int("failed" in rates[-1])
+            print(rates[-1], flush=True)
+            write()
+    finally:
+        for process in waiting:
+            process.stop()
     write()
     return code
 

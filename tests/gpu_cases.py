@@ -1,6 +1,6 @@
 """What the GPU suite simulates on both devices; run as a program it stores the CPU's results.
 
-python tests/gpu_cases.py RESULTS.npz
+python tests/gpu_cases.py short/spheres RESULTS.npz
 """
 
 import sys
@@ -48,7 +48,7 @@ def inputs(scene, count):
 
 
 def short_scene(name):
-    """A small scene: two fingers of two links and a cylinder, or a mug from a mesh."""
+    """A small scene: two fingers of two links, and a cylinder or household objects from meshes."""
     if name == "mesh":
         return scenes.load(
             "paper",
@@ -86,13 +86,12 @@ def whole(name):
     return {"cost": np.asarray(outcome.cost), "failed": np.asarray(cost.failed(outcome.status))}
 
 
-def main(path):
-    """Stores everything."""
-    found = {f"short/{n}": short(n) for n in [*EFFECTS, "mesh"]}
-    found |= {f"whole/{n}": whole(n) for n in WHOLE}
-    np.savez(path, **{f"{n}/{k}": v for n, group in found.items() for k, v in group.items()})
+def main(case, path):
+    """Stores what one case finds."""
+    kind, name = case.split("/", 1)
+    np.savez(path, **{"short": short, "whole": whole}[kind](name))
 
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -92,7 +92,7 @@ def random_constants(the_scene, seed, count=None):
 def still(shape=0):
     """A trial without noise, as NumPy arrays."""
     zero, one = np.zeros(()), np.ones(())
-    return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), one, one, one, one)
+    return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), one, one, one, one, one)
 
 
 def hand_world(the_scene, **changes):

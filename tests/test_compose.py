@@ -142,7 +142,8 @@ def test_a_trajectory_changes_no_outcome(decided):
 def test_a_run_is_the_loop_of_its_episodes_and_vmaps_over_seeds():
     """By the kernel, bit for bit; each seed of a batch as alone, with its own schedule.
 
-    One episode alone maps as well.
+    One episode alone maps as well.  XLA may round the model fields of a larger batch differently in
+    their last bit, which moves the states at the end by 5e-6 here, and no particle.
     """
     scene = small.pinch("sphere", **SHORT)
     space = parameters.design_space(scene.hand, "2d")
@@ -163,10 +164,30 @@ def test_a_run_is_the_loop_of_its_episodes_and_vmaps_over_seeds():
         np.testing.assert_array_equal(end.particles, state.particles)
         np.testing.assert_array_equal(ends.particles[k], end.particles)
         for a, b in zip(jax.tree.leaves(infos), jax.tree.leaves(info), strict=True):
-            np.testing.assert_array_equal(a[k], b)
+            np.testing.assert_allclose(a[k], b, rtol=1e-4, atol=1e-4)
     _, firsts = jax.jit(jax.vmap(episode))(batch, masks[:, 0])
     np.testing.assert_array_equal(firsts.trials.cost, infos.trials.cost[:, 0])
     assert np.ptp(infos.trials.cost) > 0.1 and (infos.trials.status & ~int(WARNINGS) == 0).any()
+
+
+@pytest.mark.slow
+def test_a_run_vmaps_over_constants():
+    """Each world's physics as in a run of its own with those numbers."""
+    scene = small.pinch("sphere", **SHORT)
+    space = parameters.design_space(scene.hand, "2d")
+    optimizer = codesign.make_filter(space)
+    run = codesign.make_run(scene, StructuredEngine(scene), space, optimizer, 2)
+    start = optimizer.init(jax.random.key(0), np.array((0.1, 0.05)), 3)
+    masks = np.ones((2, 2), bool)
+    numbers = [scene.constants(), small.random_constants(scene, 1)]
+    both = jax.tree.map(lambda *v: jnp.asarray(v, jnp.float32), *numbers)
+    ends, infos = jax.jit(jax.vmap(run, (None, None, 0)))(start, masks, both)
+    for k in range(2):
+        end, info = run(start, masks, small.nth(both, k))
+        # Two programs round fields differently, which may move a loss by a step of 10 ms.
+        np.testing.assert_allclose(infos.trials.cost[k], info.trials.cost, atol=0.05)
+        np.testing.assert_allclose(ends.particles[k], end.particles, rtol=1e-5)
+    assert np.abs(infos.trials.cost[0] - infos.trials.cost[1]).max() > 0.1
 
 
 # --- a cost of one's own -------------------------------------------------------------------------

@@ -18,55 +18,64 @@ from tests import gpu_cases, small
 pytestmark = pytest.mark.gpu
 
 
-@pytest.fixture(scope="module")
-def on_cpu(tmp_path_factory):
-    """Starts the CPU's part in another process; a function that waits for it and reads a result."""
-    path, here = tmp_path_factory.mktemp("cpu") / "results.npz", Path(__file__)
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    environment["PYTHONPATH"] = f"{here.parents[1]}:{environment.get('PYTHONPATH', '')}"
-    command = [sys.executable, str(here.with_name("gpu_cases.py")), str(path)]
-    process = subprocess.Popen(command, env=environment)
+@pytest.fixture
+def on_cpu(tmp_path):
+    """A function that starts a case on the CPU, in another process, and returns how to wait for it.
 
-    def read(name):
-        if process.poll() is None:
+    The GPU's part runs meanwhile in this process; several tests run at once under pytest-xdist.
+    """
+    started = []
+
+    def start(case):
+        path, here = tmp_path / "result.npz", Path(__file__)
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        environment["PYTHONPATH"] = f"{here.parents[1]}:{environment.get('PYTHONPATH', '')}"
+        command = [sys.executable, str(here.with_name("gpu_cases.py")), case, str(path)]
+        process = subprocess.Popen(command, env=environment)
+        started.append(process)
+
+        def read():
             process.communicate()
-        assert process.returncode == 0, "the CPU's part failed, see above"
-        with np.load(path) as found:
-            return {k.rsplit("/", 1)[1]: found[k] for k in found if k.startswith(name + "/")}
+            assert process.returncode == 0, "the CPU's part failed, see above"
+            with np.load(path) as found:
+                return dict(found)
 
-    yield read
-    if process.poll() is None:
-        process.kill()
-        process.communicate()
+        return read
 
-
-@pytest.fixture(scope="module")
-def on_gpu():
-    """Results of this process, computed while the other one computes the CPU's."""
-    assert jax.default_backend() == "gpu"
-    short = {n: gpu_cases.short(n) for n in [*gpu_cases.EFFECTS, "mesh"]}
-    return {"short": short, "whole": {n: gpu_cases.whole(n) for n in gpu_cases.WHOLE}}
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
 
 
 @pytest.mark.parametrize("name", [*gpu_cases.EFFECTS, "mesh"])
-def test_effects(on_cpu, on_gpu, name):
+def test_effects(on_cpu, name):
     """Every effect in float64: GPU and CPU follow the same path through the first contacts."""
-    got = on_gpu["short"][name]
-    want = on_cpu(f"short/{name}")
+    read = on_cpu(f"short/{name}")
+    assert jax.default_backend() == "gpu"
+    got, want = gpu_cases.short(name), read()
     assert np.abs(want["qpos"][:, -1] - want["qpos"][:, 0]).max() > 0.05  # it moves
     for key, value in want.items():
         # Steps round differently by 1e-16; contact multiplies it by up to seven in a step.
-        np.testing.assert_allclose(got[key], value, rtol=1e-7, atol=1e-7, err_msg=key)
+        tolerance = np.full(value.shape, 1e-7)
+        if name == "mesh":
+            # The capsule of world 0 rocks on corners of its mesh: on the CPU alone, fields changed
+            # by 1e-15 of themselves move it by 1e-14 at step 50, five times as much every ten steps
+            # and 1e-9 at step 120, up to 1.3e-5, at which it stays; the other worlds by 2e-12.
+            tolerance[0, 120:] = 1e-4
+        np.testing.assert_array_less(np.abs(got[key] - value), tolerance, err_msg=key)
 
 
 @pytest.mark.parametrize("name", gpu_cases.WHOLE)
-def test_verdicts(on_cpu, on_gpu, name):
+def test_verdicts(on_cpu, name):
     """Whole grasps in float32: kept on one device, kept on the other.
 
     MuJoCo C agrees with itself on 99.2 % of grasps if their objects are moved by a micrometre
     (docs/performance.md): three of 384 differ by chaos alone, ten with a probability below 1e-3.
     """
-    got, want = on_gpu["whole"][name], on_cpu(f"whole/{name}")
+    read = on_cpu(f"whole/{name}")
+    got, want = gpu_cases.whole(name), read()
     kept = [np.where(r["failed"], -1, r["cost"] < 0.01) for r in (got, want)]
     assert 0.1 < (kept[1] == 1).mean() < 0.9
     assert (kept[0] != kept[1]).sum() <= 10

@@ -63,7 +63,7 @@ def worlds(request):
     """A scene with fields of six random worlds in float64 and their fresh compiles.
 
     In each world all numbers of scene, hand and objects are others, and the trial has factors on
-    friction and stiffness.
+    friction, stiffness and the hand's masses.
     """
     the_scene = SCENES[request.param]()
 
@@ -86,9 +86,10 @@ def worlds(request):
 
 
 def noisy(objects):
-    """Numbers of an object set with noise of friction and stiffness."""
+    """Numbers of an object set with noise of friction, stiffness and the hand's masses."""
     one = np.ones_like(objects.noise.position)
-    return objects._replace(noise=objects.noise._replace(friction=0.3 * one, stiffness=0.2 * one))
+    noise = {"friction": 0.3 * one, "stiffness": 0.2 * one, "hand_mass": 0.2 * one}
+    return objects._replace(noise=objects.noise._replace(**noise))
 
 
 def test_fields_equal_a_fresh_compile(worlds):

@@ -53,7 +53,7 @@ def template_world(scene: Scene) -> tuple[Params, Trial]:
     one = np.ones(scene.num_fingers)
     params = Params(0.1 * one, 0.02 * one, 0.004 * one, np.zeros(()), np.zeros(6), 0.0 * one)
     zero, unit = np.zeros(()), np.ones(())
-    return params, Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), unit, unit, unit, unit)
+    return params, Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), *[unit] * 5)
 
 
 @contextlib.contextmanager

@@ -175,7 +175,7 @@ def make_episode(
       cost: As in `rollout.simulate`.
     """
     program = _episode(scene, engine, space, num_trials, trajectory, cost)
-    return Program(scene, program, optimizer, np.int32(0))
+    return Program(scene, program, optimizer)
 
 
 @shared
@@ -192,11 +192,7 @@ def _episode(
         mask: jax.typing.ArrayLike,
         constants: Constants,
         optimizer: ParticleFilter,
-        count: jax.typing.ArrayLike,
     ) -> tuple[State, EpisodeInfo]:
-        # A choice that XLA cannot make ahead: what depends on the numbers alone would be computed
-        # before a loop over episodes, fused and so rounded in another way than in an episode alone.
-        constants = jax.tree.map(lambda v: jnp.where(count >= 0, v, jnp.nan), constants)
         population = optimizer.ask(state, mask)
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
@@ -222,8 +218,9 @@ def make_run(
 ) -> Program:
     """Returns the jitted function (state, masks, constants) -> (state, info) of a whole run.
 
-    The loop over the episodes is a `jax.lax.scan`: the same numbers as a loop in Python over
-    `make_episode`'s function, without a way to stop in between.  The masks, one for each episode,
+    The loop over the episodes is a `jax.lax.scan`: a loop in Python over `make_episode`'s function
+    without a way to stop in between. XLA rounds the model fields of the two programs, and of
+    batches of other sizes, differently in the last bit.  The masks, one for each episode,
     have shape (episode, parameter), and the info's arrays get a leading axis (episode,).
     `jax.vmap` over the state runs many seeds in one batch, see `optimize.State`, and over constants
     (`Scene.constants`, by default the scene's own) many worlds' physics.
@@ -250,11 +247,10 @@ def _run(scene: Scene, *how: Any) -> EpisodeFunction:
         constants: Constants,
         optimizer: ParticleFilter,
     ) -> tuple[State, EpisodeInfo]:
-        def one(state: State, x: tuple) -> tuple[State, EpisodeInfo]:
-            return episode(state, x[0], constants, optimizer, x[1])
+        def one(state: State, mask: jax.Array) -> tuple[State, EpisodeInfo]:
+            return episode(state, mask, constants, optimizer)
 
-        masks = jnp.asarray(masks)
-        return jax.lax.scan(one, state, (masks, jnp.arange(masks.shape[0], dtype=jnp.int32)))
+        return jax.lax.scan(one, state, jnp.asarray(masks))
 
     return run
 

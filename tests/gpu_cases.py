@@ -14,7 +14,7 @@ from codesign_jax import cost, rollout
 from codesign_jax import scene as scenes
 from codesign_jax.benchmark import work
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small
+from tests import quick_compile, small
 
 STEPS = 230
 """Steps of a short grasp: through the approach and the first touch into the inflation."""
@@ -88,6 +88,7 @@ def whole(name):
 
 def main(case, path):
     """Stores what one case finds."""
+    quick_compile.use()  # what XLA compiles here, the model fields, runs once
     kind, name = case.split("/", 1)
     np.savez(path, **{"short": short, "whole": whole}[kind](name))
 

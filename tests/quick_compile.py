@@ -2,10 +2,10 @@
 
 import os
 
-# Without optimising and without fusion emitters a step of the batch form compiles in 5 s instead
-# of 17 and runs half as fast; one thread compiles, as every core has a process of its own.
+# Without fusion emitters a step of the batch form compiles in 8 s instead of 17 and runs as fast;
+# one thread compiles, as every core has a process of its own. At an optimisation level of 0 it
+# would be 5 s, but there a scan over episodes has no longer the bits of the episodes by themselves.
 FLAGS = (
-    "--xla_backend_optimization_level=0",
     "--xla_cpu_use_fusion_emitters=false",
     "--xla_cpu_parallel_codegen_split_count=1",
 )

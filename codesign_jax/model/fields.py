@@ -177,7 +177,7 @@ def _pair_kinds(scene: Scene) -> np.ndarray:
     """Which friction each of the template's contact pairs has, an index into `_frictions`."""
     template, lay = compile_template(scene), layout(scene)
     shapes = len(scene.objects.object)
-    kinds = np.zeros(template.npair, int)
+    kinds = np.zeros(template.npair, np.int32)  # see layout: one width in every precision
     for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
         touched = np.isin(lay.object_geoms, pair)
         if 0 in pair:  # the table

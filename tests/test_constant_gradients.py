@@ -127,4 +127,4 @@ def test_the_default_gradient_in_float32(checked):
     print("float32", error)
     for name, *row in zip(names, slope, found, strict=True):
         print(name, *(f"{v:.3e}" for v in row))
-    assert error < 1e-2
+    assert error < 5e-3  # 6e-4 were seen

@@ -84,7 +84,7 @@ class Search:
             self._balls()
 
         def pairing(row: jax.Array, x: jax.Array) -> jax.Array:
-            partner = self.pairs.partner(row)
+            partner = self.pairs.pairing(row).lane
             other = jax.lax.div(partner, jnp.int32(self.p.block))
             there = (self.block.finger < self.p.num_fingers) & (other < self.p.num_fingers)
             first = self.block.finger < other

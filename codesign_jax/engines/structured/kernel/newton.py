@@ -366,7 +366,7 @@ class Newton:
             self.write("step_acc", a, i)
             self.write("step_motion", moved, i)
             if self.pairs:
-                self.pairs.put("motion", moved, i + 1)
+                self.pairs.put_link(i, parent, moved)
             terms = [touch]
             for contacts in self.fingers:
                 rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
@@ -379,7 +379,7 @@ class Newton:
         none = zeros((), self.like)
         parent = self.widened(step.palm_motion)
         if self.pairs:
-            self.pairs.put("motion", parent, 0)
+            self.pairs.put_palm(parent)
         last, slope, curvature, touch = loop(
             self.links, one, (parent, none, none, none), self.block.size
         )

@@ -17,7 +17,7 @@ from codesign_jax.engines.structured import contact
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.hull import across
-from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop
+from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop, solid
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -36,7 +36,9 @@ def pair_slots(scene: Scene) -> int:
 class PairSet(HullSet):
     """Contacts between fingers; a row is a pairing of all fingers."""
 
-    def __init__(self, scene: Scene, block: tuple[int, int], links: int, slots: int):
+    def __init__(
+        self, scene: Scene, block: tuple[int, int], links: int, slots: int, *, gathers: bool
+    ):
         """Prepares the set.
 
         Args:
@@ -44,16 +46,17 @@ class PairSet(HullSet):
           block: Fingers, a power of two, and worlds of a block.
           links: Moving links of a finger.
           slots: Slots of a pairing, on each lane.
+          gathers: Whether lanes read rows of their own as fast as a common one: on GPUs.
         """
         fingers, worlds = block
         super().__init__(scene, "finger_finger", fingers - 1, slots, fingers * worlds)
-        self.block, self.links = block, links
+        self.block, self.links, self.gathers = block, links, gathers
         self.skin = scene.effects.surface == "hull"
         if not self.skin:
             self.places, self.of_lines = ContactSet.places, ContactSet.of_lines
         n = ROWS[scene.effects.friction][0]
         self.more = {"row": 1, "hessian": n * (n + 1) // 2}
-        self.more |= {field: n for field in ("own", "first", "left", "along", "moved", "sum")}
+        self.more |= {f: n for f in ("first", "left", "answer", "along", "moved", "sum")}
         if self.skin:
             self.more |= HullSet.more
 
@@ -65,6 +68,7 @@ class PairSet(HullSet):
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; and the sides of all fingers, from the palm to the tips."""
         sides = {"motion": 6, "vel": 6, "push": self.components}
+        sides |= {"turn": 3} if self.skin else {}
         rows = {f"side.{name}": (self.links + 1, (n,)) for name, n in sides.items()}
         return super().groups() | rows
 
@@ -82,6 +86,38 @@ class PairSet(HullSet):
         return BoundPairs(self, table, ref, self.cone(read))
 
 
+class Pairing:
+    """Fingers in pairs: those whose numbers differ by an exclusive or with the row's number + 1.
+
+    Attributes:
+      lane: Lane of the finger that each lane's finger is paired with, shape (lane,).
+    """
+
+    def __init__(self, block: Block, row: Any):
+        """Takes the row, a scalar."""
+        self.block = block
+        self.number = (jnp.zeros_like(block.finger) + (row + 1)).astype(jnp.int32)
+        other = jax.lax.bitwise_xor(block.finger, self.number)
+        self.lane = other * block.worlds + block.world
+
+    def swap(self, tree: Any) -> Any:
+        """What the lanes that the lanes are paired with have, of a tree of lanes.
+
+        Registers are exchanged, once for each binary digit of the row's number: lanes of memory
+        that another lane has just written would have to wait for it.
+        """
+        block = self.block
+        arrays, rebuild = solid(tree, block.size)
+        for digit in range(block.fingers.bit_length() - 1):
+            distance = block.worlds << digit
+            chosen = jax.lax.bitwise_and(self.number, jnp.int32(1 << digit)) > 0
+            arrays = [
+                jnp.where(chosen, jax.lax.rev(a.reshape(-1, 2, distance), (1,)).reshape(-1), a)
+                for a in arrays
+            ]
+        return rebuild(arrays)
+
+
 class BoundPairs(BoundSlots):
     """Contacts between fingers with their memory."""
 
@@ -92,15 +128,9 @@ class BoundPairs(BoundSlots):
         super().__init__(of, table, ref, cone)
         self.block = Block(*of.block)
 
-    def partner(self, row: Any) -> jax.Array:
-        """Lane of the finger that each lane's finger is paired with, shape (lane,)."""
-        number = jnp.zeros_like(self.block.finger) + (row + 1)
-        other = jax.lax.bitwise_xor(self.block.finger, number.astype(jnp.int32))
-        return other * self.set.block[1] + self.block.world
-
-    def theirs(self, field: str, item: Any, partner: jax.Array) -> Lanes:
-        """A field of the partners' slots."""
-        return self.table.gather(self.ref, f"{self.set.name}.{field}", item, partner)
+    def pairing(self, row: Any) -> "Pairing":
+        """A row's pairing of the fingers."""
+        return Pairing(self.block, row)
 
     def side(self, name: str, row: Any, lane: jax.Array) -> Lanes:
         """Motion of rows, (6 or 9, ...): of the link before a joint, and the joint's turning."""
@@ -115,6 +145,19 @@ class BoundPairs(BoundSlots):
     def put(self, name: str, value: Lanes, row: Any) -> None:
         """Stores what a row's link before its joint does; row 0 is the palm's."""
         self.table.write(self.ref, f"side.{name}", value, row)
+
+    def put_palm(self, motion: Lanes) -> None:
+        """Stores the palm's motion along a step; the tip, which has no joint, does not turn."""
+        self.put("motion", motion, 0)
+        if self.set.skin:
+            like = jnp.zeros((self.set.size,), self.ref.dtype)
+            self.put("turn", zeros((3,), like), self.set.links)
+
+    def put_link(self, i: Any, before: Lanes, motion: Lanes) -> None:
+        """Stores a link's motion along a step, and how the joint between it and `before` turns."""
+        self.put("motion", motion, i + 1)
+        if self.set.skin:
+            self.put("turn", lanewise(lambda a, b: b[:3] - a[:3], before, motion), i)
 
     def pushed(self, row: Any) -> Lanes:
         """Wrench of all contacts of a row's own side, (6 or 9, ...)."""
@@ -139,37 +182,31 @@ class BoundPairs(BoundSlots):
           other: What its partner keeps.
           alike: What every lane knows of its own side.
         """
-        count = self.read("count", row).lane.astype(jnp.int32)
-        # Beyond what any lane has filled: a place to hand the partner's part over.
-        free = row * (self.set.slots + 1) + jnp.minimum(jnp.max(count), self.set.slots)
         gap = lanewise(
             lambda w, g: jnp.where(w, g, 1.0), lanes([which], (), wide=True), other["gap"]
         )
-        for field, value in (other | {"gap": gap}).items():
-            self.write(field, value, free)
-        partner = self.partner(row)
+        theirs = self.pairing(row).swap(other | {"gap": gap})
         side = lanes([owner], (), wide=True)
         fields = {
-            field: lanewise(jnp.where, side, value, self.theirs(field, free, partner))
-            for field, value in mine.items()
+            field: lanewise(jnp.where, side, value, theirs[field]) for field, value in mine.items()
         }
         touch = which | (~owner & (fields["gap"].lane < 0))
         self.add(row, touch, fields | alike, self.block.lane)
 
     def each(self, body: Callable, start: Any) -> Any:
-        """Folds body(item, partner's lanes, tree of lanes) over all slots in use."""
+        """Folds body(item, pairing, tree of lanes) over all slots in use."""
 
-        def pairing(row: Any, carry: Any) -> Any:
-            partner = self.partner(row)
-            return self.fold(row, lambda item, c: body(item, partner, c), carry)
+        def of_row(row: Any, carry: Any) -> Any:
+            pairing = self.pairing(row)
+            return self.fold(row, lambda item, c: body(item, pairing, c), carry)
 
-        return loop(self.set.rows, pairing, start, self.set.size)
+        return loop(self.set.rows, of_row, start, self.set.size)
 
     def do(self, body: Callable) -> None:
-        """Runs body(item, partner's lanes), which stores something, over all slots in use."""
+        """Runs body(item, pairing), which stores something, over all slots in use."""
 
-        def one(item: Any, partner: jax.Array, carry: list) -> list:
-            body(item, partner)
+        def one(item: Any, pairing: Pairing, carry: list) -> list:
+            body(item, pairing)
             return carry
 
         self.each(one, [])
@@ -184,22 +221,51 @@ class BoundPairs(BoundSlots):
 
     # One side's part of a contact
 
-    def own_motion(self) -> None:
-        """Leaves in every slot how the links' motion moves its own side."""
+    def relative(self, item: Any, pairing: "Pairing") -> Lanes:
+        """How the links' motion moves a slot's sides to each other, on its own side's lanes."""
+        names = ("motion", "turn") if self.set.skin else ("motion",)
+        parts = self._on_rows(item, names)
+        own = lanewise(self._moved, self.place(item), self.cone, parts)
+        return lanewise(jnp.subtract, own, pairing.swap(own))
 
-        def store(item: Any, partner: jax.Array) -> None:
-            row = self.read("row", item).lane.astype(jnp.int32)
-            motion = self.side("motion", row, self.block.lane)
-            self.write("own", lanewise(self._moved, self.place(item), self.cone, motion), item)
+    def _on_rows(self, item: Any, names: tuple[str, ...]) -> list[Lanes]:
+        """What sides have at the rows of a slot's lanes; zeros where nothing touches."""
+        groups = self.table.groups
+        if self.set.gathers:
+            row, lane = self.read("row", item).lane.astype(jnp.int32), self.block.lane
+            return [self.table.gather(self.ref, f"side.{name}", row, lane) for name in names]
+        like = jnp.zeros((self.set.size,), self.ref.dtype)
+        start = [zeros(groups[f"side.{name}"][1], like) for name in names]
 
-        self.do(store)
+        def take(row: Any, chosen: jax.Array, found: list[Lanes]) -> list[Lanes]:
+            new = [self.table.read(self.ref, f"side.{name}", row) for name in names]
+            mask = lanes([chosen], (), wide=True)
+            return [lanewise(jnp.where, mask, n, f) for n, f in zip(new, found, strict=True)]
 
-    def _moved(self, place, cone, motion):
-        return self.set.contacts(place, cone).relative(motion[:, None])
+        return self._each_row(item, take, start)
 
-    def relative(self, item: Any, partner: jax.Array) -> Lanes:
-        """How the sides move to each other, after `own_motion`."""
-        return lanewise(jnp.subtract, self.read("own", item), self.theirs("own", item, partner))
+    def _each_row(self, item: Any, body: Callable, start: Any) -> Any:
+        """Folds body(row, lanes that touch there, tree of lanes) over the rows of a slot's lanes.
+
+        Few lanes of a block touch in one slot, at two rows if it is one contact: on CPUs whose
+        vectors gather number by number that is faster than to gather.
+        """
+        gap = self.read("gap", item).lane
+        left = jnp.where(gap < 0, self.read("row", item).lane.astype(jnp.int32), -1)
+        arrays, rebuild = solid(start, self.set.size)
+
+        def step(carry: list) -> list:
+            row, left, *values = carry
+            chosen = left == row
+            left = jnp.where(chosen, -1, left)
+            new = solid(body(row, chosen, rebuild(values)), self.set.size)[0]
+            return [jnp.max(left), left, *new]
+
+        first = [jnp.max(left), left, *arrays]
+        return rebuild(jax.lax.while_loop(lambda c: c[0] >= 0, step, first)[2:])
+
+    def _moved(self, place, cone, parts):
+        return self.set.contacts(place, cone).relative(jnp.concatenate(parts)[:, None])
 
     def rest(self) -> None:
         """Takes all wrenches off the sides."""
@@ -217,15 +283,19 @@ class BoundPairs(BoundSlots):
         def wrench(place, cone, force):
             return sum_axis(contact.contact_wrench(self.set.contacts(place, cone), force), 1)
 
-        row, lane = self.read("row", item).lane.astype(jnp.int32), self.block.lane
         more = lanewise(wrench, self.place(item), self.cone, force)
-        sums = lanewise(jnp.add, self.table.gather(self.ref, "side.push", row, lane), more)
-        self.table.scatter(self.ref, "side.push", sums, row, lane)
+        if self.set.gathers:
+            row, lane = self.read("row", item).lane.astype(jnp.int32), self.block.lane
+            sums = lanewise(jnp.add, self.table.gather(self.ref, "side.push", row, lane), more)
+            self.table.scatter(self.ref, "side.push", sums, row, lane)
+            return
 
-    def load_all(self, field: str) -> None:
-        """Wrenches of forces that a field of the slots has."""
-        self.rest()
-        self.do(lambda item, _: self.load(item, self.read(field, item)))
+        def add(row: Any, chosen: jax.Array, nothing: list) -> list:
+            mask = lanes([chosen], (), wide=True)
+            self.put("push", lanewise(_add_where, mask, self.pushed(row), more), row)
+            return nothing
+
+        self._each_row(item, add, [])
 
     # Newton's method
 
@@ -237,7 +307,7 @@ class BoundPairs(BoundSlots):
             found = contact.respond(self.set.contacts(place, cone), jar)
             return found.hessian, found.force
 
-        def store(item: Any, partner: jax.Array) -> None:
+        def store(item: Any, pairing: Pairing) -> None:
             jar = lanewise(along, alpha, self.read("jar", item), self.read("step", item))
             self.write("jar", jar, item)
             hessian, force = lanewise(response, self.place(item), self.cone, jar)
@@ -252,10 +322,9 @@ class BoundPairs(BoundSlots):
 
     def aim_all(self) -> Lanes:
         """Stores the lines along the links' motion; returns the sum of the slopes at 0."""
-        self.own_motion()
 
-        def add(item: Any, partner: jax.Array, sums: Lanes) -> Lanes:
-            slope = self.line(item, self.relative(item, partner))
+        def add(item: Any, pairing: Pairing, sums: Lanes) -> Lanes:
+            slope = self.line(item, self.relative(item, pairing))
             return lanewise(lambda s, f: s + 0.5 * f, sums, slope)  # both lanes have it
 
         return self.each(add, self._zeros(())[0])
@@ -263,13 +332,17 @@ class BoundPairs(BoundSlots):
     def slopes_of_all(self, alpha: Lanes, sums: list[Lanes]) -> list[Lanes]:
         """Adds first and second derivative of the cost along the line."""
 
-        def add(item: Any, partner: jax.Array, sums: list[Lanes]) -> list[Lanes]:
+        def add(item: Any, pairing: Pairing, sums: list[Lanes]) -> list[Lanes]:
             new = self._slopes(item, alpha)
             return lanewise(
                 lambda a, b: [x + 0.5 * y for x, y in zip(a, b, strict=True)], sums, new
             )
 
         return self.each(add, sums)
+
+
+def _add_where(chosen, sums, more):
+    return sums + jnp.where(chosen, more, 0.0)
 
 
 def _times(triangle: jax.Array, x: jax.Array) -> jax.Array:

@@ -97,7 +97,8 @@ class Program:
             sets += [self._skin(name) for name in on if on[name]]
         if e.finger_finger and self.num_fingers > 1:
             block, slots = (self.fingers, self.block), pair_slots(self.scene)
-            sets.append(PairSet(self.scene, block, self.links, slots))
+            gathers = self.backend == "gpu"
+            sets.append(PairSet(self.scene, block, self.links, slots, gathers=gathers))
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
         on_table = [make("object_table", -(-4 // self.fingers), 1)] if e.object_table else []

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.constants import apply_columns
 from codesign_jax.engines.structured.kernel import hull
-from codesign_jax.engines.structured.kernel.pairs import BoundPairs
+from codesign_jax.engines.structured.kernel.pairs import BoundPairs, Pairing
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -48,11 +48,10 @@ class Search:
         """Stores where a finger is."""
         self.scratch.write(self.ref, f"pair.{name}", value, item)
 
-    def read(self, name: str, item: Any, lane: jax.Array | None = None) -> Lanes:
-        """Where the lanes' own fingers are, or those of other lanes."""
-        if lane is None:
-            return self.scratch.read(self.ref, f"pair.{name}", item)
-        return self.scratch.gather(self.ref, f"pair.{name}", item, lane)
+    def read(self, name: str, item: Any, pairing: Pairing | None = None) -> Lanes:
+        """Where the lanes' own fingers are, or those that they are paired with."""
+        own = self.scratch.read(self.ref, f"pair.{name}", item)
+        return own if pairing is None else pairing.swap(own)
 
     def start(self, motion: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
         """Empties the slots; stores what belongs to the palm."""
@@ -84,22 +83,22 @@ class Search:
             self._balls()
 
         def pairing(row: jax.Array, x: jax.Array) -> jax.Array:
-            partner = self.pairs.pairing(row).lane
-            other = jax.lax.div(partner, jnp.int32(self.p.block))
+            pairing = self.pairs.pairing(row)
+            other = jax.lax.div(pairing.lane, jnp.int32(self.p.block))
             there = (self.block.finger < self.p.num_fingers) & (other < self.p.num_fingers)
             first = self.block.finger < other
-            (self._spheres if self.p.k else self._rows)(row, partner, there, first)
+            (self._spheres if self.p.k else self._rows)(row, pairing, there, first)
             return x
 
         jax.lax.fori_loop(0, self.pairs.set.rows, pairing, jnp.int32(0))
 
     # Spheres
 
-    def _spheres(self, row: Any, partner: jax.Array, there: jax.Array, first: jax.Array) -> None:
+    def _spheres(self, row: Any, pairing: Pairing, there: jax.Array, first: jax.Array) -> None:
         count, owner = self.p.links * self.p.k, there & first
 
         def outer(i: Any) -> None:
-            theirs = self.read("sphere", i, partner)
+            theirs = self.read("sphere", i, pairing)
 
             def inner(j: Any) -> None:
                 mine = self.read("sphere", j)
@@ -108,7 +107,7 @@ class Search:
                 def enter() -> None:
                     one, other = lanewise(_between, mine, theirs)
                     rows = tuple(jax.lax.div(v, jnp.asarray(self.p.k, v.dtype)) + 1 for v in (j, i))
-                    moves = self._moves(rows, partner)
+                    moves = self._moves(rows, pairing)
                     self._enter(row, which, owner, (one, other), rows, moves)
 
                 any_of(which, enter)
@@ -132,21 +131,21 @@ class Search:
 
         each(self.p.links + 1, one)
 
-    def _links(self, row: Any, lane: jax.Array | None = None) -> tuple[Lanes, Lanes, Lanes]:
+    def _links(self, row: Any, pairing: Pairing | None = None) -> tuple[Lanes, Lanes, Lanes]:
         """Joint of a row, and the frames of the links before and behind it."""
         behind = jnp.minimum(row + 1, self.p.links)
         places = (("joint", behind), ("frame", row), ("frame", behind))
-        return tuple(self.read(name, r, lane) for name, r in places)  # type: ignore[return-value]
+        return tuple(self.read(name, r, pairing) for name, r in places)  # type: ignore[return-value]
 
-    def _rows(self, row: Any, partner: jax.Array, there: jax.Array, first: jax.Array) -> None:
+    def _rows(self, row: Any, pairing: Pairing, there: jax.Array, first: jax.Array) -> None:
         d, links = self.p.scene.discretization, self.p.links
         count = d.hull_rings * d.hull_points
-        size = self.p.hand.gather(self.step.hand, "section_box", 0, partner)
         self_size = self.p.hand.read(self.step.hand, "section_box")
+        size = pairing.swap(self_size)
         side = first.astype(jnp.int32)
 
         def outer(i: Any) -> None:
-            theirs, ball = self._links(i, partner), self.read("ball", i, partner)
+            theirs, ball = self._links(i, pairing), self.read("ball", i, pairing)
             last = jnp.where(i == links - 1, self.like + 1.0, self.like)
 
             def inner(j: Any) -> None:
@@ -159,7 +158,7 @@ class Search:
                     )
 
                     def vertices() -> None:
-                        moves = self._moves((j, i), partner)
+                        moves = self._moves((j, i), pairing)
                         each(count, lambda v: vertex(j, own, moves, kind * count + v))
 
                     any_of(near & (apart.lane < 0), vertices)
@@ -187,13 +186,10 @@ class Search:
 
         each(links, outer)
 
-    def _moves(self, rows: tuple, partner: jax.Array) -> list[tuple[Lanes, Lanes]]:
+    def _moves(self, rows: tuple, pairing: Pairing) -> list[tuple[Lanes, Lanes]]:
         """Accelerations and velocities of the lanes' own row and of their partners' row."""
-        pairs, lane = self.pairs, self.block.lane
-        return [
-            (pairs.side(name, rows[0], lane), pairs.side(name, rows[1], partner))
-            for name in ("motion", "vel")
-        ]
+        own, theirs = ([self.pairs.side(n, row) for n in ("motion", "vel")] for row in rows)
+        return list(zip(own, pairing.swap(theirs), strict=True))
 
     def _enter(
         self,

@@ -132,14 +132,13 @@ class BoundPairs(BoundSlots):
         """A row's pairing of the fingers."""
         return Pairing(self.block, row)
 
-    def side(self, name: str, row: Any, lane: jax.Array) -> Lanes:
-        """Motion of rows, (6 or 9, ...): of the link before a joint, and the joint's turning."""
-        before = self.table.gather(self.ref, f"side.{name}", row, lane)
+    def side(self, name: str, row: Any) -> Lanes:
+        """Motion of a row, (6 or 9, ...): of the link before a joint, and the joint's turning."""
+        before = self.table.read(self.ref, f"side.{name}", row)
         if not self.set.skin:
             return before
-        after = self.table.gather(
-            self.ref, f"side.{name}", jnp.minimum(row + 1, self.set.links), lane
-        )
+        behind = jnp.minimum(row + 1, self.set.links)
+        after = self.table.read(self.ref, f"side.{name}", behind)
         return lanewise(lambda a, b: across(a, b, None), before, after)
 
     def put(self, name: str, value: Lanes, row: Any) -> None:

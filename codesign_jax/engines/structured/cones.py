@@ -1,5 +1,6 @@
 """Parameters of the friction cones of every world, from the scene's numbers, once a rollout."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ from codesign_jax.scene import Scene
 
 
 class Cones(NamedTuple):
-    """Cones by what touches; their numbers have shape (1, world).
+    """Cones by what touches; their numbers have shape (1, world).  None where nothing of it does.
 
     Attributes:
       hand_object: Fingers, hull or palm on the object.
@@ -20,10 +21,10 @@ class Cones(NamedTuple):
       finger_finger: Fingers on one another.
     """
 
-    hand_object: Cone
-    hand_table: Cone
-    object_table: Cone
-    finger_finger: Cone
+    hand_object: Cone | None
+    hand_table: Cone | None
+    object_table: Cone | None
+    finger_finger: Cone | None
 
 
 def which_cone(pair: str) -> str:
@@ -64,11 +65,13 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
     on_object = scene.objects.object[0].friction
     for i, other in enumerate(scene.objects.object[1:], 1):
         on_object = jnp.where(shape == i, other.friction, on_object)
+    e, c = scene.effects, scene.contact
+    two, one = partial(make_cone, scene, bodies=2), partial(make_cone, scene, bodies=1)
     return Cones(
-        hand_object=make_cone(scene, on_object, bodies=2),
-        hand_table=make_cone(scene, scene.contact.finger_table_friction, bodies=1),
-        object_table=make_cone(scene, scene.objects.table.friction, bodies=1),
-        finger_finger=make_cone(scene, scene.contact.finger_finger_friction, bodies=2),
+        hand_object=two(on_object) if e.finger_object or e.palm_object else None,
+        hand_table=one(c.finger_table_friction) if e.finger_table or e.palm_table else None,
+        object_table=one(scene.objects.table.friction) if e.object_table else None,
+        finger_finger=two(c.finger_finger_friction) if e.finger_finger else None,
     )
 
 

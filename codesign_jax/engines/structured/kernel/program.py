@@ -202,6 +202,8 @@ class Program:
         }
         arrays |= hand.bounds._asdict()
         for name, cone in hand.cones._asdict().items():
+            if cone is None:
+                continue
             arrays[f"cone.{name}"] = jnp.stack([v for v in cone if v is not None])
         # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
         share = jnp.ones((self.links + 1, *lane), dtype)

@@ -404,6 +404,10 @@ def test_a_set_that_meets_every_target_is_left():
         ("solutions", {"lossless": -0.01}),
         ("poor seeds", {"above_two": -0.01}),
         ("single is poor", {"success single, own": 0.8}),
+        (
+            "single is poor",  # where nothing succeeds, the order alone would say nothing
+            {f"success {s}, own": 0.0 for s in ("single", "switch-4", "concurrent")},
+        ),
         ("concurrent succeeds", {"success switch-4, own": 1.0, "success concurrent, own": 0.6}),
     ],
 )

@@ -29,6 +29,10 @@ def constants(wave: Scored, path: Path) -> Path:
         axes.set(xscale="log" if o.log else "linear", ylim=(0, HIGHEST * 1.03))
         axes.set_title(f"{o.label} [{o.unit}]" if o.unit else o.label, fontsize=8)
         axes.tick_params(labelsize=7)
+        if o.log:
+            ticks = np.geomspace(o.low, o.high, 4)
+            axes.set_xticks(ticks, [f"{t:.2g}" if t < 100 else f"{t:.0f}" for t in ticks])
+            axes.minorticks_off()
     figure.supylabel("worst distance to a target [standard deviations]", fontsize=9)
     return _save(figure, path)
 

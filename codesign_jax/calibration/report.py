@@ -100,8 +100,9 @@ def correlations(wave: Scored) -> np.ndarray:
 def wave_table(waves: Sequence[Scored]) -> str:
     """What was simulated, a row a wave."""
     lines = [
-        "| wave | simulated | sets | grid × trials | grasps | device | commit | left |",
-        "|---|---|---|---|---|---|---|---|",
+        "| wave | simulated | sets | grid × trials | grasps | failed | solver at limit | device "
+        "| commit | left |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for wave in waves:
         notes, count = wave.notes["wave"], len(wave.data["units"])
@@ -110,7 +111,9 @@ def wave_table(waves: Sequence[Scored]) -> str:
         commit = str(notes.get("commit"))[:7]
         lines.append(
             f"| {wave.name} | {wave.fidelity} | {count:,} | {points} × {points} × {trials} "
-            f"| {grasps:,} | {notes['device']} | {commit} | {int(wave.plausible.sum())} |"
+            f"| {grasps:,} | {100 * wave.data['failed'].mean():.1f} % "
+            f"| {100 * wave.data['capped'].mean():.0f} % "
+            f"| {notes['device']} | {commit} | {int(wave.plausible.sum())} |"
         )
     return "\n".join(lines)
 

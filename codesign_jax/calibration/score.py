@@ -27,6 +27,9 @@ _SHARE = 0.12
 """Standard deviation of a difference of two shares of 30 runs: sqrt(2 p (1 - p) / 30), p = 0.5."""
 _COST = 0.3
 """Standard deviation of a mean of 6 trials near a cost of 1: losses spread over all of [0, 3]."""
+_MORE = 0.4
+"""Share of runs by which success "quickly increases": 12 of 30 runs, a reading of ours. Without it
+a set in which nothing ever succeeds would meet every statement about the order."""
 _COMMON = 0.05
 """Of the share of poor designs, on a grid of 144."""
 
@@ -69,8 +72,11 @@ def _order(v: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _poor_alone(v: Mapping[str, np.ndarray]) -> np.ndarray:
-    """In a single domain at most half of the concurrent strategy's success: one reading of poor."""
-    return _at_least(0.5 * v["success concurrent, own"], v["success single, own"], _SHARE)
+    """A single domain reaches at most half of what concurrent design does, and `_MORE` less."""
+    single, concurrent = v["success single, own"], v["success concurrent, own"]
+    return np.maximum(
+        _at_least(0.5 * concurrent, single, _SHARE), _at_least(concurrent - single, _MORE, _SHARE)
+    )
 
 
 def _speed(v: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -98,7 +104,11 @@ TARGETS = (
         "seeds with cost > 2 can be drawn",
         lambda v: _at_least(v["above_two"], 0.15, _COMMON),
     ),
-    Target("single is poor", "in one domain success is poor (Fig. 7a)", _poor_alone),
+    Target(
+        "single is poor",
+        "in one domain success is poor; it quickly increases (Fig. 7a)",
+        _poor_alone,
+    ),
     Target("concurrent succeeds", "concurrent succeeds most often (Fig. 7a)", _order),
     Target("switching is faster", "more switching converges faster (Fig. 7b)", _speed),
 )

@@ -64,7 +64,7 @@ def kept(name: str, build: Callable[[], bytes]) -> bytes:
 
 def _folder() -> Path | None:
     place = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if place is None or "://" in str(place):
+    if not place or "://" in str(place):
         return None
     return Path(place) / "kernels"
 

@@ -182,6 +182,7 @@ def test_a_run_vmaps_over_constants():
     start = optimizer.init(jax.random.key(0), np.array((0.1, 0.05)), 3)
     masks = np.ones((2, 2), bool)
     numbers = [scene.constants(), small.random_constants(scene, 1)]
+    numbers[1] = numbers[1]._replace(phases=numbers[0].phases)  # the number of steps is structure
     both = jax.tree.map(lambda *v: jnp.asarray(v, jnp.float32), *numbers)
     ends, infos = jax.jit(jax.vmap(run, (None, None, 0)))(start, masks, both)
     for k in range(2):

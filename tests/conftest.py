@@ -23,5 +23,5 @@ def pytest_configure(config):
         folder = tempfile.mkdtemp(prefix="codesign-tests-")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
-        # Small programs too: JAX keeps those that take a second.
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    # Small programs too: JAX keeps those that take a second.
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

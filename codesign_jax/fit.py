@@ -8,6 +8,7 @@ import optax
 
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import apply_columns, world_constants
+from codesign_jax.engines.structured.coordinates import reset
 from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
@@ -69,8 +70,7 @@ def tip_positions(scene: Scene, fields: ModelFields, qpos: jax.Array) -> jax.Arr
     world = jax.tree.map(lambda v: v[None], fields)
     hand = world_constants(scene, world)
     # Times stand in for worlds: all of them see the same hand.
-    times = world._replace(start=qpos)
-    state = StructuredEngine(scene).reset(times)
+    state = reset(scene, world._replace(start=qpos))
     kin = kinematics(Stages(None), hand, layout(scene).axes, state)
     half = jnp.zeros_like(kin.origin[:, -1]).at[0].set(0.5 * hand.offset[-1])
     tip = kin.origin[:, -1] + apply_columns(kin.link[:, :, -1], half) + state.wrist[:3]

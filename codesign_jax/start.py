@@ -7,8 +7,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import apply_columns, world_constants
+from codesign_jax.engines.structured.coordinates import reset
+from codesign_jax.engines.structured.differentiable import contacts
 from codesign_jax.engines.structured.kinematics import straight
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
@@ -56,10 +57,10 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
       Shape (world,).
     """
     alone = dataclasses.replace(scene.effects, finger_finger=False)
-    engine = StructuredEngine(dataclasses.replace(scene, effects=alone), kernel=False)
-    state, hand = engine.reset(fields), world_constants(engine.scene, fields)
-    contacts = engine.contacts(Stages(None), hand, straight(hand, state), state.wrist[2])
-    found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in contacts.values()]
+    scene = dataclasses.replace(scene, effects=alone)
+    state, hand = reset(scene, fields), world_constants(scene, fields)
+    every = contacts(scene, Stages(None), hand, straight(hand, state), state.wrist[2])
+    found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
     return jnp.stack(found).max(0)
 
 
@@ -73,10 +74,7 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
     worlds, count = fields.start.shape[0], scene.num_fingers
     if not scene.effects.finger_finger or count == 1:
         return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
-    state, hand = (
-        StructuredEngine(scene, kernel=False).reset(fields),
-        world_constants(scene, fields),
-    )
+    state, hand = reset(scene, fields), world_constants(scene, fields)
     kin, up = straight(hand, state), hand.centre[2]
     middle = kin.origin + apply_columns(kin.link, hand.centre)
     deepest = []

@@ -34,12 +34,11 @@ lose their object, and designs around 64 mm and an arm height of 0 mm, which hol
   contact: the row of MuJoCo C at its own tolerance shows how much agreement can be had.
 * *error*: relative error of the accelerations along the engine's own trajectory in contact,
   against converged MuJoCo C in the same states. Positions are float32 there, so that the row of
-  MuJoCo C shows the floor. On a GPU the structured engine's trajectories are its batch form's, not
-  the kernel's, whose iterations and decrements have a table of their own.
+  MuJoCo C shows the floor. Iterations
+  and decrements of the structured engine's kernel have a table of their own.
 * Settings: `equal` is the scene's tolerance; `documented` what the engine's documentation advises
   (C and Warp: MuJoCo's defaults; MJX: one iteration with four of the line search). The structured
-  engine's tolerance is a relative Newton decrement: `default` 1e-6, `tight` 1e-8, `loose` 1e-4;
-  `unison` steps all worlds together.
+  engine's tolerance is a relative Newton decrement: `default` 1e-6, `tight` 1e-8, `loose` 1e-4.
 * Compile times are a fresh process's with empty caches, tracing included; in brackets those of a
   second one that finds the program in the persistent cache. Rates are medians of the repeats
   without it. Warp's do not include the making of the model fields and the costs, the others' do;
@@ -146,8 +145,7 @@ Read from these tables:
 
 * The structured engine's kernel does 16 times the grasps of MuJoCo C on both cores, at 60 and at
   360 worlds; 19 and 21 times in other runs, as the virtual machine's speed changes by half between
-  hours and not alike for both. Same verdicts on all 360 grasps. Its own batch form (`unison`) was
-  measured in a faster hour.
+  hours and not alike for both. Same verdicts on all 360 grasps.
 * Stock MJX steps 64 worlds a second: two thousand times fewer.
 * Linear in links and in fingers.
 * Compiling: most is Python that traces the kernel. A new process that finds its machine code and

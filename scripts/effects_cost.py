@@ -11,20 +11,18 @@ import csv
 import json
 import os
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from codesign_jax import scene
-from codesign_jax.benchmark import beam, effects, effects_page
+from codesign_jax.benchmark import effects, effects_page
 from codesign_jax.benchmark.measure import provenance
 from codesign_jax.commands import common
 
 DOCS = Path(__file__).parent.parent / "docs"
 AS_IT_IS = effects_page.REFERENCE
-NO_CONTACT, BEAMS = "all contacts off", "beams alone"
 
 
 def main() -> None:
@@ -102,12 +100,6 @@ def _programs(
             programs[name] = program
         results["effects"].setdefault(name, {}).update(program.record)
         print(name, program.record, flush=True)
-    free = everything[NO_CONTACT]
-    beams = effects.compile_steps(
-        free, worlds, effects.lifting(free, worlds), compiled, step=partial(beam.step, free)
-    )
-    programs[BEAMS] = beams
-    results["effects"].setdefault(BEAMS, {}).update(beams.record)
     results["load_before"] = os.getloadavg()
     times = effects.measure(programs, 9)
     results["load_after"] = os.getloadavg()
@@ -119,8 +111,6 @@ def _programs(
             "ratio": float(np.median(ratios)),
             "ratio_quartiles": [float(q) for q in np.quantile(ratios, [0.25, 0.75])],
         }
-    ratios = np.array(times[NO_CONTACT]) / np.array(times[BEAMS])
-    results["no_contact_over_beams"] = [float(q) for q in np.quantile(ratios, [0.25, 0.5, 0.75])]
     _store(results, path)
 
 

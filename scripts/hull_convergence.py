@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from codesign_jax import control, model, parameters, rollout, scene
-from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured import StructuredEngine, differentiable
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.types import Trial
@@ -50,27 +50,23 @@ class Case:
         batch = [jax.tree.map(lambda *v: jnp.stack(v), *x) for x in (params, trials)]
         fields = jax.vmap(lambda p, t: model.model_fields(self.scene, p, Trial(*t)))(*batch)
         self.ctrl = jax.vmap(lambda p, t: control.commands(self.scene, p, Trial(*t)))(*batch)
-        self.engine = StructuredEngine(self.scene, tolerance=1e-10, iterations=60, evaluations=12)
+        self.engine = StructuredEngine(self.scene, tolerance=1e-10, iterations=60)
         self.hand, self.state = world_constants(self.scene, fields), self.engine.reset(fields)
 
     def settle(self) -> None:
         """Steps to just before the lift."""
         steps = round(self.scene.phases.inflate / self.scene.discretization.timestep) - 5
 
-        @jax.jit
-        def run(hand, state, ctrl):
-            step = self.engine.step
-            return jax.lax.scan(lambda s, u: (step(hand, s, u)[0], None), state, ctrl)[0]
-
-        self.state = run(self.hand, self.state, jnp.moveaxis(self.ctrl[:, :steps], 0, -1))
+        run = jax.jit(lambda *args: self.engine.advance(*args)[1])
+        self.state = run(self.hand, self.state, self.ctrl[:, :steps])
 
     def force(self, state) -> np.ndarray:
         """Sum of the normal forces that the penetrations cause [N], shape (world,)."""
 
         @jax.jit
         def total(hand, state, u):
-            run = Stages(hand.shape[0, 0] >= 0)
-            c = self.engine.problem(run, hand, state, u)[0].contacts["hull_object"]
+            found = differentiable.problem(self.scene, Stages(None), hand, state, u)[0]
+            c = found.contacts["hull_object"]
             push = c.cone.normal * c.cone.spring * jnp.maximum(-c.distance, 0.0)
             return push.sum((0, 1, 2)), (push > 0).sum((0, 1, 2))
 

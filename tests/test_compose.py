@@ -58,14 +58,16 @@ def test_vmap_is_a_larger_batch(batch):
     np.testing.assert_array_equal(shared.distance[:, 0], alone.distance)
 
 
-# Compiling the batch form takes longer than all that is done with it here.
+# Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
 
 
 def engines(scene):
-    """Every way to simulate but stock MJX, whose compile takes longer than all of these tests."""
-    kernel, plain = (StructuredEngine(scene, kernel=k, tolerance=1e-16) for k in (True, False))
-    return {"kernel": kernel, "batch": plain, "mujoco": MujocoEngine(scene, num_threads=1)}
+    """Every engine but stock MJX, whose compile takes longer than all of these tests."""
+    return {
+        "structured": StructuredEngine(scene, tolerance=1e-16),
+        "mujoco": MujocoEngine(scene, num_threads=1),
+    }
 
 
 @pytest.fixture(scope="module")
@@ -108,15 +110,15 @@ def test_a_trace_means_the_same_on_every_engine(decided, trajectory):
     lost_at = 0.01 * first
     assert outcomes["mujoco", trajectory].lost_time[0] == pytest.approx(lost_at)
     assert outcomes["mujoco", trajectory].bad_step.tolist() == [-1, 0, 11]
-    for name in ("kernel", "batch"):
-        for a, b in zip(outcomes[name, trajectory], outcomes["mujoco", trajectory], strict=True):
-            np.testing.assert_allclose(a, b, err_msg=name)
-        got = found[name, trajectory]
-        for field in ("distance", "height", "speed", "qpos", "last"):
-            # No contact but the object's with the table, where MuJoCo stops at its tolerance.
-            a, b = getattr(got, field), getattr(want, field)
-            np.testing.assert_allclose(a, b, atol=1e-6, err_msg=f"{name} {field}")
-    for trace in (found[name, trajectory] for name in ("kernel", "batch", "mujoco")):
+    pairs = zip(outcomes["structured", trajectory], outcomes["mujoco", trajectory], strict=True)
+    for a, b in pairs:
+        np.testing.assert_allclose(a, b)
+    got = found["structured", trajectory]
+    for field in ("distance", "height", "speed", "qpos", "last"):
+        # No contact but the object's with the table, where MuJoCo stops at its tolerance.
+        a, b = getattr(got, field), getattr(want, field)
+        np.testing.assert_allclose(a, b, atol=1e-6, err_msg=field)
+    for trace in (found[name, trajectory] for name in ("structured", "mujoco")):
         rest = trace.distance[0, first:]
         if trajectory:
             assert rest[-1] - rest[0] > 0.03 and trace.qpos.shape[1] == end
@@ -131,7 +133,7 @@ def test_a_trace_means_the_same_on_every_engine(decided, trajectory):
 
 def test_a_trajectory_changes_no_outcome(decided):
     _, _, outcomes = decided
-    for name in ("kernel", "batch", "mujoco"):
+    for name in ("structured", "mujoco"):
         for a, b in zip(outcomes[name, False], outcomes[name, True], strict=True):
             np.testing.assert_array_equal(a, b)
 

@@ -11,7 +11,6 @@ from small import hand_world, nth, pinch, random_constants, random_worlds
 from codesign_jax import model, rollout, scene, schema
 from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 
 SHORT = dict(  # 30 steps, with every phase
@@ -136,8 +135,7 @@ def test_constants_equal_a_scene_file_with_those_numbers(engine):
     worlds = jax.tree.map(lambda v: np.broadcast_to(v, (2, *v.shape)), world)
 
     def run(s, **more):
-        batch = engine == "structured"
-        made = StructuredEngine(s, kernel=False) if batch else make_engine(engine, s)
+        made = make_engine(engine, s)
         result = jax.jit(lambda p, t: rollout.simulate(s, made, p, t, **more))(*worlds)
         return jax.tree.map(np.asarray, result)
 

@@ -1,7 +1,6 @@
 """Effects of a scene: as in MuJoCo C, inert without a stimulus, not in the program if off."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,15 +10,13 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from codesign_jax import control, effects, model, schema
-from codesign_jax.benchmark import beam
-from codesign_jax.benchmark.program_cost import program_size
+from codesign_jax import control, effects, model, rollout, schema
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
-from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured import StructuredEngine, coordinates, differentiable
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
-from tests import small
+from tests import small, steps
 from tests.test_structured import lanes_state
 
 # Compiling takes longer than all that is done with a program here.
@@ -58,44 +55,22 @@ def setting(effects, shape="box", **changes):
     return scene, oracle, fields, ctrl
 
 
-def apply_softening(scene, fields, data):
-    """What the engine `mujoco` applies before a step."""
-    if scene.effects.neo_hookean:
-        bend = model.layout(scene).dofs[..., 0]
-        data.qfrc_applied[bend] = model.softening_moments(scene, fields, data.qpos[bend])
-
-
 @pytest.mark.parametrize(
     "name", [n if n in TOGETHER else pytest.param(n, marks=slow) for n in SETTINGS]
 )
 def test_steps_equal_mujocos(name):
-    """Accelerations on states along a grasp, from MuJoCo C's own path, contacts included."""
+    """Accelerations of every step of the kernel's own path, contacts included."""
     with jax.enable_x64(True):
-        scene, oracle, fields, ctrl = setting(SETTINGS[name])
-        engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand = small.lanes(scene, jax.tree.map(lambda x: jnp.asarray(x)[None], fields))
-        step, data, most = jax.jit(engine.step, compiler_options=QUICK), mujoco.MjData(oracle), 0
-        data.qpos[:] = fields.start
-        for k in range(420):
-            data.ctrl[:] = ctrl[k]
-            apply_softening(scene, fields, data)
-            if k % 35 == 20:
-                qpos, qvel = data.qpos.copy(), data.qvel.copy()
-                mujoco.mj_forward(oracle, data)
-                batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-                state = lanes_state(engine, scene, batch, qpos, qvel)
-                new, _ = step(hand, state, jnp.asarray(ctrl[k])[:, None])
-                acc = (np.asarray(engine.qvel(new))[0] - qvel) / scene.discretization.timestep
-                scale = max(np.linalg.norm(data.qacc), 100.0)
-                error = np.linalg.norm(acc - data.qacc) / scale
-                # As in test_structured; MuJoCo's rigid arm gives way by the hand's forces over
-                # 1e9 kg, which stiff fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
-                bound = 1e-8 if scene.effects.wrist else 1e-7
-                assert error < bound, (k, data.ncon, error)
-                most = max(most, data.ncon)
-            mujoco.mj_step(oracle, data)
+        scene, _, fields, ctrl = setting(SETTINGS[name])
+        engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
+        fields, ctrl = jax.tree.map(lambda x: jnp.asarray(x)[None], fields), ctrl[None, :420]
+        found = steps.path(engine, fields, ctrl)
+    errors, far, touching = steps.against_mujoco(scene, fields, ctrl, found)
+    # As in test_structured; MuJoCo's rigid arm gives way by the hand's forces over 1e9 kg, which
+    # stiff fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
+    assert errors.max() < (1e-8 if scene.effects.wrist else 1e-7) and far.max() < 1e-12
     if scene.effects.finger_object and scene.effects.object_table:
-        assert most > 4  # more than the box on the table
+        assert touching.max() > 4  # more than the box on the table
 
 
 @slow
@@ -113,7 +88,7 @@ def test_mjx_steps_equal_mujocos():
         data.qpos[:] = fields.start
         for k in range(420):
             data.ctrl[:] = ctrl[k]
-            apply_softening(scene, fields, data)
+            steps.soften(scene, fields, data)
             if k % 70 == 20:
                 ours = ours.replace(qpos=data.qpos.copy(), qvel=data.qvel.copy())
                 found = step(fields, ours, ctrl[k])
@@ -136,19 +111,30 @@ def test_gradients_of_a_step(name):
         qpos = np.array(fields.start)
         qpos[2] = 0.06
         qpos[6 : 6 + model.layout(scene).dofs.size] = 0.1
-        state = lanes_state(engine, scene, batch, qpos, np.zeros(len(qpos) - 1))
+        start = lanes_state(engine, scene, batch, qpos, np.zeros(len(qpos) - 1))
         base = jnp.asarray(ctrl[200]).at[2].set(0.0601)
 
-        def end(change):
+        def inputs(change):
             u = base.at[2].add(change[0]).at[6].add(1e5 * change[1])
             stiffer = batch._replace(jnt_stiffness=batch.jnt_stiffness * (1 + change[2]))
-            new, _ = engine.step(world_constants(scene, stiffer), state, u[:, None])
+            return world_constants(scene, stiffer), u[:, None]
+
+        def end(new):
             return (engine.qvel(new) ** 2).sum()
 
+        def run(change):
+            hand, u = inputs(change)
+            new, info = engine.step(hand, start, u)
+            return end(new), info.acc
+
+        def known(change, acc):
+            hand, u = inputs(change)
+            return end(differentiable.step(scene, hand, start._replace(acc=acc), u).state)
+
+        run, zero = jax.jit(run), jnp.zeros(3)
         # Options are for the outermost program only.
-        found = jax.jit(jax.grad(end), compiler_options=QUICK)(jnp.zeros(3))
-        end, e = jax.jit(end, compiler_options=QUICK), 1e-6 * jnp.eye(3)
-        expected = [(end(d) - end(-d)) / 2e-6 for d in e]
+        found = jax.jit(jax.grad(known), compiler_options=QUICK)(zero, run(zero)[1])
+        expected = [(run(d)[0] - run(-d)[0]) / 2e-6 for d in 1e-6 * jnp.eye(3)]
         assert np.abs(expected).min() > 0
         # Central differences of 1e-6 lose ten of 16 digits and add their square.
         np.testing.assert_allclose(found, expected, rtol=1e-5)
@@ -232,18 +218,27 @@ def changed(value, path, field, new):
 
 
 def program(scene):
-    """Text of everything a grasp computes: fields, controls and a step."""
+    """Text of everything a grasp computes: fields, controls and the kernel of a step."""
     world, trial = small.hand_world(scene)
     world = jax.tree.map(jnp.asarray, small.stack(world))
     trial = small.stack(trial)
-    engine = StructuredEngine(scene)
 
     def run(p, t):
         fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(p, t)
         ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(p, t)
-        return engine.step(world_constants(scene, fields), engine.reset(fields), ctrl[:, 0].T)
+        return fields, ctrl
 
-    return jax.jit(run).lower(world, trial).as_text()
+    return jax.jit(run).lower(world, trial).as_text() + str(step_jaxpr(scene))
+
+
+def step_jaxpr(scene):
+    """The jaxpr of the kernel of one step."""
+    shapes = [small.stack(v) for v in small.hand_world(scene)]
+    fields = jax.eval_shape(jax.vmap(lambda p, t: model.model_fields(scene, p, t)), *shapes)
+    hand = jax.eval_shape(lambda f: world_constants(scene, f), fields)
+    state = jax.eval_shape(lambda f: coordinates.reset(scene, f), fields)
+    ctrl = jax.ShapeDtypeStruct((1, 1, 6 + scene.num_fingers), fields.start.dtype)
+    return Program(scene, Limits(8, 8, 1e-6), width=8).jaxpr(hand, state, ctrl)
 
 
 def effects_scene(values, **settings):
@@ -286,75 +281,25 @@ def primitives(jaxpr, found):
     return found
 
 
-def step_primitives(scene):
-    fields = jax.eval_shape(
-        jax.vmap(lambda p, t: model.model_fields(scene, p, t)),
-        *(small.stack(v) for v in small.hand_world(scene)),
-    )
-    engine = StructuredEngine(scene)
-    hand = jax.eval_shape(lambda f: world_constants(scene, f), fields)
-    state = jax.eval_shape(engine.reset, fields)
-    ctrl = jax.ShapeDtypeStruct((6 + scene.num_fingers, 1), fields.start.dtype)
-    return primitives(jax.make_jaxpr(engine.step)(hand, state, ctrl).jaxpr, {})
-
-
-def test_without_contacts_the_step_is_one_elimination():
-    """No Newton loop, no line search, no cone: a beam simulation and a falling body."""
-    free = step_primitives(effects_scene(dict.fromkeys(CONTACTS, False)))
-    touching = step_primitives(effects_scene({}))
-    assert "while" in touching and "while" not in free
-    # One elimination has a scan to the palm and one back; kinematics one.
-    assert free["scan"] == 3
+def test_without_contacts_the_kernel_has_no_cone():
+    """A beam simulation and a falling body: no contact is found, kept, or evaluated."""
+    free = primitives(step_jaxpr(effects_scene(dict.fromkeys(CONTACTS, False))), {})
+    touching = primitives(step_jaxpr(effects_scene({})), {})
     assert sum(free.values()) < 0.6 * sum(touching.values())
 
 
-@jax.enable_x64(True)
-def test_without_contacts_a_step_is_that_of_beams_alone():
-    """A separately written simulation of beams and a falling body: its numbers, and its program."""
-    scene, _, fields, ctrl = setting(dict.fromkeys(CONTACTS, False))
-    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-    engine, hand = StructuredEngine(scene), small.lanes(scene, batch)
-    random, start = np.random.default_rng(0), engine.reset(batch)
-    size = len(fields.start)
-    qpos = fields.start + 0.1 * random.normal(size=size) * (np.arange(size) < size - 7)
-    state = engine.place(start, jnp.asarray(qpos)[None], random.normal(size=(1, size - 1)))
-    args = hand, state, jnp.asarray(ctrl[200])[:, None]
-    steps = (lambda *a: engine.step(*a)[0]), partial(beam.step, scene)
-    ours, beams = (jax.jit(f, compiler_options=QUICK).lower(*args).compile() for f in steps)
-    found, expected = engine.qvel(ours(*args)), engine.qvel(beams(*args))
-    # The same equations in another order: rounding.
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-    # What is left is the hand's centre, which the engine reports, and the first sums with zeros.
-    sizes = [program_size(f, *args).flops for f in (engine.step, steps[1])]
-    assert sizes[0] < 1.05 * sizes[1], sizes
-    # Substitution stores the links' motion, which nothing reads without contacts.
-    moved = [p.cost_analysis()["bytes accessed"] for p in (ours, beams)]
-    assert moved[0] < 1.2 * moved[1], moved
-
-
-def test_the_kernel_runs_every_effect(monkeypatch):
-    """Any scene; the batch form is for derivatives, and refuses what it lacks."""
-
-    def taken(way):
-        def run(self, fields, ctrl, *_, **__):
-            raise RuntimeError(way)
-
-        return run
-
-    monkeypatch.setattr(StructuredEngine, "_one_kernel", taken("kernel"))
-    ctrl = jnp.zeros((1, 2, 8), jnp.float32)
-    for values in (
-        {},
-        {"gravity": False, "palm_table": False, "pressure_dynamics": True},
-        {"friction": "full", "neo_hookean": True, "finger_finger": True},
-        {"wrist": False, "object_table": False, "surface": "hull", "finger_finger": True},
-    ):
-        engine = StructuredEngine(effects_scene(values), kernel=True)
-        with pytest.raises(RuntimeError, match="kernel"):
-            engine.simulate(None, ctrl)
+def test_what_has_no_derivative_is_refused():
+    """The kernel runs every effect; a derivative names what it lacks as it is asked for."""
     for values in ({"surface": "hull"}, {"friction": "full"}):
-        with pytest.raises(schema.SceneError, match="runs in the kernel only"):
-            step_primitives(effects_scene({"finger_finger": True, **values}))
+        scene = effects_scene({"finger_finger": True, **values})
+        world, trial = (small.stack(v) for v in small.hand_world(scene))
+        engine = StructuredEngine(scene)
+
+        def cost(p, scene=scene, engine=engine, trial=trial):
+            return rollout.simulate(scene, engine, p, trial)[0].cost.sum()
+
+        with pytest.raises(schema.SceneError, match="has no derivative"):
+            jax.eval_shape(jax.grad(cost), jax.tree.map(jnp.asarray, world))
 
 
 def test_kernel_without_palm_on_table():
@@ -395,13 +340,10 @@ COMBINATIONS = st.fixed_dictionaries(
 def check_combination(values, shape):
     """Every engine takes a step that is finite, or traces one, or says what it cannot do.
 
-    The hull has no friction with torsion and rolling, and the batch form, whose steps these are,
-    has contact between fingers of spheres without it only.
+    The hull has no friction with torsion and rolling.
     """
     chosen = {f"effects__{k}": v for k, v in values.items()}
-    hull, between = values["surface"] == "hull", values["finger_finger"]
-    full = values["friction"] == "full"
-    if hull and full:
+    if values["surface"] == "hull" and values["friction"] == "full":
         with pytest.raises(schema.SceneError, match="effects.surface = 'hull' needs friction"):
             small.pinch(shape, links=1, **chosen)
         return
@@ -420,11 +362,8 @@ def check_combination(values, shape):
             fields, ctrl = small.batch_inputs(scene, world, trial)
             trace = engine.rollout(fields, ctrl[:, :2])
             assert np.isfinite(trace.speed).all() and np.isfinite(trace.distance).all()
-        elif name == "structured" and between and (hull or full):
-            with pytest.raises(schema.SceneError, match="runs in the kernel only"):
-                step_primitives(scene)
         elif name == "structured":
-            assert "scan" in step_primitives(scene)
+            assert "while" in primitives(step_jaxpr(scene), {})
 
 
 OPTIONS = {"deadline": None, "derandomize": True, "phases": [Phase.generate]}

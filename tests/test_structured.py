@@ -12,7 +12,10 @@ import pytest
 from codesign_jax import cost, rollout
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small
+from tests import small, steps
+
+EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-24}
+"""Limits at which the kernel solves a step to rounding in float64."""
 
 
 @functools.lru_cache(maxsize=4)
@@ -38,30 +41,17 @@ def setting(shape, **params):
 
 
 @pytest.mark.parametrize("shape", small.SHAPES)
-def test_accelerations_equal_mujoco_along_a_grasp(shape):
-    """Converged accelerations on states of a grasp, contacts included."""
+def test_every_step_of_a_grasp_equals_mujocos(shape):
+    """Converged accelerations along the kernel's own path, contacts included."""
     with jax.enable_x64(True):
-        scene, oracle, start, fields, ctrl = setting(shape)
-        engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand, step = small.lanes(scene, fields), jax.jit(engine.step)
-        data, touched = mujoco.MjData(oracle), 0
-        data.qpos[:] = start
-        for k in range(420):
-            data.ctrl[:] = ctrl[k]
-            if k % 35 == 20:
-                qpos, qvel = data.qpos.copy(), data.qvel.copy()
-                mujoco.mj_forward(oracle, data)
-                state = lanes_state(engine, scene, fields, qpos, qvel)
-                new, _ = step(hand, state, jnp.asarray(ctrl[k])[:, None])
-                acc = (np.asarray(engine.qvel(new))[0] - qvel) / scene.discretization.timestep
-                scale = max(np.linalg.norm(data.qacc), 100.0)
-                error = np.linalg.norm(acc - data.qacc) / scale
-                # A difference of velocities over 10 ms loses two of 16 digits, and MuJoCo's own
-                # Newton stops at rounding of its cost; the floor is ten g: at rest qacc is noise.
-                assert error < 1e-8, (k, data.ncon, error)
-                touched = max(touched, data.ncon)
-            mujoco.mj_step(oracle, data)
-        assert touched > (4 if shape != "sphere" else 1)  # more than the object on the table
+        scene, _, _, fields, ctrl = setting(shape)
+        engine, ctrl = StructuredEngine(scene, **EXACT), ctrl[None, :420]
+        found = steps.path(engine, fields, ctrl)
+    errors, far, touching = steps.against_mujoco(scene, fields, ctrl, found)
+    # A difference of velocities over 10 ms loses two of 16 digits, and MuJoCo's own Newton stops
+    # at rounding of its cost.
+    assert errors.max() < 1e-8 and far.max() < 1e-12
+    assert touching.max() > (4 if shape != "sphere" else 1)  # more than the object on the table
 
 
 def test_free_motion_equals_mujoco_step_by_step():
@@ -69,20 +59,18 @@ def test_free_motion_equals_mujoco_step_by_step():
     with jax.enable_x64(True):
         scene, oracle, start, fields, ctrl = setting("box")
         oracle.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        hand, step = small.lanes(scene, fields), jax.jit(engine.step)
         data = mujoco.MjData(oracle)
         data.qpos[:] = start
         # Lift the object off the table: it falls for 20 steps without reaching it.
         data.qpos[-5] += 0.5
-        state = lanes_state(engine, scene, fields, data.qpos, data.qvel)
-        for k in range(20):
-            data.ctrl[:] = ctrl[k]
-            mujoco.mj_step(oracle, data)
-            state, _ = step(hand, state, jnp.asarray(ctrl[k])[:, None])
-            # Rounding of 1e-16 relative, grown over twenty steps of a stiff chain.
-            np.testing.assert_allclose(engine.qpos(state)[0], data.qpos, rtol=0, atol=1e-12)
-            np.testing.assert_allclose(engine.qvel(state)[0], data.qvel, rtol=0, atol=1e-10)
+        lifted = fields._replace(start=fields.start.at[0, -5].add(0.5))
+        found = steps.path(StructuredEngine(scene, **EXACT), lifted, ctrl[None, :20])
+    for k in range(20):
+        # Rounding of 1e-16 relative, grown over twenty steps of a stiff chain.
+        np.testing.assert_allclose(found.qpos[0, k], data.qpos, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.qvel[0, k], data.qvel, rtol=0, atol=1e-10)
+        data.ctrl[:] = ctrl[k]
+        mujoco.mj_step(oracle, data)
 
 
 def test_float32_is_close_to_float64():
@@ -109,7 +97,7 @@ def test_float32_is_close_to_float64():
 
 
 def test_worlds_that_end_early():
-    """They change no verdict, the block's other worlds no bit, and the motion is the same."""
+    """They change no verdict, and the block's other worlds no bit."""
     with jax.enable_x64(True):
         scene = small.pinch("cylinder")
         # On the way to this distance nothing is ever decided: every world runs to the end.
@@ -125,20 +113,16 @@ def test_worlds_that_end_early():
         back = jax.tree.map(lambda v: v[::-1], params)
         trials = small.stack(*[trial] * len(lengths))
 
-        def traces(scene, kernel, *batches):
-            engine = StructuredEngine(scene, tolerance=1e-16, iterations=30, kernel=kernel)
+        def traces(scene, *batches):
+            engine = StructuredEngine(scene, tolerance=1e-16, iterations=30)
             run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t)[1])
             return [jax.tree.map(np.asarray, run(p, trials)) for p in batches]
 
-        (unison,) = traces(scene, False, params)
-        early, reverse = traces(scene, True, params, back)
-        (full,) = traces(patient, True, params)
+        early, reverse = traces(scene, params, back)
+        (full,) = traces(patient, params)
         read = jax.vmap(lambda t: cost.outcome(scene, t))
         short, long = (jax.tree.map(np.asarray, read(t)) for t in (early, full))
     assert np.ptp(short.cost) > 1.0  # they end at very different times
     for field, whole in zip(short, long, strict=True):
         np.testing.assert_array_equal(field, whole)
     np.testing.assert_array_equal(reverse.distance[::-1], early.distance)
-    # Sums in another order differ by rounding. From the lift on slipping multiplies a difference by
-    # ten every three steps, a change of 1e-14 in the length as well, so the comparison ends there.
-    np.testing.assert_allclose(early.distance[:, :380], unison.distance[:, :380], atol=1e-10)

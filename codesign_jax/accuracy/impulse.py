@@ -8,13 +8,14 @@ import numpy as np
 
 from codesign_jax.accuracy import oracle, worlds
 from codesign_jax.accuracy.settings import Setting
-from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured import StructuredEngine, coordinates, differentiable
 from codesign_jax.engines.structured.constants import WorldConstants, world_constants
 from codesign_jax.engines.structured.contact import respond
-from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import Stages, dot
 from codesign_jax.engines.structured.problem import propagate, relative
 from codesign_jax.model import ModelFields
+from codesign_jax.scene import Scene
 
 # The arm comes down in 0.5 s, the fingers are inflated in the next 0.5 s, on an object at rest.
 # The forces are summed up to 0.2 s later, before the lift; no world ends early.
@@ -48,7 +49,9 @@ def forces(setting: Setting, hands: int, seconds: float = SECONDS) -> tuple[np.n
         step = scene.discretization.timestep
         ctrl = ctrl[:, : round(seconds / step)]
         if setting.engine == "structured":
-            return _structured(setting.make(scene), fields, ctrl), step
+            engine = setting.make(scene)
+            assert isinstance(engine, StructuredEngine)
+            return _structured(engine, fields, ctrl), step
 
     def simulate(world: int) -> list[float]:
         found: list[float] = []
@@ -60,40 +63,41 @@ def forces(setting: Setting, hands: int, seconds: float = SECONDS) -> tuple[np.n
     return np.array(oracle.each_world(simulate, hands)), step
 
 
-def _structured(engine: Any, fields: ModelFields, ctrl: np.ndarray) -> np.ndarray:
-    hand = world_constants(engine.scene, jax.tree.map(jnp.asarray, fields))
+def _structured(engine: StructuredEngine, fields: ModelFields, ctrl: np.ndarray) -> np.ndarray:
+    scene = engine.scene
+    hand = world_constants(scene, jax.tree.map(jnp.asarray, fields))
 
     @jax.jit
     def run(hand: WorldConstants, state: State, ctrl: jax.Array) -> jax.Array:
-        def advance(state: State, u: jax.Array):
-            new, info = engine.step(hand, state, u)
-            return new, grip(engine, hand, state, u, info.acc)
+        found, _ = engine.advance(hand, state, ctrl)
+        path = (found["qpos"], found["qvel"], found["acc"], ctrl)
 
-        return jax.lax.scan(advance, state, ctrl)[1]
+        def force(at: tuple) -> jax.Array:
+            qpos, qvel, acc, u = at
+            return grip(scene, hand, coordinates.make(scene, qpos, qvel, acc), u.T)
+
+        return jax.lax.map(force, jax.tree.map(lambda v: jnp.moveaxis(v, 1, 0), path))
 
     with jax.default_matmul_precision("highest"):
-        found = run(hand, engine.reset(fields), jnp.moveaxis(jnp.asarray(ctrl), 0, -1))
+        found = run(hand, coordinates.reset(scene, fields), jnp.asarray(ctrl))
     return np.asarray(found, np.float64).T
 
 
-def grip(
-    engine: StructuredEngine, hand: WorldConstants, state: State, ctrl: jax.Array, acc: Acc
-) -> jax.Array:
+def grip(scene: Scene, hand: WorldConstants, state: State, ctrl: jax.Array) -> jax.Array:
     """Sum of the normal forces of fingers and palm on the object [N], shape (world,).
 
     The cone's response (`contact.respond`) at the accelerations that a step found, as the engine
     itself pushes: of spheres or of the hull, which MuJoCo C does not know.
 
     Args:
-      engine: The engine.
+      scene: The scene.
       hand: The worlds' hands.
-      state: Their states before the step.
+      state: Their states before the step, with the accelerations of the step.
       ctrl: Controls of the step, shape (nu, world).
-      acc: Accelerations of the step.
     """
     run = Stages(None)
-    problem, velocity = engine.problem(run, hand, state, ctrl)
-    motion = propagate(run, problem.kin, acc)
+    problem, velocity = differentiable.problem(scene, run, hand, state, ctrl)
+    motion = propagate(run, problem.kin, state.acc)
     found = jnp.zeros(ctrl.shape[1], ctrl.dtype)
     for name, contacts in problem.contacts.items():
         if name.endswith("_object"):

@@ -146,7 +146,7 @@ def _structured(setting: Setting, scene: Scene, fields: ModelFields, samples: Sa
     @jax.jit
     def step(batch: ModelFields, state: State, ctrl: jax.Array):
         info = engine.step(world_constants(scene, batch), state, ctrl)[1]
-        return info.acc, info.residual[0], info.iterations
+        return info.acc, info.residual[0], info.iterations.max()
 
     state = to_state(engine, scene, batch, worlds.cast(samples, dtype))
     with jax.default_matmul_precision("highest"):

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -242,44 +241,30 @@ def quantiles(errors: np.ndarray) -> dict:
 def quality(case: Case) -> dict:
     """Newton iterations and decrements of the structured engine's steps over whole grasps.
 
-    On a GPU those of the kernel; elsewhere those of the batch engine in contact.  A case of growth
-    has the short rollouts in contact that its times are of.
+    A case of growth has the short rollouts in contact that its times are of.
     """
     from codesign_jax.engines.structured import kernel
     from codesign_jax.engines.structured.constants import world_constants
 
-    worlds = case.values["worlds"][0]
-    engine: Any = peers.build(case.engine, case.setting, case.scene)
-    limits = (engine.iterations, engine.kernel_evaluations, engine.tolerance)
-    short = partial(work.window, case.scene, worlds, case.values["steps"])
-    if engine.kernel:
-        whole = partial(work.make_worlds, case.scene, worlds)
-        grown = case.values.get("growth")
+    worlds, scene = case.values["worlds"][0], case.scene
+    engine: Any = peers.build(case.engine, case.setting, scene)
+    if case.values.get("growth"):
         distinct = case.values["distinct"]
-        fields, ctrl = short(distinct=distinct) if grown else work.inputs(case.scene, whole())
-        program = kernel.Program.here(case.scene, kernel.Limits(*limits), ctrl.dtype)
-        found = jax.jit(
-            lambda f, c: program.run(world_constants(case.scene, f), engine.reset(f), c)
-        )(fields, ctrl)
-        iterations, residual = (np.asarray(found[n]) for n in ("iterations", "residual"))
+        fields, ctrl = work.window(scene, worlds, case.values["steps"], distinct=distinct)
     else:
-        fields, ctrl = short(distinct=worlds)
-
-        def body(carry: tuple, u: jax.Array) -> tuple:
-            state, info = engine.step(carry[0], carry[1], u)
-            return (carry[0], state), (info.iterations, info.residual[0])
-
-        def run(f: Any, c: jax.Array) -> Any:
-            start = world_constants(case.scene, f), engine.reset(f)
-            return jax.lax.scan(body, start, jnp.moveaxis(c, 0, -1))[1]
-
-        iterations, residual = (np.asarray(v) for v in jax.jit(run)(fields, ctrl))
+        fields, ctrl = work.inputs(scene, work.make_worlds(scene, worlds))
+    program = kernel.Program.here(scene, engine.limits, ctrl.dtype)
+    found = jax.jit(lambda f, c: program.run(world_constants(scene, f), engine.reset(f), c))(
+        fields, ctrl
+    )
+    iterations, residual = (np.asarray(found[n]) for n in ("iterations", "residual"))
+    limits = engine.limits
     return {
         "worlds": worlds,
         "limits": list(limits),
         "iterations_mean": float(iterations.mean()),
         "iterations_max": float(iterations.max()),
-        "at_the_cap": float((iterations >= limits[0]).mean()),
-        "above_tolerance": float((residual > limits[2]).mean()),
+        "at_the_cap": float((iterations >= limits.iterations).mean()),
+        "above_tolerance": float((residual > limits.tolerance).mean()),
         **{f"decrement_{k}": v for k, v in quantiles(residual).items()},
     }

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import parameters, rollout
-from codesign_jax.benchmark.program_cost import program_size
+from codesign_jax.benchmark.program_cost import jaxpr_size
 from codesign_jax.benchmark.statistics import agreement
 from codesign_jax.benchmark.work import Worlds, inputs
 from codesign_jax.codesign import SUCCESS_COST
@@ -19,7 +19,7 @@ from codesign_jax.effects import refusals
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.kinematics import State
+from codesign_jax.engines.structured.kernel import Program
 from codesign_jax.scene import Scene
 from codesign_jax.statistics import wilson
 from codesign_jax.types import Params, failed
@@ -135,13 +135,13 @@ def compare(found: Decision, reference: Decision, trials: int) -> dict[str, Any]
     }
 
 
-class Program(NamedTuple):
+class Steps(NamedTuple):
     """A compiled program of `STEPS` steps, what it does, and its arguments.
 
     Attributes:
       run: The program; None if it was not to be compiled.
-      args: Its arguments.
-      record: Size, and a digest of the text from which it was compiled.
+      args: Its arguments: constants and states of the worlds, and controls (world, time, nu).
+      record: Size of the kernel, and a digest of its jaxpr.
     """
 
     run: Callable | None
@@ -150,53 +150,33 @@ class Program(NamedTuple):
 
 
 def compile_steps(
-    scene: Scene,
-    worlds: Worlds,
-    at: Moment,
-    compiled: dict[str, Any],
-    *,
-    new: bool = True,
-    step: Callable | None = None,
-) -> Program:
-    """Compiles steps of the structured engine from a state of the grasps.
+    scene: Scene, worlds: Worlds, at: Moment, compiled: dict[str, Any], *, new: bool = True
+) -> Steps:
+    """Compiles the kernel of some steps from a state of the grasps.
 
     Args:
       scene: The scene.
       worlds: The grasps.
       at: Where they are.
-      compiled: Programs by digest: effects that are not in the step give the same text, and the
-        same program.
+      compiled: Programs by digest: effects that are not in the step give the same kernel.
       new: Whether a program that is not among them is compiled.
-      step: From hand, state and controls (nu, world) to the next state; by default the engine's.
     """
-    engine = StructuredEngine(scene, kernel=False)
+    engine = StructuredEngine(scene)
     fields, ctrl = inputs(scene, worlds)
-    hand = world_constants(scene, fields)
     q, v = (jnp.asarray(x, fields.start.dtype) for x in (at.qpos, at.qvel))
     state = engine.place(engine.reset(fields), q, v)
-    rows = jnp.moveaxis(ctrl[:, at.step : at.step + STEPS], 0, -1)
-
-    one = step or (lambda *args: engine.step(*args)[0])
-
-    def steps(hand: Any, state: State, rows: jax.Array) -> State:
-        return jax.lax.scan(lambda s, u: (one(hand, s, u), None), state, rows)[0]
-
-    size = program_size(step or engine.step, hand, state, rows[0])
-    lowered = jax.jit(steps).lower(hand, state, rows)
-    digest = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
-    each = hand.object_id.shape[1]
-    record = {"equations": size.equations, "flops": size.flops / each, "program": digest}
+    args = world_constants(scene, fields), state, ctrl[:, at.step : at.step + STEPS]
+    program = Program.here(scene, engine.limits, ctrl.dtype)
+    jaxpr = program.jaxpr(*args)
+    size, digest = jaxpr_size(jaxpr), hashlib.sha256(str(jaxpr).encode()).hexdigest()[:16]
+    flops = size.flops / program.block
+    record = {"equations": size.equations, "flops": flops, "program": digest}
     if digest not in compiled and new:
-        compiled[digest] = lowered.compile()
-    program = compiled.get(digest)
-    if program is not None:
-        analysis = program.cost_analysis()
-        record["xla_flops"] = analysis["flops"] / each
-        record["xla_bytes"] = analysis["bytes accessed"] / each
-    return Program(program, (hand, state, rows), record)
+        compiled[digest] = jax.jit(program.simulate).lower(*args).compile()
+    return Steps(compiled.get(digest), args, record)
 
 
-def measure(programs: dict[str, Program], repeats: int) -> dict[str, list[float]]:
+def measure(programs: dict[str, Steps], repeats: int) -> dict[str, list[float]]:
     """Times programs in turn, so that a busy machine slows all alike.
 
     Args:

@@ -57,14 +57,13 @@ def support_table() -> list[list[str]]:
 
 def measured_table(results: dict[str, Any]) -> list[list[str]]:
     """A row for each change of the scene; what was not measured is a dash."""
-    head = ["change", "equations", "kFLOP", "XLA kFLOP", "XLA kB", "µs a step", "time ×"]
+    head = ["change", "equations", "kFLOP", "µs a step", "time ×"]
     table = [[*head, "success (95 %)", "same verdict", "rank corr."]]
     rows = results["effects"]
     for name, r in rows.items():
         same = " (same program)" if _same(rows, name) else ""
-        sizes = ("flops", "xla_flops", "xla_bytes")
-        program = [str(r.get("equations", "–"))]
-        program += [f"{r[k] / 1e3:.1f}" if k in r else "–" for k in sizes]
+        flops = f"{r['flops'] / 1e3:.1f}" if "flops" in r else "–"
+        program = [str(r.get("equations", "–")), flops]
         if "ratio" not in r:
             program += ["–"] * 2
         else:

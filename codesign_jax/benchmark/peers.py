@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import jax
-
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import Scene
@@ -22,7 +20,6 @@ STRUCTURED: dict[str, dict[str, Any]] = {
     "default": {},
     "tight": {"iterations": 48, "tolerance": 1e-8},
     "loose": {"iterations": 6, "tolerance": 1e-4},
-    "unison": {"kernel": False},
 }
 REFERENCE = {"iterations": 300, "ls_iterations": 100, "tolerance": 1e-15}
 """Solver values at which MuJoCo C finds the solution to rounding."""
@@ -61,7 +58,4 @@ def how(engine: str, setting: str) -> str:
         return {"mujoco": "MuJoCo C, float64, all cores", "mjx": "stock MJX (JAX)"}.get(
             engine, "MuJoCo Warp, one CUDA graph a step"
         )
-    on_gpu = jax.default_backend() == "gpu"
-    if setting == "unison":
-        return "XLA, all worlds step in unison"
-    return "one kernel a rollout" if on_gpu else "XLA"
+    return "one kernel a rollout"

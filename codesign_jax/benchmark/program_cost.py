@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 # One operation an element; what only moves or chooses numbers is free.
@@ -26,19 +25,15 @@ class Size(NamedTuple):
     flops: float
 
 
-def program_size(function: Any, *args: Any) -> Size:
-    """Returns the size of function(*args); the arguments may be `jax.ShapeDtypeStruct`.
+def jaxpr_size(jaxpr: Any) -> Size:
+    """Returns the size of a jaxpr with all jaxprs inside its equations.
 
     XLA's own cost analysis counts the body of every loop once, also of a `scan` whose length it
     knows (`HloCostAnalysis::HandleWhile`), and so a chain of forty links like one of a single link.
     """
-    return _size(jax.make_jaxpr(function)(*args).jaxpr)
-
-
-def _size(jaxpr: Any) -> Size:
     equations, flops = 0, 0.0
     for equation in jaxpr.eqns:
-        inner = [_size(j) for j in _inner(equation)]
+        inner = [jaxpr_size(j) for j in _inner(equation)]
         equations += 1 + sum(s.equations for s in inner)
         name = equation.primitive.name
         if name == "scan":

@@ -2,7 +2,6 @@
 
 import functools
 import importlib.metadata
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,8 +16,6 @@ from codesign_jax.compiler.layout import INPUT, OUTPUT, SCRATCH, Array, Layout
 OLDEST_LLVMLITE = (0, 45)
 OLDEST_GPU = (8, 0)
 """Oldest compute capability that device code is written for (sm_80)."""
-
-_warned: set[str] = set()
 
 
 class Kernel(NamedTuple):
@@ -49,14 +46,6 @@ def available(platform: str) -> str | None:
       platform: As `jax.default_backend` names it; "gpu" is only NVIDIA's.
     """
     return _available(platform)
-
-
-def warn(reason: str) -> None:
-    """Says once that kernels cannot run and what that means."""
-    if reason not in _warned:
-        _warned.add(reason)
-        text = f"no kernel: {reason}; simulating without it, which takes many times as long"
-        warnings.warn(text, RuntimeWarning, stacklevel=3)
 
 
 def block_lanes(platform: str, dtype: Any) -> int:

@@ -95,7 +95,6 @@ class Bench:
         self.scene, self.engine, self.wide = the_scene, engine, precision == "float64"
         assert self.wide or engine == "structured"  # MuJoCo C is built for float64
         self.h = the_scene.discretization.timestep
-        self._programs: dict = {}
 
     def fields(self, params, trials):
         """Model fields of worlds, float64 NumPy arrays with a leading world axis."""
@@ -147,36 +146,32 @@ class Bench:
     def _structured(self, fields, ctrl, qvel) -> History:
         dtype = jnp.float64 if self.wide else jnp.float32
         fields = jax.tree.map(lambda v: jnp.asarray(v, dtype), fields)
-        worlds, steps = ctrl.shape[:2]
-        start, advance = self._program(worlds)
+        steps, start, advance = ctrl.shape[1], *self._program
         hand, state = start(fields, jnp.asarray(qvel, dtype))
         ctrl = np.concatenate([ctrl, np.repeat(ctrl[:, -1:], -steps % CHUNK, 1)], 1)
         rows = []
-        for first in range(0, steps, CHUNK):
-            u = jnp.asarray(np.moveaxis(ctrl[:, first : first + CHUNK], 0, -1), dtype)
-            state, row = advance(hand, state, u)
+        for first in range(0, ctrl.shape[1], CHUNK):
+            row, state = advance(hand, state, jnp.asarray(ctrl[:, first : first + CHUNK], dtype))
             rows.append(jax.tree.map(np.asarray, row))
-        return History(
-            *(np.moveaxis(np.concatenate(v), 1, 0)[:, :steps] for v in zip(*rows, strict=True))
-        )
+        return History(*(np.concatenate(v, 1)[:, :steps] for v in zip(*rows, strict=True)))
 
-    def _program(self, worlds: int):
-        """Compiled start and chunk of steps for a number of worlds."""
-        if worlds not in self._programs:
-            engine = StructuredEngine(self.scene, tolerance=self.tolerance)
+    @functools.cached_property
+    def _program(self):
+        """Compiled start, and compiled chunk of steps."""
+        engine = StructuredEngine(self.scene, tolerance=self.tolerance)
 
-            def start(fields, qvel):
-                return world_constants(self.scene, fields), moving(engine, fields, qvel)
+        def start(fields, qvel):
+            return world_constants(self.scene, fields), moving(engine, fields, qvel)
 
-            def advance(hand, state, ctrl):
-                def one(state, u):
-                    state, _ = engine.step(hand, state, u)
-                    return state, (engine.qpos(state), engine.qvel(state))
+        def advance(hand, state, ctrl):
+            found, end = engine.advance(hand, state, ctrl)
+            last = engine.qpos(end)[:, None], engine.qvel(end)[:, None]
+            after = (found["qpos"], found["qvel"]), last
+            return tuple(
+                jnp.concatenate([a[:, 1:], b], 1) for a, b in zip(*after, strict=True)
+            ), end
 
-                return jax.lax.scan(one, state, ctrl)
-
-            self._programs[worlds] = jax.jit(start), jax.jit(advance)
-        return self._programs[worlds]
+        return jax.jit(start), jax.jit(advance)
 
 
 def moving(engine: StructuredEngine, fields, qvel):

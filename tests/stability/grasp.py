@@ -126,7 +126,7 @@ def one_step(base, fields, ctrl, qpos, qvel, precision):
     with floats(wide):
         dtype = jnp.float64 if wide else jnp.float32
         tolerance = 1e-24 if wide else 1e-10
-        engine = StructuredEngine(base, iterations=100, evaluations=16, tolerance=tolerance)
+        engine = StructuredEngine(base, iterations=100, evaluations=40, tolerance=tolerance)
 
         def step(fields, ctrl, qvel):
             state = moving(engine, fields, qvel)

@@ -1,4 +1,4 @@
-"""Newton steps with contacts between fingers, which couple the chains.
+"""The linear system of a derivative with contacts between fingers, which couple the chains.
 
 With these contacts the Newton matrix is H = P + F: P is what one elimination solves, F couples two
 fingers.  H x = g is solved by conjugate gradients preconditioned with P, started at z = P^-1 g
@@ -6,8 +6,7 @@ fingers.  H x = g is solved by conjugate gradients preconditioned with P, starte
 directions a contact, so that the iteration ends after at most 3 n + 1 steps for n contacts, and
 often far earlier.  Since H >= P, the residual r has |x - H^-1 g|_H^2 <= r'P^-1 r, which is known:
 that is where it stops.  All residuals are J'L for spatial forces L on the links, which is all that
-has to be stored.  A result that does not descend gives way to z, which always does; the exact line
-search thus decreases the objective in every Newton step however early the iteration is cut off.
+has to be stored.
 """
 
 from collections.abc import Callable
@@ -31,17 +30,15 @@ ITERATIONS = 60
 
 
 class Coupling(NamedTuple):
-    """Response of the pairs of fingers at an iterate.
+    """Stiffness of the contacts between fingers at a solution.
 
     Attributes:
       contacts: The contacts.
       hessian: Their Hessians, upper triangles, shape (6, slot, 1, world).
-      push: Their forces on the links, shape (6, link, finger, world).
     """
 
     contacts: Contacts
     hessian: jax.Array
-    push: jax.Array
 
     def apply(self, run: Stages, links: jax.Array) -> jax.Array:
         """F: forces on the links, (6, link, finger, world), of the links' motion."""
@@ -59,17 +56,14 @@ class Coupling(NamedTuple):
         return each_block(self.contacts, add, (self.hessian,), jnp.zeros_like(links))
 
 
-def coupling(run: Stages, c: Contacts, jar: jax.Array, like: jax.Array) -> Coupling:
-    """Evaluates the pairs of fingers at jar; forces are shaped as `like`."""
+def coupling(run: Stages, c: Contacts, jar: jax.Array) -> Coupling:
+    """Evaluates the contacts between fingers at jar."""
 
-    def add(carry: tuple, at: jax.Array, part: Contacts, jar: jax.Array) -> tuple:
-        hessian, push = carry
-        response = run(respond, part, jar)
-        push = run(lambda s, c, f: s + on_links(c, f, s), push, part, response.force)
-        return store(hessian, response.hessian, at), push
+    def add(hessian: jax.Array, at: jax.Array, part: Contacts, jar: jax.Array) -> jax.Array:
+        return store(hessian, run(lambda c, j: respond(c, j).hessian, part, jar), at)
 
-    empty = jnp.zeros((6, *c.distance.shape), jar.dtype), jnp.zeros_like(like)
-    return Coupling(c, *each_block(c, add, (jar,), empty))
+    empty = jnp.zeros((6, *c.distance.shape), jar.dtype)
+    return Coupling(c, each_block(c, add, (jar,), empty))
 
 
 def product(force: jax.Array, links: jax.Array) -> jax.Array:
@@ -82,24 +76,22 @@ def correct(
     pairs: Coupling,
     start: tuple,
     descent: jax.Array,
-    idle: jax.Array,
     precondition: Callable[[jax.Array], tuple],
-    tolerance: float,
 ) -> tuple:
-    """Solves (P + F) x = g by preconditioned conjugate gradients.
+    """Solves (P + F) x = g by preconditioned conjugate gradients, as far as rounding allows.
 
     Args:
       run: Runs the stages of the pairs.
       pairs: F.
       start: z = P^-1 g as accelerations and spatial motion.
       descent: g'z, shape (1, world).
-      idle: Worlds for which nothing is done, shape (1, world).
       precondition: P^-1 J'L of forces L on the links, as accelerations and spatial motion.
-      tolerance: Squared error of x, relative to its squared size, both as measured by H.
 
     Returns:
       x as accelerations and spatial motion.
     """
+    # Squared error of x, relative to its squared size, both as measured by H.
+    tolerance = float(jnp.finfo(descent.dtype).eps) ** 1.5
 
     def apply(motion) -> jax.Array:
         return pairs.apply(run, motion.link)
@@ -128,8 +120,7 @@ def correct(
         z = precondition(r)
         rz = jnp.maximum(product(r, z[1].link), 0.0)
         first = (start, descent, r, z, r, rz, jnp.zeros((), jnp.int32))
-        x, gx, *_ = jax.lax.while_loop(going, body, first)
-        return jax.tree.map(lambda a, b: jnp.where(gx > 0, a, b), x, start)
+        return jax.lax.while_loop(going, body, first)[0]
 
-    r = jnp.where(idle, 0.0, -apply(start[1]))
+    r = -apply(start[1])
     return jax.lax.cond(pairs.contacts.active.any(), iterate, lambda _: start, r)

@@ -3,7 +3,7 @@
 Every sphere of one finger is a candidate against every sphere of another; the relative motion is
 the first finger's minus the second's.  Few candidates touch, so that once a step a broad phase
 finds those that do and gives each a slot: slots have the axes (slot, 1, world), those in use come
-first, and whatever an iteration does ends after the last block of slots that any world uses.
+first, and loops over them end after the last block of slots that any world uses.
 """
 
 import itertools
@@ -18,17 +18,12 @@ from codesign_jax.engines.structured.contact import (
     Cone,
     Contacts,
     Ends,
-    Line,
     contact_wrench,
-    slopes,
 )
-from codesign_jax.engines.structured.lanes import Stages, dot, sum_items, total
+from codesign_jax.engines.structured.lanes import Stages, dot, total
 
 BLOCK = 8
 """Slots that are done at a time."""
-SHARE = 4
-"""Every fourth candidate can touch at once: fingers that start inside one another touch with up to
-0.22 of theirs (500 random designs; docs/hull.md).  A world with more is a failed one."""
 MARGIN = 1e-5
 """Of the squared distance: the broad phase leaves the last digit to the exact distance."""
 
@@ -38,9 +33,15 @@ def finger_pairs(fingers: int) -> list[tuple[int, int]]:
     return list(itertools.combinations(range(fingers), 2))
 
 
-def slots(candidates: int) -> int:
-    """Number of slots of a world: whole blocks."""
-    return BLOCK * -(-candidates // (BLOCK * SHARE))
+def slots(spheres: int, fingers: int) -> int:
+    """Number of slots of a world, whole blocks: as many as the kernel has, which tells of too few.
+
+    Args:
+      spheres: Spheres of a finger.
+      fingers: Number of fingers.
+    """
+    count = min(4 * spheres, spheres**2) * len(finger_pairs(fingers))
+    return BLOCK * -(-count // BLOCK)
 
 
 def contacts(run: Stages, cone: Cone, centre: jax.Array, radius: jax.Array) -> Contacts:
@@ -53,17 +54,17 @@ def contacts(run: Stages, cone: Cone, centre: jax.Array, radius: jax.Array) -> C
       radius: Radii [m], shape (link, k, finger, world).
     """
     links, k, fingers, worlds = radius.shape
-    first, second = _candidates(links, k, fingers)
+    (first, second), count = _candidates(links, k, fingers), slots(links * k, fingers)
     fits = run(_near, jax.lax.stop_gradient(centre), radius)
     touching = fits.sum(0, dtype=jnp.int32)[None]
-    chosen = run.only_if(touching.any())(lambda f: _choose(f, slots(len(first))), fits)
+    chosen = run(lambda f: _choose(f, count), fits)
     ends = jnp.stack([jnp.asarray(s, jnp.int32)[chosen] for s in (first, second)])
-    used = jnp.arange(slots(len(first)))[:, None] < touching
+    used = jnp.arange(count)[:, None] < touching
 
     def place(centre: jax.Array, radius: jax.Array, ends: jax.Array, used: jax.Array):
         return _place(centre.reshape(3, -1, worlds), radius.reshape(-1, worlds), ends, used)
 
-    found = run.only_if(touching.any())(place, centre, radius, ends, used)
+    found = run(place, centre, radius, ends, used)
     point, normal, gap = (x[..., None, :] for x in found)
     link = (ends // (k * fingers)) * fingers + ends % fingers
     return Contacts(point, normal, gap, cone, ends=Ends(link[:, :, None], touching))
@@ -148,11 +149,6 @@ def ends_of(c: Contacts) -> Ends:
     return c.ends
 
 
-def overflow(c: Contacts) -> jax.Array:
-    """Worlds in which more pairs touch than there are slots, shape (1, world)."""
-    return ends_of(c).touching > c.distance.shape[0]
-
-
 def blocks(c: Contacts) -> jax.Array:
     """Number of blocks of slots that any world uses, shape ()."""
     used = jnp.minimum(ends_of(c).touching.max(), c.distance.shape[0])
@@ -198,31 +194,3 @@ def on_links(c: Contacts, force: jax.Array, like: jax.Array) -> jax.Array:
         for s in range(wrench.shape[1])
     ]
     return total(terms).reshape(like.shape)
-
-
-def jar_of(run: Stages, c: Contacts, links: jax.Array) -> jax.Array:
-    """J a of accelerations of the links, (6, link, finger, world), shape (3, slot, 1, world)."""
-
-    def add(whole: jax.Array, at: jax.Array, part: Contacts) -> jax.Array:
-        return store(whole, part.relative(relative(links, ends_of(part).link)), at)
-
-    def fill(c: Contacts) -> jax.Array:
-        return each_block(c, add, (), jnp.zeros_like(c.point))
-
-    return run(fill, c)
-
-
-def line_slopes(
-    run: Stages, c: Contacts, ray: Line, alpha: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """First and second derivative of the cost of all slots along the line, shape (1, world)."""
-
-    def add(sums: tuple, _: jax.Array, part: Contacts, *ray: jax.Array) -> tuple:
-        return tuple(
-            s + sum_items(v) for s, v in zip(sums, slopes(part, Line(*ray), alpha), strict=True)
-        )
-
-    def fold(c: Contacts, ray: Line) -> tuple:
-        return each_block(c, add, tuple(ray), (jnp.zeros_like(alpha),) * 2)
-
-    return run(fold, c, ray)

@@ -21,15 +21,12 @@ from codesign_jax import hull
 from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
 from codesign_jax.engines.structured.contact import (
     Contacts,
-    Line,
     contact_inertia,
-    contact_wrench,
     respond,
-    slopes,
 )
 from codesign_jax.engines.structured.elimination import JointTerms
 from codesign_jax.engines.structured.kinematics import Kinematics
-from codesign_jax.engines.structured.lanes import Stages, contract, sum_items
+from codesign_jax.engines.structured.lanes import Stages, contract
 from codesign_jax.scene import Scene
 
 
@@ -99,9 +96,7 @@ def attach(run: Stages, contacts: Contacts, skin: Vertices) -> Contacts:
             for x in each
         )
 
-    # Where no vertex touches all become zero, which is no contact either.
-    touching = run.only_if(contacts.active.any())
-    point, normal, distance, lever, share = touching(ordered, contacts, skin)
+    point, normal, distance, lever, share = run(ordered, contacts, skin)
     cone = contacts.cone
     tangent = None if cone.tangent is None else cone.tangent * share
     cone = cone._replace(normal=cone.normal * share, tangent=tangent)
@@ -116,39 +111,25 @@ def across_joints(palm: jax.Array, links: jax.Array) -> jax.Array:
     return jnp.concatenate([before, turning])
 
 
-def push(run: Stages, c: Contacts, jar: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Contact inertia (9, 9, row, finger, world) and wrench (9, row, finger, world) of the rows."""
+def inertia(run: Stages, c: Contacts, jar: jax.Array) -> jax.Array:
+    """Contact inertia of the rows at jar, shape (9, 9, row, finger, world)."""
 
-    def evaluate(point, normal, distance, lever, stiff, tangent, jar) -> tuple:
+    def evaluate(point, normal, distance, lever, stiff, tangent, jar) -> jax.Array:
         cone = c.cone._replace(normal=stiff, tangent=tangent)
         vertex = Contacts(point, normal, distance, cone, lever)
-        response = respond(vertex, jar)
-        matrix = contact_inertia(vertex, response.hessian)
-        wrench = contact_wrench(vertex, response.force)
-        return jnp.stack([matrix[i, j] for i, j in _UPPER]), wrench
+        matrix = contact_inertia(vertex, respond(vertex, jar).hessian)
+        return jnp.stack([matrix[i, j] for i, j in _UPPER])
 
     each = (c.point, c.normal, c.distance, c.lever, c.cone.normal, c.cone.tangent, jar)
-    upper, wrench = _sum_vertices(run, c, evaluate, each, (len(_UPPER), 9))
+    upper = _sum_vertices(run, c, evaluate, each, len(_UPPER))
     place = {ij: n for n, ij in enumerate(_UPPER)}
     rows = [jnp.stack([upper[place[min(i, j), max(i, j)]] for j in range(9)]) for i in range(9)]
-    return jnp.stack(rows), wrench
-
-
-def line_slopes(run: Stages, c: Contacts, ray: Line, alpha: jax.Array) -> tuple:
-    """First and second derivative of the cost of all vertices along the line, shape (1, world)."""
-
-    def evaluate(distance, stiff, tangent, *ray) -> tuple:
-        cone = c.cone._replace(normal=stiff, tangent=tangent)
-        vertex = Contacts(distance, distance, distance, cone)
-        return tuple(v[None] for v in slopes(vertex, Line(*ray), alpha))
-
-    each = (c.distance, c.cone.normal, c.cone.tangent, *ray)
-    return tuple(sum_items(v[0]) for v in _sum_vertices(run, c, evaluate, each, (1, 1)))
+    return jnp.stack(rows)
 
 
 def _sum_vertices(
-    run: Stages, c: Contacts, function: Callable, each: tuple, sizes: tuple[int, ...]
-) -> tuple:
+    run: Stages, c: Contacts, function: Callable, each: tuple, size: int
+) -> jax.Array:
     """Sums over the vertices of each row that touch in any lane, one vertex after the other.
 
     All vertices' matrices would not fit a CPU's cache, and most vertices, such as those on a
@@ -158,49 +139,44 @@ def _sum_vertices(
       run: Runs the stages.
       c: The contacts.
       function: From the arrays of one vertex of each row, shape (..., row, finger, world), to
-        arrays of shape (size, row, finger, world).
+        an array of shape (size, row, finger, world).
       each: Arrays of shape (..., row, k, finger, world), or None.
-      sizes: The sizes.
+      size: The size.
     """
     rows, k, *lanes = c.distance.shape
     arrays, structure = jax.tree.flatten(each)
     # Rows and planes to the compiler, as in `scan_links`.
     planes = [x.reshape(-1, k, lanes[0] * lanes[1]) for x in arrays]
 
-    def add(i: jax.Array, sums: tuple) -> tuple:
+    def add(i: jax.Array, sums: jax.Array) -> jax.Array:
         vertex = [
             jax.lax.dynamic_index_in_dim(p, i, 1, keepdims=False).reshape(*x.shape[:-3], *lanes)
             for p, x in zip(planes, arrays, strict=True)
         ]
-        new = run(function, *jax.tree.unflatten(structure, vertex))
-        return tuple(s + v for s, v in zip(sums, new, strict=True))
+        return sums + run(function, *jax.tree.unflatten(structure, vertex))
 
-    zero = tuple(jnp.zeros((n, rows, *lanes), c.distance.dtype) for n in sizes)
+    zero = jnp.zeros((size, rows, *lanes), c.distance.dtype)
     return jax.lax.fori_loop(0, c.active.sum(1).max(), add, zero)
 
 
 _UPPER = [(i, j) for i in range(9) for j in range(i, 9)]
 
 
-def joint_terms(
-    axes: jax.Array,
-    terms: dict[str, tuple[jax.Array, jax.Array]],
-) -> JointTerms:
-    """What the contacts of the rows add to the elimination of their joints.
+def joint_terms(axes: jax.Array, inertias: dict[str, jax.Array]) -> JointTerms:
+    """What the contacts of the rows add to the elimination of their joints, without forces.
 
     Args:
       axes: Motion subspaces, shape (link, axis, 6, finger, world).
-      terms: Contact inertia, (9, 9, row, finger, world), and wrench by pair of bodies.
+      inertias: Contact inertia, (9, 9, row, finger, world), by pair of bodies.
     """
     turn = jnp.moveaxis(axes[:, :, :3], 0, 2)  # (axis, 3, link, finger, world)
     result = None
-    for name, (inertia, wrench) in terms.items():
+    for name, inertia in inertias.items():
         mixed = contract(turn[:, :, None], inertia[None, 6:, :, :-1], 1)  # (axis, 9, link, ...)
         parent = mixed[:, :6]
         own = contract(turn[:, None], mixed[None, :, 6:], 2)
-        force = contract(turn, wrench[None, 6:, :-1], 1)
         obj = parent if name.endswith("object") else jnp.zeros_like(parent)
-        new = JointTerms(own, parent, obj, force)
+        new = JointTerms(own, parent, obj, jnp.zeros_like(own[0]))
         result = new if result is None else jax.tree.map(jnp.add, result, new)
     assert result is not None
     return result

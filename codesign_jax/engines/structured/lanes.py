@@ -41,10 +41,6 @@ class Stages:
 
         return jax.lax.cond(self.predicate, traced, never, *args)
 
-    def only_if(self, condition: jax.Array) -> "Stages":
-        """Stages that return zeros when a scalar is false; with barriers they always run."""
-        return Stages(None if self.predicate is None else condition)
-
 
 def scan_links(
     step: Callable, first: Any, links: Any, inner: Any = (), *, reverse: bool = False

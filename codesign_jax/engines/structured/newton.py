@@ -1,6 +1,8 @@
-"""A Newton step on the contact problem by elimination, from the tips to the object.
+"""The Newton system of the contact problem by elimination, from the tips to the object.
 
 A contact acts on a link as a wrench and a 6 x 6 contact inertia X'KX: the cost is that of a chain.
+The kernel sums links, palm and contacts with the functions of this module; `linear_solve` is the
+one system that a derivative solves, in plain JAX.
 """
 
 from typing import Any, NamedTuple
@@ -10,21 +12,9 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import coupling, hull
 from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured.contact import (
-    Contacts,
-    contact_inertia,
-    contact_wrench,
-    respond,
-)
+from codesign_jax.engines.structured.contact import Contacts, contact_inertia, respond
 from codesign_jax.engines.structured.kinematics import Acc
-from codesign_jax.engines.structured.lanes import (
-    Stages,
-    dot,
-    scan_links,
-    sum_axis,
-    sum_fingers,
-    sum_items,
-)
+from codesign_jax.engines.structured.lanes import Stages, scan_links, sum_axis, sum_fingers
 from codesign_jax.engines.structured.problem import (
     Forces,
     Matrices,
@@ -32,7 +22,6 @@ from codesign_jax.engines.structured.problem import (
     Spatial,
     object_acceleration,
     on_links,
-    relative,
     work,
 )
 
@@ -55,33 +44,50 @@ class Eliminated(NamedTuple):
     r_object: jax.Array
 
 
-def newton_step(
-    run: Stages, problem: Problem, force: Forces, pushes: dict[str, tuple[jax.Array, jax.Array]]
-) -> tuple[Acc, Spatial]:
-    """Solves (M + J'WJ) p = -gradient by elimination from the tips to the object.
+def linear_solve(run: Stages, problem: Problem, force: Forces, jar: dict[str, jax.Array]) -> Acc:
+    """Solves (M + J'KJ) x = force, K the Hessians of the contacts.
 
     Args:
       run: Runs the stages.
       problem: The problem.
-      force: Smooth forces minus inertial forces.
-      pushes: Contact inertia (6, 6, ...) and wrench (6, ...) by pair of bodies, summed over a
-        body's contacts.
-
-    Returns:
-      The step in the joints and its spatial motion.
+      force: The right side.
+      jar: J a - aref of every contact, where the Hessians are taken.
     """
-    return substitute(run, problem, eliminate(run, problem, force, pushes))
+    between = "finger_finger"
+    inertias = {
+        name: _inertia(run, name, c, jar[name])
+        for name, c in problem.contacts.items()
+        if name != between
+    }
+    done = eliminate(run, problem, force, inertias, keep=between in jar)
+    x, motion = substitute(run, problem, done)
+    if between not in jar:
+        return x
+    pairs = coupling.coupling(run, problem.contacts[between], jar[between])
+
+    def again(links: jax.Array) -> tuple[Acc, Spatial]:
+        return substitute(run, problem, eliminate_again(run, problem, done, links))
+
+    return coupling.correct(run, pairs, (x, motion), work(run, force, x, motion), again)[0]
 
 
 def eliminate(
     run: Stages,
     problem: Problem,
     force: Forces,
-    pushes: dict[str, tuple[jax.Array, jax.Array]],
+    inertias: dict[str, jax.Array],
     *,
     keep: bool = False,
 ) -> Eliminated:
-    """First half of `newton_step`; keep: also what `eliminate_again` needs."""
+    """Eliminates all joints from the tips to the object.
+
+    Args:
+      run: Runs the stages.
+      problem: The problem.
+      force: The right side.
+      inertias: Contact inertia (6, 6, ...) by pair of bodies, summed over a body's contacts.
+      keep: Whether to keep what `eliminate_again` needs.
+    """
     kin, hand = problem.kin, problem.hand
 
     def next_joint(node: el.Quadratic, link: tuple):
@@ -90,19 +96,20 @@ def eliminate(
         return node, kept if keep else kept._replace(inverse=())
 
     # Sums over all links at once: the recursion then slices fewer arrays.
-    terms = {n: v for n, v in pushes.items() if n.startswith("finger")}
-    skin = {n: v for n, v in pushes.items() if n.startswith("hull")}
+    skin = {n: v for n, v in inertias.items() if n.startswith("hull")}
+    others = {n: _still(v) for n, v in inertias.items() if n not in skin}
     joints = run(hull.joint_terms, kin.axes, skin) if skin else None
+    terms = {n: v for n, v in others.items() if n.startswith("finger")}
     terms |= _of_links(skin, slice(1, None))
     own = run(link_terms, problem.matrix.link, force.link, terms), joints
     links = (kin.axes, hand.armature, force.finger)
-    held = any(n.endswith("_object") for n in pushes)
+    held = any(n.endswith("_object") for n in inertias)
     node = _nothing(force.link[:, 0], held)
     node, fingers = scan_links(next_joint, node, links, own, reverse=True)
     if skin:  # what the first joints' rows add to the palm
         zero = jnp.zeros_like(node.p), jnp.zeros_like(node.r)
         node = run(lambda n, s: add_link(n, link_terms(*zero, _of_links(s, 0))), node, skin)
-    node = run(add_palm, node, problem.matrix, force, pushes)
+    node = run(add_palm, node, problem.matrix, force, others)
     if problem.arm is not None:  # known: no step
         return Eliminated(fingers, None, None, node.q, node.r_object)
     arm, wrist = hand.wrist_armature, force.wrist
@@ -138,7 +145,7 @@ def eliminate_again(
 
 
 def substitute(run: Stages, problem: Problem, done: Eliminated) -> tuple[Acc, Spatial]:
-    """Second half of `newton_step`: the step in the joints and its spatial motion."""
+    """Back substitution: the solution in the joints and its spatial motion."""
     kin, like = problem.kin, done.fingers.factors.w[0, 0]
     joints, palm, obj = _palm_step(run, problem, done)
 
@@ -166,62 +173,14 @@ def _palm_step(
     return [first, second], palm, obj
 
 
-def respond_all(
-    runs: dict[str, Stages],
-    contacts: dict[str, Contacts],
-    jar: dict[str, jax.Array],
-    motion: Spatial,
-) -> tuple[dict[str, tuple[jax.Array, jax.Array]], coupling.Coupling | None]:
-    """What the contacts add to the Newton system: to its elimination, and between the fingers."""
-    name = "finger_finger"
-    pushes = {n: _push(runs[n], n, c, jar[n]) for n, c in contacts.items() if n != name}
-    if name not in contacts:
-        return pushes, None
-    return pushes, coupling.coupling(runs[name], contacts[name], jar[name], motion.link)
+def _still(inertia: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A contact inertia with the wrench of zero that the system of a derivative has."""
+    return inertia, jnp.zeros_like(inertia[0])
 
 
-def linear_solve(
-    run: Stages,
-    problem: Problem,
-    force: Forces,
-    pushes: dict[str, tuple[jax.Array, jax.Array]],
-    pairs: coupling.Coupling | None,
-    idle: jax.Array | None = None,
-    tolerance: float = 1e-6,
-) -> tuple[Acc, Spatial]:
-    """`newton_step` with the contacts between fingers, if the scene has them.
-
-    Args:
-      run: Runs the stages.
-      problem: The problem.
-      force: Smooth forces minus inertial forces.
-      pushes: As in `newton_step`.
-      pairs: The contacts between fingers.
-      idle: Worlds whose step is of no use, shape (1, world).
-      tolerance: Squared relative error of the step.
-    """
-    if pairs is None:
-        return newton_step(run, problem, force, pushes)
-    force = force._replace(link=force.link + pairs.push)
-    done = eliminate(run, problem, force, pushes, keep=True)
-    step, motion = substitute(run, problem, done)
-    descent = decrement(-work(run, force, step, motion), pushes, motion, None)
-
-    def again(links: jax.Array) -> tuple[Acc, Spatial]:
-        return substitute(run, problem, eliminate_again(run, problem, done, links))
-
-    active = run.only_if(pairs.contacts.active.any())
-    idle = jnp.zeros_like(descent, bool) if idle is None else idle
-    start = step, motion
-    return coupling.correct(active, pairs, start, descent, idle, again, tolerance)
-
-
-def _of_links(skin: dict, rows: slice | int) -> dict:
+def _of_links(skin: dict[str, jax.Array], rows: slice | int) -> dict:
     """The hull's contacts as those of the links before its rows."""
-    return {
-        n.replace("hull", "finger"): (inertia[:6, :6, rows], wrench[:6, rows])
-        for n, (inertia, wrench) in skin.items()
-    }
+    return {n.replace("hull", "finger"): _still(v[:6, :6, rows]) for n, v in skin.items()}
 
 
 def _nothing(like: jax.Array, held: bool) -> el.Quadratic:
@@ -294,32 +253,11 @@ def wrist_slides(like: jax.Array) -> jax.Array:
     return jnp.broadcast_to(eye, (3, 6, *like.shape[1:]))
 
 
-def _push(stages: Stages, name: str, c: Contacts, jar: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Contact inertia and wrench of a pair of bodies, summed over the contacts of each body."""
+def _inertia(run: Stages, name: str, c: Contacts, jar: jax.Array) -> jax.Array:
+    """Contact inertia of a pair of bodies, summed over the contacts of each body."""
 
-    def summed(c: Contacts, hessian: jax.Array, force: jax.Array):
-        matrix, wrench = contact_inertia(c, hessian), contact_wrench(c, force)
-        if on_links(name):
-            return sum_axis(matrix, 3), sum_axis(wrench, 2)
-        return sum_fingers(matrix), sum_fingers(wrench)
+    def summed(c: Contacts, jar: jax.Array) -> jax.Array:
+        matrix = contact_inertia(c, respond(c, jar).hessian)
+        return sum_axis(matrix, 3) if on_links(name) else sum_fingers(matrix)
 
-    if c.lever is not None:
-        return hull.push(stages, c, jar)
-    response = stages(respond, c, jar)
-    return stages(summed, c, response.hessian, response.force)
-
-
-def decrement(
-    slope: jax.Array, pushes: dict, step: Spatial, pairs: coupling.Coupling | None
-) -> jax.Array:
-    """Newton decrement -p'gradient, shape (1, world): twice the decrease that the step predicts."""
-    pushed = -slope
-    for name, (_, wrench) in pushes.items():
-        product = dot(
-            relative(name, step)[:, :, 0] if on_links(name) else relative(name, step),
-            wrench,
-        )
-        pushed = pushed + sum_items(product)
-    if pairs is not None:
-        pushed = pushed + coupling.product(pairs.push, step.link)
-    return jnp.maximum(pushed, 0.0)
+    return hull.inertia(run, c, jar) if c.lever is not None else run(summed, c, jar)

@@ -5,8 +5,8 @@ them whatever the nesting (`jax.custom_batching.custom_vmap`).
 
 Differentiation (`jax.custom_vjp`): the forward pass is the same kernel, which then stores the state
 before each step and the accelerations of the step.  The backward pass is one reverse scan over the
-steps.  Each step is repeated from its stored accelerations as plain JAX and pulled back by the
-implicit function theorem (`implicit`): one linear solve a step, no Newton iteration.
+steps.  Each step is repeated from its stored accelerations as plain JAX (`differentiable`) and
+pulled back by the implicit function theorem (`implicit`): one linear solve a step.
 
 The derivative is that of the trace as it was computed.  A world that is decided stands still, and
 so does its derivative: what later entries repeat counts for the state that they repeat.  A step
@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax import verdict
+from codesign_jax.engines.structured import coordinates, differentiable
 from codesign_jax.engines.structured.constants import WorldConstants, world_constants
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.model import ModelFields
@@ -60,6 +61,7 @@ def rollout(
 
     Raises:
       NotImplementedError: If a derivative is differentiated again.
+      SceneError: If a derivative is asked for and the scene has none.
     """
     plain = folded(lambda f, c: engine.simulate(f, c, trajectory=trajectory)[0])
     recorded = _once(folded(partial(engine.simulate, trajectory=trajectory, states=True)))
@@ -70,6 +72,7 @@ def rollout(
         return plain(fields, ctrl)
 
     def forward(fields: ModelFields, ctrl: jax.Array):
+        differentiable.refuse(engine.scene)  # before the kernel, whose compile takes a while
         trace, path = recorded(fields, ctrl)
         return trace, (fields, ctrl, path, trace.speed)
 
@@ -146,7 +149,7 @@ def _reverse_scan(
     speed: jax.Array,
     cotangent: Trace,
 ) -> tuple[ModelFields, jax.Array]:
-    scene, nq, like = engine.scene, path.qpos.shape[-1], engine.reset(fields)
+    scene, nq = engine.scene, path.qpos.shape[-1]
     hand = world_constants(scene, fields)
     _, rebuild = _numbers(hand)
     bounds = verdict.Bounds(*(v[0] for v in hand.bounds))
@@ -163,12 +166,12 @@ def _reverse_scan(
         acc = jnp.where(moved, here.acc, 0.0)
 
         def step(numbers: list, qpos: jax.Array, qvel: jax.Array, u: jax.Array):
-            state = engine.place(like, qpos, qvel, acc)
-            new, info = engine.step(rebuild(numbers), state, u.T, iterations=0)
-            away = state.position - info.centre
+            state = coordinates.make(scene, qpos, qvel, acc)
+            new, centre = differentiable.step(scene, rebuild(numbers), state, u.T)
+            away = state.position - centre
             distance = jnp.sqrt(total([away[i, 0] ** 2 for i in range(3)]))
-            entry = distance, state.position[2, 0], engine.speed(state)
-            return engine.qpos(new), engine.qvel(new), *entry
+            entry = distance, state.position[2, 0], coordinates.speed(state)
+            return coordinates.qpos(new), coordinates.qvel(new), *entry
 
         _, pull = jax.vjp(step, numbers, here.qpos, here.qvel, u)
         # The entry after a failed step shows the speed of a state that was not kept.

@@ -18,9 +18,9 @@ from codesign_jax.engines.structured.kernel.memory import (
     upper,
 )
 from codesign_jax.engines.structured.kernel.objects import WorldObject
+from codesign_jax.engines.structured.kernel.solver import along
 from codesign_jax.engines.structured.lanes import sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.solver import along
 from codesign_jax.scene import Scene
 
 # Rows of a contact's jar and numbers of its line, by friction model.

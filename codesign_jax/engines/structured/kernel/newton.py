@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured import newton, solver
+from codesign_jax.engines.structured import newton
 from codesign_jax.engines.structured.inertia import Body
-from codesign_jax.engines.structured.kernel import hull
+from codesign_jax.engines.structured.kernel import hull, solver
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, direct, zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.memory import (
@@ -428,7 +428,7 @@ class Newton:
         floor: jax.Array,
         evaluations: int,
     ) -> Lanes:
-        """Step length, lanes of a world; see `solver.line_search`.
+        """Step length, lanes of a world.
 
         Args:
           slope: Slope of the smooth part at 0.

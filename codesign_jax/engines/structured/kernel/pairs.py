@@ -19,9 +19,9 @@ from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, ze
 from codesign_jax.engines.structured.kernel.hull import across
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop, solid
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet
+from codesign_jax.engines.structured.kernel.solver import along
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.solver import along
 from codesign_jax.scene import Scene
 
 

@@ -5,6 +5,7 @@ wait for each other: each does the Newton iterations that its own worlds need, a
 are all decided.
 """
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,8 +17,8 @@ from jax.experimental import pallas as pl
 
 from codesign_jax import verdict
 from codesign_jax.compiler import cache
-from codesign_jax.compiler.launch import Kernel, block_lanes, launch
-from codesign_jax.engines.structured import collision
+from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
+from codesign_jax.engines.structured import collision, coordinates
 from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.kernel import fingers, hull, objects
 from codesign_jax.engines.structured.kernel.contacts import ContactSet
@@ -300,11 +301,44 @@ class Program:
           `trace` by name, shape (world, time), with "qpos", "qvel" and "acc", shape (world, time,
           nq or nv), of what is recorded; and the last states.
         """
+        inputs = self._inputs(hand, state, ctrl)
+        call, outputs = self._call(inputs, trajectory, states)
+        if self.backend == "interpreter":
+            out = call(*inputs)
+        else:
+            code = cache.sources(PACKAGE, UNRELATED)
+            origin = repr((self.scene.structure, self.limits, trajectory, states, code))
+            shared = (len(inputs) - 1,) if self.meshes else ()
+            kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
+            out = launch(call, inputs, outputs, kernel)
+        steps = ctrl.shape[1]
+        trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
+        trace = trace.reshape(-1, steps, len(self.trace))[: ctrl.shape[0]]
+        found = {name: trace[..., k] for k, name in enumerate(self.trace)}
+        if trajectory or states:
+            found |= {k: v[: ctrl.shape[0]] for k, v in self._path(out[4], out[5], states).items()}
+        last = self.unpack_state(out[0], out[1], ctrl.shape[0])
+        if states:
+            # A row holds the acceleration of the step before it, the solver's warm start.
+            end = coordinates.flat_acc(last.acc)[:, None]
+            found["acc"] = jnp.concatenate([found["acc"][:, 1:], end], 1)
+        return found, last
+
+    def jaxpr(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> Any:
+        """The jaxpr of a block of a rollout's kernel; arguments may be `jax.ShapeDtypeStruct`."""
+        inputs = jax.eval_shape(self._inputs, hand, state, ctrl)
+        return kernel_jaxpr(self._call(inputs, False, False)[0], list(inputs))
+
+    def _inputs(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> tuple:
+        """The kernel's arguments, which have a leading axis of blocks; the last may be shared."""
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
-        shared = (len(inputs),) if self.meshes else ()
-        if hand.mesh is not None:
-            inputs += (hand.mesh.values[None],)
-        blocks, steps, dtype = inputs[0].shape[0], ctrl.shape[1], ctrl.dtype
+        return inputs if hand.mesh is None else (*inputs, hand.mesh.values[None])
+
+    def _call(
+        self, inputs: tuple, trajectory: bool, states: bool
+    ) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
+        """The kernel of arguments as a function of them, and its outputs."""
+        blocks, steps, dtype = inputs[0].shape[0], inputs[4].shape[1], inputs[4].dtype
         shapes = [
             (blocks, self.finger_state.rows, self.size),
             (blocks, self.world_state.rows, self.block),
@@ -329,26 +363,7 @@ class Program:
             interpret=self.backend == "interpreter",
             name="grasp",
         )
-        if self.backend == "interpreter":
-            out = call(*inputs)
-        else:
-            code = cache.sources(PACKAGE, UNRELATED)
-            origin = repr((self.scene.structure, self.limits, trajectory, states, code))
-            kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
-            out = launch(call, inputs, outputs, kernel)
-        trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
-        trace = trace.reshape(-1, steps, len(self.trace))[: ctrl.shape[0]]
-        found = {name: trace[..., k] for k, name in enumerate(self.trace)}
-        if trajectory or states:
-            found |= {k: v[: ctrl.shape[0]] for k, v in self._path(out[4], out[5], states).items()}
-        last = self.unpack_state(out[0], out[1], ctrl.shape[0])
-        if states:
-            # A row holds the acceleration of the step before it, the solver's warm start.
-            fingers = jnp.moveaxis(last.acc.finger, 2, 0).reshape(-1, ctrl.shape[0])
-            parts = [last.acc.wrist[:, 0], fingers, last.acc.object[:, 0]]
-            end = jnp.concatenate(parts).T[:, None]
-            found["acc"] = jnp.concatenate([found["acc"][:, 1:], end], 1)
-        return found, last
+        return call, outputs
 
     def _path_rows(self, states: bool) -> tuple[int, int]:
         """Numbers of rows of the state's tables that are recorded: all, or the positions."""

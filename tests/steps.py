@@ -1,0 +1,128 @@
+"""Steps of the structured engine's kernel, checked one by one against what it does not share.
+
+Every step of a path is compared at the state that the kernel itself went through, so that chaos
+does not enter, and a whole grasp is one program.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from codesign_jax import model
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured import coordinates, differentiable, implicit
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kinematics import Acc
+from codesign_jax.engines.structured.lanes import Stages
+from tests import small
+
+FLOOR = 100.0
+"""Smallest scale of relative errors of accelerations, ten g: at rest they are rounding."""
+
+
+class Path(NamedTuple):
+    """States of worlds, float64: qpos, qvel, acc (world, time, ...), distance (world, time)."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    acc: np.ndarray
+    distance: np.ndarray
+
+
+def path(engine, fields, ctrl):
+    """The kernel's path under controls (world, time, nu), whatever becomes of the worlds."""
+
+    @jax.jit
+    def run(fields, ctrl):
+        state = engine.reset(fields)
+        return engine.advance(world_constants(engine.scene, fields), state, ctrl)[0]
+
+    found = run(fields, jnp.asarray(ctrl))
+    return Path(*(np.asarray(found[name]) for name in Path._fields))
+
+
+def against_mujoco(scene, fields, ctrl, found):
+    """Errors of a path's steps against MuJoCo C, which converges at each of its states.
+
+    Args:
+      scene: The scene.
+      fields: Model fields of the worlds.
+      ctrl: Controls, shape (world, time, nu).
+      found: The path.
+
+    Returns:
+      Relative errors of the accelerations and errors of the distance [m], shape (world, time - 2),
+      and numbers of contacts, alike.  The start is left out: there the object is so exactly on the
+      table that rounding decides whether it touches.
+    """
+    h, lay = scene.discretization.timestep, model.layout(scene)
+    errors, far, touching = [], [], []
+    for world in range(len(ctrl)):
+        own = small.nth(fields, world)
+        compiled = world_model(scene, own)
+        compiled.opt.tolerance, compiled.opt.iterations, compiled.opt.ls_iterations = 0.0, 200, 50
+        data = mujoco.MjData(compiled)
+        for k in range(1, ctrl.shape[1] - 1):
+            qpos, (qvel, after) = found.qpos[world, k], found.qvel[world, k : k + 2]
+            data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl[world, k]
+            soften(scene, own, data)
+            mujoco.mj_forward(compiled, data)
+            scale = max(np.linalg.norm(data.qacc), FLOOR)
+            errors.append(np.linalg.norm((after - qvel) / h - data.qacc) / scale)
+            away = data.xipos[lay.object] - lay.centre_weights @ data.xipos
+            far.append(abs(np.linalg.norm(away) - found.distance[world, k]))
+            touching.append(data.ncon)
+    return (np.array(v).reshape(len(ctrl), -1) for v in (errors, far, touching))
+
+
+def soften(scene, fields, data):
+    """What the engine `mujoco` applies before a step."""
+    if scene.effects.neo_hookean:
+        bend = model.layout(scene).dofs[..., 0]
+        data.qfrc_applied[bend] = model.softening_moments(scene, fields, data.qpos[bend])
+
+
+def unbalanced(scene, fields, ctrl, found, stride):
+    """Forces that a path's accelerations leave unbalanced: the gradient of a step's objective.
+
+    Plain JAX over whole arrays: no Newton iteration, no elimination and no memory of the kernel,
+    whose functions of geometry and friction cone alone are shared.
+
+    Args:
+      scene: The scene.
+      fields: Model fields of the worlds.
+      ctrl: Controls, shape (world, time, nu).
+      found: The path.
+      stride: Steps between states that are checked.
+
+    Returns:
+      Largest forces on wrist, joints and object, each relative to what it is if nothing is
+      accelerated, shape (3, state).
+    """
+    times = slice(None, None, stride)
+    states = [v[:, times] for v in (found.qpos, found.qvel, found.acc, ctrl)]
+    count = states[0].shape[1]
+    qpos, qvel, acc, u = (jnp.asarray(v.reshape(-1, v.shape[-1])) for v in states)
+    many = jax.tree.map(lambda v: jnp.repeat(jnp.asarray(v), count, 0), fields)
+
+    @jax.jit
+    def force(many, qpos, qvel, acc, u):
+        run = Stages(None)
+        state = coordinates.make(scene, qpos, qvel, acc)
+        given = differentiable.problem(scene, run, world_constants(scene, many), state, u.T)
+
+        def power(virtual: Acc, acc: Acc):
+            return implicit.residual_power(run, *given, acc, virtual).sum()
+
+        none = jax.tree.map(jnp.zeros_like, state.acc)
+        # Power is linear in the virtual accelerations: its slope is the force itself.
+        return [jax.grad(power)(none, a) for a in (state.acc, none)]
+
+    left, all_of_it = force.lower(many, qpos, qvel, acc, u).compile(
+        {"xla_backend_optimization_level": 0}
+    )(many, qpos, qvel, acc, u)
+    worst = [[np.abs(v).reshape(-1, len(qpos)).max(0) for v in f] for f in (left, all_of_it)]
+    return np.array(worst[0]) / np.array(worst[1])

@@ -99,8 +99,8 @@ def unbalanced(scene, fields, ctrl, found, stride):
       stride: Steps between states that are checked.
 
     Returns:
-      Largest forces on wrist, joints and object, each relative to what it is if nothing is
-      accelerated, shape (3, state).
+      Largest forces on wrist, joints and object, each relative to the largest of all states if
+      nothing were accelerated, shape (3, state).
     """
     times = slice(None, None, stride)
     states = [v[:, times] for v in (found.qpos, found.qvel, found.acc, ctrl)]
@@ -125,4 +125,5 @@ def unbalanced(scene, fields, ctrl, found, stride):
         {"xla_backend_optimization_level": 0}
     )(many, qpos, qvel, acc, u)
     worst = [[np.abs(v).reshape(-1, len(qpos)).max(0) for v in f] for f in (left, all_of_it)]
-    return np.array(worst[0]) / np.array(worst[1])
+    # At rest nothing is accelerated, and what is left is rounding of forces that cancel.
+    return np.array(worst[0]) / np.max(worst[1], axis=1, keepdims=True)

@@ -218,15 +218,14 @@ def changed(value, path, field, new):
 
 
 def program(scene):
-    """Text of everything a grasp computes: fields, controls and the kernel of a step."""
-    world, trial = small.hand_world(scene)
-    world = jax.tree.map(jnp.asarray, small.stack(world))
-    trial = small.stack(trial)
+    """Text of everything a grasp computes: the kernel's arguments, and the kernel of a step."""
+    world, trial = (jax.tree.map(jnp.asarray, small.stack(v)) for v in small.hand_world(scene))
+    kernel = Program(scene, Limits(8, 8, 1e-6), width=8)
 
     def run(p, t):
         fields = jax.vmap(lambda p, t: model.model_fields(scene, p, t))(p, t)
         ctrl = jax.vmap(lambda p, t: control.commands(scene, p, t))(p, t)
-        return fields, ctrl
+        return kernel.inputs(world_constants(scene, fields), coordinates.reset(scene, fields), ctrl)
 
     return jax.jit(run).lower(world, trial).as_text() + str(step_jaxpr(scene))
 

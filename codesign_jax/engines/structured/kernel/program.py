@@ -301,7 +301,7 @@ class Program:
           `trace` by name, shape (world, time), with "qpos", "qvel" and "acc", shape (world, time,
           nq or nv), of what is recorded; and the last states.
         """
-        inputs = self._inputs(hand, state, ctrl)
+        inputs = self.inputs(hand, state, ctrl)
         call, outputs = self._call(inputs, trajectory, states)
         if self.backend == "interpreter":
             out = call(*inputs)
@@ -326,10 +326,10 @@ class Program:
 
     def jaxpr(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> Any:
         """The jaxpr of a block of a rollout's kernel; arguments may be `jax.ShapeDtypeStruct`."""
-        inputs = jax.eval_shape(self._inputs, hand, state, ctrl)
+        inputs = jax.eval_shape(self.inputs, hand, state, ctrl)
         return kernel_jaxpr(self._call(inputs, False, False)[0], list(inputs))
 
-    def _inputs(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> tuple:
+    def inputs(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> tuple:
         """The kernel's arguments, which have a leading axis of blocks; the last may be shared."""
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         return inputs if hand.mesh is None else (*inputs, hand.mesh.values[None])

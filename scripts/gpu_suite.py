@@ -34,7 +34,8 @@ RATES: dict[str, dict[str, Any]] = {
     "spheres, 40 links": {"discretization": {"links": 40}},
     "hull": {"effects": {"surface": "hull"}},
     "spheres and fingers": {"effects": {"finger_finger": True}},
-    "hull and fingers": {"effects": {"surface": "hull", "finger_finger": True}},
+    # Hands whose fingers start apart; the other cases' designs put fingers into one another.
+    "hull and fingers": {"scene": "paper_hull"},
     "household meshes": {"objects": "household"},
 }
 RATES |= {
@@ -78,14 +79,15 @@ def rate(name: str, values: dict[str, Any], wait: Callable[[], Any]) -> dict[str
     values = dict(values)
     dtype, worlds = values.pop("dtype", np.float32), values.pop("worlds", WORLDS)
     objects, whole = values.pop("objects", None), values.pop("whole", False)
-    scene = scenes.load("paper_spheres", object_set=objects, overrides=values)
+    base, effects = values.pop("scene", "paper_spheres"), values.get("effects", {})
+    scene = scenes.load(base, object_set=objects, overrides=values)
     if whole:
         fields, ctrl = work.inputs(scene, work.make_worlds(scene, worlds))
         index = np.arange(worlds)
     else:
         # Start states are those of MuJoCo C, which has neither hull nor meshes: spheres' serve.
-        apart = {"finger_finger": values.pop("effects", {}).get("finger_finger", False)}
-        plain = scenes.load("paper_spheres", overrides={**values, "effects": apart})
+        bare = effects | {"surface": "spheres"}
+        plain = scenes.load(base, overrides={**values, "effects": bare})
         starts, ctrl = work.window(plain, DISTINCT, STEPS, distinct=DISTINCT)
         made, _ = work.inputs(scene, work.make_worlds(scene, DISTINCT))
         fields = made._replace(start=starts.start)

@@ -75,8 +75,8 @@ def test_a_failed_world_returns_its_last_good_state(batches, traces):
 def test_the_cap_is_flagged_step_by_step():
     """Bits of a step come from its residual; exactly the tolerance is solved."""
     engine = StructuredEngine(pinch("box"), tolerance=1e-6)
-    residual = jnp.array([0.0, 1e-6, 2e-6, jnp.nan])
-    np.testing.assert_array_equal(engine._status(residual), [0, 0, Status.SOLVER_CAP, 0])
+    found = {"residual": jnp.array([0.0, 1e-6, 2e-6, jnp.nan])}
+    np.testing.assert_array_equal(engine._status(found), [0, 0, Status.SOLVER_CAP, 0])
 
 
 # --- the cap's meaning -----------------------------------------------------------------------

@@ -48,7 +48,7 @@ def test_lowest_point_bounds_mujocos_geoms():
 def test_starts_inside_table_or_object_are_refused_and_those_called_clear_are_clear():
     scene = low_start()
     designs = hands(scene, 64)
-    exact = np.asarray(clearance._depths(scene, single(designs)))[0]
+    exact = np.asarray(clearance._depths(*clearance._arguments(scene, single(designs))))[0]
     low = [clearance.lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
     clear = np.array(low) >= 0.06  # the box's height
     assert clear.any() and (exact[clear] <= 0).all()

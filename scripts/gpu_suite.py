@@ -149,8 +149,10 @@ def run_tests(recorder: Recorder, processes: int) -> int:
     paths = sorted(Path("tests").glob("test_*.py"))
     files = [str(p) for p in paths if "pytest.mark.gpu" in p.read_text(encoding="utf-8")]
     options = ["-m", "gpu", "-q", "-p", "no:cacheprovider", *files]
+    # Other plugins that happen to be installed may not bear several processes.
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     if processes > 1 and importlib.util.find_spec("xdist"):
-        options += ["-n", str(processes), "--dist", "worksteal"]
+        options += ["-p", "xdist.plugin", "-n", str(processes), "--dist", "worksteal"]
     return int(pytest.main(options, plugins=[recorder]))
 
 

@@ -282,9 +282,15 @@ def primitives(jaxpr, found):
 
 def test_without_contacts_the_kernel_has_no_cone():
     """A beam simulation and a falling body: no contact is found, kept, or evaluated."""
-    free = primitives(step_jaxpr(effects_scene(dict.fromkeys(CONTACTS, False))), {})
+    scene = effects_scene(dict.fromkeys(CONTACTS, False))
+    assert not Program(scene, Limits(8, 8, 1e-6)).sets
+    free = primitives(step_jaxpr(scene), {})
     touching = primitives(step_jaxpr(effects_scene({})), {})
-    assert sum(free.values()) < 0.6 * sum(touching.values())
+    # A contact is evaluated on condition that it touches, and a cone divides by its forces.  Of all
+    # primitives 61 % are left, the fingers' dynamics and the Newton solver's loop.
+    assert "cond" not in free and touching["cond"] > 0
+    assert free["div"] < touching["div"] / 4
+    assert sum(free.values()) < 0.7 * sum(touching.values())
 
 
 def test_what_has_no_derivative_is_refused():

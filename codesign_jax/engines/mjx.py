@@ -46,8 +46,13 @@ class MjxEngine(Equal):
         return self.scene.structure, self.data.qpos.dtype
 
     def model(self, fields: ModelFields) -> mjx.Model:
-        """Returns the template with the fields of one world."""
-        return self.template.tree_replace(fields.of_model)  # type: ignore[arg-type]
+        """Returns the template with the fields of one world.
+
+        NumPy fields become JAX arrays: MJX takes a NumPy field for the same at every body of a
+        depth of the tree, and refuses fingers whose mounts lie at different points.
+        """
+        values = {name: jnp.asarray(value) for name, value in fields.of_model.items()}
+        return self.template.tree_replace(values)  # type: ignore[arg-type]
 
     def reset(self, fields: ModelFields) -> mjx.Data:
         """Returns the start state of one world."""

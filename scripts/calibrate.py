@@ -4,6 +4,8 @@ python scripts/calibrate.py wave first --size gpu --minutes 7       # again to r
 python scripts/calibrate.py score first
 python scripts/calibrate.py wave second --seed 1 --after runs/calibration/first_scores.npz
 python scripts/calibrate.py wave check --like runs/calibration/first_scores.npz --best 60 --fingers
+python scripts/calibrate.py wave check --like runs/calibration/first_scores.npz --best 60 \
+    --others 60 --fingers                                           # sets of an earlier wave
 python scripts/calibrate.py compare first check                     # do they rank sets alike?
 python scripts/calibrate.py report --data docs/data/calibration --page docs/calibration.md
 
@@ -63,6 +65,9 @@ def parse() -> argparse.Namespace:
     wave.add_argument(
         "--best", type=int, help="with --like: only the best of its first --sets sets"
     )
+    wave.add_argument(
+        "--others", type=int, help="with --best: as many of the rest, evenly over their ranks"
+    )
     wave.add_argument("--seed", type=int, default=0)
     wave.add_argument("--minutes", type=float, help="save and stop after this time")
     wave.add_argument("--every", type=int, help="calls between saves; by default 20 s")
@@ -94,11 +99,14 @@ def chosen_sets(args: argparse.Namespace, count: int) -> tuple[np.ndarray, str]:
         raise SceneError(["--after and --like exclude each other"])
     if args.best and not args.like:
         raise SceneError(["--best needs --like"])
+    if args.others and not args.best:
+        raise SceneError(["--others needs --best"])
     if args.like:
         [earlier] = files.read_scores([args.like])
         units = earlier.data["units"][: args.sets]
         if args.best:
-            units = units[score.best(earlier.data["distances"][: args.sets], args.best)]
+            distances = earlier.data["distances"][: args.sets]
+            units = units[score.best_and_others(distances, args.best, args.others or 0)]
         return units, f"{len(units)} sets of {earlier.name}"
     if args.after:
         return files.next_sets(files.read_scores(args.after), count, args.seed, args.keep)

@@ -496,7 +496,7 @@ def test_sets_of_another_wave_are_taken_in_its_order_or_the_best(scored):
     folder, calibrate = scored
     path = folder / "one_scores.npz"
     [one] = files.read_scores([path])
-    ask = argparse.Namespace(after=None, like=path, best=None, sets=5, seed=0, keep=4)
+    ask = argparse.Namespace(after=None, like=path, best=None, others=None, sets=5, seed=0, keep=4)
     units, _ = calibrate.chosen_sets(ask, 99)
     np.testing.assert_array_equal(units, one.data["units"][:5])
     ask.best = 2
@@ -504,6 +504,11 @@ def test_sets_of_another_wave_are_taken_in_its_order_or_the_best(scored):
     worst = one.data["distances"][:5].max(-1)
     found = [int(np.argmax((one.data["units"] == u).all(1))) for u in units]
     assert worst[found].max() <= np.sort(worst)[1] and text == "2 sets of one"
+    ask.others = 2
+    units, _ = calibrate.chosen_sets(ask, 99)
+    found = [int(np.argmax((one.data["units"] == u).all(1))) for u in units]
+    # The two best, the next one and the worst, in the wave's order.
+    assert found == sorted(score.best(one.data["distances"][:5], 5)[[0, 1, 2, 4]])
 
 
 @pytest.mark.parametrize(
@@ -512,6 +517,7 @@ def test_sets_of_another_wave_are_taken_in_its_order_or_the_best(scored):
         (["score", "three"], "three.npz and its .json cannot be read"),
         (["wave", "x", "--sets", "1"], "--sets 1 must be at least 2"),
         (["wave", "x", "--best", "3"], "--best needs --like"),
+        (["wave", "x", "--others", "3"], "--others needs --best"),
         (["wave", "x", "--trials", "4", "--size", "tiny"], "4 trials: must be a multiple of 3"),
         (["wave", "x", "--set", "contact.frictoin=1"], "frictoin"),
         (["wave", "x", "--like", "one.npz"], "holds no scores"),

@@ -156,3 +156,21 @@ def best(distances: np.ndarray, count: int) -> np.ndarray:
       count: How many.
     """
     return np.lexsort((distances.mean(-1), distances.max(-1)))[:count]
+
+
+def best_and_others(distances: np.ndarray, count: int, others: int) -> np.ndarray:
+    """Indices of the best sets and of some of the rest, in the wave's order.
+
+    A second fidelity is compared with the first on both kinds: best sets alone tell whether they
+    stay, and not whether it ranks sets alike.  In the wave's order both kinds are mixed, so that a
+    comparison that stops early has some of each.
+
+    Args:
+      distances: Shape (set, target).
+      count: Number of best sets.
+      others: Number of sets from the rest, evenly over their ranks.
+    """
+    ranked = best(distances, len(distances))
+    rest = ranked[count:]
+    places = np.linspace(0, len(rest) - 1, min(others, len(rest))).round().astype(int)
+    return np.sort(np.concatenate([ranked[:count], rest[places]]))

@@ -11,29 +11,37 @@ from codesign_jax.calibration.files import Scored
 
 COLUMNS = 5
 LANDSCAPES = 8
-HIGHEST = 12.0
-"""Distances above are drawn there."""
+BINS = 6
+"""Parts of a constant's range."""
 
 
 def constants(wave: Scored, path: Path) -> Path:
-    """Draws the worst distance to a target over each constant, with the sets that are left."""
+    """Draws which share of the sets is left in each part of every constant's range."""
     rows = -(-len(sets.OPEN) // COLUMNS)
-    figure = matplotlib.figure.Figure(figsize=(2.3 * COLUMNS, 2.0 * rows), layout="constrained")
-    worst, left = np.minimum(wave.data["distances"].max(-1), HIGHEST), wave.plausible
-    values = sets.values(wave.data["units"])
+    figure = matplotlib.figure.Figure(figsize=(2.3 * COLUMNS, 1.9 * rows), layout="constrained")
+    left, values = wave.plausible, sets.values(wave.data["units"])
+    axes = None
     for i, o in enumerate(sets.OPEN):
-        axes = figure.add_subplot(rows, COLUMNS, i + 1)
-        axes.scatter(values[o.name], worst, s=4, color="tab:gray", alpha=0.5, lw=0)
-        axes.scatter(values[o.name][left], worst[left], s=10, color="tab:blue", lw=0)
-        axes.axhline(score.CUTOFF, color="black", lw=0.8, ls="--")
-        axes.set(xscale="log" if o.log else "linear", ylim=(0, HIGHEST * 1.03))
-        axes.set_title(f"{o.label} [{o.unit}]" if o.unit else o.label, fontsize=8)
-        axes.tick_params(labelsize=7)
+        axes = figure.add_subplot(rows, COLUMNS, i + 1, sharey=axes)
+        space = np.geomspace if o.log else np.linspace
+        edges = space(o.low, o.high, BINS + 1)
+        tried, found = (np.histogram(v, edges)[0] for v in (values[o.name], values[o.name][left]))
+        share = found / np.maximum(tried, 1)
+        # One more of either kind, so that a bin without a set that is left has an error too.
+        known = (found + 1) / (tried + 2)
+        error = np.sqrt(known * (1 - known) / np.maximum(tried, 1))
+        axes.stairs(100 * share, edges, fill=True, color="tab:blue", alpha=0.6)
+        middle = np.sqrt(edges[1:] * edges[:-1]) if o.log else (edges[1:] + edges[:-1]) / 2
+        axes.errorbar(middle, 100 * share, 100 * error, fmt="none", ecolor="black", lw=0.9)
+        axes.axhline(100 * left.mean(), color="black", lw=0.8, ls="--")
+        axes.set(xscale="log" if o.log else "linear", ylim=(0, None))
+        axes.set_title(f"{o.label} [{o.unit}]" if o.unit else o.label, fontsize=9)
+        axes.tick_params(labelsize=8, labelleft=i % COLUMNS == 0)
         if o.log:
             ticks = np.geomspace(o.low, o.high, 4)
             axes.set_xticks(ticks, [f"{t:.2g}" if t < 100 else f"{t:.0f}" for t in ticks])
             axes.minorticks_off()
-    figure.supylabel("worst distance to a target [standard deviations]", fontsize=9)
+    figure.supylabel("sets left [%]", fontsize=10)
     return _save(figure, path)
 
 

@@ -155,7 +155,9 @@ def test_a_run_is_the_loop_of_its_episodes_and_vmaps_over_seeds():
     starts = [optimizer.init(jax.random.key(k), np.array(d), 3) for k, d, _ in seeds]
     masks = np.stack([schedule(n, np.array(space.is_morphology), 2) for *_, n in seeds])
     batch = jax.tree.map(lambda *v: jnp.stack(v), *starts)
-    ends, infos = jax.jit(jax.vmap(run))(batch, masks)
+    ends, infos = jax.jit(jax.vmap(run), compiler_options=QUICK)(batch, masks)
+    _, firsts = jax.jit(jax.vmap(episode), compiler_options=QUICK)(batch, masks[:, 0])
+    run, episode = (jax.jit(f, compiler_options=QUICK) for f in (run, episode))
     # XLA rounds the model fields of these programs differently in their last bit, which moves the
     # states at the end by 1e-5, but no loss by a step, which would be 4e-2 of cost.
     close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
@@ -169,7 +171,6 @@ def test_a_run_is_the_loop_of_its_episodes_and_vmaps_over_seeds():
         close(ends.particles[k], end.particles)
         for a, b in zip(jax.tree.leaves(infos), jax.tree.leaves(info), strict=True):
             close(a[k], b)
-    _, firsts = jax.jit(jax.vmap(episode))(batch, masks[:, 0])
     close(firsts.trials.cost, infos.trials.cost[:, 0])
     assert np.ptp(infos.trials.cost) > 0.1 and (infos.trials.status & ~int(WARNINGS) == 0).any()
 
@@ -282,7 +283,8 @@ def test_gradients_by_the_kernel_equal_central_differences():
         step = 1e-5 * jnp.eye(3)
         sides = jnp.stack([x[:, None] + step, x[:, None] - step])
         run = jax.vmap(jax.vmap(value, in_axes=(0, None)))
-        high, low = np.asarray(jax.jit(jax.vmap(run, in_axes=(0, None)))(sides, broken))
+        both = jax.jit(jax.vmap(run, in_axes=(0, None)), compiler_options=QUICK)
+        high, low = np.asarray(both(sides, broken))
     assert np.isfinite(slope).all() and (np.abs(slope) > 1e-3).all()
     # A step of 1e-5 loses 1e-10 to truncation and 1e-11 to rounding.
     np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)

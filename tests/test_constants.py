@@ -13,6 +13,8 @@ from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.constants import world_constants
 
+# Compiling takes longer than all that is done with a program here.
+QUICK = {"xla_backend_optimization_level": 0}
 SHORT = dict(  # 30 steps, with every phase
     phases__approach=0.1,
     phases__inflate=0.15,
@@ -99,9 +101,11 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     trials = trials._replace(shape=jnp.zeros(2, jnp.int32))
 
     @jax.jit
-    def height(constants):
+    def heights(constants):
         outcome, trace = rollout.simulate(the_scene, engine, params, trials, constants=constants)
         return trace.height[:, -1], outcome.cost
+
+    height = jax.jit(heights, compiler_options=QUICK)
 
     constants = in_float32(the_scene.constants())
     first = height(constants)
@@ -113,12 +117,14 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     assert height._cache_size() == 1 and len(compiled) == 1
     assert not np.allclose(first[0], changed[0], rtol=1e-2)
     both = jax.tree.map(lambda *v: jnp.stack(v), constants, other)
-    for mapped, *alone in zip(jax.jit(jax.vmap(height))(both), first, changed, strict=True):
+    every = jax.jit(jax.vmap(heights), compiler_options=QUICK)(both)
+    for mapped, *alone in zip(every, first, changed, strict=True):
         # XLA's two programs round model fields differently by 1e-7, and a few contacts follow.
         np.testing.assert_allclose(mapped, np.stack(alone), rtol=1e-4)
     # A scene read from other files asks for the same kernel.
     again = as_file(the_scene, other)
-    rollout.simulate(again, make_engine("structured", again), params, trials)
+    other_engine = make_engine("structured", again)
+    jax.eval_shape(lambda: rollout.simulate(again, other_engine, params, trials))
     assert len(compiled) == 3 and len(set(compiled)) == 1
 
 
@@ -244,13 +250,13 @@ def test_derivatives_equal_differences():
             leaves = [x for x in jax.tree.leaves((fields, hand)) if x.dtype == float and x.size]
             return jnp.concatenate([x.ravel() for x in leaves])
 
-        size = jnp.abs(numbers(start)) + 1e-6
+        size = jnp.abs(jax.jit(numbers, compiler_options=QUICK)(start)) + 1e-6
 
-        @jax.jit
         def total(c):
             return jnp.sum(numbers(c) / size)
 
-        slopes = jax.grad(total)(start)
+        slopes = jax.jit(jax.grad(total), compiler_options=QUICK)(start)
+        total = jax.jit(total, compiler_options=QUICK)
         assert all(np.isfinite(v) for v in jax.tree.leaves(slopes))
         products = jax.tree.map(lambda a, b: a * b, slopes, way)
         # A central difference's error is of order h^2, and of 1e-16 / 1e-6 / h by rounding, in each
@@ -285,10 +291,8 @@ def test_later_noise_leaves_earlier_draws_alone():
     draws = [drawn.mass, drawn.size, *np.log([friction, stiffness, hand_mass])]
     assert np.abs(np.corrcoef(draws) - np.eye(5)).max() < 0.1
     params, _ = jax.tree.map(jnp.asarray, hand_world(the_scene))
-    fields, one = (
-        jax.jit(lambda p, t: model.model_fields(the_scene, p, t))(params, nth(trials, 1))
-        for trials in (drawn, plain)
-    )
+    fields_of = jax.jit(lambda p, t: model.model_fields(the_scene, p, t), compiler_options=QUICK)
+    fields, one = (fields_of(params, nth(trials, 1)) for trials in (drawn, plain))
     materials = fields.constants.hand.material.shear_modulus / 56e3
     np.testing.assert_allclose(materials, stiffness[1], rtol=1e-6)
     ratio = fields.pair_friction[:, 0] / one.pair_friction[:, 0]

@@ -138,41 +138,47 @@ import sys
 from pathlib import Path
 import jax
 import numpy as np
-from toy import ToyEngine, tiny
+from toy import tiny
 from codesign_jax import codesign
 from codesign_jax.experiments import Batch, Strategies, Worlds, drive
 
 plan = Strategies("2d", "2d", ("single", "concurrent"), 2, 3, 3, 3, 3)
-scene, space, _ = tiny()
-used, count = set(), jax.device_count()
-worlds = Worlds(scene, ToyEngine(scene), space, chunk=12, devices=count)
-simulate = worlds._simulate
+scene, space, engine = tiny()
+optimizer = codesign.make_filter(space)
+assert jax.device_count() == 2
 
-def spy(*args):
-    found = simulate(*args)
-    used.update(found.cost.devices())
-    return found
+def run(count):
+    used, worlds = set(), Worlds(scene, engine, space, chunk=12, devices=count)
+    simulate = worlds._simulate
 
-worlds._simulate = spy
-batch = Batch(plan, scene, worlds, codesign.make_filter(space), seed=5)
-record = drive(batch, Path(sys.argv[1]).with_suffix(".state"), {}, say=lambda _: None).record
-assert len(used) == count, used
-assert simulate._cache_size() == count
-np.savez(sys.argv[1], **record)
+    def spy(*args):
+        found = simulate(*args)
+        used.update(found.cost.devices())
+        return found
+
+    worlds._simulate = spy
+    batch = Batch(plan, scene, worlds, optimizer, seed=5)
+    path = Path(sys.argv[1]) / str(count)
+    record = drive(batch, path.with_suffix(".state"), {}, say=lambda _: None).record
+    assert len(used) == count, used
+    assert simulate._cache_size() == count
+    np.savez(path.with_suffix(".npz"), **record)
+
+run(1)
+run(2)
 """
 
 
 def test_two_devices_give_the_bits_of_one(tmp_path):
     """Chunks of a step are dealt to the devices; 3 chunks on 2 leave one idle at the end."""
+    paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    changed = {"XLA_FLAGS": flags, "PYTHONPATH": ":".join(paths), "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", TWO_DEVICES, str(tmp_path)]
+    subprocess.run(command, check=True, env=os.environ | changed)
     records = []
     for count in (1, 2):
-        path = tmp_path / f"{count}.npz"
-        paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-        flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
-        changed = {"XLA_FLAGS": flags, "PYTHONPATH": ":".join(paths), "JAX_PLATFORMS": "cpu"}
-        command = [sys.executable, "-c", TWO_DEVICES, str(path)]
-        subprocess.run(command, check=True, env=os.environ | changed)
-        with np.load(path) as file:
+        with np.load(tmp_path / f"{count}.npz") as file:
             records.append({name: file[name] for name in file.files})
     assert_equal(*records)
     assert len(np.unique(records[0]["cost"])) > 5

@@ -70,6 +70,7 @@ def grasp():
     return scene, fields, ctrl[:, :230]
 
 
+@pytest.mark.slow
 def test_machine_code_equals_the_interpreter(grasp):
     """This CPU's code and Pallas' own interpreter, on the way to the object and in contact."""
     scene, fields, ctrl = grasp

@@ -15,7 +15,7 @@ import pytest
 import scipy.stats
 
 from codesign_jax import files
-from codesign_jax.accuracy import labels, report, statistics
+from codesign_jax.accuracy import labels, report, statistics, study
 from codesign_jax.accuracy.results import Study
 from codesign_jax.accuracy.settings import PRESETS, STANDARD, Setting
 
@@ -134,8 +134,11 @@ def test_the_presets_files_and_the_front_page_state_what_was_measured(tmp_path, 
     assert all("# measured: finger tip" in text for text in stated.values())
 
 
-def test_a_tiny_study_runs_resumes_and_is_drawn(tmp_path, monkeypatch, capsys):
-    """The script with MuJoCo C alone: every part, a refused setting, the budget, page and CSV."""
+@pytest.mark.parametrize(
+    "parts", ["tip,impulse,time", pytest.param(",".join(study.PARTS), marks=pytest.mark.slow)]
+)
+def test_a_tiny_study_runs_resumes_and_is_drawn(parts, tmp_path, monkeypatch, capsys):
+    """The script with MuJoCo C alone: parts, a refused setting, the budget, page and CSV."""
     data = tmp_path / "docs" / "data"
     data.mkdir(parents=True)
     page = tmp_path / "docs" / "accuracy.md"
@@ -143,7 +146,7 @@ def test_a_tiny_study_runs_resumes_and_is_drawn(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
 
     def run(*more):
-        arguments = ["--size", "tiny", "--json", str(data / "accuracy_cpu.json")]
+        arguments = ["--size", "tiny", "--json", str(data / "accuracy_cpu.json"), "--parts", parts]
         script = str(ROOT / "scripts" / "accuracy_vs_time.py")
         monkeypatch.setattr(sys, "argv", [script, *arguments, "--engines", "mujoco", *more])
         with pytest.raises(SystemExit) as end:

@@ -1,6 +1,9 @@
 """Simulates random particles of the whole parameter table and counts the worlds that fail.
 
 python scripts/random_particles.py --worlds 100000 --json docs/data/random_particles.json
+python scripts/random_particles.py --scene paper_hull --json docs/data/random_particles_hull.json
+
+The file is written after every chunk, so that what was simulated before an interruption is kept.
 """
 
 import argparse
@@ -30,12 +33,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=100_000)
     parser.add_argument("--chunk", type=int, default=16_384)
+    parser.add_argument("--scene", default="paper_spheres")
     parser.add_argument("--iterations", type=int, default=24)
     parser.add_argument("--evaluations", type=int, default=14)
     parser.add_argument("--commit", help="where there is no repository to ask")
     parser.add_argument("--json", type=Path, required=True)
     args = parser.parse_args()
-    the_scene = scene.load("paper_spheres")
+    the_scene = scene.load(args.scene)
     space = parameters.design_space(the_scene.hand)
     engine = StructuredEngine(
         the_scene, iterations=args.iterations, evaluations=args.evaluations, tolerance=1e-6
@@ -46,8 +50,9 @@ def main() -> None:
         trials = rollout.sample_trials(the_scene, key, designs.shape[0])
         return rollout.simulate(the_scene, engine, jax.vmap(space.params)(designs), trials)[0]
 
+    args.json.parent.mkdir(parents=True, exist_ok=True)
     chunks = -(-args.worlds // args.chunk)
-    seconds, status, cost, failures = [], [], [], []
+    seconds, status, cost, failures, result = [], [], [], [], {}
     for c in range(chunks):
         designs = particles(space, c, args.chunk)
         start = time.perf_counter()
@@ -62,10 +67,18 @@ def main() -> None:
             bits = Status(int(status[-1][world]))
             bad = int(result.bad_step[world])
             failures.append({"chunk": c, "world": int(world), "status": bits.name, "step": bad})
+        result = summary(args, the_scene, status, cost, seconds) | {"failures": failures}
+        args.json.write_text(json.dumps(result, indent=2) + "\n")
+    print(json.dumps(result | {"failures": len(failures)}, indent=2))
+
+
+def summary(args, the_scene, status: list, cost: list, seconds: list) -> dict:
+    """Counts and rates of the chunks so far, with their provenance."""
     bits, costs = np.concatenate(status), np.concatenate(cost)
     steady = float(np.median(seconds[1:] or seconds))
-    result = {
+    return {
         **measure.provenance(commit=args.commit),
+        "scene": args.scene,
         "worlds": int(bits.size),
         "steps_per_world": the_scene.num_steps,
         "iterations": args.iterations,
@@ -76,11 +89,7 @@ def main() -> None:
         "world_steps_per_s": args.chunk * the_scene.num_steps / steady,
         "grasps_per_s": args.chunk / steady,
         "chunk": args.chunk,
-        "failures": failures,
     }
-    args.json.parent.mkdir(parents=True, exist_ok=True)
-    args.json.write_text(json.dumps(result, indent=2) + "\n")
-    print(json.dumps(result, indent=2))
 
 
 if __name__ == "__main__":

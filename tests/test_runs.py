@@ -86,11 +86,22 @@ def test_resolved_scene_ignores_the_working_directory(tmp_path, monkeypatch):
 
 def test_resolved_scene_names_units(tmp_path):
     write_scene(scene.load(), tmp_path)
-    assert "timestep = 0.01  # s\n" in (tmp_path / "scene.toml").read_text()
+    text = (tmp_path / "scene.toml").read_text()
+    assert "timestep = 0.01  # s\n" in text and 'hand = "hand.toml"\n' in text
     hand = (tmp_path / "hand.toml").read_text()
     assert "shear_modulus = 56000.0  # Pa\n" in hand
     assert "finger = [  # azimuth in deg, tilt in deg, radius in m, base in m\n" in hand
     assert "size = [  # m\n" in (tmp_path / "objects.toml").read_text()
+
+
+def test_a_scene_with_other_constants_is_written(tmp_path):
+    original = scene.load()
+    numbers = original.constants()
+    numbers = numbers._replace(contact=numbers.contact._replace(normal_stiffness=4321.0))
+    write_scene(original.with_constants(numbers), tmp_path)
+    again = scene.load(tmp_path / "scene.toml")
+    assert again.contact.normal_stiffness == 4321.0
+    assert again.hand == original.hand and again.cost == original.cost
 
 
 def test_text_survives_the_scene_file(tmp_path):

@@ -24,7 +24,9 @@ def scene_texts(scene: Scene) -> dict[str, str]:
     )
     objects = dataclasses.replace(scene.objects, object=shapes)
     return {
-        "scene.toml": _document(top, _units(scene) | {"gravity": "m/s^2"}),
+        "scene.toml": _document(
+            top, _units(scene) | {"gravity": "m/s^2", "hand": "", "objects": ""}
+        ),
         "hand.toml": _document(_plain(scene.hand), _units(scene.hand)),
         "objects.toml": _document(_plain(objects), _units(objects)),
     }
@@ -46,7 +48,9 @@ def write_scene(scene: Scene, folder: Path) -> None:
         if shape.mesh:
             (folder / MESHES).mkdir(exist_ok=True)
             (folder / _mesh_name(shape, i)).write_bytes(shape.mesh.path.read_bytes())
-    if scenes.load(folder / "scene.toml") != scene:
+    again = scenes.load(folder / "scene.toml")
+    # A scene with other constants is another kind of object than one that was read.
+    if again != scene and scene_texts(again) != scene_texts(scene):
         raise RuntimeError(f"{folder / 'scene.toml'} does not read back as it was written")
 
 

@@ -71,7 +71,7 @@ class Coupling:
         self.substitute("z", step)
         self._begin(lanes([~idle], (), wide=False))
         none, one = jnp.zeros_like(work), jnp.ones_like(work)
-        # Squared error, curvature before and after the turn of the direction, length of a step.
+        # Squared error and curvature; squared error and length of the step before; work.
         start = (jnp.int32(0), *self._products(), one, none, work)
 
         def misses(size: jax.Array, work: jax.Array) -> jax.Array:

@@ -2,7 +2,7 @@
 
 Fingers pair up by an exclusive or of their numbers with 1, 2, and so on, which reaches every pair
 of fingers; a row of slots is one such number.  Both lanes of a pair fill the same slot with the
-same contact, so that what one of them needs of the other's side stands in the same row of memory.
+same contact, so that they work on it at the same time and exchange what they need in registers.
 A side is a joint's row as in `codesign_jax.engines.structured.hull`, and the link before it is what
 a sphere follows.
 """
@@ -103,8 +103,8 @@ class Pairing:
     def swap(self, tree: Any) -> Any:
         """What the lanes that the lanes are paired with have, of a tree of lanes.
 
-        Registers are exchanged, once for each binary digit of the row's number: lanes of memory
-        that another lane has just written would have to wait for it.
+        Lanes exchange registers, once for each binary digit of the pairing's number: through memory
+        a lane would have to wait until its partner has written.
         """
         block = self.block
         arrays, rebuild = solid(tree, block.size)

@@ -2,31 +2,22 @@
 
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, keypaths, rollout, runs, schema, types
-from codesign_jax import scene as scenes
+from codesign_jax import codesign, engines, rollout, runs, schema, types
 from codesign_jax.commands import common
+from codesign_jax.commands.case import Case, find_case
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
-from codesign_jax.parameters import DesignSpace, design_space
-from codesign_jax.scene import Scene
 from codesign_jax.schema import SceneError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Evaluate
-
-
-class _Case(NamedTuple):
-    scene: Scene
-    space: DesignSpace
-    design: np.ndarray
-    engine: str
 
 
 def main(options: "Evaluate") -> int:
@@ -36,7 +27,7 @@ def main(options: "Evaluate") -> int:
       SceneError: If something is wrong with the input.
     """
     common.use_compilation_cache()
-    case = _from_run(options) if options.run_folder else _from_flags(options)
+    case = find_case(options)
     _check(options, case.engine)
     engine = make_engine(case.engine, case.scene)
     notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
@@ -72,58 +63,7 @@ def _check(options: "Evaluate", engine: str) -> None:
         raise SceneError(problems)
 
 
-def _from_flags(options: "Evaluate") -> _Case:
-    scene = scenes.load(
-        options.scene,
-        hand_name=options.hand,
-        object_set=options.objects,
-        accuracy=options.accuracy,
-        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
-    )
-    space = design_space(scene.hand, options.preset)
-    design = common.parse_design(space, [*chain.from_iterable(options.design)])
-    return _Case(scene, space, design, options.engine or engines.DEFAULT)
-
-
-def _from_run(options: "Evaluate") -> _Case:
-    """The final particle of a run that tested best, or the last episode's best without a test.
-
-    Objects, accuracy and single values may differ from the run's.
-    """
-    own = {"--design": bool(options.design), "--hand": options.hand is not None}
-    own |= {"--scene": options.scene != "paper", "--preset": options.preset != "2d"}
-    given = [flag for flag, is_given in own.items() if is_given]
-    if given:
-        flags = " and ".join(given)
-        raise SceneError([f"--run brings design, hand and scene of its own; leave out {flags}"])
-    folder: Path = options.run_folder  # type: ignore[assignment]
-    scene, settings = runs.read_run(
-        folder,
-        object_set=options.objects,
-        accuracy=options.accuracy,
-        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
-    )
-    record = runs.load_record(folder)
-    if record is None or record.done == 0:
-        raise SceneError([f"--run {folder} has no finished episode yet"])
-    if record.test is not None:
-        best = int(np.asarray(particle_cost(runs.read_run(folder)[0], record.test)).argmin())
-        design = np.asarray(record.state.particles)[best]
-    else:
-        best = int(record.history.cost[record.done - 1].argmin())
-        design = record.history.population[record.done - 1][best]
-    space = design_space(scene.hand, settings.preset)
-    if len(design) != space.num_parameters:
-        raise SceneError(
-            [
-                f"--set leaves {space.num_parameters} parameters free in preset "
-                f"{settings.preset!r}; the run's designs have {len(design)}"
-            ]
-        )
-    return _Case(scene, space, design, options.engine or settings.engine)
-
-
-def _evaluate(case: _Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+def _evaluate(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
     """Simulates the trials and prints the costs of each object."""
     evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
     population = jnp.asarray(case.design, jnp.float32)[None]
@@ -143,7 +83,7 @@ def _evaluate(case: _Case, engine: engines.Engine, options: "Evaluate", console:
     console.print(f"{'all':>12}: {common.verdict(total, outcomes.cost[0], outcomes.status[0])}")
 
 
-def _render(case: _Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+def _render(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
     try:
         from codesign_jax.report import animation
     except ImportError as error:

@@ -1,0 +1,105 @@
+"""The design that a command is about: the best of a run, or one given on the command line."""
+
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from codesign_jax import engines, keypaths, runs
+from codesign_jax import scene as scenes
+from codesign_jax.commands import common
+from codesign_jax.cost import particle_cost
+from codesign_jax.parameters import DesignSpace, design_space
+from codesign_jax.scene import Scene
+from codesign_jax.schema import SceneError
+
+
+class Options(Protocol):
+    """Flags that say which design; `cli.Evaluate` has their meaning."""
+
+    design: tuple[tuple[str, ...], ...]
+    run_folder: Path | None
+    preset: str
+    hand: str | None
+    objects: str | None
+    scene: str
+    accuracy: str | None
+    overrides: tuple[tuple[str, ...], ...]
+    engine: str | None
+
+
+class Case(NamedTuple):
+    """A design and where it was found.
+
+    Attributes:
+      scene: The scene.
+      space: The design space.
+      design: The design [SI units], shape (parameter,).
+      engine: Name of the engine that simulates it.
+    """
+
+    scene: Scene
+    space: DesignSpace
+    design: np.ndarray
+    engine: str
+
+
+def find_case(options: Options) -> Case:
+    """The design that the flags name.
+
+    Raises:
+      SceneError: If something is wrong with the flags, the run or the files.
+    """
+    return _from_run(options) if options.run_folder else _from_flags(options)
+
+
+def _from_flags(options: Options) -> Case:
+    scene = scenes.load(
+        options.scene,
+        hand_name=options.hand,
+        object_set=options.objects,
+        accuracy=options.accuracy,
+        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
+    )
+    space = design_space(scene.hand, options.preset)
+    design = common.parse_design(space, [*chain.from_iterable(options.design)])
+    return Case(scene, space, design, options.engine or engines.DEFAULT)
+
+
+def _from_run(options: Options) -> Case:
+    """The final particle of a run that tested best, or the last episode's best without a test.
+
+    Objects, accuracy and single values may differ from the run's.
+    """
+    own = {"--design": bool(options.design), "--hand": options.hand is not None}
+    own |= {"--scene": options.scene != "paper", "--preset": options.preset != "2d"}
+    given = [flag for flag, is_given in own.items() if is_given]
+    if given:
+        flags = " and ".join(given)
+        raise SceneError([f"--run brings design, hand and scene of its own; leave out {flags}"])
+    folder: Path = options.run_folder  # type: ignore[assignment]
+    scene, settings = runs.read_run(
+        folder,
+        object_set=options.objects,
+        accuracy=options.accuracy,
+        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
+    )
+    record = runs.load_record(folder)
+    if record is None or record.done == 0:
+        raise SceneError([f"--run {folder} has no finished episode yet"])
+    if record.test is not None:
+        best = int(np.asarray(particle_cost(runs.read_run(folder)[0], record.test)).argmin())
+        design = np.asarray(record.state.particles)[best]
+    else:
+        best = int(record.history.cost[record.done - 1].argmin())
+        design = record.history.population[record.done - 1][best]
+    space = design_space(scene.hand, settings.preset)
+    if len(design) != space.num_parameters:
+        raise SceneError(
+            [
+                f"--set leaves {space.num_parameters} parameters free in preset "
+                f"{settings.preset!r}; the run's designs have {len(design)}"
+            ]
+        )
+    return Case(scene, space, design, options.engine or settings.engine)

@@ -23,7 +23,7 @@ help:
 	@echo "make format      ruff format          make clean       remove what make built"
 
 demo: $(STAMP)
-	$(BIN)/python scripts/demo.py
+	$(BIN)/python -m scripts.demo
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=10
@@ -32,7 +32,7 @@ test: $(STAMP)
 GPU ?= runs/gpu_suite.json
 test-gpu: $(STAMP)
 	mkdir -p $(dir $(GPU))
-	$(BIN)/python scripts/gpu_suite.py --json $(GPU) $(ARGS)
+	$(BIN)/python -m scripts.gpu_suite --json $(GPU) $(ARGS)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow
@@ -42,22 +42,22 @@ stability: $(STAMP)
 	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
 
 notebooks: $(STAMP)
-	$(BIN)/python scripts/run_notebooks.py
+	$(BIN)/python -m scripts.run_notebooks
 
 # About 40 minutes; a file that exists is extended.
 BENCHMARK ?= runs/benchmark.json
 benchmark: $(STAMP)
-	$(BIN)/python scripts/benchmark.py --json $(BENCHMARK) $(ARGS)
+	$(BIN)/python -m scripts.benchmark --json $(BENCHMARK) $(ARGS)
 
 # About 15 minutes on two idle cores.
 effects: $(STAMP)
-	$(BIN)/python scripts/effects_cost.py $(ARGS)
+	$(BIN)/python -m scripts.effects $(ARGS)
 
 # Minutes at the quick size, hours of CPU at the full one; goes on where it stopped.
 ACCURACY ?= runs/accuracy_cpu.json
 SIZE ?= quick
 accuracy: $(STAMP)
-	$(BIN)/python scripts/accuracy_vs_time.py --json $(ACCURACY) --size $(SIZE) $(ARGS)
+	$(BIN)/python -m scripts.accuracy --json $(ACCURACY) --size $(SIZE) $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(CHECKED)

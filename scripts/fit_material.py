@@ -3,7 +3,7 @@
 The measurement is synthetic: MuJoCo C in float64 with another material, and noise on every tip
 position.
 
-python scripts/fit_material.py --figure runs/fit_material.png
+python -m scripts.fit_material --figure runs/fit_material.png
 """
 
 import argparse

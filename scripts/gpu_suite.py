@@ -1,6 +1,6 @@
 """Runs everything that needs a GPU, tests and rates, and writes the result with its provenance.
 
-python scripts/gpu_suite.py --json docs/data/gpu_suite_h200.json
+python -m scripts.gpu_suite --json docs/data/gpu_suite_h200.json
 
 A change of the kernel counts as done for GPUs when this ran with it on one.  Nearly all of the time
 is compiling, on the host's cores: every rate and every test has a process that compiles by itself,
@@ -25,8 +25,8 @@ import numpy as np
 import pytest
 
 from codesign_jax import scene as scenes
-from codesign_jax.benchmark import measure, work
 from codesign_jax.engines.structured import StructuredEngine
+from scripts.shared import provenance, work
 
 RATES: dict[str, dict[str, Any]] = {
     "spheres": {},
@@ -119,7 +119,7 @@ class Rate:
         """Starts the process."""
         double = RATES[name].get("dtype") == np.float64
         environment = {**os.environ, "JAX_ENABLE_X64": str(int(double))}
-        command = [sys.executable, __file__, "--case", name]
+        command = [sys.executable, "-m", "scripts.gpu_suite", "--case", name]
         command += ["--worlds", str(worlds)] if worlds else []
         self.name = name
         self._process = subprocess.Popen(
@@ -166,7 +166,7 @@ def main() -> int:
     parser.add_argument("--rates", nargs="*", choices=RATES, default=[*RATES], metavar="CASE")
     parser.add_argument("--worlds", type=int, help="worlds of every rate, to try the suite itself")
     parser.add_argument("--processes", type=int, default=12, help="tests that run at once")
-    parser.add_argument("--commit", help="commit of the code, for a machine without its repository")
+    provenance.add_commit(parser)
     parser.add_argument(
         "--parts", nargs="+", choices=("rates", "tests"), default=["rates", "tests"]
     )
@@ -184,10 +184,10 @@ def main() -> int:
 def suite(arguments: argparse.Namespace) -> int:
     """Runs the chosen parts and writes the file; the exit status."""
     begin, rates = time.monotonic(), []
-    provenance = measure.provenance(commit=arguments.commit)
+    made = provenance.measurement(arguments.commit)
 
     def write() -> None:
-        result = {"provenance": provenance, "seconds": round(time.monotonic() - begin, 1)}
+        result = {"provenance": made, "seconds": round(time.monotonic() - begin, 1)}
         result |= {"rates": rates, "tests": recorder.tests}
         arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 

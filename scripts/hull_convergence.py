@@ -1,6 +1,6 @@
 """Contact force of the skinned hull against its mesh density.
 
-  python scripts/hull_convergence.py --out FILE.json --figure FILE.png
+  python -m scripts.hull_convergence --out FILE.json --figure FILE.png
 
 A hand with long fingers closes on each object of the paper and is at rest just before the lift.
 Two forces of the fingers on the object are measured at every density: with the hand where the

@@ -1,7 +1,7 @@
 """Simulates random particles of the whole parameter table and counts the worlds that fail.
 
-python scripts/random_particles.py --worlds 100000 --json docs/data/random_particles.json
-python scripts/random_particles.py --scene paper_hull --json docs/data/random_particles_hull.json
+python -m scripts.random_particles --worlds 100000 --json docs/data/random_particles.json
+python -m scripts.random_particles --scene paper_hull --json docs/data/random_particles_hull.json
 
 The file is written after every chunk, so that what was simulated before an interruption is kept.
 """
@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import parameters, rollout, scene, types
-from codesign_jax.benchmark import measure
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.types import Status
+from scripts.shared import provenance
 
 
 def particles(space: parameters.DesignSpace, seed: int, count: int) -> jax.Array:
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--scene", default="paper_spheres")
     parser.add_argument("--iterations", type=int, default=24)
     parser.add_argument("--evaluations", type=int, default=14)
-    parser.add_argument("--commit", help="where there is no repository to ask")
+    provenance.add_commit(parser)
     parser.add_argument("--json", type=Path, required=True)
     args = parser.parse_args()
     the_scene = scene.load(args.scene)
@@ -77,7 +77,7 @@ def summary(args, the_scene, status: list, cost: list, seconds: list) -> dict:
     bits, costs = np.concatenate(status), np.concatenate(cost)
     steady = float(np.median(seconds[1:] or seconds))
     return {
-        **measure.provenance(commit=args.commit),
+        **provenance.measurement(args.commit),
         "scene": args.scene,
         "worlds": int(bits.size),
         "steps_per_world": the_scene.num_steps,

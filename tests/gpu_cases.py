@@ -12,8 +12,8 @@ import numpy as np
 
 from codesign_jax import cost, rollout
 from codesign_jax import scene as scenes
-from codesign_jax.benchmark import work
 from codesign_jax.engines.structured import StructuredEngine
+from scripts.shared import work
 from tests import quick_compile, small
 
 STEPS = 230

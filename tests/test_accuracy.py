@@ -11,22 +11,13 @@ import pytest
 from small import pinch, still
 
 from codesign_jax import cli, model, parameters, scene, schema
-from codesign_jax.accuracy import (
-    beam,
-    decision,
-    impulse,
-    oracle,
-    steps,
-    study,
-    tip,
-    worlds,
-)
-from codesign_jax.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
-from codesign_jax.accuracy.store import Case, Store
-from codesign_jax.accuracy.timing import name
 from codesign_jax.commands import optimize
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
+from scripts.accuracy import beam, decision, impulse, oracle, steps, study, tip, worlds
+from scripts.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
+from scripts.accuracy.store import Case, Store
+from scripts.accuracy.timing import name
 
 ROOT = Path(__file__).parents[1]
 

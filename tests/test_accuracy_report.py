@@ -15,9 +15,10 @@ import pytest
 import scipy.stats
 
 from codesign_jax import files
-from codesign_jax.accuracy import labels, report, statistics, study
-from codesign_jax.accuracy.results import Study
-from codesign_jax.accuracy.settings import PRESETS, STANDARD, Setting
+from scripts.accuracy import report, statistics, study
+from scripts.accuracy.results import Study
+from scripts.accuracy.settings import PRESETS, STANDARD, Setting
+from scripts.shared import labels
 
 ROOT = Path(__file__).parents[1]
 
@@ -119,7 +120,7 @@ def test_labels_cover_neither_each_other_nor_points():
 
 
 def test_the_presets_files_and_the_front_page_state_what_was_measured(tmp_path, monkeypatch):
-    """As `scripts/accuracy_vs_time.py --report` writes them: new data without it would fail."""
+    """As `python -m scripts.accuracy --report` writes them: new data without it would fail."""
     monkeypatch.setattr(statistics, "RESAMPLES", 2)  # neither states an interval
     found, readme, page = report.studies(ROOT / "docs"), tmp_path / "README.md", ROOT / "README.md"
     stated = {n: files.find("accuracy", n).read_text() for n in PRESETS}
@@ -147,10 +148,9 @@ def test_a_tiny_study_runs_resumes_and_is_drawn(parts, tmp_path, monkeypatch, ca
 
     def run(*more):
         arguments = ["--size", "tiny", "--json", str(data / "accuracy_cpu.json"), "--parts", parts]
-        script = str(ROOT / "scripts" / "accuracy_vs_time.py")
-        monkeypatch.setattr(sys, "argv", [script, *arguments, "--engines", "mujoco", *more])
+        monkeypatch.setattr(sys, "argv", ["accuracy", *arguments, "--engines", "mujoco", *more])
         with pytest.raises(SystemExit) as end:
-            runpy.run_path(script, run_name="__main__")
+            runpy.run_module("scripts.accuracy", run_name="__main__", alter_sys=True)
         return end.value.code
 
     assert run("--budget", "0") == 3

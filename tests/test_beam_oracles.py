@@ -15,7 +15,7 @@ from scipy import linalg, special
 from small import pinch
 
 from codesign_jax import hand
-from codesign_jax.accuracy import beam
+from scripts.accuracy import beam
 
 
 @functools.cache

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from codesign_jax.benchmark import cases, report, statistics, work
 from codesign_jax.types import Trace
+from scripts.benchmark import cases, report
+from scripts.shared import agreement as statistics
+from scripts.shared import work
 
 
 def samples(seed, ties):

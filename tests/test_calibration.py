@@ -2,11 +2,9 @@
 
 import argparse
 import dataclasses
-import importlib.util
 import itertools
 import json
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +14,16 @@ import scipy.interpolate
 from toy import ToyEngine, tiny
 
 from codesign_jax import codesign, parameters, rollout, scene, schema
-from codesign_jax.calibration import files, report, score, sets, summary, surrogate
-from codesign_jax.calibration.wave import Size, Wave, keep, trial_costs
 from codesign_jax.codesign import stream_key
-from codesign_jax.experiments import Stop, drive
-from codesign_jax.experiments.landscape import STREAM_GRID
-from codesign_jax.experiments.record import StateError
 from codesign_jax.optimize import State, candidates, schedule
 from codesign_jax.types import Status
+from scripts.calibration import __main__ as calibrate
+from scripts.calibration import files, report, score, sets, summary, surrogate
+from scripts.calibration.wave import Size, Wave, keep, trial_costs
+from scripts.experiments import Stop, drive
+from scripts.experiments.landscape import STREAM_GRID
+from scripts.shared.record import StateError
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "calibrate.py"
 AXIS = np.arange(12.0)
 
 
@@ -449,9 +447,6 @@ def scored(tmp_path_factory):
         settings = {"fidelity": fidelity, "points": 4, "trials": 3}
         notes = {"settings": settings, "device": "cpu", "commit": "abc"}
         (folder / f"{name}.json").write_text(json.dumps(notes))
-    spec = importlib.util.spec_from_file_location("calibrate", SCRIPT)
-    calibrate = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(calibrate)
     sys.argv = ["calibrate.py", "score", "one", "two", "--out", str(folder), "--runs", "3"]
     assert calibrate.main() == 0
     return folder, calibrate

@@ -14,7 +14,11 @@ import pytest
 from toy import ToyEngine, tiny
 
 from codesign_jax import codesign
-from codesign_jax.experiments import (
+from codesign_jax.optimize import schedule
+from codesign_jax.parameters import design_space
+from codesign_jax.statistics import wilson
+from codesign_jax.types import Outcome
+from scripts.experiments import (
     PAPER,
     TOTAL_GRASPS,
     Batch,
@@ -26,20 +30,16 @@ from codesign_jax.experiments import (
     drive,
     figures,
     plan,
-    record,
     report,
     results,
     statistics,
 )
-from codesign_jax.experiments.worlds import chunking
-from codesign_jax.optimize import schedule
-from codesign_jax.parameters import design_space
-from codesign_jax.statistics import wilson
-from codesign_jax.types import Outcome
+from scripts.experiments.worlds import chunking
+from scripts.shared import record
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
 SEED = 5
-SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce.py"
+ROOT = Path(__file__).parents[1]
 TIMES = ("seconds", "processes")
 
 
@@ -140,7 +140,7 @@ import jax
 import numpy as np
 from toy import tiny
 from codesign_jax import codesign
-from codesign_jax.experiments import Batch, Strategies, Worlds, drive
+from scripts.experiments import Batch, Strategies, Worlds, drive
 
 plan = Strategies("2d", "2d", ("single", "concurrent"), 2, 3, 3, 3, 3)
 scene, space, engine = tiny()
@@ -414,8 +414,8 @@ def test_what_was_not_run_is_said(tmp_path):
 @pytest.mark.slow
 def test_the_script_stops_resumes_and_draws(tmp_path):
     def call(*arguments):
-        command = [sys.executable, str(SCRIPT), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=False)
+        command = [sys.executable, "-m", "scripts.experiments", *arguments]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
     run = ["2d", "--size", "tiny", "--engine", "mujoco", "--out", str(tmp_path)]
     stopped = call(*run, "--minutes", "0")
@@ -434,8 +434,8 @@ def test_the_script_stops_resumes_and_draws(tmp_path):
 
 @pytest.mark.slow
 def test_the_structured_engine_gives_the_same_bits_on_two_devices(tmp_path):
-    path, command = tmp_path / "devices.json", [sys.executable, str(SCRIPT.with_name("devices.py"))]
-    subprocess.run([*command, "--json", str(path), "--size", "tiny"], check=True)
+    path, command = tmp_path / "devices.json", [sys.executable, "-m", "scripts.experiments.devices"]
+    subprocess.run([*command, "--json", str(path), "--size", "tiny"], cwd=ROOT, check=True)
     found = json.loads(path.read_text())
     assert found["settings"]["chunk"] == 12 and found["compared"]["arrays"] > 10
     assert [row["different_arrays"] for row in found["devices"].values()] == [[], []]

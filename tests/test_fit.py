@@ -1,8 +1,5 @@
 """Material from a tip trajectory: another engine's data, noise, and a guess a third off."""
 
-import importlib.util
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,21 +7,12 @@ import pytest
 
 from codesign_jax import fit
 from codesign_jax.engines.structured import StructuredEngine
-
-SCRIPT = Path(__file__).parents[1] / "scripts" / "fit_material.py"
-
-
-def script():
-    spec = importlib.util.spec_from_file_location("fit_material", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from scripts import fit_material as study
 
 
 @pytest.mark.slow
 def test_material_is_recovered_from_another_engines_noisy_tips():
     """Within 1 %: 0.3 mm of noise leave 0.01 and 0.2 %; 40 steps are not converged (1.7 %)."""
-    study = script()
     scene = study.finger_scene(links=3, timestep=0.005)
     ctrl = study.pressure_step(scene, 60e3, 1.0)
     truth = fit.Material(jnp.asarray(70e3), jnp.asarray(0.012))

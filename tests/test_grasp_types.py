@@ -6,9 +6,9 @@ import pytest
 
 from codesign_jax import parameters, rollout, scene
 from codesign_jax.engines import make_engine
-from codesign_jax.experiments import figures, grasp_types
 from codesign_jax.report import animation
 from codesign_jax.types import Outcome
+from scripts.experiments import figures, grasp_types
 
 
 @pytest.fixture(scope="module")

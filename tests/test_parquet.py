@@ -11,9 +11,9 @@ import pytest
 from toy import ToyEngine, tiny
 
 from codesign_jax import codesign
-from codesign_jax.experiments import Batch, Grid, Landscape, Strategies, Worlds, drive, parquet
 from codesign_jax.schema import SceneError
 from codesign_jax.types import Status, failed
+from scripts.experiments import Batch, Grid, Landscape, Strategies, Worlds, drive, parquet
 
 ROOT = Path(__file__).parents[1]
 PLAN = Strategies("2d", "2d", ("single", "switch-1", "concurrent"), 2, 4, 3, 3, 6)
@@ -115,21 +115,21 @@ def test_without_pyarrow_nothing_is_simulated(finished, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(SceneError, match=r"pip install 'codesign-jax\[parquet\]'"):
         parquet.write(tmp_path / "x.parquet", *finished, NOTES)
-    arguments = ["reproduce.py", "2d", "--size", "tiny", "--engine", "mujoco"]
+    arguments = ["experiments", "2d", "--size", "tiny", "--engine", "mujoco"]
     arguments += ["--out", str(tmp_path / "out"), "--parquet", str(tmp_path / "x.parquet")]
     monkeypatch.setattr(sys, "argv", arguments)
     with pytest.raises(SystemExit, match="needs pyarrow: pip install"):
-        runpy.run_path(str(ROOT / "scripts" / "reproduce.py"), run_name="__main__")
+        runpy.run_module("scripts.experiments", run_name="__main__", alter_sys=True)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_script_writes_rows_and_again_from_a_finished_state(tmp_path, monkeypatch):
     def run(*more):
-        arguments = ["reproduce.py", "landscape", "--size", "tiny", "--engine", "mujoco"]
+        arguments = ["experiments", "landscape", "--size", "tiny", "--engine", "mujoco"]
         arguments += ["--out", str(tmp_path), *more]
         monkeypatch.setattr(sys, "argv", arguments)
         with pytest.raises(SystemExit) as end:
-            runpy.run_path(str(ROOT / "scripts" / "reproduce.py"), run_name="__main__")
+            runpy.run_module("scripts.experiments", run_name="__main__", alter_sys=True)
         assert end.value.code == 0
 
     run("--commit", "abc")

@@ -176,7 +176,7 @@ def test_every_file_and_column_is_described_on_the_reference_page(run, tmp_path)
     tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
     assert {p.name for p in tmp_path.iterdir()} == {*columns.TABLES}
     page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
-    assert page == columns.page(), "run scripts/files_page.py"
+    assert page == columns.page(), "run python -m scripts.files_page"
     for name, table in columns.TABLES.items():
         section = page.split(f"## {name}\n")[1].split("\n## ")[0]
         designs = {f"{table.designs}{d}" for d in tables.design_columns(space)}

@@ -13,8 +13,17 @@ import pytest
 from codesign_jax import model, parameters, rollout
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import make_engine
-from codesign_jax.experiments import record, winners, winners_files, winners_report
-from codesign_jax.experiments.winners import STANDARD, VARIANTS, Finals, Task, Variant
+from scripts.shared import record
+from scripts.winners import (
+    files as winners_files,
+)
+from scripts.winners import (
+    report as winners_report,
+)
+from scripts.winners import (
+    variants as winners,
+)
+from scripts.winners.variants import STANDARD, VARIANTS, Finals, Task, Variant
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "data" / "reproduction"
@@ -211,9 +220,9 @@ def test_the_script_simulates_and_draws(tmp_path, monkeypatch, capsys):
     out = tmp_path / "winners.npz"
 
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["scripts/winners.py", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", ["winners", *map(str, arguments)])
         with pytest.raises(SystemExit) as end:
-            runpy.run_path("scripts/winners.py", run_name="__main__")
+            runpy.run_module("scripts.winners", run_name="__main__", alter_sys=True)
         return end.value.code
 
     small = ["--size", "tiny", "--experiments", "23d", "--set", *SMALL, "--out", out]
@@ -231,6 +240,7 @@ def test_the_script_simulates_and_draws(tmp_path, monkeypatch, capsys):
         ("abc", ["23d|MuJoCo C|0"]),
         ("def", ["2d|MuJoCo C|0"]),
     ]
+    assert runs[0]["command"].startswith("python -m scripts.winners --size tiny")
     assert "'MuJoCo C'" in runs[0]["command"] and runs[0]["versions"]["mujoco"]
     # The standard's place is taken by the same grasps: every share of agreement is then one.
     for part in ("cost", "status"):

@@ -7,9 +7,9 @@ import numpy as np
 from scipy import linalg
 
 from codesign_jax import model, morphology
-from codesign_jax.accuracy import beam
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.types import Params
+from scripts.accuracy import beam
 from tests import small
 from tests.stability.bench import bench
 from tests.stability.table import Found, case

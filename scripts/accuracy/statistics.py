@@ -1,0 +1,228 @@
+"""From records to errors: against the reference, with intervals, orders of convergence, fronts."""
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.scene import load as load_scene
+from codesign_jax.statistics import Interval, wilson
+from scripts.accuracy import decision, impulse, tip
+from scripts.accuracy.settings import Setting
+
+Records = list[dict[str, Any]]
+
+MOVED = "moved 1 um"
+RESAMPLES = 2000
+ALPHA = 0.2
+"""The particle filter's cost offset: its weights are 1 / (0.2 + cost)."""
+
+
+def load(files: Iterable[Path]) -> tuple[Records, list[dict[str, Any]]]:
+    """Records of files, the last file's of a case, and the runs that made them."""
+    found: dict[str, dict[str, Any]] = {}
+    runs: list[dict[str, Any]] = []
+    for file in files:
+        data = json.loads(file.read_text())
+        for key, record in data["records"].items():
+            values = dict(record["setting"])
+            values["extra"] = tuple(values["extra"])
+            # A file counts its own runs.
+            found[key] = record | {"of": Setting(**values), "run": len(runs) + record["run"]}
+        runs += data["runs"]
+    return list(found.values()), runs
+
+
+def measured(records: Records, part: str) -> Records:
+    """Records of a part that hold a measurement."""
+    return [r for r in records if r["part"] == part and not bad(r)]
+
+
+def bad(record: dict[str, Any]) -> str | None:
+    """Why a setting has no measurement."""
+    return record.get("refused") or record.get("failed")
+
+
+def _role(records: Records, part: str, role: str) -> dict[str, Any] | None:
+    return next((r for r in measured(records, part) if role in r["more"]), None)
+
+
+def tips(record: dict[str, Any]) -> np.ndarray:
+    """Tips of a record [m], shape (hand, time, finger, 3)."""
+    return 1e-3 * np.reshape(record["tips_mm"], record["shape"])
+
+
+_COMPARE: dict[str, Callable[[dict, dict], dict]] = {
+    "tip": lambda a, b: tip.compare(tips(a), tips(b)),
+    "impulse": impulse.compare,
+}
+
+
+def against_reference(records: Records, part: str) -> Records:
+    """Records of the part tip or impulse with their errors; none without a reference."""
+    reference = _role(records, part, "reference")
+    if reference is None:
+        return []
+    every = (r for r in measured(records, part) if r is not reference)
+    return [r | _COMPARE[part](r, reference) for r in every]
+
+
+def order(points: Iterable[tuple[float, float]]) -> float | None:
+    """Slope of log error over log size; None with fewer than three points."""
+    x, y = np.array([p for p in points if p[1] > 0]).reshape(-1, 2).T
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if x.size > 2 else None
+
+
+def orders(records: Records) -> dict[str, float | None]:
+    """Measured orders of convergence, by what is refined and what is measured."""
+    rows = against_reference(records, "tip")
+    by_time = [r for r in rows if "at the reference's links" in r["more"]]
+    by_links = [r for r in rows if "at the reference's time step" in r["more"]]
+    found = {
+        "finger tip, time step": order((r["of"].timestep, r["tip_rms_mm"]) for r in by_time),
+        "finger tip, length of a link": order(
+            (1 / r["of"].links, r["tip_rms_mm"]) for r in by_links
+        ),
+    }
+    beams = measured(records, "beam")
+    for name in sorted({k for r in beams for k in r if k.startswith(("elastica", "arc"))}):
+        found[f"{name}, length of a link"] = order((1 / r["of"].links, r[name]) for r in beams)
+    pushes = [
+        r for r in against_reference(records, "impulse")
+        if not r["more"] and r["of"] == Setting("mujoco", timestep=r["of"].timestep)
+    ]  # fmt: skip
+    found["contact impulse, time step (ten links)"] = order(
+        (r["of"].timestep, r["impulse_error"]) for r in pushes
+    )
+    return found
+
+
+Grasps = dict[tuple[Setting, bool, str], np.ndarray]
+
+
+def decisions(records: Records) -> Grasps:
+    """Costs by setting, whether the objects were moved, and population, (particle, trial).
+
+    Not a number where a trial failed.
+    """
+    scene, parts = load_scene("paper_spheres"), {}
+    for r in measured(records, "decision"):
+        cost = decision.costs(scene, r)
+        each = np.split(cost, len(r["populations"]))
+        for name, population in zip(r["populations"], each, strict=True):
+            parts.setdefault((r["of"], MOVED in r["more"], name), []).append(
+                (r["first"], population)
+            )
+    return {
+        key: np.concatenate([c for _, c in sorted(blocks, key=lambda b: b[0])], 1)
+        for key, blocks in parts.items()
+    }
+
+
+def finest(grasps: Grasps, population: str) -> Setting | None:
+    """The setting that stands for the truth: shortest time step, then most links."""
+    known = [s for s, moved, name in grasps if name == population and not moved]
+    usual = [s for s in known if s.engine == "structured" and s.iterations is None]
+    usual = [s for s in usual if s.axes == 3 and not s.extra]
+    return min(usual, key=lambda s: (s.timestep, -s.links, -s.spheres), default=None)
+
+
+def means(cost: np.ndarray) -> np.ndarray:
+    """Mean cost of every particle over the trials that did not fail, the maximum if all did."""
+    good = np.isfinite(cost)
+    total = np.where(good, cost, 0.0).sum(-1)
+    return np.where(good.any(-1), total / np.maximum(good.sum(-1), 1), 3.0)
+
+
+def spearman(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Rank correlation along the last axis; NaN where one side does not vary."""
+    x, y = (scipy.stats.rankdata(v, axis=-1) for v in (a, b))
+    x, y = (v - v.mean(-1, keepdims=True) for v in (x, y))
+    norm = np.sqrt((x**2).sum(-1) * (y**2).sum(-1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (x * y).sum(-1) / norm
+
+
+def resampled(statistic: Callable[[np.ndarray], np.ndarray], count: int) -> Interval:
+    """Percentile bootstrap over particles.
+
+    Args:
+      statistic: From indices of particles, shape (..., particle), to values, shape (...).
+      count: Number of particles.
+    """
+    rows = np.random.default_rng(0).integers(0, count, (RESAMPLES, count))
+    drawn = statistic(rows)
+    low, high = np.nanquantile(drawn, [0.025, 0.975]) if np.isfinite(drawn).any() else (np.nan,) * 2
+    return Interval(float(statistic(np.arange(count))), float(low), float(high))
+
+
+def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
+    """Decisions of a setting beside the reference's over the same particles and trials.
+
+    Args:
+      a: Costs, shape (particle, trial), NaN where a trial failed.
+      b: The reference's, with as many trials or more.
+    """
+    trials = min(a.shape[1], b.shape[1])
+    a, b = a[:, :trials], b[:, :trials]
+    kept, expected = a < SUCCESS_COST, b < SUCCESS_COST
+    same, mine, theirs = (kept == expected).mean(1), means(a), means(b)
+    weights = [1 / (ALPHA + m) for m in (mine, theirs)]
+    shares = [w / w.sum() for w in weights]
+    top = max(1, len(a) // 6)
+    best = [set(np.argsort(m, kind="stable")[:top]) for m in (mine, theirs)]
+    return {
+        "particles": len(a),
+        "trials": trials,
+        "success": wilson(int(kept.sum()), kept.size),
+        "success_reference": wilson(int(expected.sum()), expected.size),
+        "same_verdict": resampled(lambda i: same[i].mean(-1), len(a)),
+        "cost_difference": resampled(lambda i: (mine - theirs)[i].mean(-1), len(a)),
+        "rank": resampled(lambda i: spearman(mine[i], theirs[i]), len(a)),
+        # Share of the next generation that would come from another particle.
+        "offspring_moved": float(0.5 * np.abs(shares[0] - shares[1]).sum()),
+        "best_shared": len(best[0] & best[1]) / top,
+        "failed": int((~np.isfinite(a)).sum()),
+    }
+
+
+def trial_noise(cost: np.ndarray, trials: int = 6) -> Interval | None:
+    """Rank correlation of a setting with itself over other trials: what an episode's trials give.
+
+    Args:
+      cost: Costs, shape (particle, trial).
+      trials: Trials of an episode.
+    """
+    blocks = [cost[:, i : i + trials] for i in range(0, cost.shape[1] - trials + 1, trials)]
+    if len(blocks) < 2:
+        return None
+    each = [means(b) for b in blocks]
+
+    def mean(i: np.ndarray) -> np.ndarray:
+        pairs = zip(each, each[1:], strict=False)
+        return np.mean([spearman(a[i], b[i]) for a, b in pairs], axis=0)
+
+    return resampled(mean, len(cost))
+
+
+def times(records: Records) -> dict[tuple[str, Setting], dict[str, Any]]:
+    """Times by engine's name and setting, the engine and float type being the name's."""
+    found = {}
+    for r in measured(records, "time"):
+        for name, values in r["engines"].items():
+            found[name, r["of"]] = values
+    return found
+
+
+def front(points: list[tuple[float, float]]) -> list[int]:
+    """Indices of the points that no other one beats in cost and error, cheapest first."""
+    best, chosen = np.inf, []
+    for i in sorted(range(len(points)), key=lambda i: points[i]):
+        if points[i][1] < best:
+            best = points[i][1]
+            chosen.append(i)
+    return chosen

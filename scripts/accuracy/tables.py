@@ -1,0 +1,225 @@
+"""Markdown tables of a study: references and orders, errors, decisions, what chaos alone does."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from scripts.accuracy import statistics
+from scripts.accuracy.figures import Point, grasps
+from scripts.accuracy.results import ERRORS, WANTED, Study, named
+from scripts.accuracy.settings import PRESETS, Setting, one_at_a_time
+from scripts.accuracy.statistics import Records
+from scripts.experiments.statistics import Interval
+
+COST = ["wall s / simulated s", "grasps/s"]
+POPULATIONS = {
+    "spread": "particles of every quality",
+    "late": "the final particles of one run",
+}
+
+
+def lines(records: Records) -> dict[str, list[tuple[float, float]]]:
+    """Errors over what is refined, by what is measured, for `figures.convergence`."""
+    tips = statistics.against_reference(records, "tip")
+    beams = statistics.measured(records, "beam")
+    found = {
+        "tip in motion [mm], time step": [
+            (r["of"].timestep, r["tip_rms_mm"])
+            for r in tips
+            if "at the reference's links" in r["more"]
+        ],
+        "tip in motion [mm]": [
+            (1 / r["of"].links, r["tip_rms_mm"])
+            for r in tips
+            if "at the reference's time step" in r["more"]
+        ],
+        "impulse, relative, time step": [
+            (r["of"].timestep, r["impulse_error"])
+            for r in statistics.against_reference(records, "impulse")
+            if not r["more"] and r["of"] == Setting("mujoco", timestep=r["of"].timestep)
+        ],
+    }
+    for name in sorted({k for r in beams for k in r if k.startswith(("elastica", "arc"))}):
+        found[f"{name}, tip / length"] = [(1 / r["of"].links, r[name]) for r in beams]
+    return found
+
+
+def confirmed(records: Records) -> list[list[str]]:
+    """How far the reference moves if it is refined once more, and the orders of convergence."""
+    rows = [["what", "value"]]
+    for r in records:
+        if {"timestep", "links"} & set(r["more"]) and statistics.bad(r):
+            rows.append([f"reference refined to {r['label']}: {r['part']}", _why(r)])
+    for part, unit in (("tip", "mm"), ("impulse", "")):
+        for r in statistics.against_reference(records, part):
+            for role, words in (("timestep", "time step halved"), ("links", "links doubled")):
+                if role in r["more"]:
+                    value = r[ERRORS[part][1]]
+                    what = f"reference moves, {words}: {ERRORS[part][0]}"
+                    rows.append([what, f"{value:.2g} {unit}".strip()])
+    for name, value in statistics.orders(records).items():
+        if value is not None:
+            rows.append([f"order of convergence: {name}", f"{value:.2f}"])
+    return rows
+
+
+def cost_cells(cost: float | None) -> list[str]:
+    """A cost as wall seconds of a simulated second of a world, and as grasps a second."""
+    if cost is None:
+        return ["–", "–"]
+    rate = float(f"{grasps(cost):.3g}")
+    return [f"{cost:.2e}", f"{rate:,.0f}" if rate >= 100 else f"{rate:.3g}"]
+
+
+def title(setting: Setting) -> str:
+    """A setting's name in the tables."""
+    return named(setting.label, setting.engine)
+
+
+def wanted(study: Study) -> list[list[str]]:
+    """For every error wanted and engine: the cheapest setting below it and its cost."""
+    rows = [["error", "wanted below", "engine", "setting", "error there", *COST]]
+    for part, limits in WANTED.items():
+        engines = dict.fromkeys(p.engine for p in study.points(part))
+        for engine, limit in itertools.product(engines, limits):
+            rows.append(
+                [ERRORS[part][0], f"{limit:g}", engine, *_found(study, part, engine, limit)]
+            )
+    return rows
+
+
+def _found(study: Study, part: str, engine: str, limit: float) -> list[str]:
+    p = study.cheapest(part, engine, limit)
+    if p is None:
+        return ["none", "–", "–", "–"]
+    return [named(p.label, engine), f"{p.error:.3g}", *cost_cells(p.cost)]
+
+
+def front_page(full: Study, small: Study | None) -> list[list[str]]:
+    """As `wanted` for the structured engine alone, with the same settings' costs on a CPU."""
+    costs = ["one H200: wall s / simulated s", "grasps/s"]
+    costs += ["2 CPU cores: wall s / simulated s", "grasps/s"] if small else []
+    rows = [["error", "wanted below", "setting", "error there", *costs]]
+    for part, limits in WANTED.items():
+        for limit in limits:
+            p = full.cheapest(part, "structured", limit)
+            row = [ERRORS[part][0], f"{limit:g}", *_found(full, part, "structured", limit)]
+            rows.append(row + _small_cost(small, p))
+    return rows
+
+
+def _small_cost(small: Study | None, point: Point | None) -> list[str]:
+    if small is None:
+        return []
+    every = {s.label: s for s in one_at_a_time("structured")}
+    setting = every.get(point.label) if point else None
+    return cost_cells(small.cost("structured", setting) if setting else None)
+
+
+def _number(value: float | None, form: str = ".2g") -> str:
+    return "–" if value is None or not np.isfinite(value) else format(value, form)
+
+
+def errors_table(study: Study, part: str) -> list[list[str]]:
+    """Every setting's errors of a kind and its cost."""
+    heads = {
+        "tip": ["tip_rms_mm", "tip_max_mm"],
+        "impulse": ["impulse_error", "impulse_max", "grip_error", "touch_error_ms"],
+        "step": ["step_median", "step_p99", "step_max", "iterations_max"],
+    }
+    rows = [["engine", "setting", *(h.replace("_", " ") for h in heads[part]), *COST]]
+    for r in study.errors(part):
+        setting = r["of"]
+        if statistics.bad(r):
+            values = [_why(r), *[""] * (len(heads[part]) - 1)]
+        else:
+            values = [_number(r.get(h)) for h in heads[part]]
+        cost = study.cost(setting.engine, setting)
+        rows.append([setting.engine, title(setting), *values, *cost_cells(cost)])
+    return rows
+
+
+def _why(record: dict[str, Any]) -> str:
+    """Why there is no measurement, the last clause of the reason."""
+    kind = "refused" if record.get("refused") else "failed"
+    return f"{kind}: {(statistics.bad(record) or '').split(':')[-1].strip()}"
+
+
+def _interval(value: Interval, form: str = ".1%") -> str:
+    if not np.isfinite(value.value):
+        return "–"
+    return f"{value.value:{form}} [{value.low:{form}}, {value.high:{form}}]"
+
+
+def _row(first: list[str], c: dict[str, Any]) -> list[str]:
+    return [
+        *first,
+        f"{c['particles']} x {c['trials']}",
+        _interval(c["success"]),
+        _interval(c["success_reference"]),
+        _interval(c["same_verdict"]),
+        _interval(c["cost_difference"], "+.3f"),
+        _interval(c["rank"], ".3f"),
+        f"{c['offspring_moved']:.1%}",
+        f"{c['best_shared']:.0%}",
+        str(c["failed"]),
+    ]
+
+
+_DECISION = [
+    "particles x trials", "success", "the reference's", "same verdict", "mean cost, difference",
+    "rank correlation", "offspring moved", "best sixth shared", "failed",
+]  # fmt: skip
+
+
+def decisions_table(study: Study, population: str) -> list[list[str]]:
+    """Every setting's decisions beside the finest's, and its cost."""
+    rows = [["engine", "setting", *_DECISION, *COST]]
+    for setting, c in study.decisions(population).items():
+        cost = study.cost(setting.engine, setting)
+        rows.append([*_row([setting.engine, title(setting)], c), *cost_cells(cost)])
+    for r in study.errors("decision"):
+        if statistics.bad(r):
+            head, cost = (
+                [r["of"].engine, r["of"].label, _why(r)],
+                study.cost(r["of"].engine, r["of"]),
+            )
+            rows.append([*head, *[""] * (len(_DECISION) - 1), *cost_cells(cost)])
+    return rows
+
+
+def preset_to_preset(study: Study) -> list[list[str]]:
+    """Decisions from preset to preset, the coarser beside the finer."""
+    rows = [["presets", "population", *_DECISION]]
+    names = list(PRESETS)
+    for population in POPULATIONS:
+        for a, b in ((0, 1), (1, 2), (0, 2)):
+            costs = [study.grasps.get((PRESETS[names[i]], False, population)) for i in (a, b)]
+            if costs[0] is not None and costs[1] is not None:
+                what = f"{names[a]} against {names[b]}"
+                rows.append(_row([what, population], statistics.compare(*costs)))
+    return rows
+
+
+def floors(study: Study) -> list[list[str]]:
+    """Settings against themselves with objects moved, engines against each other, other trials."""
+    rows = [["comparison", "population", *_DECISION]]
+    for (setting, moved, name), cost in study.grasps.items():
+        plain = study.grasps.get((setting, False, name))
+        if moved and plain is not None:
+            what = f"{setting.engine}, {title(setting)}: objects moved by 1 µm"
+            rows.append(_row([what, name], statistics.compare(cost, plain)))
+        own = Setting(**{**vars(setting), "engine": "structured"})
+        same = study.grasps.get((own, False, name))
+        if setting.engine == "mujoco" and not moved and same is not None:
+            what = f"MuJoCo C against structured, {setting.label}"
+            rows.append(_row([what, name], statistics.compare(cost, same)))
+    for (setting, moved, name), cost in study.grasps.items():
+        noise = statistics.trial_noise(cost)
+        if setting == Setting() and not moved and noise is not None:
+            what = "structured, standard: six trials against six others"
+            values = ["–"] * len(_DECISION)
+            values[5] = _interval(noise, ".3f")
+            rows.append([what, name, *values])
+    return rows

@@ -1,0 +1,122 @@
+"""Table and figure of what effects cost and decide, from the measured file."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.figure
+import numpy as np
+
+from codesign_jax.effects import EFFECTS, ENGINES
+from scripts.benchmark.report import markdown
+
+REFERENCE = "as it is"
+
+
+def draw(results: dict[str, Any], path: Path) -> None:
+    """Time of a step and success rate of the scene with each effect turned over."""
+    rows = results["effects"]
+    names = [*(n for n in rows if n != REFERENCE), REFERENCE][::-1]
+    figure = matplotlib.figure.Figure(figsize=(9.6, 5.6), dpi=120, layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for axis, field, bounds in (
+        (left, "ratio", lambda r: r["ratio_quartiles"]),
+        (right, "success", lambda r: (r["success_low"], r["success_high"])),
+    ):
+        place = [k for k, n in enumerate(names) if field in rows[n]]
+        value = np.array([rows[names[k]][field] for k in place])
+        low, high = np.array([bounds(rows[names[k]]) for k in place]).T
+        # A share of 0 or 1 lies on its interval's end but for rounding.
+        error = np.maximum([value - low, high - value], 0.0)
+        axis.errorbar(value, place, xerr=error, fmt="o", ms=4, capsize=2)
+        axis.axvline(rows[REFERENCE][field], color="black", lw=0.8, ls="--")
+        axis.grid(axis="x", alpha=0.3)
+    place = [k for k, n in enumerate(names) if "flops" in rows[n]]
+    flops = np.array([rows[names[k]]["flops"] for k in place]) / rows[REFERENCE]["flops"]
+    left.plot(flops, place, "x", color="tab:orange", ms=5, label="operations of one iteration")
+    left.plot([], [], "o", color="tab:blue", label="time, median and quartiles")
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, 1.08), ncols=2, frameon=False, fontsize=8)
+    left.set_yticks(range(len(names)), names)
+    left.set(xlabel="a step, relative to the scene as it is", xlim=(0, None))
+    right.set(xlabel="success rate with 95 % interval")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def support_table() -> list[list[str]]:
+    """What each effect means and which engines have it, in words."""
+    table = [["effect", "meaning", *ENGINES]]
+    for name, effect in EFFECTS.items():
+        cells = []
+        for engine in ENGINES:
+            refused = effect.refused.get(engine, {})
+            words = [f"not {str(v).lower() if isinstance(v, bool) else v}" for v in refused]
+            cells.append(", ".join(words) or "yes")
+        table.append([f"`{name}`", effect.meaning, *cells])
+    return table
+
+
+def measured_table(results: dict[str, Any]) -> list[list[str]]:
+    """A row for each change of the scene; what was not measured is a dash."""
+    head = ["change", "equations", "kFLOP", "µs a step", "time ×"]
+    table = [[*head, "success (95 %)", "same verdict", "rank corr."]]
+    rows = results["effects"]
+    for name, r in rows.items():
+        same = " (same program)" if _same(rows, name) else ""
+        flops = f"{r['flops'] / 1e3:.1f}" if "flops" in r else "–"
+        program = [str(r.get("equations", "–")), flops]
+        if "ratio" not in r:
+            program += ["–"] * 2
+        else:
+            low, high = r["ratio_quartiles"]
+            program += [
+                f"{r['step_seconds'] * 1e6:.1f}",
+                f"{r['ratio']:.2f} ({low:.2f}–{high:.2f})",
+            ]
+        decision = ["–"] * 3
+        if "success" in r:
+            rank = r["rank_correlation"]
+            decision = [
+                f"{r['success']:.3f} ({r['success_low']:.3f}–{r['success_high']:.3f})",
+                f"{r['same_verdict']:.3f}",
+                "–" if rank is None else f"{rank:.3f}",
+            ]
+        table.append([name + same, *program, *decision])
+    return table
+
+
+def _same(rows: dict[str, Any], name: str) -> bool:
+    mine, reference = (rows[n].get("program") for n in (name, REFERENCE))
+    return name != REFERENCE and mine is not None and mine == reference
+
+
+def write(results: dict[str, Any], page: Path) -> None:
+    """Puts the tables between the page's marks; what stands around them stays.
+
+    Args:
+      results: The measured file.
+      page: A page with the marks of "measured" and "support".
+
+    Raises:
+      ValueError: If the page lacks a mark.
+    """
+    p = results["provenance"]
+    load = [f"{results[k][0]:.1f}" for k in ("load_before", "load_after") if k in results]
+    worlds = results["effects"][REFERENCE].get("worlds", 0)
+    note = (
+        f"{worlds} grasps, {results.get('trials')} trials a design; {p['cpus']} cores of {p['cpu']}"
+        f", jax {p['jax']}, MuJoCo {p['mujoco']}, commit {p['commit']}; load of the machine while "
+        f"timing: {' to '.join(load) or 'not timed'}."
+    )
+    text = page.read_text(encoding="utf-8")
+    text = _between(text, "measured", note + "\n\n" + markdown(measured_table(results)))
+    page.write_text(_between(text, "support", markdown(support_table())), encoding="utf-8")
+
+
+def _between(text: str, name: str, made: str) -> str:
+    """The text with what stands between a pair of marks replaced."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    before, mark, rest = text.partition(begin)
+    _, last, after = rest.partition(end)
+    if not (mark and last):
+        raise ValueError(f"no {begin} ... {end} in the page")
+    return f"{before}{begin}\n\n{made}\n\n{end}{after}"

@@ -1,0 +1,108 @@
+"""Runs an experiment on one device and on several: the same numbers, and how much sooner.
+
+python -m scripts.experiments.devices --json docs/data/devices.json      # machine with two GPUs
+python -m scripts.experiments.devices --json runs/devices.json --size tiny  # on a CPU, minutes
+
+Each number of devices is a process of `scripts.experiments` that sees so many, with the same
+chunk.  The records of all are compared bit by bit.  Exit status 1: they differ.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scripts.experiments import plan
+from scripts.experiments.worlds import LIMIT, chunking
+from scripts.shared import provenance
+
+TIMES = ("seconds", "processes", "_settings", "_digest")
+"""What may differ between two records of an experiment."""
+
+
+def parse() -> argparse.Namespace:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, default=Path("runs/devices.json"))
+    parser.add_argument("--experiment", choices=list(plan.PAPER), default="23d")
+    parser.add_argument("--size", choices=list(plan.OVERRIDES), default="short")
+    parser.add_argument("--counts", type=lambda s: [int(n) for n in s.split(",")], default=[1, 2])
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    provenance.add_commit(parser)
+    return parser.parse_args()
+
+
+def run(args: argparse.Namespace, count: int, folder: Path) -> tuple[dict[str, Any], Any]:
+    """Runs the experiment on the first devices.
+
+    Args:
+      args: The command line.
+      count: Number of devices.
+      folder: Where the run is written.
+
+    Returns:
+      Provenance and record.
+
+    Raises:
+      CalledProcessError: If the run fails.
+    """
+    worlds = plan.experiment(args.experiment, args.size).worlds
+    chunk = chunking(worlds, LIMIT, max(args.counts)).size
+    command = [sys.executable, "-m", "scripts.experiments", args.experiment]
+    command += ["--size", args.size, "--devices", str(count), "--chunk", str(chunk)]
+    command += ["--out", str(folder)] + [part for pair in args.set for part in ("--set", pair)]
+    command += ["--commit", args.commit] if args.commit else []
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
+    visible = {"CUDA_VISIBLE_DEVICES": ",".join(map(str, range(count))), "XLA_FLAGS": flags}
+    subprocess.run(command, check=True, env=os.environ | visible)
+    notes = json.loads((folder / f"{args.experiment}.json").read_text())
+    with np.load(folder / f"{args.experiment}.state.npz", allow_pickle=False) as file:
+        return notes, {name: file[name] for name in file.files if name not in TIMES}
+
+
+def compare(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Runs on every number of devices, and compares each with the first."""
+    runs = {n: run(args, n, folder / str(n)) for n in args.counts}
+    (notes, first), rows = runs[args.counts[0]], {}
+    for count, (other, record) in runs.items():
+        differ = [k for k in first if first[k].tobytes() != record[k].tobytes()]
+        last = other["last_process"]
+        rows[str(count)] = {
+            "different_arrays": differ,
+            "grasps_per_s": last["grasps_per_s"],
+            "seconds_before_the_second_step": last["seconds_before_the_second_step"],
+            "speedup": round(last["grasps_per_s"] / notes["last_process"]["grasps_per_s"], 3),
+        }
+    kept = ("commit", "modified", "python", "versions", "platform", "device", "settings", "grasps")
+    arrays = {"arrays": len(first), "bytes": sum(v.nbytes for v in first.values())}
+    return {
+        "command": provenance.command(),
+        **{k: notes[k] for k in kept if k in notes},
+        "compared": arrays,
+        "devices": rows,
+    }
+
+
+def main() -> int:
+    """Runs the command and returns the exit status."""
+    args = parse()
+    with tempfile.TemporaryDirectory() as folder:
+        found = compare(args, Path(folder))
+    args.json.parent.mkdir(parents=True, exist_ok=True)
+    args.json.write_text(json.dumps(found, indent=2) + "\n")
+    for count, row in found["devices"].items():
+        text = f"{len(row['different_arrays'])} of {found['compared']['arrays']} arrays differ"
+        print(f"{count} device(s): {row['speedup']:.2f} times the first's grasps/s, {text}")
+    return int(any(row["different_arrays"] for row in found["devices"].values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""Figures 6 to 9 of the paper, redrawn from committed results (matplotlib)."""
+
+from pathlib import Path
+
+import matplotlib.figure
+import numpy as np
+
+from codesign_jax.codesign import CONVERGED_COST
+from codesign_jax.report.figures import cost_evolution
+from codesign_jax.statistics import wilson
+from scripts.experiments.statistics import RULES, Study, quantile, regions
+
+LABELS = {"single": "s.d.", "concurrent": "conc."}
+_COLORS = {"exclude": "tab:blue", "worst": "tab:orange"}
+_RULE_LABELS = {"exclude": "failed trials excluded", "worst": "failed trials cost the maximum"}
+
+LANDSCAPE_THRESHOLD = CONVERGED_COST
+"""Cost below which a point of the landscape belongs to a region."""
+
+
+def label(strategy: str) -> str:
+    """The paper's name of a strategy: s.d., the number of switches, or conc."""
+    return LABELS.get(strategy, strategy.removeprefix("switch-"))
+
+
+def typical_run(study: Study) -> int:
+    """Run of the last strategy whose convergence is the median one."""
+    episodes = study.convergence()[-1]
+    return int(np.argsort(episodes, kind="stable")[(len(episodes) - 1) // 2])
+
+
+def evolution(study: Study, path: Path) -> Path:
+    """Draws Fig. 6: the particle costs of the run that converges at the median speed."""
+    run = typical_run(study)
+    title = f"{study.strategies[-1]}, run {run} of {study.plan['runs']}"
+    return cost_evolution(study.data["particle_cost"][run].astype(float), path, title=title)
+
+
+def success(study: Study, path: Path) -> Path:
+    """Draws Figs. 7a and 9a: the ratio of successful runs with Wilson's 95 % intervals."""
+    figure, axes = _axes()
+    for offset, rule in zip((-0.18, 0.18), RULES, strict=True):
+        rates = [wilson(int(s.sum()), s.size) for s in study.success(rule)]
+        value, low, high = np.array(rates).T
+        at = np.arange(len(rates)) + offset
+        axes.bar(at, value, 0.36, color=_COLORS[rule], alpha=0.75, label=_RULE_LABELS[rule])
+        axes.errorbar(at, value, [value - low, high - value], fmt="none", color="black", capsize=3)
+    axes.set(ylabel="ratio of successful runs", ylim=(0, 1.02))
+    _strategies(axes, study)
+    return _save(figure, path)
+
+
+def convergence(study: Study, path: Path) -> Path:
+    """Draws Figs. 7b and 9b: median episodes to convergence, with the quartiles.
+
+    Runs that did not converge take part as slower than all others; above the upper line is where
+    they are.  Hollow dots are medians of the converged runs alone, whose number
+    stands under the strategy.
+    """
+    figure, axes = _axes()
+    episodes, limit = study.convergence(), study.plan["episodes"]
+    never = 1.08 * limit
+    low, middle, high = (np.minimum(quantile(episodes, q), never) for q in (0.25, 0.5, 0.75))
+    at = np.arange(len(episodes))
+    axes.errorbar(at, middle, [middle - low, high - middle], fmt="o", capsize=4, label="all runs")
+    converged = np.isfinite(episodes)
+    alone = [
+        np.median(e[c]) if c.any() else np.nan for e, c in zip(episodes, converged, strict=True)
+    ]
+    axes.plot(at, alone, "o", mfc="none", color="tab:orange", ms=9, label="converged runs alone")
+    axes.axhline(limit, color="black", lw=1, ls="--")
+    axes.text(len(at) - 0.55, limit, "not converged", ha="right", va="bottom", fontsize=8)
+    axes.set(ylabel="episodes until converged", ylim=(0, 1.15 * limit), xlim=(-0.5, len(at) - 0.5))
+    _strategies(axes, study, [f"{n}/{episodes.shape[1]}" for n in converged.sum(1)])
+    return _save(figure, path)
+
+
+def landscape(
+    data: dict[str, np.ndarray],
+    path: Path,
+    threshold: float = LANDSCAPE_THRESHOLD,
+    types: np.ndarray | None = None,
+) -> Path:
+    """Draws Fig. 8: the mean cost, white where low, with the regions below the threshold.
+
+    Args:
+      data: Arrays of the landscape.
+      path: File of the figure.
+      threshold: Cost below which a point belongs to a region.
+      types: Grasp type of each point, shape (point, point), see `grasp_types`; None for none.
+    """
+    figure, axes = _axes(5.4, 4.4)
+    x, y = data["first_axis"], data["second_axis"]
+    image = axes.pcolormesh(x, y, data["exclude"].T, cmap="gray_r", shading="nearest", vmin=0)
+    figure.colorbar(image, label="mean cost")
+    for letter, region in zip("abcdefgh", regions(data, threshold), strict=False):
+        if not region.points.all():
+            axes.contour(x, y, region.points.T.astype(float), [0.5], colors="tab:red", linewidths=1)
+        # Inside the region, also where its mean lies outside.
+        inside = np.argwhere(region.points)
+        axis = np.stack([x[inside[:, 0]], y[inside[:, 1]]], -1)
+        scale = np.array([np.ptp(x), np.ptp(y)])
+        nearest = axis[np.argmin((((axis - region.centre) / scale) ** 2).sum(1))]
+        axes.text(nearest[0], nearest[1], f"({letter})", color="tab:red", ha="center", va="center")
+    if types is not None:
+        for number in range(int(types.max()) + 1):
+            at = np.argwhere(types == number)
+            axes.plot(x[at[:, 0]], y[at[:, 1]], ".", ms=2, label=f"grasp type {number + 1}")
+        axes.legend(fontsize=8, loc="upper left", markerscale=4)
+    names, units = data["parameters"], data["units"]
+    axes.set(xlabel=f"{names[0]} [{units[0]}]", ylabel=f"{names[1]} [{units[1]}]")
+    return _save(figure, path)
+
+
+def _axes(width: float = 6.0, height: float = 3.4):
+    # A figure of its own instead of pyplot's: no state and no display is touched.
+    figure = matplotlib.figure.Figure(figsize=(width, height), dpi=120, layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def _strategies(axes, study: Study, below: list[str] | None = None) -> None:
+    labels = [label(s) for s in study.strategies]
+    if below:
+        labels = [f"{name}\n{text}" for name, text in zip(labels, below, strict=True)]
+    axes.set_xticks(range(len(labels)), labels)
+    axes.set_xlabel("strategy (s.d.: single domain; number of switches; conc.: concurrent)")
+    axes.legend(frameon=False, fontsize=8, loc="best")
+
+
+def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    return path

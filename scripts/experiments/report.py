@@ -1,0 +1,206 @@
+"""From committed results to figures and the table of the paper's statements beside ours."""
+
+from pathlib import Path
+
+import numpy as np
+
+from codesign_jax.statistics import wilson
+from scripts.experiments import figures, grasp_types, statistics
+from scripts.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
+from scripts.experiments.statistics import RULES, Interval, Study
+
+BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
+"""Marks between which a page's table is replaced."""
+
+_THRESHOLDS = (0.1, 0.5, 1.0)
+_HEAD = "| the paper | here |\n|---|---|"
+
+
+def make(data: Path, pictures: Path, page: Path | None = None) -> str:
+    """Draws the figures of whatever results there are and writes the table.
+
+    Args:
+      data: Folder of the results.
+      pictures: Folder of the figures.
+      page: Markdown page whose text between the marks is replaced; None for none.
+
+    Returns:
+      The table in Markdown.
+    """
+    studies = {name: statistics.load_study(data, name) for name in ("2d", "23d")}
+    grid = statistics.load(data, "landscape")
+    text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
+    if studies["2d"]:
+        figures.evolution(studies["2d"], pictures / "fig6_cost_evolution.png")
+    for number, study in zip("79", studies.values(), strict=True):
+        if study:
+            figures.success(study, pictures / f"fig{number}a_success.png")
+            figures.convergence(study, pictures / f"fig{number}b_convergence.png")
+    types = statistics.load(data, "types")
+    if grid:
+        dots = types[0]["type"] if types else None
+        figures.landscape(grid[0], pictures / "fig8_landscape.png", types=dots)
+    if page:
+        fill(page, text)
+    if grid and types:
+        table = grasp_types.describe(grid[0], types[0])
+        if page:
+            fill(page, table, "types")
+        text += f"\n\n{table}"
+    return text
+
+
+def fill(page: Path, text: str, mark: str = "results") -> None:
+    """Replaces what stands between the marks of a page.
+
+    Args:
+      page: Markdown page.
+      text: The new text.
+      mark: Name of the marks.
+
+    Raises:
+      ValueError: If the page does not hold both marks.
+    """
+    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
+    old = page.read_text()
+    if begin not in old or end not in old:
+        raise ValueError(f"{page} holds no {begin} and {end}")
+    head, tail = old.split(begin)[0], old.split(end)[1]
+    page.write_text(f"{head}{begin}\n\n{text}\n\n{end}{tail}")
+
+
+def comparison(studies: dict[str, Study | None], grid) -> str:
+    """The paper's statements beside ours, as a Markdown table."""
+    rows = [_grasps_row(studies, grid)]
+    for name, study in studies.items():
+        rows += _rows(name, study) if study else [(f"{name} experiment", "not run")]
+    if all(studies.values()):
+        rows.append(_growth_row(studies["2d"], studies["23d"]))  # type: ignore[arg-type]
+    rows.append(("two separate regions of success (Fig. 8)", _regions(grid) if grid else "not run"))
+    return "\n".join([_HEAD, *(f"| {a} | {b} |" for a, b in rows)])
+
+
+def details(study: Study) -> str:
+    """One line a strategy: success by both rules, convergence, tests against the last one."""
+    name, limit = study.plan["name"], study.plan["episodes"]
+    lines = [
+        f"{name}: {study.plan['runs']} runs a strategy; intervals of 95 %; p by McNemar's and "
+        f"Wilcoxon's paired tests against {study.strategies[-1]}",
+        "",
+        "| strategy | success | p | success, failed trials at the maximum | converged "
+        "| simulations to converge: median [quartiles] | p | failed trials |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    episodes, good = study.convergence(), study.success()
+    strict, failed = study.success("worst"), study.data["failed"].sum((1, 2, 3))
+    trials = study.per_episode * study.plan["runs"] * study.data["mean"].shape[-1]
+    for s, strategy in enumerate(study.strategies):
+        quartiles = [statistics.quantile(episodes[s], q) * study.per_episode for q in _QUARTERS]
+        middle, low, high = (_number(float(quartiles[i])) for i in (1, 0, 2))
+        last = s == len(study.strategies) - 1
+        p = [
+            "" if last else _p(statistics.mcnemar(good[s], good[-1])),
+            "" if last else _p(statistics.wilcoxon(episodes[s], episodes[-1], limit)),
+        ]
+        cells = [
+            figures.label(strategy),
+            _percent(wilson(int(good[s].sum()), good[s].size)),
+            p[0],
+            _percent(wilson(int(strict[s].sum()), strict[s].size)),
+            f"{int(np.isfinite(episodes[s]).sum())}/{episodes.shape[1]}",
+            f"{middle} [{low}, {high}]",
+            p[1],
+            f"{100 * failed[s] / trials:.2f} %",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+_QUARTERS = (0.25, 0.5, 0.75)
+
+
+def _rows(name: str, study: Study) -> list[tuple[str, str]]:
+    paper = {"2d": 420, "23d": 6120}[name]
+    success, episodes = study.success(), study.convergence()
+    ratios = ", ".join(
+        f"{figures.label(s)} {100 * r.mean():.0f} %"
+        for s, r in zip(study.strategies, success, strict=True)
+    )
+    finite = np.minimum(episodes, study.plan["episodes"] + 1)
+    medians = ", ".join(
+        f"{figures.label(s)} {_number(float(statistics.quantile(e, 0.5)))}"
+        for s, e in zip(study.strategies, episodes, strict=True)
+    )
+    both = [statistics.median(study.convergence(r)[-1] * study.per_episode) for r in RULES]
+    return [
+        (
+            f"{name}: success grows with more switching, concurrent best",
+            f"{ratios}; Page's trend test p {_p(statistics.trend(1.0 * success))}",
+        ),
+        (
+            f"{name}: convergence quickens with more switching, concurrent fastest",
+            f"median episodes: {medians}; Page's trend test p {_p(statistics.trend(-finite))}",
+        ),
+        (
+            f"{name}: {paper} simulations to convergence (concurrent)",
+            f"{_interval(both[0])}; failed trials at the maximum: {_interval(both[1])}",
+        ),
+    ]
+
+
+def _growth_row(two: Study, many: Study) -> tuple[str, str]:
+    parameters = len(many.data["parameters"]) / len(two.data["parameters"])
+    growth = statistics.ratio_of_medians(
+        many.convergence()[-1] * many.per_episode, two.convergence()[-1] * two.per_episode
+    )
+    text = "not defined" if np.isnan(growth.value) else _interval(growth, 3)
+    return (
+        "2 to 23 parameters: 11.5 times the parameters, 14.6 times the simulations",
+        f"{parameters:.1f} times the parameters, {text} times the simulations",
+    )
+
+
+def _grasps_row(studies: dict[str, Study | None], grid) -> tuple[str, str]:
+    notes = {name: s.notes for name, s in studies.items() if s}
+    notes |= {"landscape": grid[1]} if grid else {}
+    counts = ", ".join(f"{name} {n['grasps']:,}" for name, n in notes.items())
+    total = sum(n["grasps"] for n in notes.values())
+    minutes = sum(n["wall_seconds"] for n in notes.values()) / 60
+    paper = ", ".join(f"{name} {count:,}" for name, count in PAPER_GRASPS.items())
+    return (
+        f"grasps: {paper}; {TOTAL_GRASPS:,} in all",
+        f"{counts or 'none'}; {total:,} in all, in {minutes:.1f} minutes",
+    )
+
+
+def _regions(grid) -> str:
+    parts = []
+    for threshold in _THRESHOLDS:
+        found = statistics.regions(grid[0], threshold)
+        shares = ", ".join(f"{100 * r.share:.1f} %" for r in found)
+        parts.append(f"cost < {threshold:g}: {len(found)}" + (f" ({shares})" if found else ""))
+    units, names = grid[0]["units"], grid[0]["parameters"]
+    found = statistics.regions(grid[0], figures.LANDSCAPE_THRESHOLD)
+    for letter, region in zip("abcdefgh", found, strict=False):
+        ends = ", ".join(
+            f"{names[i]} {region.low[i]:.0f} to {region.high[i]:.0f} {units[i]}" for i in (0, 1)
+        )
+        parts.append(f"({letter}) {ends}")
+    return "; ".join(parts)
+
+
+def _percent(rate: Interval) -> str:
+    return f"{100 * rate.value:.0f} % [{100 * rate.low:.0f}, {100 * rate.high:.0f}]"
+
+
+def _interval(value: Interval, digits: int = 10) -> str:
+    middle, low, high = (_number(v, digits) for v in value)
+    return f"{middle} [{low}, {high}]"
+
+
+def _number(value: float, digits: int = 10) -> str:
+    return "never" if np.isposinf(value) else f"{value:,.{digits}g}"
+
+
+def _p(value: float) -> str:
+    return "< 0.001" if value < 1e-3 else f"= {value:.3f}"

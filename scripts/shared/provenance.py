@@ -1,0 +1,83 @@
+"""What made a result: command, commit, versions and machine; the files of every study say it."""
+
+import argparse
+import datetime
+import os
+import platform
+import shlex
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+
+from codesign_jax.provenance import environment, git_state
+
+
+def command() -> str:
+    """This process's command line, as it can be entered in the checkout's folder."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    if spec is not None:
+        program = ["-m", spec.name.removesuffix(".__main__")]
+    else:
+        path = Path(sys.argv[0])
+        program = [str(path) if not path.is_absolute() else f"scripts/{path.name}"]
+    return shlex.join(["python", *program, *sys.argv[1:]])
+
+
+def add_commit(parser: argparse.ArgumentParser) -> None:
+    """Adds the option --commit to a command line."""
+    parser.add_argument("--commit", help="commit of the code where there is no repository to ask")
+
+
+def results(commit: str | None = None) -> dict[str, object]:
+    """What results depend on: command, commit, versions, platform and device.
+
+    Args:
+      commit: Commit of the code, for a machine without its repository.
+    """
+    return {"command": command(), **git_state(commit), **environment()}
+
+
+def measurement(commit: str | None = None) -> dict:
+    """What times depend on: command, commit, versions, device, processor and its load.
+
+    Args:
+      commit: Commit of the code, for a machine without its repository.
+    """
+    device = jax.devices()[0]
+    return {
+        "command": command(),
+        **git_state(commit),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+        "numpy": np.__version__,
+        "warp": _warp_version(),
+        "platform": device.platform,
+        "device": device.device_kind,
+        "cpu": _cpu_name(),
+        "cpus": len(os.sched_getaffinity(0)),
+        "load": os.getloadavg()[0],
+    }
+
+
+def _warp_version() -> str | None:
+    """Warp's version if it is installed."""
+    try:
+        return metadata.version("warp-lang")
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _cpu_name() -> str:
+    """The processor's name as the system gives it."""
+    try:
+        with open("/proc/cpuinfo") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if "model name" in line]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor()

@@ -1,0 +1,1 @@
+"""Final particles of the experiments, simulated again with other engines, steps and hands."""

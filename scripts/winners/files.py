@@ -1,0 +1,108 @@
+"""The winners' results and, as JSON beside them, the runs that made each call; joining both."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign_jax import files
+from scripts.shared import record as records
+from scripts.shared.record import Arrays, StateError
+
+Run = dict[str, Any]
+"""Provenance of a process, with the keys of the `calls` it made."""
+
+UNKNOWN = "not recorded"
+"""Command of calls that an early file's only command did not make."""
+
+
+def calls(results: Arrays) -> list[str]:
+    """Keys of the calls in results, EXPERIMENT|VARIANT|BLOCK."""
+    return [name.removesuffix("|cost") for name in results if name.endswith("|cost")]
+
+
+def read(path: Path) -> tuple[Arrays, dict[str, Any], list[Run]]:
+    """Reads results with their settings and runs.
+
+    Args:
+      path: The .npz file; its .json lies beside it.
+
+    Raises:
+      StateError: If either file cannot be read.
+    """
+    try:
+        notes = json.loads(path.with_suffix(".json").read_text())
+        settings = notes.pop("settings")
+    except (OSError, ValueError, KeyError) as error:
+        raise StateError(f"what made {path} cannot be read from its .json: {error}") from error
+    results = records.load(path, settings)
+    runs = notes["runs"] if "runs" in notes else _early(notes, calls(results))
+    return results, settings, runs
+
+
+def _early(notes: dict[str, Any], keys: list[str]) -> list[Run]:
+    """Runs of a file that kept its last command alone, which may not have made every call."""
+    command = str(notes.get("command"))
+    named = "--variants" in command
+    made = [k for k in keys if not named or k.split("|")[1] in command]
+    runs = [{**notes, "calls": made}]
+    rest = [k for k in keys if k not in made]
+    return runs + ([{"command": UNKNOWN, "calls": rest}] if rest else [])
+
+
+def note(runs: list[Run], key: str) -> None:
+    """Notes that the last run makes a call.
+
+    A run that was killed between its note and the results made nothing: the last note counts.
+    """
+    for run in runs:
+        run["calls"] = [k for k in run["calls"] if k != key]
+    runs[-1]["calls"].append(key)
+
+
+def write_runs(path: Path, settings: dict[str, Any], runs: Sequence[Run]) -> None:
+    """Writes the .json of a results file; as a whole or not at all."""
+    kept = [run for run in runs if run["calls"]]
+    with files.atomically(path.with_suffix(".json")) as part:
+        part.write_text(json.dumps({"settings": settings, "runs": kept}, indent=2) + "\n")
+
+
+def merge(paths: Sequence[Path], out: Path) -> list[str]:
+    """Joins results of the same settings.
+
+    Args:
+      paths: Files to join; `out` may be one of them.
+      out: File to write.
+
+    Returns:
+      The calls of the new file.
+
+    Raises:
+      StateError: If a file cannot be read, if settings or the numbers of a call differ, or if
+        `out` exists and is not joined.
+    """
+    if out.exists() and out.resolve() not in [p.resolve() for p in paths]:
+        raise StateError(f"{out} exists and is not among the files to join")
+    joined, settings, runs = read(paths[0])
+    for path in paths[1:]:
+        results, other, more = read(path)
+        different = [k for k in {*settings, *other} if settings.get(k) != other.get(k)]
+        if different:
+            text = "; ".join(f"{k}: {settings.get(k)} and {other.get(k)}" for k in different)
+            raise StateError(f"{paths[0]} and {path} do not belong together ({text})")
+        _same_numbers(joined, results, path)
+        known = set(calls(joined))
+        runs += [{**run, "calls": [k for k in run["calls"] if k not in known]} for run in more]
+        joined = results | joined
+    records.save(out, joined, settings)
+    write_runs(out, settings, runs)
+    return calls(joined)
+
+
+def _same_numbers(a: Arrays, b: Arrays, path: Path) -> None:
+    for key in sorted(set(calls(a)) & set(calls(b))):
+        for part in (f"{key}|cost", f"{key}|status"):
+            if not np.array_equal(a[part], b[part], equal_nan=True):
+                raise StateError(f"{path}: its {part} differs from that of the files before it")

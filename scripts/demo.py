@@ -18,7 +18,7 @@ SIZES = ["--particles", "10", "--trials", "6", "--episodes", "64", "--test-trial
 
 def main() -> int:
     """Runs the demo and returns the exit status: 0 only if a final particle passed its test."""
-    run = ["optimize", "--scene", "paper_hull", "--preset", "2d", *SIZES, "--seed", "3"]
+    run = ["optimize", "--scene", "paper", "--preset", "2d", *SIZES, "--seed", "3"]
     run += ["--out", str(FOLDER)]
     status = cli.main([*run, *sys.argv[1:]])
     if status:

@@ -35,7 +35,7 @@ RATES: dict[str, dict[str, Any]] = {
     "hull": {"effects": {"surface": "hull"}},
     "spheres and fingers": {"effects": {"finger_finger": True}},
     # Hands whose fingers start apart; the other cases' designs put fingers into one another.
-    "hull and fingers": {"scene": "paper_hull"},
+    "hull and fingers": {"scene": "paper"},
     "household meshes": {"objects": "household"},
 }
 RATES |= {

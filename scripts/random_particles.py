@@ -1,7 +1,6 @@
 """Simulates random particles of the whole parameter table and counts the worlds that fail.
 
 python -m scripts.random_particles --worlds 100000 --json docs/data/random_particles.json
-python -m scripts.random_particles --scene paper_hull --json docs/data/random_particles_hull.json
 
 The file is written after every chunk, so that what was simulated before an interruption is kept.
 """
@@ -33,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=100_000)
     parser.add_argument("--chunk", type=int, default=16_384)
-    parser.add_argument("--scene", default="paper_spheres")
+    parser.add_argument("--scene", default="paper")
     parser.add_argument("--iterations", type=int, default=24)
     parser.add_argument("--evaluations", type=int, default=14)
     provenance.add_commit(parser)

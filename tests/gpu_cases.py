@@ -51,7 +51,7 @@ def short_scene(name):
     """A small scene: two fingers of two links, and a cylinder or household objects from meshes."""
     if name == "mesh":
         return scenes.load(
-            "paper",
+            "paper_spheres",
             hand_name=small.DATA / "pinch.toml",
             object_set="household",
             overrides={"discretization": {"links": 2}},
@@ -74,7 +74,7 @@ def short(name):
 def paper(name):
     """The paper's scene with effects by name."""
     values = {key.split("__")[1]: value for key, value in WHOLE[name].items()}
-    return scenes.load("paper", overrides={"effects": values})
+    return scenes.load("paper_spheres", overrides={"effects": values})
 
 
 def whole(name):

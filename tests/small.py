@@ -24,7 +24,7 @@ def pinch(shape="box", links=3, **settings):
         table, name = key.split("__")
         overrides.setdefault(table, {})[name] = value
     return scene.load(
-        "paper",
+        "paper_spheres",
         hand_name=DATA / "pinch.toml",
         object_set=DATA / f"{shape}.toml",
         overrides=overrides,

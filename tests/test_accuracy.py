@@ -31,26 +31,26 @@ def test_the_standard_preset_is_the_scene_and_the_study_s_default():
 
 
 def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
-    fine = scene.load("paper", accuracy="reference")
+    fine = scene.load("paper_spheres", accuracy="reference")
     assert fine.discretization == scene.Discretization(0.001, 20, 1)
     for preset_name, setting in PRESETS.items():
-        preset = scene.load("paper", accuracy=preset_name).discretization
+        preset = scene.load("paper_spheres", accuracy=preset_name).discretization
         assert preset == setting.scene().discretization
         assert setting in one_at_a_time("structured")
-    fast = scene.load("paper", accuracy="fast", overrides={"discretization": {"links": 7}})
+    fast = scene.load("paper_spheres", accuracy="fast", overrides={"discretization": {"links": 7}})
     assert (fast.discretization.links, fast.discretization.spheres_per_link) == (7, 2)
 
 
 def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
     wrong = {"discretization": {"timestep": 18.0}}
     with pytest.raises(schema.SceneError) as error:
-        scene.load("paper", accuracy="fats", overrides=wrong)
+        scene.load("paper_spheres", accuracy="fats", overrides=wrong)
     assert "did you mean 'fast'" in str(error.value)
     assert "0.018" in str(error.value)
     mistaken = tmp_path / "mine.toml"
     mistaken.write_text('description = "x"\n[discretization]\nlink = 3\n[solver]\n')
     with pytest.raises(schema.SceneError, match="links"):
-        scene.load("paper", accuracy=mistaken)
+        scene.load("paper_spheres", accuracy=mistaken)
 
 
 def test_the_command_line_takes_a_preset(capsys):

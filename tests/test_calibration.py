@@ -72,9 +72,9 @@ def test_numbers_of_a_set_are_those_of_the_files():
         "hand.material.torsion_factor": v["torsion"],
         "hand.section.width": 1e-3 * v["width"],
         "hand.wrist.linear_stiffness": v["wrist_linear"],
-        "hand.wrist.linear_damping": 22.0 * np.sqrt(v["wrist_linear"] / 300.0),
+        "hand.wrist.linear_damping": 17.0 * np.sqrt(v["wrist_linear"] / 180.0),
         "hand.wrist.angular_stiffness": v["wrist_angular"],
-        "hand.wrist.angular_damping": 0.1 * np.sqrt(v["wrist_angular"] / 3.0),
+        "hand.wrist.angular_damping": 0.2 * np.sqrt(v["wrist_angular"] / 12.0),
         "objects.table.friction": v["table_friction"],
         "arm.zero_height": 1e-3 * v["zero_height"],
         "arm.shake_amplitude": v["shake_amplitude"],
@@ -83,8 +83,8 @@ def test_numbers_of_a_set_are_those_of_the_files():
         "contact.friction_ratio": v["friction_ratio"],
         "cost.maximum": v["cost_maximum"],
     }
-    expected = scene.load("paper_hull", overrides=changes).constants()
-    found = sets.numbers(scene.load("paper_hull"), sets.values(units))
+    expected = scene.load("paper", overrides=changes).constants()
+    found = sets.numbers(scene.load("paper"), sets.values(units))
     third = jax.tree.map(lambda n: float(n[2] if np.ndim(n) else n), found)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), third, expected)
 
@@ -94,9 +94,9 @@ def test_factors_scale_the_stiffness_of_joints():
 
     from codesign_jax import morphology
 
-    plain = scene.load("paper_hull").hand
+    plain = scene.load("paper_spheres").hand
     material = dataclasses.replace(plain.material, lateral_factor=0.29, torsion_factor=3.0)
-    params, _ = hand_world(scene.load("paper_hull"))
+    params, _ = hand_world(scene.load("paper_spheres"))
     soft, stiff = (
         morphology.finger_beams(h, params)
         for h in (dataclasses.replace(plain, material=material), plain)
@@ -218,7 +218,7 @@ def test_sizes_that_do_not_fit_are_refused():
     the_scene, space, engine = sensitive()
     with pytest.raises(ValueError, match="sets"):
         Wave(the_scene, engine, space, UNITS[:0], SIZE)
-    paper = scene.load("paper_hull")
+    paper = scene.load("paper")
     with pytest.raises(ValueError, match="4 trials: must be a multiple of 3"):
         space = parameters.design_space(paper.hand, "2d")
         Wave(paper, engine, space, UNITS, Size(trials=4))
@@ -273,7 +273,7 @@ def test_specks_are_no_regions_and_failed_trials_are_left_out():
 
 
 def two_parameters():
-    space = parameters.design_space(scene.load("paper_hull").hand, "2d")
+    space = parameters.design_space(scene.load("paper").hand, "2d")
     return codesign.make_filter(space), space
 
 

@@ -59,7 +59,7 @@ def as_file(the_scene, constants):
 
 def test_every_number_is_a_leaf_with_the_name_of_its_key():
     """All numbers of the three files, but those that say how much is compiled."""
-    constants = scene.load("paper").constants()
+    constants = scene.load("paper_spheres").constants()
     assert constants.hand.material.shear_modulus == 56e3
     assert constants.contact.friction_ratio == 3.0
     assert constants.objects.object[0].mass == 0.1
@@ -269,7 +269,7 @@ def test_derivatives_equal_differences():
 
 def test_later_noise_leaves_earlier_draws_alone():
     """Friction, stiffness and the hand's masses have keys of their own; their factors are 1."""
-    the_scene, key = scene.load("paper"), jax.random.key(3)
+    the_scene, key = scene.load("paper_spheres"), jax.random.key(3)
     plain = rollout.sample_trials(the_scene, key, 5)
     np.testing.assert_array_equal(plain.friction, 1.0)
     np.testing.assert_array_equal(plain.stiffness, 1.0)
@@ -340,7 +340,7 @@ def test_bad_numbers_are_named_before_anything_runs(message):
 
 def test_constants_of_another_scene_are_refused():
     """Other fingers, other shapes: the keys that are missing and those that are too many."""
-    the_scene, paper = short(), scene.load("paper")
+    the_scene, paper = short(), scene.load("paper_spheres")
     with pytest.raises(schema.SceneError) as error:
         rollout.sample_trials(the_scene, jax.random.key(0), 1, constants=paper.constants())
     assert "constants.hand.finger[2].azimuth is no number of this scene" in str(error.value)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from codesign_jax import cost, scene
 from codesign_jax.types import Outcome, Status, Trace
 
-SCENE = scene.load("paper")
+SCENE = scene.load("paper_spheres")
 STEPS, LOST = SCENE.num_steps, SCENE.cost.lost_distance
 repeatable = settings(max_examples=50, deadline=None, derandomize=True)
 evaluate = jax.jit(lambda trace: cost.outcome(SCENE, trace))
@@ -104,7 +104,7 @@ def test_a_stuck_object_fails_the_trial():
     assert evaluate(trace(distance={last: 0.09}, height={last: 0.25})).status == Status.OK
     # One that was lost before cannot be stuck.
     assert evaluate(trace(400, distance={last: 0.05}, height={last: 0.25})).status == Status.OK
-    without = scene.load("paper", overrides={"effects": {"ungrasp": False}})
+    without = scene.load("paper_spheres", overrides={"effects": {"ungrasp": False}})
     held = jax.tree.map(lambda v: v[: without.num_steps], trace())
     assert cost.outcome(without, held).status == Status.OK
 
@@ -145,7 +145,7 @@ def test_exclusion_and_worst():
         [[0.0, 3.0, 1.0], [3.0, 3.0, 0.5], [3.0, 3.0, 3.0]], [[0, 64, 0], [1, 2, 0], [1, 1, 1]]
     )
     np.testing.assert_allclose(cost.particle_cost(SCENE, trials), [0.5, 0.5, 3.0])
-    worst = scene.load("paper", overrides={"cost": {"failure": "worst"}})
+    worst = scene.load("paper_spheres", overrides={"cost": {"failure": "worst"}})
     np.testing.assert_allclose(cost.particle_cost(worst, trials), [4 / 3, 6.5 / 3, 3.0])
 
 
@@ -153,12 +153,12 @@ def test_costs_of_failed_trials_do_not_matter():
     """Not even one that is not a number."""
     trials = outcomes([[0.25, np.nan, 0.75]], [[0, 1, 0]])
     np.testing.assert_allclose(cost.particle_cost(SCENE, trials), [0.5])
-    worst = scene.load("paper", overrides={"cost": {"failure": "worst"}})
+    worst = scene.load("paper_spheres", overrides={"cost": {"failure": "worst"}})
     np.testing.assert_allclose(cost.particle_cost(worst, trials), [4 / 3])
 
 
 def test_all_failed_is_the_maximum():
     trials = outcomes([[0.0, 0.0]], [[1, 64]])
     for rule in ("exclude", "worst"):
-        rules = scene.load("paper", overrides={"cost": {"failure": rule}})
+        rules = scene.load("paper_spheres", overrides={"cost": {"failure": rule}})
         np.testing.assert_array_equal(cost.particle_cost(rules, trials), [3.0])

@@ -60,7 +60,7 @@ def engine_contacts(kind, position, quat, centre):
     for i in range(POSES):
         mujoco.mju_quat2Mat(columns[i], quat[i])
     with jax.enable_x64(True):
-        paper = scene.load("paper")
+        paper = scene.load("paper_spheres")
         index = [s.type for s in paper.objects.object].index(kind)
         size = np.broadcast_to(np.array(SIZES[kind])[:, None, None], (3, 1, POSES))
         hand = SimpleNamespace(

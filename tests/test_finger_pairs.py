@@ -47,8 +47,8 @@ def kinds(oracle, data):
 
 def test_candidates_are_all_pairs_of_different_fingers():
     """MuJoCo's explicit pairs and the engine's slots: 6 pairs of fingers, all their spheres."""
-    the_scene = scene.load("paper", overrides={"effects": {"finger_finger": True}})
-    off = scene.load("paper")
+    the_scene = scene.load("paper_spheres", overrides={"effects": {"finger_finger": True}})
+    off = scene.load("paper_spheres")
     pairs = [model.compile_template(s).npair for s in (the_scene, off)]
     assert pairs[0] - pairs[1] == 6 * 10 * 10 == len(finger_pairs.finger_pairs(4)) * 100
 
@@ -90,7 +90,7 @@ def test_slots_hold_the_pairs_that_touch():
 
 def test_the_derivative_has_a_slot_for_whatever_touches_in_the_kernel():
     """All spheres in one place fill the slots that the kernel has, whose overflow fails a world."""
-    the_scene = scene.load("paper", overrides={"effects": {"finger_finger": True}})
+    the_scene = scene.load("paper_spheres", overrides={"effects": {"finger_finger": True}})
     pairs, spheres = 6, the_scene.discretization.links
     count = finger_pairs.slots(spheres, the_scene.num_fingers)
     assert count == pairs * pair_slots(the_scene)

@@ -43,7 +43,7 @@ def grasp(the_scene, *designs, trials=None):
 @pytest.fixture(scope="module")
 def pneuflex():
     """The paper's hand with a good design and four bad ones, on all three objects."""
-    the_scene = scene.load("paper")
+    the_scene = scene.load("paper_spheres")
     short, limp = design(the_scene, length=25), design(the_scene, pressure=0)
     high, beside = design(the_scene, arm_z=150), design(the_scene, arm_y=60)
     outcome, trace = grasp(the_scene, design(the_scene), short, limp, high, beside)
@@ -94,7 +94,7 @@ def test_bad_designs_drop_every_object(pneuflex, index):
 
 def test_without_friction_straight_sides_slip():
     """Cuboid and cylinder are held by friction alone; the sphere also by fingers underneath it."""
-    the_scene = scene.load("paper")
+    the_scene = scene.load("paper_spheres")
     slippery = tuple(dataclasses.replace(o, friction=0.0) for o in the_scene.objects.object)
     the_scene = dataclasses.replace(
         the_scene, objects=dataclasses.replace(the_scene.objects, object=slippery)
@@ -104,7 +104,7 @@ def test_without_friction_straight_sides_slip():
 
 
 def test_another_hand_grasps_with_no_line_of_code():
-    the_scene = scene.load("paper", hand_name="tripod3")
+    the_scene = scene.load("paper_spheres", hand_name="tripod3")
     outcome, _ = grasp(the_scene, design(the_scene))
     np.testing.assert_array_equal(outcome.status, Status.OK)
     np.testing.assert_array_equal(outcome.cost, 0.0)
@@ -130,7 +130,7 @@ def test_fingers_stay_outside_the_object(pneuflex):
 @pytest.mark.parametrize("hand_name", ["pneuflex4", "tripod3"])
 def test_the_good_design_is_robust(hand_name):
     """Twelve noisy trials, four an object: at most one is lost."""
-    the_scene = scene.load("paper", hand_name=hand_name)
+    the_scene = scene.load("paper_spheres", hand_name=hand_name)
     drawn = rollout.sample_trials(the_scene, jax.random.key(12), 12)
     trials = [jax.tree.map(lambda v, i=i: v[i], drawn) for i in range(12)]
     outcome, _ = grasp(the_scene, design(the_scene), trials=trials)

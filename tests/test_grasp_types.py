@@ -14,7 +14,7 @@ from scripts.experiments import figures, grasp_types
 @pytest.fixture(scope="module")
 def setup():
     """The paper's scene with two links a finger, its two parameters, MuJoCo C."""
-    the_scene = scene.load("paper", overrides={"discretization": {"links": 2}})
+    the_scene = scene.load("paper_spheres", overrides={"discretization": {"links": 2}})
     space = parameters.design_space(the_scene.hand, "2d")
     return the_scene, make_engine("mujoco", the_scene), space
 

@@ -130,4 +130,4 @@ def test_bad_settings_are_refused():
     with pytest.raises(SceneError, match="hull_points = 6 must be a multiple of 4"):
         hull_scene(points=6)
     with pytest.raises(SceneError, match="did you mean 'hull'"):
-        scene.load("paper", overrides={"effects": {"surface": "hul"}})
+        scene.load("paper_spheres", overrides={"effects": {"surface": "hul"}})

@@ -64,7 +64,7 @@ def test_household_is_what_its_script_makes(tmp_path, household):
 
 def test_household_distances_in_lanes(household):
     """The jitted interpolation against the exact distance of every mesh, a world each."""
-    the_scene = scene.load("paper", object_set="household")
+    the_scene = scene.load("paper_spheres", object_set="household")
     count = len(household)
     shape = jnp.arange(count)[None]
     size = 1.03 * np.array([s.half_sizes for s in household]).T[:, None]
@@ -89,7 +89,7 @@ def test_household_distances_in_lanes(household):
 
 def test_support_points_carry_the_lowest(household):
     """Whatever the pose, the four points include the lowest of the mesh, up to the selection."""
-    the_scene = scene.load("paper", object_set="household")
+    the_scene = scene.load("paper_spheres", object_set="household")
     poses = Rotation.from_rotvec(np.random.default_rng(5).normal(size=(40, 3))).as_matrix()
     points = jax.jit(mesh_lanes.table_points)
     for i, s in enumerate(household):
@@ -105,7 +105,7 @@ def test_support_points_carry_the_lowest(household):
 
 
 def test_engines_that_cannot_say_so():
-    the_scene = scene.load("paper", object_set="household")
+    the_scene = scene.load("paper_spheres", object_set="household")
     for name in ("mujoco", "mjx"):
         with pytest.raises(schema.SceneError) as caught:
             make_engine(name, the_scene)
@@ -114,7 +114,7 @@ def test_engines_that_cannot_say_so():
 
 
 def test_a_scene_carries_its_meshes(tmp_path):
-    the_scene = scene.load("paper", object_set="household")
+    the_scene = scene.load("paper_spheres", object_set="household")
     scene_files.write_scene(the_scene, tmp_path)  # reads it back and compares
     again = scene.load(tmp_path / "scene.toml")
     assert again == the_scene and hash(again) == hash(the_scene)
@@ -126,7 +126,7 @@ def test_a_scene_carries_its_meshes(tmp_path):
 
 
 def test_pictures_show_the_mesh_where_it_is():
-    the_scene = scene.load("paper", object_set="household", hand_name=DATA / "pinch.toml")
+    the_scene = scene.load("paper_spheres", object_set="household", hand_name=DATA / "pinch.toml")
     params, trial = hand_world(the_scene)
     index = [s.name for s in the_scene.objects.object].index("mug")
     trial = still(index)._replace(size=np.array(1.1), yaw=np.array(0.3))
@@ -229,7 +229,7 @@ def grasps(tmp_path_factory, household):
           for n, f in files.items()),
     )  # fmt: skip
     the_scene = scene.load(
-        "paper", hand_name=DATA / "pinch.toml", object_set=path, overrides=HURRIED
+        "paper_spheres", hand_name=DATA / "pinch.toml", object_set=path, overrides=HURRIED
     )
     names = [shape.name for shape in the_scene.objects.object]
     with jax.enable_x64(True):
@@ -281,7 +281,9 @@ def test_accelerations_of_a_meshed_box_equal_mujoco(grasps, tmp_path):
     """
     common = "mass = 0.1; friction = 0.8"
     path = object_file(tmp_path, f'name = "box"; type = "box"; size = [0.03, 0.03, 0.03]; {common}')
-    twin = scene.load("paper", hand_name=DATA / "pinch.toml", object_set=path, overrides=HURRIED)
+    twin = scene.load(
+        "paper_spheres", hand_name=DATA / "pinch.toml", object_set=path, overrides=HURRIED
+    )
     world = grasps.names.index("mesh box")
     trial = grasps.trials[world]._replace(shape=np.int32(0))
     with jax.enable_x64(True):
@@ -344,7 +346,7 @@ def test_the_kernel_balances_the_hull_on_meshes(tmp_path, household):
     )
     settings = HURRIED | {"effects": HURRIED["effects"] | {"surface": "hull"}}
     hand = DATA / "pinch.toml"
-    the_scene = scene.load("paper", hand_name=hand, object_set=path, overrides=settings)
+    the_scene = scene.load("paper_spheres", hand_name=hand, object_set=path, overrides=settings)
     params, _ = hand_world(the_scene, length=0.09, pressure=190e3)
     params = params._replace(arm=params.arm * (np.arange(6) != 2) + 0.05 * (np.arange(6) == 2))
     with jax.enable_x64(True):

@@ -41,9 +41,9 @@ def arrays(compiled):
 
 
 SCENES = {
-    "pneuflex4": lambda: scene.load("paper"),
+    "pneuflex4": lambda: scene.load("paper_spheres"),
     "tripod3, two spheres": lambda: scene.load(
-        "paper",
+        "paper_spheres",
         hand_name="tripod3",
         overrides={"discretization": {"links": 4, "spheres_per_link": 2}},
     ),
@@ -178,7 +178,7 @@ def test_the_template_is_its_own_field_set(worlds):
 @pytest.fixture(scope="module")
 def grasp():
     """A scene with five links and, for each object, params, trial, fields and controls."""
-    the_scene = scene.load("paper", overrides={"discretization": {"links": 5}})
+    the_scene = scene.load("paper_spheres", overrides={"discretization": {"links": 5}})
     with jax.enable_x64(True):
         params, trials = random_worlds(the_scene, seed=3, count=3)
         # Random sections and spreads, straight above the object, fingers fully inflated.

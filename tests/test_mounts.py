@@ -46,7 +46,7 @@ def test_sections_of_the_papers_hand_do_not_overlap_at_any_spread():
 
     So equal fingers of the table's corners are enough; MuJoCo C measures the boxes.
     """
-    the_scene = coarse("paper_hull", surface="spheres", finger_finger=False)
+    the_scene = coarse("paper", surface="spheres", finger_finger=False)
     for (length, height), spread in itertools.product(CORNERS, SPREADS):
         gaps = closest(the_scene, length=length, height=height, spread=spread)
         # Centres of a pair are 26 mm apart and sections 20 mm wide: turning outwards moves no
@@ -64,7 +64,7 @@ def test_sections_on_a_circle_do_overlap():
 
 
 def test_contact_between_fingers_finds_none_at_rest():
-    the_scene = coarse("paper_hull")
+    the_scene = coarse("paper")
     corners = itertools.product(CORNERS, SPREADS[[0, -1]])
     worlds = [hand_world(the_scene, length=n, height=h, spread=s)[0] for (n, h), s in corners]
     designs = Params(*(np.stack(v) for v in zip(*worlds, strict=True)))
@@ -75,7 +75,7 @@ def test_contact_between_fingers_finds_none_at_rest():
 @pytest.mark.parametrize("spread", [0.0, 1.1])
 def test_base_points_stay_and_directions_turn(spread):
     """Place and direction of a finger from MuJoCo's kinematics, against the file's numbers."""
-    the_scene = coarse("paper_hull", surface="spheres", finger_finger=False)
+    the_scene = coarse("paper", surface="spheres", finger_finger=False)
     params, trial = hand_world(the_scene, spread=spread)
     compiled = model.compile_model(the_scene, params, trial)
     data = mujoco.MjData(compiled)
@@ -94,9 +94,9 @@ def test_base_points_stay_and_directions_turn(spread):
 
 def test_base_points_are_constants():
     """One traced program takes any base points; a circle through a base point gives its place."""
-    the_scene = coarse("paper_hull")
+    the_scene = coarse("paper")
     start = the_scene.constants()
-    assert start.hand.finger[1].base == (0.025, -0.013) and not hasattr(
+    assert start.hand.finger[1].base == (0.036, -0.0175) and not hasattr(
         start.hand.finger[1], "radius"
     )
     params, trial = hand_world(the_scene, spread=0.4)
@@ -125,7 +125,7 @@ def test_the_lowest_point_of_base_points_is_that_of_the_circle_through_them():
     for i, f in enumerate(circle.hand.finger):
         angle = np.deg2rad(f.azimuth) + f.spread * 0.7
         changes[f"hand.finger.{i}.base"] = [f.radius * np.cos(angle), f.radius * np.sin(angle)]
-    points = scene.load("paper_hull", overrides={"discretization.links": 1, **changes})
+    points = scene.load("paper", overrides={"discretization.links": 1, **changes})
     # 1 nm: radians of hand_world are doubles.
     low = clearance.lowest_point(circle, params)
     assert abs(clearance.lowest_point(points, params) - low) < 1e-9

@@ -94,12 +94,12 @@ def test_numbers_that_are_no_hand_are_refused(change, part):
 def test_fingers_inside_one_another_are_refused(surface):
     """Without a spread two pairs of the paper's fingers stand in one place: 20 mm deep."""
     effects = {"surface": surface, "finger_finger": True}
-    the_scene = scene.load("paper", overrides={"effects": effects})
+    the_scene = scene.load("paper_spheres", overrides={"effects": effects})
     both = [hand_world(the_scene, spread=np.deg2rad(x))[0] for x in (0.0, 60.0)]
     designs = Params(*(np.stack(v) for v in zip(*both, strict=True)))
     refusals = preflight.check(the_scene, designs, ["together", "apart"]).refusals
     assert len(refusals) == 1 and refusals[0].startswith(
         "together: fingers start 20 mm inside one another (limits.penetration = 10 mm)"
     )
-    alone = scene.load("paper", overrides={"effects": {"surface": surface}})
+    alone = scene.load("paper_spheres", overrides={"effects": {"surface": surface}})
     assert not preflight.check(alone, designs).refusals

@@ -10,7 +10,7 @@ from small import hand_world, nth, pinch, random_designs, stack
 from codesign_jax import control, model, parameters, rollout, scene
 from codesign_jax.engines import make_engine
 
-PAPER = scene.load("paper")
+PAPER = scene.load("paper_spheres")
 KEY = jax.random.key(5)
 draw = jax.jit(lambda key, n: rollout.sample_trials(PAPER, key, n), static_argnums=1)
 
@@ -127,7 +127,7 @@ def test_the_arm_carries_the_trials_tilt():
 
 
 def test_effects_that_are_off_have_no_phase():
-    calm = scene.load("paper", overrides={"effects": {"disturb": False, "ungrasp": False}})
+    calm = scene.load("paper_spheres", overrides={"effects": {"disturb": False, "ungrasp": False}})
     params, trial = jax.tree.map(jnp.asarray, hand_world(calm))
     u = np.asarray(control.commands(calm, params, trial))
     assert u.shape == (450, 10)

@@ -31,7 +31,7 @@ from scripts.calibration.wave import Size, Wave, keep
 from scripts.experiments import Stop, drive, results
 from scripts.shared import provenance, record
 
-SCENE, PRESET = "paper_hull", "2d"
+SCENE, PRESET = "paper", "2d"
 # Sets, grid points along a side, trials, most worlds of a call, and what changes in the scene.
 SIZES = {
     "gpu": (2048, 12, 6, 16_384, {}),

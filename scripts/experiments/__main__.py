@@ -32,7 +32,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
     parser.add_argument(
         "--scene",
-        default="paper_spheres",
+        default="paper",
         help="built-in scene or file; by default that of docs/data/reproduction",
     )
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")

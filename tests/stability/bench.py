@@ -58,7 +58,7 @@ def pinch(**settings) -> Scene:
     for key, value in settings.items():
         table, name = key.split("__")
         overrides.setdefault(table, {})[name] = value
-    return scene.load("paper", hand_name=small.DATA / "pinch.toml", overrides=overrides)
+    return scene.load("paper_spheres", hand_name=small.DATA / "pinch.toml", overrides=overrides)
 
 
 @functools.lru_cache(maxsize=8)

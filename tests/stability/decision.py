@@ -23,7 +23,9 @@ DATA = Path(__file__).parents[2] / "docs" / "data" / "random_particles.json"
 @functools.cache
 def evaluated(engine, step, precision, links=10):
     """Costs (design, trial) of random 2D designs, and what the particle filter makes of them."""
-    base = refined(scene.load("paper", overrides={"discretization": {"links": links}}), step)
+    base = refined(
+        scene.load("paper_spheres", overrides={"discretization": {"links": links}}), step
+    )
     space = parameters.design_space(base.hand, "2d")
     low, high = np.array(space.low), np.array(space.high)
     unit = np.random.default_rng(24).random((DESIGNS, len(low)))

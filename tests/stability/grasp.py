@@ -29,7 +29,7 @@ def paper(**settings):
     for key, value in settings.items():
         table, name = key.split("__")
         overrides.setdefault(table, {})[name] = value
-    return scene.load("paper", overrides=overrides)
+    return scene.load("paper_spheres", overrides=overrides)
 
 
 def design(the_scene, **changes) -> Params:

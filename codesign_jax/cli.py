@@ -124,6 +124,54 @@ class Evaluate:
 
 
 @dataclasses.dataclass
+class Export:
+    """Export a design: MuJoCo models with a player, and commands of arm and valves.
+
+    docs/export.md has every file.
+    """
+
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+    """Folder to write to."""
+    design: Annotated[
+        tuple[tuple[str, ...], ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint=""),
+    ] = ()
+    """The design in the hand file's units, e.g. length=148 arm_z=-59; the rest is the default."""
+    run_folder: Annotated[
+        Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
+    ] = None
+    """Take scene, design space and best particle from this run folder; --accuracy, --objects, --set
+    and --engine then replace the run's."""
+    preset: str = "2d"
+    """Design space that the names belong to."""
+    hand: Text = None
+    """Hand: a built-in name or a .toml file; default: the scene's."""
+    objects: Text = None
+    """Object set: a built-in name or a .toml file; default: the scene's."""
+    scene: str = "paper"
+    """Scene: a built-in name or a .toml file."""
+    accuracy: Text = None
+    """Instead of the scene's discretization and solver: fast, standard, reference (their errors and
+    costs: docs/accuracy.md), or a .toml."""
+    overrides: Overrides = ()
+    engine: Text = None
+    """Engine that simulates; default: the run's, or structured."""
+    trials: int = 0
+    """Grasps with noise to export as models, beside one without noise for each object."""
+    seed: int = 0
+    """Root of the trials' noise."""
+    overwrite: Flag = False
+    """Write into a folder that has files already."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import export
+
+        return export.main(self)
+
+
+@dataclasses.dataclass
 class Scenes:
     """List scenes and their effects: on, off, or unsupported by an engine."""
 
@@ -167,7 +215,7 @@ def main(arguments: list[str] | None = None) -> int:
       arguments: Arguments without the program's name; default: those of the process.
     """
     command = tyro.cli(
-        Optimize | Evaluate | Scenes | Replay,  # type: ignore[arg-type]
+        Optimize | Evaluate | Export | Scenes | Replay,  # type: ignore[arg-type]
         args=arguments,
         prog="codesign",
         description="Co-design of soft hand morphology and control.",

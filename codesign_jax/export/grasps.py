@@ -1,0 +1,141 @@
+"""Grasps as files: a model of each, its controls, and the player that needs MuJoCo alone."""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+
+from codesign_jax import control, model, verdict
+from codesign_jax.cost import outcome
+from codesign_jax.export import plain
+from codesign_jax.export.play import play
+from codesign_jax.scene import Constants, Scene
+from codesign_jax.types import Outcome, Params, Trace, Trial
+
+PLAYER = Path(__file__).with_name("play.py")
+
+
+class Grasp(NamedTuple):
+    """A grasp as plain MuJoCo has it.
+
+    Attributes:
+      xml: The model as MJCF, or None if MJCF cannot say it.
+      note: Why not, or nothing.
+      binary: The compiled model with the inverse weights of the engine `mujoco`.
+      controls: Time [s] and controls of each step, shape (time, 1 + nu); see `control_columns`.
+      states: Generalized positions and velocities before each step, shape (time, nq + nv).
+      outcome: What became of it, by the scene's rules.
+    """
+
+    xml: str | None
+    note: str
+    binary: mujoco.MjModel
+    controls: np.ndarray
+    states: np.ndarray
+    outcome: Outcome
+
+
+def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
+    """Builds a grasp and plays it in plain MuJoCo, for its key frames and its outcome.
+
+    Args:
+      scene: The scene; `plain.obstacles` says which scenes have no such model.
+      params: Parameters as concrete arrays.
+      trial: The trial as concrete arrays.
+    """
+    scene, trial = plain.single_object(scene, trial)
+    wide = _wide(params), _wide(trial)
+    start, controls = _float64(_start, scene, *wide), schedule(scene, params, trial)
+    spec = model.build_spec(scene, *wide, visual=True)
+    limits = verdict.bounds(scene)
+    spec.add_numeric(name="hand_centre", data=model.layout(scene).centre_weights)
+    spec.add_numeric(name="lost", data=[limits.lost_distance, limits.start, limits.end])
+    spec.add_key(
+        name="start", time=0.0, qpos=start, qvel=np.zeros(len(start) - 1), ctrl=controls[0, 1:]
+    )
+    compiled = plain.engine_model(scene, spec)
+    _, distance, states = play(compiled, controls)
+    _add_keys(scene, spec, controls, states)
+    try:
+        xml, note = plain.text(scene, spec.copy()), ""
+    except plain.Inexpressible as error:
+        xml, note = None, str(error)
+    return Grasp(
+        xml,
+        note,
+        plain.engine_model(scene, spec),
+        controls,
+        states,
+        _judge(scene, distance, states, compiled.nq),
+    )
+
+
+def schedule(scene: Scene, params: Params, trial: Trial) -> np.ndarray:
+    """Time [s] and controls of each step of a grasp in float64, shape (time, 1 + nu).
+
+    Args:
+      scene: The scene.
+      params: Parameters as concrete arrays.
+      trial: The trial as concrete arrays.
+    """
+    ctrl = _float64(_commands, scene, _wide(params), _wide(trial))
+    return np.column_stack([np.arange(len(ctrl)) * scene.discretization.timestep, ctrl])
+
+
+def _wide(tree: Any) -> Any:
+    """A tree with its floating-point numbers in float64."""
+    arrays = jax.tree.map(np.asarray, tree)
+    return jax.tree.map(lambda v: v if v.dtype == np.int32 else v.astype(float), arrays)
+
+
+def _float64(program: Callable, scene: Scene, params: Params, trial: Trial) -> np.ndarray:
+    """Calls one of the programs below in float64, whatever the caller's mode."""
+    with jax.enable_x64(True):
+        return np.asarray(program(scene.structure, _wide(scene.constants()), params, trial))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _start(structure: Scene, constants: Constants, params: Params, trial: Trial) -> jax.Array:
+    return model.model_fields(structure.with_constants(constants), params, trial).start
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _commands(structure: Scene, constants: Constants, params: Params, trial: Trial) -> jax.Array:
+    return control.commands(structure.with_constants(constants), params, trial)
+
+
+def _add_keys(scene: Scene, spec: mujoco.MjSpec, controls: np.ndarray, states: np.ndarray) -> None:
+    """Key frames at the ends of the phases, from which a viewer may go on."""
+    nq = (states.shape[1] + 1) // 2
+    for name, end in phases(scene)[:-1]:
+        k = round(end / scene.discretization.timestep)
+        spec.add_key(
+            name=f"after_{name}",
+            time=controls[k, 0],
+            qpos=states[k, :nq],
+            qvel=states[k, nq:],
+            ctrl=controls[k, 1:],
+        )
+
+
+def phases(scene: Scene) -> list[tuple[str, float]]:
+    """Names and end times [s] of a grasp's phases, up to the last that is on."""
+    p = scene.phases
+    ends = [(name, getattr(p, name)) for name in ("approach", "inflate", "lift")]
+    ends += [("disturb", p.disturb)] if scene.effects.disturb else []
+    return ends + ([("ungrasp", p.ungrasp)] if scene.effects.ungrasp else [])
+
+
+def _judge(scene: Scene, distance: np.ndarray, states: np.ndarray, nq: int) -> Outcome:
+    """Outcome of one's own simulation by the scene's rule."""
+    speed = np.abs(states[:, nq:]).max(1)
+    trace = Trace(distance, states[:, nq - 5], speed, states[:, :0])
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, _outcome(scene, trace))
+
+
+_outcome = jax.jit(outcome, static_argnums=0)

@@ -1,0 +1,118 @@
+"""A grasp as a model that plain MuJoCo opens and simulates as the engine `mujoco` does.
+
+MJCF has no word for `body_invweight0`, which this project declares instead of deriving it from
+masses (`model.contact_invweight`): MuJoCo's compiler computes its own, and contacts get another
+stiffness.  It enters a contact of bodies 1 and 2 only through the regularization of its normal,
+  R = (1 - d) / d (w_1 + w_2),
+with d the pair's impedance, which is constant here.  The pair's impedance can therefore take up
+the difference: with W the declared and w the compiled sum of the two,
+  (1 - d') / d' = (1 - d) / d W / w.
+The reference acceleration a = -B v - K d r of a violation r stays with MuJoCo's direct format
+solref = (-k, -b), for which K = k / d'^2 and B = b / d', if
+  k = d' / (d tau^2),  b = 2 d' / (d tau),
+since K = 1 / (d tau)^2 and B = 2 / (d tau) for the time constant tau and damping ratio 1.  Friction
+follows from the normal's R and B.  Formulas of MuJoCo: documentation, Computation, "Parameters".
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from codesign_jax import effects
+from codesign_jax.export import mjcf
+from codesign_jax.model import contact_invweight
+from codesign_jax.model.spec import SOLIMP
+from codesign_jax.scene import Scene
+from codesign_jax.types import Trial
+
+_SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
+"""Of (1 - d) / d, as MuJoCo keeps an impedance d between 0.0001 and 0.9999."""
+
+
+class Inexpressible(ValueError):
+    """A contact that MJCF cannot say."""
+
+
+def obstacles(scene: Scene) -> list[str]:
+    """What of a scene plain MuJoCo does not simulate, a sentence each; empty if nothing."""
+    found = [
+        f"effects.{name} = {effects.setting(scene.effects, name)} ({reason}); "
+        f"{_INSTEAD.get(name, 'switch it off')} for another scene that it simulates"
+        for name, reason in effects.refusals(scene.effects, "mujoco").items()
+    ]
+    if scene.effects.neo_hookean:
+        found.append(
+            "effects.neo_hookean = true (its moments follow the angles by a law that MuJoCo's "
+            "joints do not have); --set effects.neo_hookean=false for another scene that it "
+            "simulates"
+        )
+    return found + [
+        f"object {shape.name!r} is a mesh (MuJoCo takes its convex hull); --objects with "
+        "primitives for another scene that it simulates"
+        for shape in scene.objects.object
+        if shape.mesh
+    ]
+
+
+_INSTEAD = {"surface": "--set effects.surface=spheres"}
+
+
+def single_object(scene: Scene, trial: Trial) -> tuple[Scene, Trial]:
+    """The scene with the trial's object alone, and the trial in it."""
+    alone = dataclasses.replace(scene.objects, object=(scene.objects.object[int(trial.shape)],))
+    return dataclasses.replace(scene, objects=alone), trial._replace(shape=np.int32(0))
+
+
+def engine_model(scene: Scene, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compiles a spec to the model of the engine `mujoco`: inverse weights are the declared ones.
+
+    Args:
+      scene: The scene.
+      spec: A spec of `model.build_spec`; it stays as it is.
+    """
+    model = spec.compile()
+    model.body_invweight0[1:] = contact_invweight(scene)
+    return model
+
+
+def text(scene: Scene, spec: mujoco.MjSpec) -> str:
+    """MJCF which plain MuJoCo compiles to a model of the same dynamics as `engine_model`.
+
+    Args:
+      scene: The scene.
+      spec: A spec of `model.build_spec`; its contact pairs are rewritten.
+
+    Raises:
+      Inexpressible: If a contact would need an impedance that MuJoCo does not take.
+    """
+    compiled, declared = spec.compile().body_invweight0[:, 0], contact_invweight(scene)
+    for pair in spec.pairs:
+        names = pair.geomname1, pair.geomname2
+        bodies = [spec.geom(name).parent.id for name in names]
+        wanted = declared * sum(body > 0 for body in bodies)
+        if not _absorb(scene, pair, wanted / compiled[bodies].sum()):
+            why = "" if scene.effects.wrist else ", for effects.wrist = false makes the palm heavy"
+            raise Inexpressible(
+                f"the contact of {names[0]} and {names[1]} would need an impedance outside of "
+                f"MuJoCo's 0.0001 to 0.9999{why}; the binary model (.mjb) has the contact"
+            )
+    return mjcf.text(spec)
+
+
+def _absorb(scene: Scene, pair: mujoco.MjsPair, ratio: float) -> bool:
+    """Gives a pair the impedance and reference of the module's formulas; False if it cannot.
+
+    Args:
+      scene: The scene.
+      pair: The pair.
+      ratio: Declared over compiled inverse weight.
+    """
+    d, tau = scene.contact.impedance, scene.contact.time_constant
+    softness = (1 - d) / d * ratio
+    if not _SOFTNESS[0] <= softness <= _SOFTNESS[1]:
+        return False
+    impedance = 1 / (1 + softness)
+    pair.solimp = [impedance, impedance, *SOLIMP]
+    pair.solref = [-impedance / (d * tau**2), -2 * impedance / (d * tau)]
+    return True

@@ -1,0 +1,137 @@
+"""The tables of an export: controls of a grasp, commands for an arm and valves, list of grasps."""
+
+import csv
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from codesign_jax.export.grasps import PLAYER, Grasp, phases
+from codesign_jax.model.layout import WRIST
+from codesign_jax.scene import Scene
+from codesign_jax.types import Status, Trial, failed
+
+COMMANDS, MODELS, GRASPS = "commands.csv", "model", "grasps.csv"
+
+COMMAND_COLUMNS = {
+    "time_s": "time from the start of the grasp",
+    "phase": "approach, inflate, lift, disturb or ungrasp",
+    "arm_x_mm": "position of the arm frame X_D, from the object's nominal place",
+    "arm_y_mm": "likewise",
+    "arm_z_mm": "height of the palm's underside above the table, if the wrist is not deflected",
+    "arm_roll_deg": "orientation of X_D: turned about x by this angle, ...",
+    "arm_yaw_deg": "... then about the turned z, ...",
+    "arm_pitch_deg": "... then about the turned y; Table I's arm_pitch has the other sign",
+    "pressure_0_kPa": "gauge pressure in the chamber of finger 0; a column for each finger",
+}
+"""Meaning of the columns of commands.csv, a row for each time step."""
+
+GRASP_COLUMNS = {
+    "model": "name of the model's files",
+    "object": "name of the object",
+    "object_x_mm": "place of the object on the table",
+    "object_y_mm": "likewise",
+    "object_yaw_deg": "its turn about the vertical",
+    "arm_roll_tilt_deg": "noise of the arm's roll, part of the controls",
+    "arm_pitch_tilt_deg": "noise of the arm's pitch",
+    "object_mass_factor": "factor on the object's mass",
+    "object_size_factor": "factor on its size",
+    "friction_factor": "factor on the friction of all contacts",
+    "stiffness_factor": "factor on the fingers' shear modulus",
+    "hand_mass_factor": "factor on the masses of fingers and palm",
+    "lost_time_s": "when the object was lost in plain MuJoCo; inf if it was kept",
+    "status": "OK or why the trial failed, as in a run's trials.csv; solver warnings are not seen",
+}
+"""Meaning of the columns of grasps.csv, a row for each model."""
+
+
+def control_columns(scene: Scene) -> list[str]:
+    """Names of the columns of a grasp's controls, in SI units and the order of the actuators."""
+    arm = [f"arm_{name}_{'m' if len(name) == 1 else 'rad'}" for name in WRIST]
+    return ["time_s", *arm, *(f"pressure_{i}_Pa" for i in range(scene.num_fingers))]
+
+
+def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
+    """Writes commands.csv in mm, degrees and kPa.
+
+    Args:
+      folder: An existing folder.
+      scene: The scene.
+      schedule: Time and controls, see `grasps.schedule`.
+
+    Returns:
+      The file's path.
+    """
+    factors = [1e3] * 3 + [180 / np.pi] * 3 + [1e-3] * scene.num_fingers
+    names, ends = zip(*phases(scene), strict=True)
+    rows = []
+    for time, *controls in schedule:
+        # A step belongs to the phase in which it begins; 1e-9 s is rounding of k h.
+        phase = names[min(int(np.searchsorted(ends, time + 1e-9, "right")), len(names) - 1)]
+        values = np.multiply(controls, factors)
+        rows.append([f"{time:.9g}", phase, *(f"{v:.7g}" for v in values)])  # float32 has 7
+    head = [*COMMAND_COLUMNS][:-1] + [f"pressure_{i}_kPa" for i in range(scene.num_fingers)]
+    return _write(folder / COMMANDS, head, rows)
+
+
+def write_grasps(
+    folder: Path, scene: Scene, trials: Sequence[tuple[str, Trial]], grasps: Iterable[Grasp]
+) -> list[str]:
+    """Writes models, controls, player and grasps.csv.
+
+    Args:
+      folder: An existing folder.
+      scene: The scene.
+      trials: Name and trial of each grasp.
+      grasps: The grasps, which are asked for one after the other.
+
+    Returns:
+      What became of each grasp, a line each.
+    """
+    rows, lines = [], []
+    for (name, trial), grasp in zip(trials, grasps, strict=True):
+        if grasp.xml is not None:
+            (folder / f"{name}.xml").write_text(grasp.xml, encoding="utf-8")
+        mujoco.mj_saveModel(grasp.binary, str(folder / f"{name}.mjb"))
+        # repr names a float64 exactly: the player's controls are these.
+        exact = ([repr(float(v)) for v in row] for row in grasp.controls)
+        _write(folder / f"{name}_controls.csv", control_columns(scene), exact)
+        rows.append(_row(name, scene, trial, grasp))
+        lines.append(f"{name}: {_verdict(grasp)}")
+        lines += [f"{name}: no MJCF: {grasp.note}"] if grasp.note else []
+    _write(folder / GRASPS, [*GRASP_COLUMNS], rows)
+    (folder / PLAYER.name).write_text(PLAYER.read_text(encoding="utf-8"), encoding="utf-8")
+    return lines
+
+
+def _row(name: str, scene: Scene, trial: Trial, grasp: Grasp) -> list[str]:
+    factors = [trial.mass, trial.size, trial.friction, trial.stiffness, trial.hand_mass]
+    numbers = [*np.multiply(1e3, trial.position)]
+    numbers += [*np.degrees([trial.yaw, *trial.arm_tilt])]
+    numbers += [1.0 if v is None else v for v in factors] + [grasp.outcome.lost_time]
+    status = str(Status(int(grasp.outcome.status)).name)
+    shape = scene.objects.object[int(trial.shape)].name
+    return [name, shape, *(f"{float(v):.9g}" for v in numbers), status.replace("|", "+")]
+
+
+def _verdict(grasp: Grasp) -> str:
+    status = int(grasp.outcome.status)
+    if failed(status):
+        return f"failed ({Status(status).name})"
+    lost = float(grasp.outcome.lost_time)
+    return "kept" if np.isinf(lost) else f"lost at {lost:.2f} s"
+
+
+def names_of(objects: Sequence[str]) -> list[str]:
+    """Names of files for names of objects, which are free text."""
+    plain = [re.sub(r"\W+", "_", name).strip("_") or "object" for name in objects]
+    unique = len(set(plain)) == len(plain)
+    return plain if unique else [f"{name}_{i}" for i, name in enumerate(plain)]
+
+
+def _write(path: Path, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Path:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([head, *rows])
+    return path

@@ -1,0 +1,275 @@
+"""Exported grasps: plain MuJoCo simulates the files as the engine `mujoco` does."""
+
+import ast
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from small import batch_inputs, hand_world, nth, pinch, stack
+from toy import TINY
+
+from codesign_jax import cli, parameters, rollout, scene
+from codesign_jax.cost import outcome
+from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax.export import grasps, mjcf, plain, tables
+from codesign_jax.export.play import play
+from codesign_jax.model import build_spec
+from codesign_jax.types import failed
+
+# A grasp in 2.2 s, with all joints and contacts.
+HURRIED = {
+    "phases__approach": 0.5,
+    "phases__inflate": 0.8,
+    "phases__lift": 1.2,
+    "phases__disturb": 1.6,
+    "phases__ungrasp": 2.2,
+}
+
+
+def by_engine(the_scene, params, trials):
+    """Trace and outcomes of the engine `mujoco` in float64."""
+    with jax.enable_x64(True):
+        inputs = jax.tree.map(np.asarray, batch_inputs(the_scene, params, trials))
+        trace = MujocoEngine(the_scene).rollout(*inputs, trajectory=True)
+        judged = jax.jit(jax.vmap(lambda t: outcome(the_scene, t)))(trace)
+        return jax.tree.map(np.asarray, (trace, judged))
+
+
+@pytest.fixture(scope="module")
+def grasped():
+    """A scene and three grasps: one that holds, one with every noise, one of slack fingers."""
+    the_scene = pinch("box", **HURRIED)
+    arm = np.array([0, 0, 0.03, 0, 0, 0])
+    holding, still = hand_world(the_scene, length=0.10, pressure=1.9e5)
+    holding = holding._replace(arm=arm)
+    noisy = still._replace(
+        position=np.array([0.004, -0.003]),
+        arm_tilt=np.array([0.05, -0.03]),
+        mass=np.array(1.1),
+        size=np.array(0.95),
+        friction=np.array(1.2),
+        stiffness=np.array(0.9),
+        hand_mass=np.array(1.1),
+    )
+    slack = holding._replace(pressure=0.1 * holding.pressure)
+    worlds = [(holding, still), (holding, noisy), (slack, still)]
+    with jax.enable_x64(True):
+        params, trials = stack(*worlds)
+    trace, judged = by_engine(the_scene, params, trials)
+    return the_scene, worlds, trace, judged
+
+
+def read(path):
+    """Rows of a table."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def errors(states, trace, index):
+    """Largest difference of a generalized position in each step [m or rad]."""
+    return np.abs(states[:, : trace.qpos.shape[2]] - trace.qpos[index]).max(1)
+
+
+def test_plain_mujoco_plays_the_files_as_the_engine(grasped, tmp_path):
+    the_scene, worlds, trace, judged = grasped
+    assert np.isinf(judged.lost_time).tolist() == [True, False, False]
+    found = [grasps.grasp(the_scene, *world) for world in worlds]
+    trials = [(f"grasp_{i}", trial) for i, (_, trial) in enumerate(worlds)]
+    tables.write_grasps(tmp_path, the_scene, trials, found)
+    for i, (name, _) in enumerate(trials):
+        controls = np.loadtxt(tmp_path / f"{name}_controls.csv", delimiter=",", skiprows=1)
+        xml = mujoco.MjModel.from_xml_path(str(tmp_path / f"{name}.xml"))
+        binary = mujoco.MjModel.from_binary_path(str(tmp_path / f"{name}.mjb"))
+        for loaded in (xml, binary):
+            when, _, states = play(loaded, controls)
+            assert when == judged.lost_time[i]
+            # Rounding of 1e-16 grows while fingers slide on the sphere, here to 1e-11.
+            assert errors(states, trace, i).max() < 1e-7
+        assert found[i].outcome.status == judged.status[i] & ~8  # plain MuJoCo tells no warnings
+
+
+def test_the_test_would_notice_another_contact(grasped):
+    """MJCF as MuJoCo writes it, with inverse weights of the compiler's own: another grasp."""
+    the_scene, worlds, trace, _ = grasped
+    found = grasps.grasp(the_scene, *worlds[0])
+    alone, trial = plain.single_object(the_scene, worlds[0][1])
+    naive = build_spec(alone, worlds[0][0], trial)
+    for numeric in ("hand_centre", "lost"):
+        naive.add_numeric(name=numeric, data=found.binary.numeric(numeric).data)
+    naive.add_key(name="start", qpos=found.states[0, : found.binary.nq])
+    _, _, states = play(naive.compile(), found.controls)
+    assert errors(states, trace, 0).max() > 1e-3
+
+
+def test_the_player_needs_mujoco_and_numpy_alone(grasped, tmp_path):
+    the_scene, worlds, _, judged = grasped
+    found = grasps.grasp(the_scene, *worlds[2])
+    tables.write_grasps(tmp_path, the_scene, [("lost", worlds[2][1])], [found])
+    tree = ast.parse((tmp_path / "play.py").read_text())
+    imports = [n for n in ast.walk(tree) if isinstance(n, (ast.Import, ast.ImportFrom))]
+    assert {a.name for n in imports for a in n.names} == {"sys", "mujoco", "numpy"}
+    program = [sys.executable, "play.py", "lost.xml", "lost.mjb"]
+    done = subprocess.run(program, cwd=tmp_path, check=True, capture_output=True, text=True)
+    when = f"lost at {judged.lost_time[2]:.2f} s"
+    assert done.stdout.splitlines() == [f"lost.xml: {when}", f"lost.mjb: {when}"]
+    [row] = read(tmp_path / "grasps.csv")
+    assert float(row["lost_time_s"]) == pytest.approx(judged.lost_time[2], abs=1e-9)
+
+
+@pytest.mark.parametrize("friction", ["none", "coulomb", "full"])
+def test_contacts_have_the_declared_stiffness(friction):
+    """K I, B and R of every constraint row of MuJoCo, in a state with many contacts."""
+    the_scene = pinch("box", effects__friction=friction, effects__finger_finger=True)
+    params, trial = hand_world(the_scene)
+    alone, trial = plain.single_object(the_scene, trial)
+    spec = build_spec(alone, params, trial)
+    rows = []
+    declared = plain.engine_model(alone, spec)
+    for model in (declared, mujoco.MjModel.from_xml_string(plain.text(alone, spec))):
+        data = mujoco.MjData(model)
+        # Palm, straight fingers, object and table are in one another.
+        data.qpos[2], data.qpos[-7:-4] = 0.005, [0.03, 0, 0.02]
+        mujoco.mj_forward(model, data)
+        k, b, impedance = data.efc_KBIP[:, :3].T
+        rows.append(np.stack([k * impedance, b, data.efc_R]))
+    assert rows[0].shape[1] > 10
+    np.testing.assert_allclose(rows[1], rows[0], rtol=1e-10)  # rounding
+    # One closed form: the normal of the object on the table, k_n = K I / R, is twice as stiff as
+    # that of two bodies.
+    table = np.nonzero((data.contact.geom == 0).any(1) & (data.contact.geom[:, 1] > 0))[0]
+    stiffness = (rows[0][0] / rows[0][2])[data.contact.efc_address[table]]
+    np.testing.assert_allclose(stiffness, 2 * the_scene.contact.normal_stiffness, rtol=1e-9)
+
+
+def test_what_plain_mujoco_does_not_simulate_is_named():
+    hull = pinch(effects__surface="hull", effects__neo_hookean=True)
+    surface, rubber = plain.obstacles(hull)
+    assert 'effects.surface = "hull"' in surface and "--set effects.surface=spheres" in surface
+    assert "effects.neo_hookean = true" in rubber
+    household = scene.load("paper", object_set="household")
+    assert any("'mug' is a mesh" in text for text in plain.obstacles(household))
+    assert not plain.obstacles(pinch())
+
+
+def test_a_rigid_wrist_leaves_the_binary_model_alone(tmp_path):
+    """Its palm is so heavy that no impedance makes up for the compiler's inverse weight."""
+    the_scene = pinch("sphere", effects__wrist=False, **HURRIED)
+    params, trial = hand_world(the_scene)
+    found = grasps.grasp(the_scene, params, trial)
+    assert found.xml is None and "effects.wrist = false" in found.note
+    tables.write_grasps(tmp_path, the_scene, [("rigid", trial)], [found])
+    assert not (tmp_path / "rigid.xml").exists()
+    loaded = mujoco.MjModel.from_binary_path(str(tmp_path / "rigid.mjb"))
+    with jax.enable_x64(True):
+        worlds = stack((params, trial))
+    trace, judged = by_engine(the_scene, *worlds)
+    when, _, states = play(loaded, found.controls)
+    assert when == judged.lost_time[0]
+    # Rounding of a mass of 1e9 kg is 1e-7 kg; it turns the ball, which nothing holds, by 2e-4 rad.
+    assert errors(states, trace, 0).max() < 1e-3
+
+
+def test_a_number_that_is_lost_is_noticed():
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(size=[1 / 3, 0, 0])  # without a name its numbers are not found
+    with pytest.raises(RuntimeError, match="geom_size"):
+        mjcf.text(spec)
+    spec.geoms[0].name = "found"
+    assert repr(1 / 3) in mjcf.text(spec)
+
+
+def test_commands_are_the_key_frames(tmp_path):
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "2d")
+    with jax.enable_x64(True):
+        design = nth(space.params(space.default()), ...)
+    schedule = grasps.schedule(the_scene, design, rollout.nominal_trial(the_scene))
+    tables.write_commands(tmp_path, the_scene, schedule)
+    rows = read(tmp_path / tables.COMMANDS)
+    head = [*tables.COMMAND_COLUMNS, *(f"pressure_{i}_kPa" for i in (1, 2, 3))]
+    assert [*rows[0]] == head and len(rows) == 900
+    at = {row["time_s"]: {k: v for k, v in row.items() if k != "phase"} for row in rows}
+    values = {t: {k: float(v) for k, v in row.items()} for t, row in at.items()}
+    top, grasp = 300, 60 + float(1e3 * design.arm[2])  # mm, as in the scene file
+    heights = {"0": top, "1": (top + grasp) / 2, "2": grasp, "3.5": grasp, "4.5": top}
+    for time, height in heights.items():
+        assert values[time]["arm_z_mm"] == pytest.approx(height, rel=1e-6)
+    pressures = {"2": 0, "2.75": 60, "3.5": 120, "8": 120, "8.25": 60, "8.5": 0}
+    for time, pressure in pressures.items():
+        assert values[time]["pressure_3_kPa"] == pytest.approx(pressure, abs=1e-4)
+    assert values["0"]["arm_pitch_deg"] == pytest.approx(-15, rel=1e-6)
+    # Shaken by up to 40 degrees in 3.5 s, at 1.5 Hz: the second peak of roll, in the third period.
+    peak = 4.5 + (2 + 0.25) / 1.5
+    assert values[f"{peak:.9g}"]["arm_roll_deg"] == pytest.approx(40 * 1.5 / 3.5, rel=1e-4)
+    phase = {row["time_s"]: row["phase"] for row in rows}
+    assert [phase[t] for t in ("1.99", "2", "4.49", "4.5", "7.99", "8")] == [
+        *("approach", "inflate", "lift", "disturb", "disturb", "ungrasp")
+    ]
+
+
+# --- the command ---------------------------------------------------------------------------------
+
+
+def export(*arguments):
+    return cli.main(["export", *map(str, arguments)])
+
+
+def test_command_writes_models_and_commands(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert export("--scene", TINY, "--out", out, "--trials", 1) == 0
+    names = {p.name for p in (out / "model").iterdir()}
+    assert {"sphere.xml", "sphere.mjb", "sphere_controls.csv", "play.py", "grasps.csv"} <= names
+    assert {"trial_000_sphere.xml"} <= names and (out / "commands.csv").exists()
+    assert "in plain MuJoCo: sphere: " in capsys.readouterr().out
+    assert export("--scene", TINY, "--out", out) == 2
+    assert "choose another folder, or give --overwrite" in capsys.readouterr().err
+    hull = ["--set", "effects.surface=hull", "--overwrite"]
+    assert export("--scene", TINY, "--out", out, *hull) == 0
+    assert 'no model: plain MuJoCo does not simulate effects.surface = "hull"' in (
+        capsys.readouterr().out
+    )
+
+
+def test_command_refuses_in_words_and_writes_nothing(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert export("--design", "lenght=95", "arm_z=900", "--out", out, "--trials", 1) == 2
+    text = capsys.readouterr().err
+    assert "--design 'lenght' is not a parameter; did you mean 'length'" in text
+    assert "arm_z" in text and not out.exists()
+    assert export("--trials", "-1", "--out", out) == 2
+    assert "--trials" in capsys.readouterr().err and not out.exists()
+
+
+@pytest.mark.slow
+def test_a_hundred_grasps_have_the_engine_s_verdicts():
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "full")
+    trials = jax.tree.map(np.asarray, rollout.sample_trials(the_scene, jax.random.key(5), 100))
+    with jax.enable_x64(True):
+        params = jax.tree.map(np.asarray, space.params(space.default()))
+        many = jax.tree.map(lambda v: np.broadcast_to(v, (100, *v.shape)), params)
+    trace, judged = by_engine(the_scene, many, trials)
+    kept = np.isinf(judged.lost_time)
+    assert 20 < kept.sum() < 80  # a design whose grasps differ
+    apart = []
+    for i in range(100):
+        found = grasps.grasp(the_scene, params, nth(trials, i))
+        loaded = mujoco.MjModel.from_xml_string(found.xml)
+        when, _, states = play(loaded, found.controls)
+        assert np.isinf(when) == kept[i]
+        assert bool(failed(found.outcome.status)) == bool(failed(judged.status[i]))
+        apart.append(errors(states, trace, i))
+    # Rounding grows where fingers slide: half of the grasps stay together to the end.
+    assert np.median(apart, axis=0).max() < 1e-9
+
+
+def test_the_page_has_every_column():
+    page = (Path(__file__).parent.parent / "docs" / "export.md").read_text()
+    for columns in (tables.COMMAND_COLUMNS, tables.GRASP_COLUMNS):
+        for name, meaning in columns.items():
+            assert f"| `{name}` | {meaning} |" in page

@@ -184,7 +184,7 @@ def test_a_number_that_is_lost_is_noticed():
 
 
 def test_commands_are_the_key_frames(tmp_path):
-    the_scene = scene.load("paper")
+    the_scene = scene.load("paper_spheres")
     space = parameters.design_space(the_scene.hand, "2d")
     with jax.enable_x64(True):
         design = nth(space.params(space.default()), ...)
@@ -247,7 +247,7 @@ def test_command_refuses_in_words_and_writes_nothing(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_hundred_grasps_have_the_engine_s_verdicts():
-    the_scene = scene.load("paper")
+    the_scene = scene.load("paper_spheres")
     space = parameters.design_space(the_scene.hand, "full")
     trials = jax.tree.map(np.asarray, rollout.sample_trials(the_scene, jax.random.key(5), 100))
     with jax.enable_x64(True):

@@ -125,7 +125,7 @@ class Evaluate:
 
 @dataclasses.dataclass
 class Export:
-    """Export a design: MuJoCo models with a player, and commands of arm and valves.
+    """Export a design: MuJoCo models with a player, commands of arm and valves, parts to cast.
 
     docs/export.md has every file.
     """
@@ -161,6 +161,18 @@ class Export:
     """Grasps with noise to export as models, beside one without noise for each object."""
     seed: int = 0
     """Root of the trials' noise."""
+    no_parts: Flag = False
+    """Leave out the fingers and their moulds."""
+    end_wall: float = 0.0
+    """Walls that close the chamber at base and tip [mm]; 0: as thick as the finger's others."""
+    inlet: float = 2.0
+    """Diameter of the air tube's hole through the base [mm]; 0: none."""
+    mould_wall: float = 4.0
+    """Thickness of the moulds' walls and floors [mm]."""
+    clearance: float = 0.2
+    """Gap between parts that are set into one another [mm]."""
+    draft: float = 0.0
+    """Slope of the moulds' side faces [deg]."""
     overwrite: Flag = False
     """Write into a folder that has files already."""
 

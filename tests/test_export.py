@@ -19,7 +19,7 @@ from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.export import grasps, mjcf, plain, tables
 from codesign_jax.export.play import play
 from codesign_jax.model import build_spec
-from codesign_jax.types import failed
+from codesign_jax.types import Trial, failed
 
 # A grasp in 2.2 s, with all joints and contacts.
 HURRIED = {
@@ -249,7 +249,9 @@ def test_command_refuses_in_words_and_writes_nothing(tmp_path, capsys):
 def test_a_hundred_grasps_have_the_engine_s_verdicts():
     the_scene = scene.load("paper_spheres")
     space = parameters.design_space(the_scene.hand, "full")
-    trials = jax.tree.map(np.asarray, rollout.sample_trials(the_scene, jax.random.key(5), 100))
+    drawn = rollout.sample_trials(the_scene, jax.random.key(5), 100)
+    wide = [v if v.dtype == np.int32 else v.astype(float) for v in map(np.asarray, drawn)]
+    trials = Trial(*wide)
     with jax.enable_x64(True):
         params = jax.tree.map(np.asarray, space.params(space.default()))
         many = jax.tree.map(lambda v: np.broadcast_to(v, (100, *v.shape)), params)

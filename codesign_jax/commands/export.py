@@ -1,5 +1,7 @@
 """`codesign export`."""
 
+import dataclasses
+import importlib.util
 from collections.abc import Iterator
 from itertools import chain
 from typing import TYPE_CHECKING
@@ -12,7 +14,8 @@ from rich.console import Console
 from codesign_jax import rollout, runs, schema
 from codesign_jax.commands import common
 from codesign_jax.commands.case import Case, find_case
-from codesign_jax.export import grasps, plain, tables
+from codesign_jax.export import grasps, plain, process, tables
+from codesign_jax.export.process import Process, Size
 from codesign_jax.schema import SceneError
 from codesign_jax.types import Params, Trial
 
@@ -29,6 +32,8 @@ def main(options: "Export") -> int:
     common.use_compilation_cache()
     case = find_case(options)
     _check(options, case)
+    params = _params(case)
+    sizes = [] if options.no_parts else _sizes(case, params, options)
     notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
@@ -36,8 +41,24 @@ def main(options: "Export") -> int:
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
     for note in notes:
         console.print(note, markup=False)
-    _write(case, options, console)
+    _write(case, params, sizes, options, console)
     return 0
+
+
+def _params(case: Case) -> Params:
+    """The design's parameters in float64."""
+    with jax.enable_x64(True):
+        exact = case.space.params(jnp.asarray(case.design, float))
+    return jax.tree.map(np.asarray, exact)
+
+
+def _process(options: "Export") -> Process:
+    return Process(**{f.name: getattr(options, f.name) for f in dataclasses.fields(Process)})
+
+
+def _sizes(case: Case, params: Params, options: "Export") -> list[Size]:
+    width = case.scene.hand.section.width
+    return process.sizes(params.length, width, params.height, params.wall, _process(options))
 
 
 def _check(options: "Export", case: Case) -> None:
@@ -53,22 +74,49 @@ def _check(options: "Export", case: Case) -> None:
         problems.append(f"--out {out} exists; choose another folder, or give --overwrite")
     elif out.exists() and not out.is_dir():
         problems.append(f"--out {out} is a file")
+    problems += process.problems(_process(options)) + ([] if options.no_parts else _missing())
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
     if problems:
         raise SceneError(problems)
 
 
-def _write(case: Case, options: "Export", console: Console) -> None:
+def _missing() -> list[str]:
+    """What is to be installed for the parts."""
+    names = ("manifold3d", "networkx", "lxml")
+    absent = [name for name in names if importlib.util.find_spec(name) is None]
+    install = "pip install 'codesign-jax[export]', or give --no-parts"
+    return [f"parts need {' and '.join(absent)}: {install}"] if absent else []
+
+
+def _write(
+    case: Case, params: Params, sizes: list[Size], options: "Export", console: Console
+) -> None:
     """Writes all that is asked for."""
-    with jax.enable_x64(True):
-        exact = case.space.params(jnp.asarray(case.design, float))
-    params = jax.tree.map(np.asarray, exact)
     options.out.mkdir(parents=True, exist_ok=True)
     _models(case, params, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
     schedule = grasps.schedule(case.scene, params, nominal)
     path = tables.write_commands(options.out, case.scene, schedule)
     console.print(f"commands of arm and valves: {path}", markup=False)
+    if sizes:
+        _parts(sizes, options, console)
+
+
+def _parts(sizes: list[Size], options: "Export", console: Console) -> None:
+    from codesign_jax.export import meshes  # needs the extra
+
+    folder, how = options.out / meshes.FOLDER, _process(options)
+    folder.mkdir(exist_ok=True)
+    for part in meshes.write(folder, sizes, how):
+        edges = " x ".join(f"{v:.1f}" for v in part.extents)
+        console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3", markup=False)
+    for i, size in enumerate(sizes):
+        if how.inlet and not process.inlet(size, how):
+            low = min(size.chamber[1:])
+            console.print(
+                f"finger {i} has no inlet: its chamber of {low:g} mm is narrower than the tube"
+            )
+    console.print(f"parts, in millimetres: {folder}", markup=False)
 
 
 def _models(case: Case, params: Params, options: "Export", console: Console) -> None:

@@ -1,0 +1,166 @@
+"""Exported parts: closed, in millimetres, with the design's walls, chamber and volumes."""
+
+import sys
+import zipfile
+
+import manifold3d
+import numpy as np
+import pytest
+import trimesh
+from numpy.polynomial import Polynomial
+from toy import TINY
+
+from codesign_jax import cli, schema
+from codesign_jax.export import casting, meshes, process
+from codesign_jax.export.process import Process, Size
+
+USUAL, FLAT, SHORT = Size(95, 20, 20, 5, 5), Size(170, 20, 15, 7, 7), Size(12, 20, 25, 2, 2)
+# STL holds float32: seven digits of lengths of up to 200 mm.
+EXACT = 1e-4
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Folder of the parts of three fingers, and what was said of them."""
+    folder = tmp_path_factory.mktemp("parts")
+    found = meshes.write(folder, [USUAL, FLAT, USUAL, SHORT], Process())
+    return folder, {part.name: part for part in found}
+
+
+def test_equal_fingers_are_written_once_in_both_formats(written):
+    folder, parts = written
+    labels = ["0_2", "1", "3"]
+    kinds = ["", "_tray", "_core", "_base"]
+    names = {f"finger_{label}{kind}" for label in labels for kind in kinds}
+    assert set(parts) == names
+    assert {p.name for p in folder.iterdir()} == {f"{n}.{e}" for n in names for e in meshes.FORMATS}
+    assert parts["finger_0_2"].fingers == (0, 2)
+
+
+def test_files_hold_closed_bodies_in_millimetres(written):
+    folder, parts = written
+    for path in folder.iterdir():
+        surface, part = trimesh.load_mesh(path), parts[path.stem]
+        assert surface.is_watertight and surface.is_winding_consistent
+        assert surface.volume == pytest.approx(part.volume, rel=EXACT) and surface.volume > 0
+        np.testing.assert_allclose(surface.bounds[0, 2], 0, atol=EXACT)  # on the printer's bed
+        if path.suffix == ".3mf":
+            text = zipfile.ZipFile(path).read("3D/3dmodel.model").decode()
+            assert 'unit="millimeter"' in text
+    assert np.allclose(parts["finger_1"].extents, (170, 20, 15), atol=EXACT)
+
+
+@pytest.mark.parametrize(("name", "size"), [("0_2", USUAL), ("1", FLAT), ("3", SHORT)])
+def test_walls_and_chamber_are_the_design_s(written, name, size):
+    """Rays through the finger meet its surfaces at the thickness of the walls."""
+    surface = trimesh.load_mesh(written[0] / f"finger_{name}.stl")
+    x, y, z = size.length / 2, 0.3 * size.chamber[1] / 2, size.wall + 0.3 * size.chamber[2]
+    thick = {0: size.end, 1: size.wall, 2: size.wall}
+    for axis in range(3):
+        origin, direction = np.array([x, y, z]), np.zeros(3)
+        origin[axis] = surface.bounds[0, axis] - 10
+        direction[axis] = 1
+        hits, *_ = surface.ray.intersects_location([origin], [direction])
+        places = np.unique(np.round(hits[:, axis], 4)) - surface.bounds[0, axis]
+        whole = surface.extents[axis]
+        expected = [0, thick[axis], whole - thick[axis], whole]
+        np.testing.assert_allclose(places, expected, atol=EXACT)
+
+
+def test_volume_is_the_closed_form(written):
+    """Block less chamber less the inlet's prism of 32 sides; no inlet in a chamber of 1 mm."""
+    _, parts = written
+    inlet = 32 / 2 * 1.0**2 * np.sin(2 * np.pi / 32)
+    expected = {
+        "finger_0_2": 95 * 20 * 20 - 85 * 10 * 10 - inlet * 5,
+        "finger_1": 170 * 20 * 15 - 156 * 6 * 1,
+        "finger_3": 12 * 20 * 25 - 8 * 16 * 21 - inlet * 2,
+    }
+    for name, volume in expected.items():
+        assert parts[name].volume == pytest.approx(volume, rel=1e-6)
+
+
+def solid(path):
+    """A part's file as a solid, for booleans."""
+    surface = trimesh.load_mesh(path)
+    return manifold3d.Manifold(
+        manifold3d.Mesh64(np.asarray(surface.vertices, float), np.asarray(surface.faces, "uint64"))
+    )
+
+
+def box(low, high):
+    return manifold3d.Manifold.cube(np.subtract(high, low)).translate(low)
+
+
+@pytest.mark.parametrize("draft", [0.0, 3.0])
+def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
+    """The closed mould's cavity, from the files: the shell; the base's pocket: the bottom wall."""
+    size, how = USUAL, Process(draft=draft, inlet=0.0)
+    meshes.write(tmp_path, [size], how)
+    length, width, height, wall, _ = size
+    # Back into the frame of the finger: the tray was turned over, the core's bars stood below it.
+    tray = solid(tmp_path / "finger_0_tray.stl").translate([0, 0, -height - how.mould_wall])
+    tray = tray.rotate([180, 0, 0])
+    core = solid(tmp_path / "finger_0_core.stl").translate([0, 0, wall - how.mould_wall])
+    assert (tray ^ core).volume() == pytest.approx(0, abs=1e-2)  # they fit: rounding of float32
+    room = box([-2, -width / 2 - 2, wall], [length + 2, width / 2 + 2, height])
+    cast = room - tray - core
+    z = Polynomial([0, 1])
+    side = np.tan(np.radians(draft)) * ((wall + height) / 2 - z)
+
+    def prism(a, b, low, high):
+        integral = ((a + 2 * side) * (b + 2 * side)).integ()
+        return integral(high) - integral(low)
+
+    shell = prism(length, width, wall, height) - prism(*size.chamber[:2], wall, height - wall)
+    assert cast.volume() == pytest.approx(shell, rel=EXACT)
+    base = solid(tmp_path / "finger_0_base.stl").translate([0, 0, -how.mould_wall])
+    pocket = box([-2, -width / 2 - 2, 0], [length + 2, width / 2 + 2, wall]) - base
+    bottom = (length + 2 * side(wall)) * (width + 2 * side(wall)) * wall
+    assert pocket.volume() == pytest.approx(bottom, rel=EXACT)
+    if not draft:
+        assert cast.volume() + pocket.volume() == pytest.approx(size.volume, rel=EXACT)
+    # The walls keep their thickness: what is between core and tray at any height.
+    for height_at in (wall + 1, height - wall - 1):
+        [ray] = cast.ray_cast([50.0, -50, height_at], [50.0, -size.chamber[1] / 2, height_at])[:1]
+        inner = cast.ray_cast([50.0, -50, height_at], [50.0, 0, height_at])[1]
+        assert inner.position[1] - ray.position[1] == pytest.approx(wall, abs=1e-3)
+
+
+def test_the_core_is_one_piece_with_openings_to_pour(written):
+    folder, _ = written
+    for label, size in (("0_2", USUAL), ("1", FLAT), ("3", SHORT)):
+        core = solid(folder / f"finger_{label}_core.stl")
+        assert len(core.decompose()) == 1
+        # A frame with a rod of n arms on each side has 2 n openings.
+        assert core.genus() == 2 * len(casting.bars_of(size))
+
+
+def test_a_finger_without_a_chamber_is_refused():
+    with pytest.raises(schema.SceneError) as error:
+        process.sizes([0.01, 0.1], 0.02, [0.02, 0.02], [0.005, 0.005], Process())
+    [problem] = error.value.problems
+    assert "finger 0 of 10 mm" in problem and "--end-wall" in problem
+    sizes = process.sizes([0.01], 0.02, [0.02], [0.005], Process(end_wall=1.5))
+    assert sizes == [Size(10, 20, 20, 5, 1.5)] and sizes[0].chamber == (7, 10, 10)
+
+
+def test_a_damaged_file_is_noticed(monkeypatch, tmp_path):
+    original = meshes.mesh
+    monkeypatch.setattr(
+        meshes, "mesh", lambda s: trimesh.Trimesh(original(s).vertices, original(s).faces[1:])
+    )
+    with pytest.raises(RuntimeError, match="does not hold the part"):
+        meshes.write(tmp_path, [USUAL], Process())
+
+
+def test_command_refuses_in_words(tmp_path, monkeypatch, capsys):
+    out = ["--scene", str(TINY), "--out", str(tmp_path / "out")]
+    assert cli.main(["export", *out, "--draft", "30", "--mould-wall", "0"]) == 2
+    text = capsys.readouterr().err
+    assert "--draft = 30.0 is outside [0, 10] deg" in text and "--mould-wall" in text
+    monkeypatch.setitem(sys.modules, "manifold3d", None)
+    assert cli.main(["export", *out]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "parts need manifold3d: pip install 'codesign-jax[export]'" in line
+    assert not (tmp_path / "out").exists()

@@ -1,1 +1,80 @@
-"""codesign-jax: batched simulation of soft hands and co-design of their morphology and control."""
+"""Batched simulation of soft hands and co-design of their morphology and control.
+
+The names below are the package's public list; each module has its own.  They are imported when they
+are first asked for, so that importing the package costs nothing and sets nothing.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from codesign_jax import (
+        codesign,
+        control,
+        cost,
+        engines,
+        fit,
+        model,
+        optimize,
+        report,
+        rollout,
+        runs,
+        scene,
+        types,
+    )
+    from codesign_jax.engines import make_engine
+    from codesign_jax.scene import SceneError, constants, hand, objects, parameters
+    from codesign_jax.types import Params, Status, Trace, Trial
+
+_HOME = {
+    "constants": "codesign_jax.scene",
+    "hand": "codesign_jax.scene",
+    "objects": "codesign_jax.scene",
+    "parameters": "codesign_jax.scene",
+    "SceneError": "codesign_jax.scene",
+    "make_engine": "codesign_jax.engines",
+    "Params": "codesign_jax.types",
+    "Status": "codesign_jax.types",
+    "Trace": "codesign_jax.types",
+    "Trial": "codesign_jax.types",
+}
+"""Where the names are that are not modules of this folder."""
+
+__all__ = [
+    "Params",
+    "SceneError",
+    "Status",
+    "Trace",
+    "Trial",
+    "codesign",
+    "constants",
+    "control",
+    "cost",
+    "engines",
+    "fit",
+    "hand",
+    "make_engine",
+    "model",
+    "objects",
+    "optimize",
+    "parameters",
+    "report",
+    "rollout",
+    "runs",
+    "scene",
+    "types",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _HOME:
+        home = importlib.import_module(_HOME[name])
+        found = getattr(home, name, None)
+        return importlib.import_module(f"{_HOME[name]}.{name}") if found is None else found
+    return importlib.import_module(f"codesign_jax.{name}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -232,7 +232,7 @@ def main(arguments: list[str] | None = None) -> int:
         prog="codesign",
         description="Co-design of soft hand morphology and control.",
     )
-    from codesign_jax.schema import SceneError
+    from codesign_jax.scene.schema import SceneError
 
     try:
         return command.run()

@@ -16,9 +16,9 @@ from codesign_jax import rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import Info, ParticleFilter, Space, State, rejection_sample
-from codesign_jax.parameters import DesignSpace
 from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
 # Four ASCII letters each, as the optimiser's streams, so that no two streams of a seed meet.

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 
 from codesign_jax import rollout
 from codesign_jax.engines import Engine
-from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene.parameters import DesignSpace
 
 _KEPT = 32
 """Programs of each kind that are kept for the next scene of their structure."""
@@ -41,7 +41,7 @@ class Program:
         """Calls the program; `constants` are checked and replace the scene's.
 
         Raises:
-          SceneError: If the constants do not fit the scene, see `constants.check`.
+          SceneError: If the constants do not fit the scene, see `scene.constants.check`.
         """
         return self._jitted(first, second, self._numbers(constants), *self._more)
 

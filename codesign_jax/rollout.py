@@ -6,11 +6,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import control, model, parameters, schema
-from codesign_jax.constants import batch_axes, check
+from codesign_jax import control, model
 from codesign_jax.cost import outcome
 from codesign_jax.engines import Engine
-from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene import Constants, Scene, parameters, schema
+from codesign_jax.scene.constants import batch_axes, check
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Trace, Trial, failed
 
@@ -70,7 +70,7 @@ def numbers(scene: Scene, constants: Constants | None) -> Constants:
     """The constants if there are any, checked, or else the scene's.
 
     Raises:
-      SceneError: If they do not fit the scene, see `constants.check`.
+      SceneError: If they do not fit the scene, see `scene.constants.check`.
     """
     if constants is None:
         return scene.constants()

@@ -26,10 +26,11 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from codesign_jax import codesign, parameters, rollout, scene
+from codesign_jax import codesign, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import schedule
 from codesign_jax.report import animation
+from codesign_jax.scene import parameters
 
 FAST = bool(os.environ.get("CODESIGN_FAST"))
 

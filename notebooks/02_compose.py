@@ -28,9 +28,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from codesign_jax import codesign, parameters, rollout, scene
+from codesign_jax import codesign, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import schedule
+from codesign_jax.scene import parameters
 
 FAST = bool(os.environ.get("CODESIGN_FAST"))
 

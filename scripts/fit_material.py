@@ -14,9 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import fit, model, parameters, rollout, scene
+from codesign_jax import fit, model, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.scene import parameters
+from scripts.shared import figures as pictures
 
 OFF = ("finger_object", "finger_table", "palm_object", "palm_table", "disturb", "ungrasp")
 
@@ -63,17 +65,14 @@ def measure(
 
 def draw(path: Path, time: np.ndarray, measured: jax.Array, tips: dict[str, jax.Array]) -> None:
     """Writes the figure: vertical tip position, measured, at the guess and fitted."""
-    import matplotlib.figure
-
-    figure = matplotlib.figure.Figure(figsize=(6.4, 3.6), dpi=120, layout="constrained")
+    figure = pictures.new(6.4, 3.6)
     axes = figure.add_subplot()
     axes.plot(time, 1e3 * measured[:, 0, 2], ".", color="0.6", ms=4, label="measured")
     for (name, tip), style in zip(tips.items(), ("--", "-"), strict=True):
         axes.plot(time, 1e3 * tip[:, 0, 2], style, color="tab:blue", label=name)
     axes.set(xlabel="time [s]", ylabel="tip height [mm]")
     axes.legend(frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    pictures.save(figure, path)
 
 
 def main() -> None:

@@ -17,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from codesign_jax import control, model, parameters, rollout, scene
+from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines.structured import StructuredEngine, differentiable
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.scene import parameters
 from codesign_jax.types import Trial
+from scripts.shared import figures as pictures
 
 DENSITIES = ((1, 4), (1, 8), (2, 8), (3, 12), (4, 16), (8, 32))
 DESIGN = np.array([0.148, -0.059])  # length and arm height [m] of a hand that holds all three
@@ -105,9 +107,7 @@ def main(options: Options) -> None:
 
 def draw(record: dict, path: Path) -> None:
     """Relative deviation from the finest mesh against the vertices of a link."""
-    import matplotlib.figure
-
-    figure = matplotlib.figure.Figure(figsize=(9, 3.6), layout="constrained")
+    figure = pictures.new(9, 3.6)
     rows = record["rows"]
     x = [r["hull_rings"] * r["hull_points"] for r in rows]
     for i, key in enumerate(("force_same_place", "force_at_rest")):
@@ -122,8 +122,7 @@ def draw(record: dict, path: Path) -> None:
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("normal force, deviation from the finest mesh")
     figure.axes[0].legend()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    pictures.save(figure, path, dpi=110)
 
 
 if __name__ == "__main__":

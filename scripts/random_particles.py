@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import parameters, rollout, scene, types
+from codesign_jax import rollout, scene, types
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.scene import parameters
 from codesign_jax.types import Status
 from scripts.shared import provenance
 

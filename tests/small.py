@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import control, model, parameters, rollout, scene, schema
+from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Trial
 
 DATA = Path(__file__).parent / "data"

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from small import pinch, still
 
-from codesign_jax import cli, model, parameters, scene, schema
+from codesign_jax import cli, model, scene
 from codesign_jax.commands import optimize
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.scene import parameters, schema
 from scripts.accuracy import beam, decision, impulse, oracle, steps, study, tip, worlds
 from scripts.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
 from scripts.accuracy.store import Case, Store

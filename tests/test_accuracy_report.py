@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from codesign_jax import files
-from scripts.accuracy import report, statistics, study
+from codesign_jax.scene import library
+from scripts.accuracy import analysis, report, study
 from scripts.accuracy.results import Study
 from scripts.accuracy.settings import PRESETS, STANDARD, Setting
-from scripts.shared import labels
+from scripts.shared import labels, statistics
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,7 +29,7 @@ def test_rank_correlation_and_its_interval_are_scipy_s():
     b = a + rng.normal(size=40)
     expected = scipy.stats.spearmanr(a, b).statistic
     assert statistics.spearman(a, b) == pytest.approx(expected, rel=1e-12)
-    found = statistics.resampled(lambda i: statistics.spearman(a[i], b[i]), 40)
+    found = statistics.bootstrap(lambda i: statistics.spearman(a[i], b[i]), 40, resamples=2000)
     interval = scipy.stats.bootstrap(
         (a, b),
         lambda x, y: scipy.stats.spearmanr(x, y).statistic,
@@ -45,22 +45,22 @@ def test_rank_correlation_and_its_interval_are_scipy_s():
 
 def test_comparing_a_setting_with_itself_and_with_its_opposite():
     cost = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0], [1.0, 0.0], [2.0, 2.0], [0.5, 0.0]])
-    same = statistics.compare(cost, cost)
+    same = analysis.compare(cost, cost)
     assert same["same_verdict"].value == same["rank"].value == 1.0
     assert same["offspring_moved"] == 0.0 and same["failed"] == 0
-    other = statistics.compare(3.0 - cost, cost)
+    other = analysis.compare(3.0 - cost, cost)
     assert other["rank"].value == pytest.approx(-1.0)
     failed = cost.copy()
     failed[0, 0] = np.nan
-    lost = statistics.compare(failed, cost)
+    lost = analysis.compare(failed, cost)
     assert lost["failed"] == 1
     assert lost["same_verdict"].value == pytest.approx(11 / 12)  # a failed trial is not kept
 
 
 def test_fronts_and_orders():
-    assert statistics.front([(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (0.5, 9.0)]) == [3, 0, 2]
-    assert statistics.order([(h, 3.0 * h**2) for h in (1, 2, 4)]) == pytest.approx(2.0)
-    assert statistics.order([(1.0, 1.0)]) is None
+    assert analysis.front([(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (0.5, 9.0)]) == [3, 0, 2]
+    assert analysis.order([(h, 3.0 * h**2) for h in (1, 2, 4)]) == pytest.approx(2.0)
+    assert analysis.order([(1.0, 1.0)]) is None
 
 
 def test_every_record_finds_the_run_of_its_own_file(tmp_path):
@@ -70,8 +70,8 @@ def test_every_record_finds_the_run_of_its_own_file(tmp_path):
         file = tmp_path / f"{number}.json"
         file.write_text(json.dumps({"runs": [{"date": number}], "records": {str(number): record}}))
         files.append(file)
-    records, runs = statistics.load(files)
-    assert [runs[r["run"]]["date"] for r in records] == [0, 1]
+    every, runs = analysis.load(files)
+    assert [runs[r["run"]]["date"] for r in every] == [0, 1]
 
 
 def test_what_beats_a_setting_is_cheaper_and_better_in_every_error():
@@ -121,9 +121,9 @@ def test_labels_cover_neither_each_other_nor_points():
 
 def test_the_presets_files_and_the_front_page_state_what_was_measured(tmp_path, monkeypatch):
     """As `python -m scripts.accuracy --report` writes them: new data without it would fail."""
-    monkeypatch.setattr(statistics, "RESAMPLES", 2)  # neither states an interval
+    monkeypatch.setattr(analysis, "RESAMPLES", 2)  # neither states an interval
     found, readme, page = report.studies(ROOT / "docs"), tmp_path / "README.md", ROOT / "README.md"
-    stated = {n: files.find("accuracy", n).read_text() for n in PRESETS}
+    stated = {n: library.find("accuracy", n).read_text() for n in PRESETS}
     for preset_name, text in stated.items():  # the values alone, and what an earlier study found
         values = [line for line in text.splitlines(True) if not line.startswith("# measured: ")]
         (tmp_path / f"{preset_name}.toml").write_text("# measured: old\n" + "".join(values))

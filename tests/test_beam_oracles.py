@@ -14,7 +14,7 @@ import pytest
 from scipy import linalg, special
 from small import pinch
 
-from codesign_jax import hand
+from codesign_jax.scene import hand
 from scripts.accuracy import beam
 
 

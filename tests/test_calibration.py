@@ -13,9 +13,10 @@ import pytest
 import scipy.interpolate
 from toy import ToyEngine, tiny
 
-from codesign_jax import codesign, parameters, rollout, scene, schema
+from codesign_jax import codesign, rollout, scene
 from codesign_jax.codesign import stream_key
 from codesign_jax.optimize import State, candidates, schedule
+from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Status
 from scripts.calibration import __main__ as calibrate
 from scripts.calibration import files, report, score, sets, summary, surrogate
@@ -92,7 +93,7 @@ def test_numbers_of_a_set_are_those_of_the_files():
 def test_factors_scale_the_stiffness_of_joints():
     from small import hand_world
 
-    from codesign_jax import morphology
+    from codesign_jax.model import morphology
 
     plain = scene.load("paper_spheres").hand
     material = dataclasses.replace(plain.material, lateral_factor=0.29, torsion_factor=3.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from codesign_jax.checkpoint import Checkpoints, digest
+from codesign_jax.runs.checkpoint import Checkpoints, digest
 
 PACKAGE = Path(__file__).parent.parent / "codesign_jax"
 
@@ -136,7 +136,7 @@ import resource, signal, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 import numpy as np
-from codesign_jax.checkpoint import Checkpoints
+from codesign_jax.runs.checkpoint import Checkpoints
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 with Checkpoints(Path({str(folder)!r})) as store:
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from toy import TINY
 
-from codesign_jax import cli, preflight, runs
-from codesign_jax.checkpoint import Checkpoints, digest
-from codesign_jax.commands import common
+from codesign_jax import cli, runs
+from codesign_jax.commands import common, preflight
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import columns
+from codesign_jax.runs.checkpoint import Checkpoints, digest
 from codesign_jax.runs.record import to_arrays
 from codesign_jax.types import Status
 

@@ -8,11 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, control, cost, model, parameters, rollout
+from codesign_jax import codesign, control, cost, model, rollout
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.unstack import unstacked
 from codesign_jax.optimize import schedule
+from codesign_jax.scene import parameters
 from codesign_jax.types import WARNINGS
 from tests import small, toy
 

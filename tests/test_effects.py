@@ -10,12 +10,13 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from codesign_jax import control, effects, model, rollout, schema
+from codesign_jax import control, model, rollout
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine, coordinates, differentiable
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.scene import effects, schema
 from tests import small, steps
 from tests.test_structured import lanes_state
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from small import batch_inputs, nth, pinch, stack, still, world_inputs
 
-from codesign_jax import cost, model, parameters, scene, schema
+from codesign_jax import cost, model, scene
 from codesign_jax.engines import make_engine, solver_problems
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
+from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Status
 
 # Designs (length, arm_z) [m] at which two fingers of three links lift the object at 190 kPa.

@@ -15,8 +15,8 @@ from toy import ToyEngine, tiny
 
 from codesign_jax import codesign
 from codesign_jax.optimize import schedule
-from codesign_jax.parameters import design_space
-from codesign_jax.statistics import wilson
+from codesign_jax.report.statistics import wilson
+from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
 from scripts.experiments import (
     PAPER,
@@ -32,10 +32,10 @@ from scripts.experiments import (
     plan,
     report,
     results,
-    statistics,
+    study,
 )
 from scripts.experiments.worlds import chunking
-from scripts.shared import record
+from scripts.shared import record, statistics
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
 SEED = 5
@@ -369,11 +369,11 @@ def test_regions_are_counted_and_specks_are_not():
     cost = np.full((20, 10), 3.0)
     cost[2:5, 2:5], cost[10:18, 6:9], cost[0, 9] = 0.5, 0.2, 0.0
     data = {"first_axis": x, "second_axis": y, "exclude": cost}
-    found = statistics.regions(data, 1.0, smallest=0.02)
+    found = study.regions(data, 1.0, smallest=0.02)
     assert [r.points.sum() for r in found] == [24, 9]
     np.testing.assert_allclose(found[0].low, [10, 6])
     np.testing.assert_allclose(found[0].high, [17, 8])
-    assert len(statistics.regions(data, 0.3, smallest=0.0)) == 2
+    assert len(study.regions(data, 0.3, smallest=0.0)) == 2
 
 
 def write_small(finished, grid, folder):
@@ -392,7 +392,7 @@ def write_small(finished, grid, folder):
 def test_figures_and_page_are_made_from_files_alone(finished, landscape, tmp_path):
     write_small(finished, landscape, tmp_path)
     page = tmp_path / "page.md"
-    page.write_text(f"before\n{report.BEGIN}\nold\n{report.END}\nafter\n")
+    page.write_text("before\n<!-- results:begin -->\nold\n<!-- results:end -->\nafter\n")
     text = report.make(tmp_path, tmp_path / "figures", page)
     names = ["6_cost_evolution", "7a_success", "7b_convergence", "8_landscape"]
     names += ["9a_success", "9b_convergence"]

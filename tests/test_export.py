@@ -13,12 +13,13 @@ import pytest
 from small import batch_inputs, hand_world, nth, pinch, stack
 from toy import TINY
 
-from codesign_jax import cli, parameters, rollout, scene
+from codesign_jax import cli, rollout, scene
 from codesign_jax.cost import outcome
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.export import grasps, mjcf, plain, tables
 from codesign_jax.export.play import play
 from codesign_jax.model import build_spec
+from codesign_jax.scene import parameters
 from codesign_jax.types import Trial, failed
 
 # A grasp in 2.2 s, with all joints and contacts.

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from small import stack
 
-from codesign_jax import model, parameters, rollout, scene
+from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
+from codesign_jax.scene import parameters
 from codesign_jax.types import Status
 
 # Found by a random search over symmetric designs, straight above the object; in the files' units.

@@ -4,9 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import parameters, rollout, scene
+from codesign_jax import rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation
+from codesign_jax.scene import parameters
 from codesign_jax.types import Outcome
 from scripts.experiments import figures, grasp_types
 

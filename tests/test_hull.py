@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from codesign_jax import hull, model, scene
+from codesign_jax import model, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import hull as skin
@@ -17,7 +17,8 @@ from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.problem import Spatial, relative
-from codesign_jax.schema import SceneError
+from codesign_jax.model import hull
+from codesign_jax.scene.schema import SceneError
 from tests import small
 from tests.test_structured import lanes_state
 

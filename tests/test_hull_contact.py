@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from codesign_jax import hull, model
+from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.model import hull
 from tests import small, steps
 
 TINY = 1e-12  # [m] radius of MuJoCo's stand-ins for points

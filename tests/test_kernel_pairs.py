@@ -6,11 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import hull
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
-from codesign_jax.model import layout
+from codesign_jax.model import hull, layout
 from tests import small
 from tests import test_hull_contact as oracle
 from tests.test_finger_pairs import SETTINGS, curled, kinds

@@ -16,14 +16,15 @@ from scipy.spatial.transform import Rotation
 from small import DATA, hand_world, nth, stack, still
 from solids import box, object_file
 
-from codesign_jax import control, model, objects, parameters, scene, schema
+from codesign_jax import control, model, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines import mujoco as mujoco_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import mesh as mesh_lanes
-from codesign_jax.meshes import surface
 from codesign_jax.report import sketch
 from codesign_jax.runs import scene_files
+from codesign_jax.scene import objects, parameters, schema
+from codesign_jax.scene.meshes import surface
 from tests import steps
 
 ROOT = Path(__file__).parent.parent

@@ -11,10 +11,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from solids import box, bracket, object_file
 
-from codesign_jax import meshes, objects, scene, schema
+from codesign_jax import scene
 from codesign_jax.commands import common
 from codesign_jax.engines.structured import collision
-from codesign_jax.meshes import grid, mass, repair, surface
+from codesign_jax.scene import meshes, objects, schema
+from codesign_jax.scene.meshes import grid, mass, repair, surface
 
 
 def solid(tmp_path, mesh, *, unit="m", repaired=False, voxel_error=5e-4):

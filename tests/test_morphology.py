@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import integrate
 
-from codesign_jax import morphology
+from codesign_jax.model import morphology
 
 repeatable = settings(max_examples=100, deadline=None, derandomize=True)
 heights, walls = st.floats(0.015, 0.025), st.floats(0.002, 0.007)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from small import DATA, hand_world
 
-from codesign_jax import clearance, constants, hand, model, preflight, scene, schema
+from codesign_jax import model, scene
+from codesign_jax.commands import clearance, preflight
+from codesign_jax.scene import constants, hand, schema
 from codesign_jax.types import Params
 
 SPREADS = np.deg2rad([0.0, 30.0, 60.0, 90.0, 110.0])

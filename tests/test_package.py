@@ -50,8 +50,9 @@ def test_the_mjx_engine_says_nothing_when_it_is_imported():
 def test_installed_wheel_finds_its_files(installed, tmp_path):
     program = """
 import json
-from codesign_jax import files, objects, scene
-found = {kind: {n: str(p) for n, p in files.available(kind).items()}
+from codesign_jax import scene
+from codesign_jax.scene import library, objects
+found = {kind: {n: str(p) for n, p in library.available(kind).items()}
          for kind in ("hands", "objects", "scenes")}
 loaded = {name: scene.load(hand_name=name).num_fingers for name in found["hands"]}
 meshes = {s.name: str(s.mesh.path) for s in objects.load("household").object}

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from codesign_jax import hand, parameters, schema
+from codesign_jax.scene import hand, parameters, schema
 
 HAND = hand.load("pneuflex4")
 FULL, PLANAR = parameters.design_space(HAND), parameters.design_space(HAND, "2d")

@@ -11,7 +11,7 @@ import pytest
 from toy import ToyEngine, tiny
 
 from codesign_jax import codesign
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Status, failed
 from scripts.experiments import Batch, Grid, Landscape, Strategies, Worlds, drive, parquet
 

@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 from toy import TINY
 
-from codesign_jax import cli, parameters, rollout, scene
+from codesign_jax import cli, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, figures
+from codesign_jax.scene import parameters
 
 TIMES = np.array([0.0, 0.5, 1.2])
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from small import hand_world, nth, pinch, random_designs, stack
 
-from codesign_jax import control, model, parameters, rollout, scene
+from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine
+from codesign_jax.scene import parameters
 
 PAPER = scene.load("paper_spheres")
 KEY = jax.random.key(5)

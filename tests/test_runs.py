@@ -14,15 +14,16 @@ import numpy as np
 import pytest
 from toy import tiny
 
-from codesign_jax import codesign, files, parameters, scene
-from codesign_jax.checkpoint import digest
+from codesign_jax import codesign, files, scene
 from codesign_jax.runs import columns, rates, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
+from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Progress, duration
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
+from codesign_jax.scene import library, parameters
 from codesign_jax.types import Status
 
 ROOT = Path(__file__).parent.parent
@@ -66,8 +67,8 @@ def run():
     return the_scene, space, record, test
 
 
-@pytest.mark.parametrize("hand", sorted(files.available("hands")))
-@pytest.mark.parametrize("name", sorted(files.available("scenes")))
+@pytest.mark.parametrize("hand", sorted(library.available("hands")))
+@pytest.mark.parametrize("name", sorted(library.available("scenes")))
 def test_resolved_scene_reads_back_the_same(tmp_path, name, hand):
     original = scene.load(name, hand_name=hand, overrides={"discretization": {"links": 7}})
     write_scene(original, tmp_path)

@@ -9,26 +9,16 @@ import numpy as np
 import pytest
 from small import DATA, nth, stack
 
-from codesign_jax import (
-    control,
-    files,
-    hand,
-    keypaths,
-    model,
-    objects,
-    parameters,
-    rollout,
-    scene,
-    schema,
-)
+from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.scene_files import write_scene
+from codesign_jax.scene import hand, keypaths, library, objects, parameters, schema
 
-HANDS, OBJECTS = sorted(files.available("hands")), sorted(files.available("objects"))
+HANDS, OBJECTS = sorted(library.available("hands")), sorted(library.available("objects"))
 
 
 def text_of(kind, name):
-    return files.available(kind)[name].read_text()
+    return library.available(kind)[name].read_text()
 
 
 def problems_of(loader, path):

@@ -10,9 +10,10 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import model, parameters, rollout
+from codesign_jax import model, rollout
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import make_engine
+from codesign_jax.scene import parameters
 from scripts.shared import record
 from scripts.winners import (
     files as winners_files,

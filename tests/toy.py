@@ -5,7 +5,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import model, parameters, scene
+from codesign_jax import model, scene
+from codesign_jax.scene import parameters
 from codesign_jax.types import Trace
 
 TINY = Path(__file__).parent / "data" / "tiny.toml"

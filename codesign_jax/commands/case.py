@@ -6,13 +6,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from codesign_jax import engines, keypaths, runs
+from codesign_jax import engines, runs
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common
 from codesign_jax.cost import particle_cost
-from codesign_jax.parameters import DesignSpace, design_space
-from codesign_jax.scene import Scene
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import Scene, keypaths
+from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.scene.schema import SceneError
 
 
 class Options(Protocol):

@@ -6,19 +6,12 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 
-from codesign_jax import (
-    codesign,
-    engines,
-    files,
-    keypaths,
-    preflight,
-    schema,
-    statistics,
-    types,
-)
-from codesign_jax.parameters import DesignSpace, params_of
-from codesign_jax.scene import Scene
-from codesign_jax.schema import SceneError
+from codesign_jax import codesign, engines, files, types
+from codesign_jax.commands import preflight
+from codesign_jax.report import statistics
+from codesign_jax.scene import Scene, keypaths, schema
+from codesign_jax.scene.parameters import DesignSpace, params_of
+from codesign_jax.scene.schema import SceneError
 
 
 def use_compilation_cache() -> None:

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, rollout, runs, schema, types
+from codesign_jax import codesign, engines, rollout, runs, types
 from codesign_jax.commands import common
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import schema
+from codesign_jax.scene.schema import SceneError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Evaluate

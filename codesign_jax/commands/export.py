@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import rollout, runs, schema
+from codesign_jax import rollout, runs
 from codesign_jax.commands import common
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import schema
+from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Params, Trial
 
 if TYPE_CHECKING:

@@ -10,15 +10,15 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, keypaths, runs
+from codesign_jax import codesign, engines, runs
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common, seeds
-from codesign_jax.parameters import design_space
 from codesign_jax.runs import AllFailed, Plan, RunResult, Settings, rates
 from codesign_jax.runs.progress import duration
 from codesign_jax.runs.scene_files import scene_texts
-from codesign_jax.scene import Scene
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import Scene, keypaths
+from codesign_jax.scene.parameters import design_space
+from codesign_jax.scene.schema import SceneError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Optimize

@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from codesign_jax import control, engines, model, rollout, runs, schema
+from codesign_jax import control, engines, model, rollout, runs
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
-from codesign_jax.parameters import DesignSpace, design_space
 from codesign_jax.runs import failures
 from codesign_jax.runs.failures import Failure
-from codesign_jax.scene import Scene
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import Scene, schema
+from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.scene.schema import SceneError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Replay

@@ -6,9 +6,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import effects, files, schema
 from codesign_jax import scene as scenes
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import effects, library, schema
+from codesign_jax.scene.schema import SceneError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Scenes
@@ -24,7 +24,7 @@ def main(options: "Scenes") -> int:
         hint = schema.nearest(options.engine, effects.ENGINES)
         raise SceneError([f"--engine {options.engine!r} is not valid; {hint}"])
     engines = effects.ENGINES if options.engine is None else (options.engine,)
-    names = files.available("scenes") if options.name is None else [options.name]
+    names = library.available("scenes") if options.name is None else [options.name]
     console = Console(highlight=False)
     for scene in [scenes.load(name) for name in names]:
         console.print(f"{scene.name}: {scene.description}", markup=False)

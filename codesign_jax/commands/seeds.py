@@ -7,9 +7,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import codesign, statistics
+from codesign_jax import codesign
+from codesign_jax.report import statistics
 from codesign_jax.runs import RunResult
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""

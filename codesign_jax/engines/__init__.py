@@ -2,9 +2,8 @@
 
 import functools
 
-from codesign_jax import files, schema
 from codesign_jax.engines.base import Engine
-from codesign_jax.scene import Newton, Scene, Solver, load_accuracy
+from codesign_jax.scene import Newton, Scene, Solver, library, load_accuracy, schema
 
 NAMES = ("structured", "mujoco", "mjx")
 DEFAULT = "structured"
@@ -78,7 +77,7 @@ def solver_problem(given: str, key: str = "") -> str:
 @functools.cache
 def _usual_solvers() -> tuple[Solver, ...]:
     """The defaults and what the presets of accuracy set, each with its [newton] table."""
-    presets = (load_accuracy(name).solver for name in files.available("accuracy"))
+    presets = (load_accuracy(name).solver for name in library.available("accuracy"))
     return Solver(), *(Solver(**values) for values in presets)
 
 

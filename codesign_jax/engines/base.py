@@ -6,7 +6,7 @@ import jax
 
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Trace
 
 

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
-from codesign_jax import effects, verdict
+from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, effects
 from codesign_jax.types import Trace
 
 

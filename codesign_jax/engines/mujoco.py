@@ -7,10 +7,10 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from codesign_jax import effects, verdict
+from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, effects
 from codesign_jax.types import Status, Trace
 
 # Steps between looking at the worlds: a lost object or a failed world stops being simulated at this

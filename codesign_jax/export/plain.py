@@ -19,11 +19,10 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from codesign_jax import effects
 from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
 from codesign_jax.model.spec import SOLIMP
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, effects
 from codesign_jax.types import Trial
 
 _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-from codesign_jax.schema import SceneError, quantity, range_problem
+from codesign_jax.scene.schema import SceneError, quantity, range_problem
 
 
 @dataclasses.dataclass(frozen=True)

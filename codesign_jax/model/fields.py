@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import morphology
-from codesign_jax.constants import with_trial
+from codesign_jax.model import morphology
 from codesign_jax.model.layout import (
     Layout,
     contact_invweight,
@@ -21,6 +20,7 @@ from codesign_jax.model.layout import (
 )
 from codesign_jax.model.spec import SOLIMP, compile_template, palm_inertia
 from codesign_jax.scene import Constants, Scene, by_structure
+from codesign_jax.scene.constants import with_trial
 from codesign_jax.types import Params, Trial
 
 

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import morphology
-from codesign_jax.objects import Shape
+from codesign_jax.model import morphology
 from codesign_jax.scene import Scene, by_structure
+from codesign_jax.scene.objects import Shape
 from codesign_jax.types import Trial
 
 # An object body carries one geom for each shape of the set; those that a trial does not use shrink

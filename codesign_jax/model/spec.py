@@ -9,8 +9,7 @@ import jax
 import mujoco
 import numpy as np
 
-from codesign_jax import hull, morphology
-from codesign_jax.constants import with_trial
+from codesign_jax.model import hull, morphology
 from codesign_jax.model.layout import (
     AXES,
     RIGID,
@@ -24,8 +23,9 @@ from codesign_jax.model.layout import (
     palm_touches,
     wrist_springs,
 )
-from codesign_jax.morphology import Beam
+from codesign_jax.model.morphology import Beam
 from codesign_jax.scene import Constants, Scene, by_structure
+from codesign_jax.scene.constants import with_trial
 from codesign_jax.types import Params, Trial
 
 _GEOM = {

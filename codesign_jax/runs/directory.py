@@ -23,7 +23,7 @@ from codesign_jax.runs import scene_files
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 
 _LOCK = ".lock"
 _PROVENANCE = "provenance.json"

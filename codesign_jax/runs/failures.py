@@ -9,7 +9,7 @@ import numpy as np
 
 from codesign_jax import types
 from codesign_jax.codesign import EpisodeInfo
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Trial
 
 FOLDER = "failures"

@@ -9,19 +9,19 @@ import jax
 import numpy as np
 
 from codesign_jax import codesign, types
-from codesign_jax.checkpoint import Checkpoints
 from codesign_jax.codesign import EpisodeFunction, EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.optimize import ParticleFilter
-from codesign_jax.parameters import DesignSpace, design_space
 from codesign_jax.runs import failures, tables
 from codesign_jax.runs import record as records
+from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.directory import RunDirectory, open_run
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Progress
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.types import Status
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import tomli_w
 
 from codesign_jax import scene as scenes
-from codesign_jax.objects import Shape
 from codesign_jax.scene import Scene
+from codesign_jax.scene.objects import Shape
 
 NAMES = ("scene.toml", "hand.toml", "objects.toml")
 MESHES = "meshes"  # folder of the objects' meshes

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax import engines, schema
-from codesign_jax.hand import Hand
+from codesign_jax import engines
 from codesign_jax.optimize import MAX_PARTICLES, schedule
-from codesign_jax.parameters import DesignSpace, design_space
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, schema
+from codesign_jax.scene.hand import Hand
+from codesign_jax.scene.parameters import DesignSpace, design_space
 
 
 @dataclasses.dataclass(frozen=True)

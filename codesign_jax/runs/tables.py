@@ -12,10 +12,10 @@ import numpy as np
 
 from codesign_jax import files, types
 from codesign_jax.codesign import FinalTest
-from codesign_jax.parameters import DesignSpace
 from codesign_jax.runs.columns import TABLES
 from codesign_jax.runs.record import History
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Status
 
 TESTS = "tests.csv"

@@ -7,8 +7,9 @@ import mujoco
 import numpy as np
 from scipy import optimize, special
 
-from codesign_jax import hand, model, morphology
-from codesign_jax.scene import Scene, load
+from codesign_jax import model
+from codesign_jax.model import morphology
+from codesign_jax.scene import Scene, hand, load
 from codesign_jax.types import Params, Trial
 from scripts.accuracy.settings import merge
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import parameters, rollout
-from codesign_jax.scene import Scene
+from codesign_jax import rollout
+from codesign_jax.scene import Scene, parameters
 from codesign_jax.types import failed
 from scripts.accuracy import worlds
 from scripts.accuracy.settings import Setting

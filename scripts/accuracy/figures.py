@@ -4,14 +4,14 @@ import textwrap
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib.figure
 import matplotlib.lines
 import numpy as np
 from matplotlib.axes import Axes
 
 from codesign_jax.scene import load as load_scene
-from scripts.accuracy import statistics
+from scripts.accuracy import analysis
 from scripts.accuracy.settings import LINKS, TIMESTEPS, Setting
+from scripts.shared import figures as pictures
 from scripts.shared import labels
 
 COLORS = {"structured": "tab:blue", "mujoco": "tab:green", "mjx": "tab:orange"}
@@ -82,7 +82,7 @@ def diagram(panels: dict[str, list[Point]], path: Path, title: str) -> None:
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     size = 6.4 * columns, 4.4 * rows + 1.0
-    figure = matplotlib.figure.Figure(size, dpi=120, layout="constrained")
+    figure = pictures.new(*size)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes[len(panels) :]:
         axis.set_axis_off()
@@ -101,8 +101,7 @@ def diagram(panels: dict[str, list[Point]], path: Path, title: str) -> None:
     figure.set_layout_engine("none")
     for axis, (texts, points) in zip(axes, names, strict=False):
         labels.add(axis, texts, points)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    pictures.save(figure, path)
 
 
 def _panel(axis: Axes, item: tuple[str, list[Point]]) -> tuple[list[labels.Label], np.ndarray]:
@@ -114,7 +113,7 @@ def _panel(axis: Axes, item: tuple[str, list[Point]]) -> tuple[list[labels.Label
     texts: list[labels.Label] = []
     for engine in dict.fromkeys(p.engine for p in points):
         mine = [p for p in drawn if p.engine == engine and np.isfinite(p.error)]
-        chosen = [mine[i] for i in statistics.front([(p.cost, p.error) for p in mine])]
+        chosen = [mine[i] for i in analysis.front([(p.cost, p.error) for p in mine])]
         line = np.array([(p.cost, p.error) for p in chosen]).reshape(-1, 2)
         axis.plot(*line.T, color=COLORS[engine], lw=1, alpha=0.6)
         for p in mine:
@@ -146,11 +145,11 @@ def convergence(lines: dict[str, list[tuple[float, float]]], path: Path) -> None
       lines: (size, error) by name; the names that speak of the time step go left.
       path: Picture.
     """
-    figure = matplotlib.figure.Figure((9.6, 4.4), dpi=120, layout="constrained")
+    figure = pictures.new(9.6, 4.4)
     left, right = figure.subplots(1, 2)
     for name, points in lines.items():
         axis = left if "time step" in name else right
-        slope = statistics.order(points)
+        slope = analysis.order(points)
         label = name + ("" if slope is None else f": order {slope:.2f}")
         if points:
             axis.loglog(*zip(*sorted(points), strict=True), marker="o", ms=4, label=label)
@@ -164,5 +163,4 @@ def convergence(lines: dict[str, list[tuple[float, float]]], path: Path) -> None
             axis.legend(frameon=False, fontsize=7, loc="upper center",
                         bbox_to_anchor=(0.5, -0.16), ncols=2)  # fmt: skip
         axis.grid(alpha=0.3, which="both", lw=0.4)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    pictures.save(figure, path)

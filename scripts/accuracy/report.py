@@ -4,10 +4,9 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from scripts.accuracy import figures, presets, statistics, tables
+from scripts.accuracy import analysis, figures, presets, tables
 from scripts.accuracy.results import ERRORS, Study
-from scripts.benchmark.report import markdown
-from scripts.experiments.report import fill
+from scripts.shared.tables import fill, markdown
 
 MACHINES = {"h200": "NVIDIA H200 and 16 CPU cores", "cpu": "2 CPU cores"}
 SHORT = {"h200": "one H200", "cpu": "2 CPU cores"}
@@ -35,7 +34,7 @@ def make(docs: Path, found: dict[str, Study] | None = None) -> str:
         parts.append(_section(study, name, docs))
         table(study, docs / "data" / f"accuracy_{name}.csv")
     text = "\n\n".join(parts) or "Not measured yet."
-    fill(docs / "accuracy.md", text)
+    fill(docs / "accuracy.md", text, "results")
     return text
 
 
@@ -95,7 +94,7 @@ def table(study: Study, path: Path) -> None:
             row |= {n: getattr(setting, n) for n in ("links", "axes", "spheres", "iterations")}
             row |= {"precision": "float64" if setting.engine == "mujoco" else setting.precision}
             row |= {"wall_s_per_simulated_s": study.cost(setting.engine, setting)}
-            row |= {"not_measured": statistics.bad(r), key: r.get(key)}
+            row |= {"not_measured": analysis.bad(r), key: r.get(key)}
     names = list(dict.fromkeys(k for row in values.values() for k in row))
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["label", *names], lineterminator="\n")

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from scripts.accuracy import figures, statistics
+from scripts.accuracy import analysis, figures
+from scripts.accuracy.analysis import Records
 from scripts.accuracy.figures import Point
 from scripts.accuracy.settings import PRESETS, Setting, one_at_a_time
-from scripts.accuracy.statistics import Records
 
 ERRORS = {
     "tip": ("finger tip [mm]", "tip_rms_mm"),
@@ -33,10 +33,10 @@ class Study:
 
     def __init__(self, files: Sequence[Path]):
         """Reads the files."""
-        self.records, self.runs = statistics.load(files)
-        self.times = statistics.times(self.records)
-        self.grasps = statistics.decisions(self.records)
-        self.reference = statistics.finest(self.grasps, "spread")
+        self.records, self.runs = analysis.load(files)
+        self.times = analysis.times(self.records)
+        self.grasps = analysis.decisions(self.records)
+        self.reference = analysis.finest(self.grasps, "spread")
         self._compared: dict[str, dict[Setting, dict[str, Any]]] = {}
 
     def decisions(self, population: str) -> dict[Setting, dict[str, Any]]:
@@ -44,7 +44,7 @@ class Study:
         if population not in self._compared:
             truth = self.grasps.get((self.reference, False, population))  # type: ignore[arg-type]
             found = {
-                setting: statistics.compare(cost, truth)
+                setting: analysis.compare(cost, truth)
                 for (setting, moved, name), cost in self.grasps.items()
                 if name == population and not moved and setting != self.reference
                 if truth is not None
@@ -58,15 +58,15 @@ class Study:
 
         Those without a measurement as well, but not what only confirms the reference.
         """
-        failed = [r for r in self.records if r["part"] == part and statistics.bad(r)]
+        failed = [r for r in self.records if r["part"] == part and analysis.bad(r)]
         failed = [r for r in failed if part == "decision" or not r["more"]]
         return sorted(failed + self._errors(part), key=lambda r: place(r["of"]))
 
     def _errors(self, part: str) -> Records:
         if part in ("tip", "impulse"):
-            return [r for r in statistics.against_reference(self.records, part) if not r["more"]]
+            return [r for r in analysis.against_reference(self.records, part) if not r["more"]]
         if part == "step":
-            return statistics.measured(self.records, part)
+            return analysis.measured(self.records, part)
         return [
             {"of": setting, "flipped": 1 - row["same_verdict"].value}
             for setting, row in self.decisions("spread").items()
@@ -91,7 +91,7 @@ class Study:
         rows, found = self.errors(part), {}
         for r in rows:
             setting = r["of"]
-            error = np.nan if statistics.bad(r) else r[ERRORS[part][1]]
+            error = np.nan if analysis.bad(r) else r[ERRORS[part][1]]
             shared = part in SHARED and setting.engine == "mujoco" and setting.iterations is None
             for engine in (setting.engine, *(("structured",) if shared else ())):
                 cost, key = self.cost(engine, setting), (engine, setting.label)
@@ -107,7 +107,7 @@ class Study:
         engines = [setting.engine] + ["mujoco"] * (part in SHARED and setting.iterations is None)
         found = {(r["of"].engine, r["of"].label): r for r in self.errors(part)}
         rows = (found.get((engine, setting.label)) for engine in engines)
-        row = next((r for r in rows if r and not statistics.bad(r)), None)
+        row = next((r for r in rows if r and not analysis.bad(r)), None)
         return None if row is None else row[ERRORS[part][1]]
 
     def cheapest(self, part: str, engine: str, limit: float) -> Point | None:
@@ -137,7 +137,7 @@ class Study:
         run = self.runs[max(timed, key=timed.count)] if timed else self.runs[-1]
         batch = {
             v["engine"]: v["worlds"]
-            for r in statistics.measured(self.records, "time")
+            for r in analysis.measured(self.records, "time")
             for v in r["engines"].values()
         }
         worlds = ", ".join(f"{e} {n:,} worlds" for e, n in batch.items())

@@ -4,11 +4,10 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from codesign_jax import keypaths
 from codesign_jax import scene as scenes
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, keypaths
 from scripts.shared import peers
 
 Overrides = Mapping[Any, Any]

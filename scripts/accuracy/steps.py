@@ -16,8 +16,8 @@ from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
 from scripts.accuracy import oracle, worlds
 from scripts.accuracy.settings import Setting
-from scripts.benchmark.cases import quantiles
 from scripts.shared.peers import REFERENCE
+from scripts.shared.statistics import quantiles
 
 FLOOR = 100.0
 """Smallest scale of relative errors, ten g: an object at rest has accelerations of rounding."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from codesign_jax import files
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 from scripts.accuracy.settings import Setting
 from scripts.shared import provenance
 

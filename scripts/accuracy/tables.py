@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from scripts.accuracy import statistics
+from codesign_jax.report.statistics import Interval
+from scripts.accuracy import analysis
+from scripts.accuracy.analysis import Records
 from scripts.accuracy.figures import Point, grasps
 from scripts.accuracy.results import ERRORS, WANTED, Study, named
 from scripts.accuracy.settings import PRESETS, Setting, one_at_a_time
-from scripts.accuracy.statistics import Records
-from scripts.experiments.statistics import Interval
 
 COST = ["wall s / simulated s", "grasps/s"]
 POPULATIONS = {
@@ -21,8 +21,8 @@ POPULATIONS = {
 
 def lines(records: Records) -> dict[str, list[tuple[float, float]]]:
     """Errors over what is refined, by what is measured, for `figures.convergence`."""
-    tips = statistics.against_reference(records, "tip")
-    beams = statistics.measured(records, "beam")
+    tips = analysis.against_reference(records, "tip")
+    beams = analysis.measured(records, "beam")
     found = {
         "tip in motion [mm], time step": [
             (r["of"].timestep, r["tip_rms_mm"])
@@ -36,7 +36,7 @@ def lines(records: Records) -> dict[str, list[tuple[float, float]]]:
         ],
         "impulse, relative, time step": [
             (r["of"].timestep, r["impulse_error"])
-            for r in statistics.against_reference(records, "impulse")
+            for r in analysis.against_reference(records, "impulse")
             if not r["more"] and r["of"] == Setting("mujoco", timestep=r["of"].timestep)
         ],
     }
@@ -49,16 +49,16 @@ def confirmed(records: Records) -> list[list[str]]:
     """How far the reference moves if it is refined once more, and the orders of convergence."""
     rows = [["what", "value"]]
     for r in records:
-        if {"timestep", "links"} & set(r["more"]) and statistics.bad(r):
+        if {"timestep", "links"} & set(r["more"]) and analysis.bad(r):
             rows.append([f"reference refined to {r['label']}: {r['part']}", _why(r)])
     for part, unit in (("tip", "mm"), ("impulse", "")):
-        for r in statistics.against_reference(records, part):
+        for r in analysis.against_reference(records, part):
             for role, words in (("timestep", "time step halved"), ("links", "links doubled")):
                 if role in r["more"]:
                     value = r[ERRORS[part][1]]
                     what = f"reference moves, {words}: {ERRORS[part][0]}"
                     rows.append([what, f"{value:.2g} {unit}".strip()])
-    for name, value in statistics.orders(records).items():
+    for name, value in analysis.orders(records).items():
         if value is not None:
             rows.append([f"order of convergence: {name}", f"{value:.2f}"])
     return rows
@@ -131,7 +131,7 @@ def errors_table(study: Study, part: str) -> list[list[str]]:
     rows = [["engine", "setting", *(h.replace("_", " ") for h in heads[part]), *COST]]
     for r in study.errors(part):
         setting = r["of"]
-        if statistics.bad(r):
+        if analysis.bad(r):
             values = [_why(r), *[""] * (len(heads[part]) - 1)]
         else:
             values = [_number(r.get(h)) for h in heads[part]]
@@ -143,7 +143,7 @@ def errors_table(study: Study, part: str) -> list[list[str]]:
 def _why(record: dict[str, Any]) -> str:
     """Why there is no measurement, the last clause of the reason."""
     kind = "refused" if record.get("refused") else "failed"
-    return f"{kind}: {(statistics.bad(record) or '').split(':')[-1].strip()}"
+    return f"{kind}: {(analysis.bad(record) or '').split(':')[-1].strip()}"
 
 
 def _interval(value: Interval, form: str = ".1%") -> str:
@@ -180,7 +180,7 @@ def decisions_table(study: Study, population: str) -> list[list[str]]:
         cost = study.cost(setting.engine, setting)
         rows.append([*_row([setting.engine, title(setting)], c), *cost_cells(cost)])
     for r in study.errors("decision"):
-        if statistics.bad(r):
+        if analysis.bad(r):
             head, cost = (
                 [r["of"].engine, r["of"].label, _why(r)],
                 study.cost(r["of"].engine, r["of"]),
@@ -198,7 +198,7 @@ def preset_to_preset(study: Study) -> list[list[str]]:
             costs = [study.grasps.get((PRESETS[names[i]], False, population)) for i in (a, b)]
             if costs[0] is not None and costs[1] is not None:
                 what = f"{names[a]} against {names[b]}"
-                rows.append(_row([what, population], statistics.compare(*costs)))
+                rows.append(_row([what, population], analysis.compare(*costs)))
     return rows
 
 
@@ -209,14 +209,14 @@ def floors(study: Study) -> list[list[str]]:
         plain = study.grasps.get((setting, False, name))
         if moved and plain is not None:
             what = f"{setting.engine}, {title(setting)}: objects moved by 1 µm"
-            rows.append(_row([what, name], statistics.compare(cost, plain)))
+            rows.append(_row([what, name], analysis.compare(cost, plain)))
         own = Setting(**{**vars(setting), "engine": "structured"})
         same = study.grasps.get((own, False, name))
         if setting.engine == "mujoco" and not moved and same is not None:
             what = f"MuJoCo C against structured, {setting.label}"
-            rows.append(_row([what, name], statistics.compare(cost, same)))
+            rows.append(_row([what, name], analysis.compare(cost, same)))
     for (setting, moved, name), cost in study.grasps.items():
-        noise = statistics.trial_noise(cost)
+        noise = analysis.trial_noise(cost)
         if setting == Setting() and not moved and noise is not None:
             what = "structured, standard: six trials against six others"
             values = ["–"] * len(_DECISION)

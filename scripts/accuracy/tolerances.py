@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import spearmanr
 
-from codesign_jax import control, cost, model, parameters, rollout, scene
+from codesign_jax import control, cost, model, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.scene import parameters
 from codesign_jax.types import Trace, failed
 from scripts.shared import provenance
 

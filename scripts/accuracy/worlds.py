@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import parameters, rollout
+from codesign_jax import rollout
 from codesign_jax.model import ModelFields
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, parameters
 from codesign_jax.types import Params, Trial
 from scripts.shared import work
 

@@ -19,6 +19,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Trace, failed
 from scripts.shared import measure, peers, provenance, work
+from scripts.shared.statistics import quantiles
 
 # Steps between states at which accelerations are compared.
 _STRIDE = 3
@@ -230,12 +231,6 @@ def _errors(scene: Scene, fields: Any, qpos: np.ndarray, ctrl: np.ndarray) -> np
         got = (velocity[k + 1] - velocity[k]) / h
         errors.append(np.linalg.norm(got - data.qacc) / max(np.linalg.norm(data.qacc), 100.0))
     return np.array(errors)
-
-
-def quantiles(errors: np.ndarray) -> dict:
-    """Median, upper quantiles and maximum of errors."""
-    levels = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
-    return {name: float(np.quantile(errors, q)) for name, q in levels.items()}
 
 
 def quality(case: Case) -> dict:

@@ -19,8 +19,7 @@ import numpy as np
 from codesign_jax import rollout
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.scene import Scene
-from scripts.shared import agreement as statistics
-from scripts.shared import peers, provenance, work
+from scripts.shared import peers, provenance, statistics, work
 
 NUDGE = 1e-6
 """Displacement of the objects of the perturbed runs [m]."""

@@ -11,10 +11,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib.figure
 import matplotlib.ticker
 
 from scripts.benchmark import report
+from scripts.shared import figures as pictures
+from scripts.shared.statistics import slope
+from scripts.shared.tables import markdown
 
 MACHINES = {"cpu": "benchmark_cpu.json", "h200": "benchmark_h200.json"}
 COLORS = {"structured": "tab:blue", "mujoco": "tab:green", "mjx": "tab:orange", "warp": "tab:red"}
@@ -49,7 +51,7 @@ lose their object, and designs around 64 mm and an arm height of 0 mm, which hol
 
 def draw(results: dict[str, Any], path: Path) -> None:
     """Rates against worlds, whole grasps and in contact; cost against links and fingers."""
-    figure = matplotlib.figure.Figure(figsize=(9.6, 6.4), dpi=120, layout="constrained")
+    figure = pictures.new(9.6, 6.4)
     axes = figure.subplots(2, 2)
     for axis, kind, title in (
         (axes[0, 0], "grasp", "whole grasps, nominal"),
@@ -61,7 +63,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
         (axes[1, 1], "fingers", (2, 3, 4, 6, 8)),
     ):
         _growth(axis, results, name, ticks)
-    figure.savefig(path)
+    pictures.save(figure, path)
 
 
 def _rates(axis: Any, records: list[dict[str, Any]], title: str) -> None:
@@ -89,7 +91,7 @@ def _growth(axis: Any, results: dict[str, Any], name: str, ticks: tuple[int, ...
         label = engine
         upper = [p for p in points if name != "links" or p[0] >= 10]
         if len(upper) > 1:
-            label += f": {report.exponent(*map(list, zip(*upper, strict=True))):.2f}"
+            label += f": {slope(*zip(*upper, strict=True)):.2f}"
         axis.loglog(x, y, marker="o", ms=4, color=COLORS[engine], label=label)
     axis.set(xlabel=name, ylabel="µs a world and step")
     axis.set_xticks(ticks, [str(t) for t in ticks])
@@ -136,7 +138,7 @@ def compared(found: dict[str, Any]) -> str:
             ]
         )
     note = "`mujoco, perturbed` is MuJoCo C with every object moved by a micrometre."
-    return "\n\n".join(["## Costs against MuJoCo C", note, report.markdown(rows), machine(found)])
+    return "\n\n".join(["## Costs against MuJoCo C", note, markdown(rows), machine(found)])
 
 
 READ = {

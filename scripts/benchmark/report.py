@@ -4,10 +4,8 @@ import dataclasses
 import hashlib
 from typing import Any
 
-import numpy as np
-
-from scripts.shared import agreement as statistics
-from scripts.shared import peers, work
+from scripts.shared import peers, statistics, work
+from scripts.shared.tables import markdown
 
 KEY = ("engine", "setting", "kind", "worlds", "variant", "growth")
 
@@ -58,11 +56,6 @@ def line(record: dict[str, Any]) -> str:
     if record["kind"] == "quality":
         return f"{name}: {record['iterations_mean']:.2f} iterations a step"
     return f"{name}: median error {record['median']:.1e}, 99 % {record['p99']:.1e}"
-
-
-def exponent(sizes: list[float], seconds: list[float]) -> float:
-    """Slope of a straight line through the logarithms."""
-    return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
 
 
 def growth(results: dict[str, Any], name: str) -> dict[str, list[tuple[float, float]]]:
@@ -175,7 +168,7 @@ def growth_table(results: dict[str, Any]) -> list[list[str]]:
     for name in ("links", "fingers", "spheres"):
         for engine, points in growth(results, name).items():
             upper = [p for p in points if name != "links" or p[0] >= 10]
-            slope = exponent(*map(list, zip(*upper, strict=True))) if len(upper) > 1 else None
+            slope = statistics.slope(*zip(*upper, strict=True)) if len(upper) > 1 else None
             text = ", ".join(f"{int(n)}: {cost:,.3g}" for n, cost in points)
             done = [
                 f"{int(n)}: {counts[k]:.2f}"
@@ -190,12 +183,6 @@ def growth_table(results: dict[str, Any]) -> list[list[str]]:
                 [r["engine"], "hand", f"{r['variant']['hand_name']}: {cost:,.3g}", "–", "–"]
             )
     return rows
-
-
-def markdown(rows: list[list[str]]) -> str:
-    """A Markdown table; the first row is its head."""
-    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-    return "\n".join("| " + " | ".join(row) + " |" for row in lines)
 
 
 def tables(results: dict[str, Any]) -> str:

@@ -21,10 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign_jax import codesign, keypaths, parameters, scene
+from codesign_jax import codesign, scene
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import keypaths, parameters
+from codesign_jax.scene.schema import SceneError
 from scripts.calibration import files, score, sets
 from scripts.calibration.surrogate import Plan
 from scripts.calibration.wave import Size, Wave, keep

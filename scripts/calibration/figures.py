@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib.figure
 import numpy as np
 
 from scripts.calibration import score, sets
 from scripts.calibration.files import Scored
+from scripts.shared import figures as pictures
 
 COLUMNS = 5
 LANDSCAPES = 8
@@ -18,7 +18,7 @@ BINS = 6
 def constants(wave: Scored, path: Path) -> Path:
     """Draws which share of the sets is left in each part of every constant's range."""
     rows = -(-len(sets.OPEN) // COLUMNS)
-    figure = matplotlib.figure.Figure(figsize=(2.3 * COLUMNS, 1.9 * rows), layout="constrained")
+    figure = pictures.new(2.3 * COLUMNS, 1.9 * rows)
     left, values = wave.plausible, sets.values(wave.data["units"])
     axes = None
     for i, o in enumerate(sets.OPEN):
@@ -42,12 +42,12 @@ def constants(wave: Scored, path: Path) -> Path:
             axes.set_xticks(ticks, [f"{t:.2g}" if t < 100 else f"{t:.0f}" for t in ticks])
             axes.minorticks_off()
     figure.supylabel("sets left [%]", fontsize=10)
-    return _save(figure, path)
+    return pictures.save(figure, path, dpi=110)
 
 
 def correlations(found: np.ndarray, measures: Mapping[str, str], path: Path) -> Path:
     """Draws rank correlations of constants and measures, shape (constant, measure)."""
-    figure = matplotlib.figure.Figure(figsize=(6.5, 6.5), layout="constrained")
+    figure = pictures.new(6.5, 6.5)
     axes = figure.add_subplot()
     image = axes.imshow(found, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
     for (i, j), value in np.ndenumerate(found):
@@ -58,7 +58,7 @@ def correlations(found: np.ndarray, measures: Mapping[str, str], path: Path) -> 
     axes.set_xticks(range(len(measures)), list(measures.values()), rotation=40, ha="right")
     axes.tick_params(axis="x", labelsize=8)
     figure.colorbar(image, label="Spearman's rank correlation")
-    return _save(figure, path)
+    return pictures.save(figure, path, dpi=110)
 
 
 def landscapes(wave: Scored, path: Path) -> Path:
@@ -66,7 +66,7 @@ def landscapes(wave: Scored, path: Path) -> Path:
     chosen = score.best(wave.data["distances"], LANDSCAPES)
     columns = min(4, len(chosen))
     rows = -(-len(chosen) // columns)
-    figure = matplotlib.figure.Figure(figsize=(2.6 * columns, 2.5 * rows), layout="constrained")
+    figure = pictures.new(2.6 * columns, 2.5 * rows)
     x, y = wave.data["first_axis"], wave.data["second_axis"]
     image = None
     for k, i in enumerate(chosen):
@@ -82,10 +82,4 @@ def landscapes(wave: Scored, path: Path) -> Path:
     figure.supylabel("X_D z [mm]", fontsize=9)
     if image is not None:
         figure.colorbar(image, ax=figure.axes, label="mean cost")
-    return _save(figure, path)
-
-
-def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    return path
+    return pictures.save(figure, path, dpi=110)

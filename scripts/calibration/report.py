@@ -8,7 +8,7 @@ from scipy import stats
 
 from scripts.calibration import figures, files, score, sets
 from scripts.calibration.files import Scored
-from scripts.experiments.report import fill
+from scripts.shared.tables import fill
 
 MEASURES = {
     "untouched": "never touched",

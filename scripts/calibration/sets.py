@@ -8,9 +8,9 @@ import numpy as np
 from scipy import stats
 from scipy.stats import qmc
 
-from codesign_jax import constants as checks
 from codesign_jax.scene import Constants, Scene
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import constants as checks
+from codesign_jax.scene.schema import SceneError
 
 CLEARANCE = 0.002
 """Smallest gap between the sections of a pair of fingers at a spread of zero [m]."""

@@ -10,8 +10,8 @@ import numpy as np
 from codesign_jax import rollout
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import Engine
-from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, failed
 from scripts.calibration import sets
 from scripts.experiments.landscape import STREAM_GRID, grid
@@ -45,7 +45,7 @@ class Size:
 
 
 class Wave:
-    """Landscapes of sets, some sets a step; `experiments.drive` runs and resumes it.
+    """Landscapes of sets, some sets a step; `shared.driver.drive` runs and resumes it.
 
     Set i meets trials of the key (seed, number of the set); all designs of a set meet the same ones
     and a set's result does not depend on the others.

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib.figure
 import numpy as np
 
-from codesign_jax.effects import EFFECTS, ENGINES
-from scripts.benchmark.report import markdown
+from codesign_jax.scene.effects import EFFECTS, ENGINES
+from scripts.shared import figures as pictures
+from scripts.shared.tables import fill, markdown
 
 REFERENCE = "as it is"
 
@@ -16,7 +16,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
     """Time of a step and success rate of the scene with each effect turned over."""
     rows = results["effects"]
     names = [*(n for n in rows if n != REFERENCE), REFERENCE][::-1]
-    figure = matplotlib.figure.Figure(figsize=(9.6, 5.6), dpi=120, layout="constrained")
+    figure = pictures.new(9.6, 5.6)
     left, right = figure.subplots(1, 2, sharey=True)
     for axis, field, bounds in (
         (left, "ratio", lambda r: r["ratio_quartiles"]),
@@ -38,8 +38,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
     left.set_yticks(range(len(names)), names)
     left.set(xlabel="a step, relative to the scene as it is", xlim=(0, None))
     right.set(xlabel="success rate with 95 % interval")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    pictures.save(figure, path)
 
 
 def support_table() -> list[list[str]]:
@@ -107,16 +106,5 @@ def write(results: dict[str, Any], page: Path) -> None:
         f", jax {p['jax']}, MuJoCo {p['mujoco']}, commit {p['commit']}; load of the machine while "
         f"timing: {' to '.join(load) or 'not timed'}."
     )
-    text = page.read_text(encoding="utf-8")
-    text = _between(text, "measured", note + "\n\n" + markdown(measured_table(results)))
-    page.write_text(_between(text, "support", markdown(support_table())), encoding="utf-8")
-
-
-def _between(text: str, name: str, made: str) -> str:
-    """The text with what stands between a pair of marks replaced."""
-    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    before, mark, rest = text.partition(begin)
-    _, last, after = rest.partition(end)
-    if not (mark and last):
-        raise ValueError(f"no {begin} ... {end} in the page")
-    return f"{before}{begin}\n\n{made}\n\n{end}{after}"
+    fill(page, note + "\n\n" + markdown(measured_table(results)), "measured")
+    fill(page, markdown(support_table()), "support")

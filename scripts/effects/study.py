@@ -10,18 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import parameters, rollout
+from codesign_jax import rollout
 from codesign_jax.codesign import SUCCESS_COST
-from codesign_jax.effects import refusals
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Program
-from codesign_jax.scene import Scene
-from codesign_jax.statistics import wilson
+from codesign_jax.report.statistics import wilson
+from codesign_jax.scene import Scene, parameters
+from codesign_jax.scene.effects import refusals
 from codesign_jax.types import Params, failed
 from scripts.effects.program_cost import jaxpr_size
-from scripts.shared.agreement import agreement
+from scripts.shared.statistics import agreement
 from scripts.shared.work import Worlds, inputs
 
 CONTACTS = ("finger_object", "palm_object", "finger_table", "palm_table", "object_table")

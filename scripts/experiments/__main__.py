@@ -14,10 +14,11 @@ from pathlib import Path
 
 import jax
 
-from codesign_jax import codesign, keypaths, parameters, scene
+from codesign_jax import codesign, scene
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
-from codesign_jax.schema import SceneError
+from codesign_jax.scene import keypaths, parameters
+from codesign_jax.scene.schema import SceneError
 from scripts.experiments import Batch, Grid, Stop, Worlds, drive, parquet, plan, results
 from scripts.experiments.worlds import LIMIT, chunking
 from scripts.shared import provenance, record
@@ -104,18 +105,18 @@ def simulate(args: argparse.Namespace) -> int:
 
 def find_types(args: argparse.Namespace) -> int:
     """Clusters what the hand does in the landscape's good designs, and shows it."""
-    from scripts.experiments import grasp_types, statistics
+    from scripts.experiments import grasp_types, study
     from scripts.experiments.figures import LANDSCAPE_THRESHOLD
 
     common.use_compilation_cache()
-    grid = statistics.load(args.data, "landscape")
+    grid = study.load(args.data, "landscape")
     if grid is None:
         sys.exit(f"error: {args.data} holds no landscape.npz")
     overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
     the_scene = scene.load(args.scene, overrides=overrides)
     space = parameters.design_space(the_scene.hand, "2d")
     engine = make_engine(args.engine, the_scene)
-    found = statistics.load(args.data, "types")
+    found = study.load(args.data, "types")
     if found is None or args.fresh:
         arrays = grasp_types.study(grid[0], the_scene, engine, space, LANDSCAPE_THRESHOLD)
         notes = {

@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
-import matplotlib.figure
 import numpy as np
 
 from codesign_jax.codesign import CONVERGED_COST
 from codesign_jax.report.figures import cost_evolution
-from codesign_jax.statistics import wilson
-from scripts.experiments.statistics import RULES, Study, quantile, regions
+from codesign_jax.report.statistics import wilson
+from scripts.experiments.study import RULES, Study, regions
+from scripts.shared import figures as pictures
+from scripts.shared.statistics import quantile
 
 LABELS = {"single": "s.d.", "concurrent": "conc."}
 _COLORS = {"exclude": "tab:blue", "worst": "tab:orange"}
@@ -47,7 +48,7 @@ def success(study: Study, path: Path) -> Path:
         axes.errorbar(at, value, [value - low, high - value], fmt="none", color="black", capsize=3)
     axes.set(ylabel="ratio of successful runs", ylim=(0, 1.02))
     _strategies(axes, study)
-    return _save(figure, path)
+    return pictures.save(figure, path)
 
 
 def convergence(study: Study, path: Path) -> Path:
@@ -72,7 +73,7 @@ def convergence(study: Study, path: Path) -> Path:
     axes.text(len(at) - 0.55, limit, "not converged", ha="right", va="bottom", fontsize=8)
     axes.set(ylabel="episodes until converged", ylim=(0, 1.15 * limit), xlim=(-0.5, len(at) - 0.5))
     _strategies(axes, study, [f"{n}/{episodes.shape[1]}" for n in converged.sum(1)])
-    return _save(figure, path)
+    return pictures.save(figure, path)
 
 
 def landscape(
@@ -109,12 +110,11 @@ def landscape(
         axes.legend(fontsize=8, loc="upper left", markerscale=4)
     names, units = data["parameters"], data["units"]
     axes.set(xlabel=f"{names[0]} [{units[0]}]", ylabel=f"{names[1]} [{units[1]}]")
-    return _save(figure, path)
+    return pictures.save(figure, path)
 
 
 def _axes(width: float = 6.0, height: float = 3.4):
-    # A figure of its own instead of pyplot's: no state and no display is touched.
-    figure = matplotlib.figure.Figure(figsize=(width, height), dpi=120, layout="constrained")
+    figure = pictures.new(width, height)
     return figure, figure.add_subplot()
 
 
@@ -125,9 +125,3 @@ def _strategies(axes, study: Study, below: list[str] | None = None) -> None:
     axes.set_xticks(range(len(labels)), labels)
     axes.set_xlabel("strategy (s.d.: single domain; number of switches; conc.: concurrent)")
     axes.legend(frameon=False, fontsize=8, loc="best")
-
-
-def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    return path

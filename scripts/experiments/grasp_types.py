@@ -16,8 +16,8 @@ import scipy.spatial.distance
 
 from codesign_jax import model, rollout
 from codesign_jax.engines import Engine
-from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Trial, failed
 from scripts.shared.record import Arrays
 

@@ -5,8 +5,8 @@ import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax.codesign import stream_key
-from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import failed
 from scripts.experiments.plan import Landscape
 from scripts.experiments.worlds import Worlds

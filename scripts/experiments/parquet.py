@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from codesign_jax import files
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Status
 from scripts.experiments import results
 from scripts.experiments.batch import Batch

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from codesign_jax.optimize import schedule
-from codesign_jax.parameters import DesignSpace
+from codesign_jax.scene.parameters import DesignSpace
 
 
 @dataclasses.dataclass(frozen=True)

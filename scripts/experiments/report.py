@@ -4,13 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign_jax.statistics import wilson
-from scripts.experiments import figures, grasp_types, statistics
+from codesign_jax.report.statistics import Interval, wilson
+from scripts.experiments import figures, grasp_types
 from scripts.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
-from scripts.experiments.statistics import RULES, Interval, Study
-
-BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
-"""Marks between which a page's table is replaced."""
+from scripts.experiments.study import RULES, Study, load, load_study, regions
+from scripts.shared import statistics
+from scripts.shared.tables import fill
 
 _THRESHOLDS = (0.1, 0.5, 1.0)
 _HEAD = "| the paper | here |\n|---|---|"
@@ -27,8 +26,8 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     Returns:
       The table in Markdown.
     """
-    studies = {name: statistics.load_study(data, name) for name in ("2d", "23d")}
-    grid = statistics.load(data, "landscape")
+    studies = {name: load_study(data, name) for name in ("2d", "23d")}
+    grid = load(data, "landscape")
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
     if studies["2d"]:
         figures.evolution(studies["2d"], pictures / "fig6_cost_evolution.png")
@@ -36,37 +35,18 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
         if study:
             figures.success(study, pictures / f"fig{number}a_success.png")
             figures.convergence(study, pictures / f"fig{number}b_convergence.png")
-    types = statistics.load(data, "types")
+    types = load(data, "types")
     if grid:
         dots = types[0]["type"] if types else None
         figures.landscape(grid[0], pictures / "fig8_landscape.png", types=dots)
     if page:
-        fill(page, text)
+        fill(page, text, "results")
     if grid and types:
         table = grasp_types.describe(grid[0], types[0])
         if page:
             fill(page, table, "types")
         text += f"\n\n{table}"
     return text
-
-
-def fill(page: Path, text: str, mark: str = "results") -> None:
-    """Replaces what stands between the marks of a page.
-
-    Args:
-      page: Markdown page.
-      text: The new text.
-      mark: Name of the marks.
-
-    Raises:
-      ValueError: If the page does not hold both marks.
-    """
-    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
-    old = page.read_text()
-    if begin not in old or end not in old:
-        raise ValueError(f"{page} holds no {begin} and {end}")
-    head, tail = old.split(begin)[0], old.split(end)[1]
-    page.write_text(f"{head}{begin}\n\n{text}\n\n{end}{tail}")
 
 
 def comparison(studies: dict[str, Study | None], grid) -> str:
@@ -176,11 +156,11 @@ def _grasps_row(studies: dict[str, Study | None], grid) -> tuple[str, str]:
 def _regions(grid) -> str:
     parts = []
     for threshold in _THRESHOLDS:
-        found = statistics.regions(grid[0], threshold)
+        found = regions(grid[0], threshold)
         shares = ", ".join(f"{100 * r.share:.1f} %" for r in found)
         parts.append(f"cost < {threshold:g}: {len(found)}" + (f" ({shares})" if found else ""))
     units, names = grid[0]["units"], grid[0]["parameters"]
-    found = statistics.regions(grid[0], figures.LANDSCAPE_THRESHOLD)
+    found = regions(grid[0], figures.LANDSCAPE_THRESHOLD)
     for letter, region in zip("abcdefgh", found, strict=False):
         ends = ", ".join(
             f"{names[i]} {region.low[i]:.0f} to {region.high[i]:.0f} {units[i]}" for i in (0, 1)

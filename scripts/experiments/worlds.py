@@ -7,8 +7,8 @@ import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax.engines import Engine
-from codesign_jax.parameters import DesignSpace
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
 LIMIT = 16_384

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from codesign_jax import files
-from codesign_jax.checkpoint import digest
+from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import control, hand, model, parameters, rollout, scene
+from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.model import ModelFields
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, hand, parameters
 from codesign_jax.types import Params, Trial
 
 TRIALS = 6

@@ -7,12 +7,12 @@ import matplotlib.figure
 import numpy as np
 
 from codesign_jax.codesign import SUCCESS_COST
-from codesign_jax.statistics import wilson
+from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.types import failed
-from scripts.experiments import statistics
-from scripts.experiments.report import fill
-from scripts.experiments.statistics import Interval
+from scripts.shared import figures as pictures
+from scripts.shared import statistics
 from scripts.shared.record import Arrays
+from scripts.shared.tables import fill
 from scripts.winners import files as winners_files
 from scripts.winners import variants as winners
 from scripts.winners.files import Run
@@ -144,11 +144,15 @@ def _row(
         (int(good[won].sum()), int(won.sum())),
         shared,
         p,
-        statistics.bootstrap(by_run, lambda v: v.mean(-1)) if cost.shape[1] > 1 else None,
-        statistics.bootstrap(kept[won].mean(1), lambda v: v.mean(-1)) if won.any() else NOTHING,
+        _mean(by_run) if cost.shape[1] > 1 else None,
+        _mean(kept[won].mean(1)) if won.any() else NOTHING,
         same,
         float(failed(status).mean()),
     )
+
+
+def _mean(values: np.ndarray) -> Interval:
+    return statistics.bootstrap(lambda i: values[i].mean(-1), len(values))
 
 
 def _kept(cost: np.ndarray, status: np.ndarray) -> np.ndarray:
@@ -217,5 +221,4 @@ def figure(tables: dict[str, tuple[Finals, list[Row]]], path: Path) -> None:
     axes[1].legend(frameon=False, fontsize=8, loc="center left")
     for axis in axes:
         axis.grid(alpha=0.3, lw=0.4)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    picture.savefig(path)
+    pictures.save(picture, path)

@@ -9,11 +9,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from codesign_jax import keypaths, parameters, rollout
+from codesign_jax import rollout
 from codesign_jax import scene as scenes
 from codesign_jax.codesign import SUCCESS_COST, stream_key
 from codesign_jax.engines import make_engine
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.types import Outcome
 from scripts.experiments.worlds import LIMIT, Worlds, chunking
 from scripts.shared import record as records

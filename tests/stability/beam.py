@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 from scipy import linalg
 
-from codesign_jax import model, morphology
+from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
+from codesign_jax.model import morphology
 from codesign_jax.types import Params
 from scripts.accuracy import beam
 from tests import small

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from codesign_jax import parameters, rollout, scene
+from codesign_jax import rollout, scene
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.scene import parameters
 from tests.stability.bench import floats, refined
 from tests.stability.table import Found, case
 

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from codesign_jax import hand, model, parameters, rollout, scene
+from codesign_jax import model, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.scene import hand, parameters
 from codesign_jax.types import Params, failed
 from tests import small
 from tests.stability.bench import bench, floats, moving, pinch, refined

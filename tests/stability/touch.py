@@ -6,8 +6,9 @@ import functools
 import mujoco
 import numpy as np
 
-from codesign_jax import hand, model
+from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
+from codesign_jax.scene import hand
 from tests import small
 from tests.stability.bench import bench, pinch, refined
 from tests.stability.table import Found, case

@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.problem import Matrices, Problem, Spatial
 from codesign_jax.model import layout
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 
 
 class Moved(NamedTuple):

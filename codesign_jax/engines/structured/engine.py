@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import effects
 from codesign_jax.compiler import launch
 from codesign_jax.engines.base import Equal
 from codesign_jax.engines.structured import coordinates, mesh, transforms
@@ -14,7 +13,7 @@ from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.transforms import Path
 from codesign_jax.model import ModelFields
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, effects
 from codesign_jax.types import Status, Trace
 
 FAR = 1e30

@@ -17,7 +17,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import hull
 from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
 from codesign_jax.engines.structured.contact import (
     Contacts,
@@ -27,11 +26,12 @@ from codesign_jax.engines.structured.contact import (
 from codesign_jax.engines.structured.elimination import JointTerms
 from codesign_jax.engines.structured.kinematics import Kinematics
 from codesign_jax.engines.structured.lanes import Stages, contract
+from codesign_jax.model import hull
 from codesign_jax.scene import Scene
 
 
 class Vertices(NamedTuple):
-    """Contact points of the hull; rows are the joints and the tip, see `codesign_jax.hull.Slots`.
+    """Contact points of the hull; rows are the joints and the tip, see `model.hull.Slots`.
 
     Attributes:
       point: In the palm's frame, shape (3, row, k, finger, world).

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
 from codesign_jax.engines.structured.kinematics import Kinematics, State
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
-from codesign_jax.morphology import softening
+from codesign_jax.model.morphology import softening
 
 
 class Body(NamedTuple):

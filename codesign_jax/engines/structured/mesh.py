@@ -17,7 +17,7 @@ import numpy as np
 
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.scene import Scene, by_structure
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 
 # Grids begin at multiples of this index, which a float32 holds exactly up to 2^31.
 _ALIGNED = 128

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.stats
 
 from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.scene import load as load_scene
-from codesign_jax.statistics import Interval, wilson
 from scripts.accuracy import decision, impulse, tip
 from scripts.accuracy.settings import Setting
+from scripts.shared.statistics import bootstrap, slope, spearman
 
 Records = list[dict[str, Any]]
 
@@ -74,7 +74,7 @@ def against_reference(records: Records, part: str) -> Records:
 def order(points: Iterable[tuple[float, float]]) -> float | None:
     """Slope of log error over log size; None with fewer than three points."""
     x, y = np.array([p for p in points if p[1] > 0]).reshape(-1, 2).T
-    return float(np.polyfit(np.log(x), np.log(y), 1)[0]) if x.size > 2 else None
+    return slope(x, y) if x.size > 2 else None
 
 
 def orders(records: Records) -> dict[str, float | None]:
@@ -138,28 +138,6 @@ def means(cost: np.ndarray) -> np.ndarray:
     return np.where(good.any(-1), total / np.maximum(good.sum(-1), 1), 3.0)
 
 
-def spearman(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Rank correlation along the last axis; NaN where one side does not vary."""
-    x, y = (scipy.stats.rankdata(v, axis=-1) for v in (a, b))
-    x, y = (v - v.mean(-1, keepdims=True) for v in (x, y))
-    norm = np.sqrt((x**2).sum(-1) * (y**2).sum(-1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return (x * y).sum(-1) / norm
-
-
-def resampled(statistic: Callable[[np.ndarray], np.ndarray], count: int) -> Interval:
-    """Percentile bootstrap over particles.
-
-    Args:
-      statistic: From indices of particles, shape (..., particle), to values, shape (...).
-      count: Number of particles.
-    """
-    rows = np.random.default_rng(0).integers(0, count, (RESAMPLES, count))
-    drawn = statistic(rows)
-    low, high = np.nanquantile(drawn, [0.025, 0.975]) if np.isfinite(drawn).any() else (np.nan,) * 2
-    return Interval(float(statistic(np.arange(count))), float(low), float(high))
-
-
 def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
     """Decisions of a setting beside the reference's over the same particles and trials.
 
@@ -180,14 +158,18 @@ def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
         "trials": trials,
         "success": wilson(int(kept.sum()), kept.size),
         "success_reference": wilson(int(expected.sum()), expected.size),
-        "same_verdict": resampled(lambda i: same[i].mean(-1), len(a)),
-        "cost_difference": resampled(lambda i: (mine - theirs)[i].mean(-1), len(a)),
-        "rank": resampled(lambda i: spearman(mine[i], theirs[i]), len(a)),
+        "same_verdict": _interval(lambda i: same[i].mean(-1), len(a)),
+        "cost_difference": _interval(lambda i: (mine - theirs)[i].mean(-1), len(a)),
+        "rank": _interval(lambda i: spearman(mine[i], theirs[i]), len(a)),
         # Share of the next generation that would come from another particle.
         "offspring_moved": float(0.5 * np.abs(shares[0] - shares[1]).sum()),
         "best_shared": len(best[0] & best[1]) / top,
         "failed": int((~np.isfinite(a)).sum()),
     }
+
+
+def _interval(statistic: Callable[[np.ndarray], np.ndarray], particles: int) -> Interval:
+    return bootstrap(statistic, particles, resamples=RESAMPLES)
 
 
 def trial_noise(cost: np.ndarray, trials: int = 6) -> Interval | None:
@@ -206,7 +188,7 @@ def trial_noise(cost: np.ndarray, trials: int = 6) -> Interval | None:
         pairs = zip(each, each[1:], strict=False)
         return np.mean([spearman(a[i], b[i]) for a, b in pairs], axis=0)
 
-    return resampled(mean, len(cost))
+    return _interval(mean, len(cost))
 
 
 def times(records: Records) -> dict[tuple[str, Setting], dict[str, Any]]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from codesign_jax.meshes import grid, mass, repair, support
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.meshes import grid, mass, repair, support
+from codesign_jax.scene.schema import SceneError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}

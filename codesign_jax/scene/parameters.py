@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import schema
-from codesign_jax.hand import PARAMETERS, UNITS, Hand, Parameter, Preset, structure
+from codesign_jax.scene import schema
+from codesign_jax.scene.hand import PARAMETERS, UNITS, Hand, Parameter, Preset, structure
 from codesign_jax.types import Params
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.

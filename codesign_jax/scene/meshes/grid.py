@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 
 from codesign_jax import files
-from codesign_jax.meshes import surface as surfaces
-from codesign_jax.meshes.surface import Surface
+from codesign_jax.scene.meshes import surface as surfaces
+from codesign_jax.scene.meshes.surface import Surface
 
 # Contact spheres have radii of up to 12.5 mm (fingers of 25 mm height): no farther from the surface
 # does any contact begin.  The rest is for objects that the size noise shrinks.

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import schema
-from codesign_jax.scene import Constants, Scene, check_together
+from codesign_jax.scene import Constants, Scene, check_together, schema
 from codesign_jax.types import Trial
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from codesign_jax import files, keypaths, schema
-from codesign_jax.schema import choice, quantity
+from codesign_jax.scene import keypaths, library, schema
+from codesign_jax.scene.schema import choice, quantity
 
 # Unit of a file -> (SI unit, factor).
 UNITS = {
@@ -208,9 +208,9 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
     Raises:
       SceneError: with every problem in the file.
     """
-    path = files.find("hands", name)
+    path = library.find("hands", name)
     problems: list[str] = []
-    table = files.read(path)
+    table = library.read(path)
     keypaths.apply(table, keypaths.flatten(overrides or {}), path.name, problems)
     hand = schema.parse(Hand, table, path.name, problems)
     if hand is not None:

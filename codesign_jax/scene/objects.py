@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from codesign_jax import files, keypaths, schema
-from codesign_jax.schema import choice, quantity
+from codesign_jax.scene import keypaths, library, schema
+from codesign_jax.scene.schema import choice, quantity
 
 if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitives need neither
-    from codesign_jax.meshes import Solid
+    from codesign_jax.scene.meshes import Solid
 
 SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
 _MESH_KEYS = ("file", "unit", "density", "repair", "voxel_error")
@@ -134,9 +134,9 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
     Raises:
       SceneError: with every problem in the file and in its meshes.
     """
-    path = files.find("objects", name)
+    path = library.find("objects", name)
     problems: list[str] = []
-    table = files.read(path)
+    table = library.read(path)
     keypaths.apply(table, keypaths.flatten(overrides or {}), path.name, problems)
     parsed = schema.parse(_ObjectSetFile, table, path.name, problems)
     if parsed is None:
@@ -178,7 +178,7 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
 
 
 def _mesh_shape(values: dict, path: Path, where: str, problems: list[str]) -> Shape | None:
-    from codesign_jax import meshes
+    from codesign_jax.scene import meshes
 
     try:
         mesh = meshes.load(

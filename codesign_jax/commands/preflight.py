@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax import clearance, morphology
+from codesign_jax.commands import clearance
+from codesign_jax.model import morphology
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 

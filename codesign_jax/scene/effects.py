@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from codesign_jax.schema import SceneError
+from codesign_jax.scene.schema import SceneError
 
 ENGINES = ("mjx", "mujoco", "structured")
 

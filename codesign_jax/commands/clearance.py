@@ -8,8 +8,8 @@ import numpy as np
 
 from codesign_jax import model, rollout
 from codesign_jax.model.layout import palm_points
-from codesign_jax.objects import Shape
 from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene.objects import Shape
 from codesign_jax.start import depth, depth_between
 from codesign_jax.types import Params
 

@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from codesign_jax import schema
+from codesign_jax.scene import schema
 
 Path = tuple[str, ...]
 

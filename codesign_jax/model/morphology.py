@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 
-from codesign_jax.hand import Hand
+from codesign_jax.scene.hand import Hand
 from codesign_jax.types import Params
 
 

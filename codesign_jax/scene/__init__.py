@@ -1,0 +1,46 @@
+"""What is simulated and what may change, as data: hand, objects, effects, phases, numbers.
+
+`load` reads a scene file with the hand and the objects that it names, and checks all of them.
+`parameters` has the design space, `constants` the numbers that may be traced, `effects` what each
+effect means, `schema` the checks of files, `meshes` objects of any shape.
+"""
+
+from codesign_jax.scene.description import (
+    Accuracy,
+    Arm,
+    Constants,
+    Contact,
+    Cost,
+    Discretization,
+    Effects,
+    Limits,
+    Newton,
+    Phases,
+    Pneumatics,
+    Scene,
+    Solver,
+    by_structure,
+)
+from codesign_jax.scene.loading import check_together, load, load_accuracy
+from codesign_jax.scene.schema import SceneError
+
+__all__ = [
+    "Accuracy",
+    "Arm",
+    "Constants",
+    "Contact",
+    "Cost",
+    "Discretization",
+    "Effects",
+    "Limits",
+    "Newton",
+    "Phases",
+    "Pneumatics",
+    "Scene",
+    "SceneError",
+    "Solver",
+    "by_structure",
+    "check_together",
+    "load",
+    "load_accuracy",
+]

@@ -1,0 +1,181 @@
+"""Scene files: read with hand, objects and a preset of accuracy, and checked as a whole."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from codesign_jax.scene import hand, keypaths, library, objects, schema
+from codesign_jax.scene.description import (
+    Accuracy,
+    Arm,
+    Contact,
+    Cost,
+    Discretization,
+    Effects,
+    Limits,
+    Newton,
+    Phases,
+    Pneumatics,
+    Scene,
+    Solver,
+)
+from codesign_jax.scene.schema import quantity
+
+
+@dataclasses.dataclass(frozen=True)
+class _SceneFile:
+    """Schema of a scene file: as `Scene`, with hand and objects by name."""
+
+    name: str
+    description: str
+    hand: str
+    objects: str
+    effects: Effects
+    phases: Phases
+    arm: Arm
+    cost: Cost
+    contact: Contact
+    discretization: Discretization
+    solver: Solver
+    limits: Limits
+    pneumatics: Pneumatics = Pneumatics()
+    newton: Newton = Newton()
+    gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
+
+
+def load(
+    name: str | Path = "paper",
+    *,
+    hand_name: str | Path | None = None,
+    object_set: str | Path | None = None,
+    accuracy: str | Path | None = None,
+    overrides: Mapping[Any, Any] | None = None,
+) -> Scene:
+    """Reads a scene with its hand and objects.
+
+    Args:
+      name: Name of a built-in scene, or a path ending in .toml.
+      hand_name: Hand to use instead of the scene's.
+      object_set: Object set to use instead of the scene's.
+      accuracy: Preset of discretization and solver to use instead of the scene's: "fast",
+        "standard", "reference", or a path ending in .toml; see `load_accuracy`.
+      overrides: Values by key path that replace the files' and the preset's, nested or dotted,
+        e.g. {"discretization": {"links": 5}, "hand.material.shear_modulus": 60e3}; see `keypaths`.
+
+    Raises:
+      SceneError: with every problem of the scene, the hand and the objects.
+    """
+    path = library.find("scenes", name)
+    table = library.read(path)
+    problems: list[str] = []
+    changes = keypaths.flatten(_preset(accuracy, problems)) | keypaths.flatten(overrides or {})
+    inside = {key: keypaths.below(changes, key) for key in ("hand", "objects")}
+    own = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
+    keypaths.apply(table, own, path.name, problems)
+    parsed = schema.parse(_SceneFile, table, path.name, problems)
+    parts = {}
+    for key, loader, chosen in (
+        ("hand", hand.load, hand_name),
+        ("objects", objects.load, object_set),
+    ):
+        named = table.get(key)
+        if chosen is None and not isinstance(named, str):
+            continue  # missing or of the wrong type: `parse` has said so
+        try:
+            source = _beside(path, named) if chosen is None else chosen
+            parts[key] = loader(source, overrides=inside[key])
+        except schema.SceneError as error:
+            problems += error.problems
+    if parsed is not None:
+        _check(parsed, path.name, problems)
+    if problems or parsed is None:
+        raise schema.SceneError(problems)
+    names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
+    return Scene(**parts, **{n: getattr(parsed, n) for n in names})
+
+
+def load_accuracy(name: str | Path) -> Accuracy:
+    """Reads a preset of discretization and solver; its values are checked with the scene's.
+
+    Args:
+      name: Name of a built-in preset, or a path ending in .toml.
+
+    Raises:
+      SceneError: with every problem of the file.
+    """
+    path = library.find("accuracy", name)
+    problems: list[str] = []
+    preset = schema.parse(Accuracy, library.read(path), path.name, problems)
+    if problems or preset is None:
+        raise schema.SceneError(problems)
+    return preset
+
+
+def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str, Any]]:
+    """Overrides of a preset of accuracy; none without a name or with problems."""
+    if name is None:
+        return {}
+    try:
+        preset = load_accuracy(name)
+    except schema.SceneError as error:
+        problems += error.problems
+        return {}
+    return {
+        "discretization": preset.discretization,
+        "solver": preset.solver,
+        "newton": preset.newton,
+    }
+
+
+def _beside(path: Path, name: str) -> str | Path:
+    """Paths inside a scene file are relative to that file, whatever the working directory holds."""
+    return path.parent / name if name.endswith(".toml") else name
+
+
+def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
+    problems += check_together(scene, where)
+    e = scene.effects
+    if e.surface == "hull" and e.friction == "full":
+        problems.append(
+            f"{where}.effects.surface = 'hull' needs friction = 'coulomb' or 'none', not 'full': "
+            "a vertex has no patch of its own, its neighbours resist turning"
+        )
+    if scene.discretization.hull_points % 4:
+        problems.append(
+            f"{where}.discretization.hull_points = {scene.discretization.hull_points} "
+            "must be a multiple of 4: every side of the section has as many"
+        )
+
+
+def check_together(scene: Scene | _SceneFile, where: str) -> list[str]:
+    """Returns what is wrong with numbers that are each in range, but do not go together.
+
+    Args:
+      scene: The scene, its numbers not traced.
+      where: Key path shown before those of the scene.
+    """
+    problems = []
+    p, h = scene.phases, scene.discretization.timestep
+    times = [("approach", p.approach), ("inflate", p.inflate), ("lift", p.lift)]
+    times += [("disturb", p.disturb), ("ungrasp", p.ungrasp)]
+    for (first, a), (second, b) in zip(times, times[1:], strict=False):
+        if not a < b:
+            problems.append(f"{where}.phases.{second} = {b:g} s must come after {first} = {a:g} s")
+    if p.ungrasp < p.disturb + p.deflate_time:
+        problems.append(
+            f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
+            f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
+        )
+    if scene.contact.time_constant < 2 * h:
+        problems.append(
+            f"{where}.contact.time_constant = {scene.contact.time_constant:g} s "
+            f"must be at least two time steps ({2 * h:g} s): "
+            "a stiffer contact is unstable (MuJoCo's refsafe)"
+        )
+    if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:
+        problems.append(
+            f"{where}.phases ends after {scene.end_time:g} s: the number of steps is structure, "
+            f"{scene.num_steps} of {h:g} s"
+        )
+    return problems

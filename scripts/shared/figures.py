@@ -1,0 +1,28 @@
+"""Matplotlib figures without pyplot: no state of a session and no display is touched."""
+
+from pathlib import Path
+
+import matplotlib.figure
+
+
+def new(width: float, height: float) -> matplotlib.figure.Figure:
+    """An empty figure whose parts are laid out when it is drawn.
+
+    Args:
+      width: Width [inch].
+      height: Height [inch].
+    """
+    return matplotlib.figure.Figure(figsize=(width, height), dpi=120, layout="constrained")
+
+
+def save(figure: matplotlib.figure.Figure, path: Path, **options: float) -> Path:
+    """Writes a figure, its folder included, and returns its path.
+
+    Args:
+      figure: The figure.
+      path: File; its ending says the format.
+      **options: Options of `Figure.savefig`.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, **options)
+    return path

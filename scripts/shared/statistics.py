@@ -1,0 +1,196 @@
+"""Statistics that studies share: verdicts, ranks, distributions, paired tests, bootstraps.
+
+SciPy's where it has them; the rest says why it does not use SciPy's.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.stats
+from numpy.typing import ArrayLike
+
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.report.statistics import Interval
+
+RESAMPLES = 10_000
+_CONFIDENCE = 0.95
+
+
+def spearman(a: ArrayLike, b: ArrayLike) -> np.ndarray:
+    """Spearman's rank correlation along the last axis; NaN where one side does not vary.
+
+    SciPy's takes one pair of samples at a time, and bootstraps need thousands.
+    """
+    x, y = (scipy.stats.rankdata(v, axis=-1) for v in (a, b))
+    x, y = (v - v.mean(-1, keepdims=True) for v in (x, y))
+    norm = np.sqrt((x**2).sum(-1) * (y**2).sum(-1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (x * y).sum(-1) / norm
+
+
+def slope(sizes: ArrayLike, values: ArrayLike) -> float:
+    """Slope of a straight line through the logarithms: an order of convergence or of growth."""
+    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
+
+
+def quantiles(errors: np.ndarray) -> dict[str, float]:
+    """Median, upper quantiles and maximum of errors."""
+    levels = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
+    return {name: float(np.quantile(errors, q)) for name, q in levels.items()}
+
+
+def agreement(cost: ArrayLike, reference: ArrayLike, trials: int) -> dict:
+    """Compares costs of the same worlds, trials of a design following each other.
+
+    Args:
+      cost: Costs of worlds, shape (world,).
+      reference: Costs of the same worlds, or of more of them, shape (>= world,).
+      trials: Trials of a design; an incomplete last design is left out of the correlation.
+
+    Returns:
+      Counts and shares by name: the verdicts are cost < `SUCCESS_COST`.
+    """
+    a = np.asarray(cost, float)
+    b = np.asarray(reference, float)[: a.size]
+    a = a[: b.size]
+    whole = a.size // trials * trials
+    means = [x[:whole].reshape(-1, trials).mean(1) for x in (a, b)]
+    kept, expected = a < SUCCESS_COST, b < SUCCESS_COST
+    rank = float(spearman(*means)) if whole >= 3 * trials else None
+    return {
+        "worlds": int(a.size),
+        "same_verdict": float((kept == expected).mean()),
+        "success": float(kept.mean()),
+        "success_reference": float(expected.mean()),
+        "mean_abs_cost_difference": float(np.abs(a - b).mean()),
+        "designs": int(whole // trials),
+        "spearman": None if rank is None or np.isnan(rank) else rank,
+    }
+
+
+def paired_difference(a: ArrayLike, b: ArrayLike) -> dict:
+    """Difference of two success shares over the same worlds with its 95 % interval.
+
+    The variance of the mean of the differences -1, 0 and 1, with one pseudo-count in each cell of
+    discordant pairs (Agresti and Min 2005), so that an interval is never empty.
+
+    Args:
+      a: Whether each world succeeded, bool, shape (world,).
+      b: The same of the other engine.
+    """
+    a, b = np.asarray(a, bool), np.asarray(b, bool)
+    n = a.size
+    only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
+    difference = (only_a - only_b) / n
+    up, down, total = only_a + 0.5, only_b + 0.5, n + 2.0
+    centre = (up - down) / total
+    half = 1.96 * np.sqrt(up + down - (up - down) ** 2 / total) / total
+    return {
+        "difference": difference,
+        "interval_95": [float(centre - half), float(centre + half)],
+        "only_first": only_a,
+        "only_second": only_b,
+    }
+
+
+def kolmogorov_smirnov(a: ArrayLike, b: ArrayLike) -> dict:
+    """Two-sample Kolmogorov-Smirnov test with the asymptotic p-value.
+
+    With ties, of which costs have many, the p-value is too large rather than too small.
+
+    Args:
+      a: Sample, shape (n,).
+      b: Sample, shape (m,).
+    """
+    x, y = np.asarray(a, float), np.asarray(b, float)
+    distance = float(scipy.stats.ks_2samp(x, y, method="asymp").statistic)
+    # The limiting law: SciPy's own p-value is that of an exact test of n m / (n + m) values.
+    scaled = distance * np.sqrt(x.size * y.size / (x.size + y.size))
+    return {"distance": distance, "p": float(scipy.stats.kstwobign.sf(scaled))}
+
+
+def quantile(values: np.ndarray, q: float) -> np.ndarray:
+    """Quantile over the last axis, also where numbers are infinite.
+
+    The median of an even count is the mean of two, elsewhere it is one of the numbers: NumPy's
+    "averaged_inverted_cdf", whose interpolation turns two infinite neighbours into nan.
+    """
+    rank = values.shape[-1] * q
+    first, second = (max(int(np.ceil(rank)) - 1, 0), min(int(rank), values.shape[-1] - 1))
+    ordered = np.sort(values, axis=-1)
+    return (ordered[..., first] + ordered[..., second]) / 2
+
+
+def bootstrap(
+    statistic: Callable[[np.ndarray], np.ndarray],
+    count: int,
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Interval:
+    """Percentile bootstrap; infinite values take part, undefined ones are left out.
+
+    SciPy's interpolates between resamples, which makes two infinite neighbours not a number.
+
+    Args:
+      statistic: From indices of what is resampled, shape (..., count), to values, shape (...):
+        whatever it reads at these indices is resampled together, which keeps the pairing.
+      count: Number of runs or particles.
+      resamples: Number of resamples.
+      seed: Seed of the resampling.
+    """
+    rows = np.random.default_rng(seed).integers(0, count, (resamples, count))
+    drawn = np.asarray(statistic(rows), float)
+    drawn = drawn[~np.isnan(drawn)]
+    tail = (1 - _CONFIDENCE) / 2
+    low, high = (float(quantile(drawn, q)) if drawn.size else np.nan for q in (tail, 1 - tail))
+    return Interval(float(np.squeeze(statistic(np.arange(count)))), low, high)
+
+
+def median(values: np.ndarray) -> Interval:
+    """Median over runs with its bootstrap interval; values have shape (run,)."""
+    return bootstrap(lambda i: quantile(values[i], 0.5), len(values))
+
+
+def ratio_of_medians(a: np.ndarray, b: np.ndarray) -> Interval:
+    """Median of a over that of b, of independent runs, with its bootstrap interval."""
+    draws = np.random.default_rng(0)
+    drawn = [quantile(v[draws.integers(0, v.size, (RESAMPLES, v.size))], 0.5) for v in (a, b)]
+    with np.errstate(invalid="ignore"):
+        ratios = np.nan_to_num(drawn[0] / drawn[1], nan=np.inf, posinf=np.inf)
+        value = float(quantile(a, 0.5) / quantile(b, 0.5))
+    low, high = (float(quantile(ratios, q)) for q in (0.025, 0.975))
+    return Interval(value, low, high)
+
+
+def mcnemar(a: np.ndarray, b: np.ndarray) -> float:
+    """Exact two-sided McNemar test of paired successes, shape (run,): the p-value."""
+    only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
+    if only_a + only_b == 0:
+        return 1.0
+    return float(scipy.stats.binomtest(only_a, only_a + only_b).pvalue)
+
+
+def wilcoxon(a: np.ndarray, b: np.ndarray, episodes: int) -> float:
+    """Two-sided signed rank test of paired episodes to convergence: the p-value.
+
+    Args:
+      a: Episodes, shape (run,); infinite where a run did not converge.
+      b: Episodes of the other strategy.
+      episodes: Episodes of a run; a run that did not converge counts as one more.
+    """
+    a, b = (np.minimum(v, episodes + 1) for v in (a, b))
+    if (a == b).all():
+        return 1.0
+    return float(scipy.stats.wilcoxon(a, b, method="approx", zero_method="pratt").pvalue)
+
+
+def trend(values: np.ndarray) -> float:
+    """Page's test that values grow along the strategies: the one-sided p-value.
+
+    Args:
+      values: Finite numbers, shape (strategy, run); runs are the paired blocks.
+    """
+    if (values == values[:1]).all():
+        return 1.0
+    return float(scipy.stats.page_trend_test(values.T, method="asymptotic").pvalue)

@@ -1,0 +1,138 @@
+"""Imports point one way: nothing imports what comes after it, and no modules import in a circle."""
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# What stands in a line may import lines before it, and its own folder.
+LAYERS = """
+types files provenance compiler optimize
+scene
+model control verdict
+engines cost
+start
+rollout
+programs
+codesign fit export
+report
+runs
+commands
+cli
+"""
+ORDER = {name: level for level, line in enumerate(LAYERS.split("\n")) for name in line.split()}
+STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "winners"}
+# Studies of results: they take up what these left.
+BUILD_ON = {"winners": {"experiments"}, "calibration": {"experiments"}}
+
+
+def modules(root=ROOT):
+    """Files by the dotted names of their modules."""
+    found = {}
+    for top in ("codesign_jax", "scripts"):
+        for path in sorted((root / top).rglob("*.py")):
+            parts = path.relative_to(root).with_suffix("").parts
+            found[".".join(parts).removesuffix(".__init__")] = path
+    return found
+
+
+def imports(tree, names, *, inside=True):
+    """Modules that a syntax tree imports; what only the type checker sees is left out."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names if a.name in names)
+        elif isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                found = full if full in names else node.module
+                if found in names:
+                    yield found
+        elif inside or not isinstance(node, ast.FunctionDef):
+            yield from imports(node, names, inside=inside)
+
+
+def graph(*, inside=True):
+    """Modules that each module imports; `inside`: also those that functions import when called."""
+    names = modules()
+    return {
+        name: set(imports(ast.parse(path.read_text(encoding="utf-8")), names, inside=inside))
+        for name, path in names.items()
+    }
+
+
+def wrong(name, other):
+    """What forbids an import, or None."""
+    mine, theirs = name.split("."), other.split(".")
+    if theirs[0] == "scripts" and mine[0] != "scripts":
+        return "the package does not know the studies"
+    if mine[0] == "scripts":
+        if theirs[0] == "scripts" and theirs[1:2] and mine[1] != theirs[1] != "shared":
+            known = BUILD_ON.get(mine[1], set())
+            if mine[1] == "shared" or theirs[1] in STUDIES - known:
+                return "studies share through scripts.shared"
+        return None
+    if len(mine) == 1 or len(theirs) == 1 or mine[1] == theirs[1]:
+        return None
+    if not ORDER[theirs[1]] < ORDER[mine[1]]:
+        return f"{theirs[1]} comes after {mine[1]}, or beside it"
+    return None
+
+
+def test_every_part_of_the_package_has_its_layer():
+    parts = {name.split(".")[1] for name in modules() if name.startswith("codesign_jax.")}
+    assert parts == set(ORDER)
+
+
+def test_imports_point_one_way():
+    problems = [
+        f"{name} imports {other}: {problem}"
+        for name, others in graph().items()
+        for other in sorted(others)
+        if (problem := wrong(name, other))
+    ]
+    assert not problems, "\n".join(problems)
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "forbidden"),
+    [
+        ("codesign_jax.rollout", "codesign_jax.codesign", True),
+        ("codesign_jax.codesign", "codesign_jax.rollout", False),
+        ("codesign_jax.optimize.schedule", "codesign_jax.scene.hand", True),
+        ("codesign_jax.compiler.cpu", "codesign_jax.scene", True),
+        ("codesign_jax.runs.loop", "scripts.shared.record", True),
+        ("scripts.shared.record", "scripts.experiments.plan", True),
+        ("scripts.accuracy.tables", "scripts.benchmark.report", True),
+        ("scripts.winners.variants", "scripts.experiments.worlds", False),
+    ],
+)
+def test_an_import_against_the_arrows_would_be_found(name, other, forbidden):
+    assert bool(wrong(name, other)) == forbidden
+
+
+def test_no_modules_import_in_a_circle():
+    """A folder's `__init__` is not what its modules import: it only lists them."""
+    names = modules()
+    lists = {n for n, path in names.items() if path.name == "__init__.py"}
+    links = {
+        name: {other for other in others if other not in lists and other != name}
+        for name, others in graph(inside=False).items()
+        if name not in lists
+    }
+    try:
+        tuple(TopologicalSorter(links).static_order())
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_what_imports_are_seen_in_a_file():
+    text = "import a.b\nfrom a import b, c\nif TYPE_CHECKING:\n    from a import d\n"
+    text += "def f():\n    from a import d\n"
+    names = {"a", "a.b", "a.d"}
+    assert list(imports(ast.parse(text), names)) == ["a.b", "a.b", "a", "a.d"]
+    assert list(imports(ast.parse(text), names, inside=False)) == ["a.b", "a.b", "a"]

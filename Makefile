@@ -9,12 +9,13 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
-.PHONY: demo test test-gpu test-slow stability notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo test test-browser test-gpu test-slow stability notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
+	@echo "make test-browser  the report in a headless Chromium"
 	@echo "make stability   the hard cases and their margins, docs/stability.md"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
@@ -27,6 +28,10 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=10
+
+# What needs a browser: the report and its 3D replay in a headless Chromium.
+test-browser: $(STAMP)
+	$(BIN)/python -m pytest -q -m browser -rs
 
 # Everything that needs a GPU; GPU=docs/data/gpu_suite_h200.json keeps what it found.
 GPU ?= runs/gpu_suite.json
@@ -75,7 +80,7 @@ $(STAMP): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found: apt-get install python3 python3-venv" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
 		{ echo "No venv module: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[viz,notebooks,test,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[notebooks,report,test,dev]'
 	@touch $@
 
 clean:

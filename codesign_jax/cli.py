@@ -184,6 +184,30 @@ class Export:
 
 
 @dataclasses.dataclass
+class Report:
+    """Write the report of a run: one HTML file, with the best grasp in 3D, that works offline.
+
+    It has the chosen design and its success, the evolution of cost and parameters, the landscape
+    (where `codesign landscape --run` was there before), failures by cause, and provenance.
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run folder."""
+    out: File = None
+    """The file; default: report.html in the run folder."""
+    engine: Text = None
+    """Engine that simulates the best grasp again; default: the run's."""
+    no_replay: Flag = False
+    """Leave the grasp in 3D out: nothing is simulated."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import report
+
+        return report.main(self)
+
+
+@dataclasses.dataclass
 class Scenes:
     """List scenes and their effects: on, off, or unsupported by an engine."""
 
@@ -227,7 +251,7 @@ def main(arguments: list[str] | None = None) -> int:
       arguments: Arguments without the program's name; default: those of the process.
     """
     command = tyro.cli(
-        Optimize | Evaluate | Export | Scenes | Replay,  # type: ignore[arg-type]
+        Optimize | Evaluate | Report | Export | Scenes | Replay,  # type: ignore[arg-type]
         args=arguments,
         prog="codesign",
         description="Co-design of soft hand morphology and control.",

@@ -27,12 +27,15 @@ def main() -> int:
     for path in pictures:
         print()
         cli.main(["evaluate", "--run", str(FOLDER), "--trials", "3", "--render", str(path)])
+    print()
+    cli.main(["report", str(FOLDER)])
     with (FOLDER / "tests.csv").open(newline="") as file:
         successes = sum(int(row["success"]) for row in csv.DictReader(file))
     print(f"\n{successes} final particles passed the test (mean cost below 0.01)")
     print("the run, cost by cost:  ", FOLDER / "episodes.csv")
     print("the cost's evolution:   ", FOLDER / "figures" / "cost_evolution.png")
     print("the best grasp, moving: ", pictures[1])
+    print("all of it, for a browser:", FOLDER / "report.html")
     return 0 if successes else 1
 
 

@@ -11,7 +11,7 @@ import pytest
 from toy import TINY
 
 from codesign_jax import cli
-from codesign_jax.commands import evaluate, export, replay
+from codesign_jax.commands import evaluate, export, replay, report
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -39,7 +39,7 @@ CODESIGN = [" ".join(words) for words in examples("codesign")]
 
 def test_the_pages_have_examples():
     kinds = {example.split()[0] for example in CODESIGN}
-    assert kinds == {"optimize", "evaluate", "export", "scenes", "replay"} and len(CODESIGN) > 10
+    assert kinds == {"optimize", "evaluate", "report", "export", "scenes", "replay"}
 
 
 @pytest.fixture(scope="module")
@@ -74,21 +74,23 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
             monkeypatch.setattr(evaluate, name, lambda *rest: reached.append(rest))
     elif arguments[0] == "export":
         monkeypatch.setattr(export, "_write", lambda *rest: reached.append(rest))
+    elif arguments[0] == "report":
+        monkeypatch.setattr(report, "_best_grasp", lambda *rest: reached.append(rest))
     elif arguments[0] == "replay":
         monkeypatch.setattr(replay, "main", lambda options: reached.append(options) or 0)
     assert cli.main(arguments) == 0
-    assert bool(reached) == (arguments[0] in ("evaluate", "export", "replay"))
+    assert bool(reached) == (arguments[0] in ("evaluate", "report", "export", "replay"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("example", [e for e in CODESIGN if not e.startswith("replay")])
 def test_every_command_runs_at_a_small_size(example, here):
-    size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"], "scenes": []}
+    size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
     size["export"] = ["--overwrite", "--trials", "0"]
     arguments = shlex.split(example)
     if arguments[0] == "optimize" and "switch" in example:
         size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]
-    assert cli.main([*arguments, *size[arguments[0]]]) == 0
+    assert cli.main([*arguments, *size.get(arguments[0], [])]) == 0
 
 
 def test_every_target_of_make_is_there():

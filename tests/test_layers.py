@@ -18,8 +18,8 @@ start
 rollout
 programs
 codesign fit export
-report
 runs
+report
 commands
 cli
 """

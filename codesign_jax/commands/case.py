@@ -9,7 +9,7 @@ import numpy as np
 from codesign_jax import engines, runs
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common
-from codesign_jax.cost import particle_cost
+from codesign_jax.runs import choice
 from codesign_jax.scene import Scene, keypaths
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import SceneError
@@ -85,15 +85,8 @@ def _from_run(options: Options) -> Case:
         accuracy=options.accuracy,
         overrides=keypaths.parse(chain.from_iterable(options.overrides)),
     )
-    record = runs.load_record(folder)
-    if record is None or record.done == 0:
-        raise SceneError([f"--run {folder} has no finished episode yet"])
-    if record.test is not None:
-        best = int(np.asarray(particle_cost(runs.read_run(folder)[0], record.test)).argmin())
-        design = np.asarray(record.state.particles)[best]
-    else:
-        best = int(record.history.cost[record.done - 1].argmin())
-        design = record.history.population[record.done - 1][best]
+    # By the run's own rule for failed trials, whatever --set says.
+    design = choice.choose(runs.read_run(folder)[0], choice.read_record(folder)).design
     space = design_space(scene.hand, settings.preset)
     if len(design) != space.num_parameters:
         raise SceneError(

@@ -183,6 +183,7 @@ def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:
         )
     _figures(plan, result, folder, console)
     console.print(f"results: {folder}", markup=False)
+    console.print(f"to look at: codesign report {folder}", markup=False)
 
 
 def _figures(plan: Plan, result: RunResult, folder: Path, console: Console) -> None:

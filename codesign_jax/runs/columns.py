@@ -111,6 +111,7 @@ FILES = {
     "events.log": "what happened when, with the wall time of each episode",
     "failures": "worlds that failed, at most ten an episode, for `codesign replay`",
     "figures": "pictures",
+    "report.html": "the report of `codesign report`: opens in any browser, without a network",
 }
 
 

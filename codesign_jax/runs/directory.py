@@ -76,7 +76,7 @@ def open_run(
         if fresh:
             _clear(path)
         if (path / _PROVENANCE).exists():
-            stored = _read_provenance(path)
+            stored = read_provenance(path)
             _refuse_other(path, scene, settings, stored)
             notes = _differences(stored["environment"], environment())
             stored["resumed"] = [*stored.get("resumed", []), _start(command)]
@@ -111,7 +111,7 @@ def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = 
     """
     _refuse_foreign(path)
     if (path / _PROVENANCE).exists() and not fresh:
-        _refuse_other(path, scene, settings, _read_provenance(path))
+        _refuse_other(path, scene, settings, read_provenance(path))
 
 
 def read_run(
@@ -132,14 +132,19 @@ def read_run(
     Raises:
       SceneError: If it is not a run folder.
     """
-    stored = _read_provenance(path)
+    stored = read_provenance(path)
     scene = scenes.load(
         path / "scene.toml", object_set=object_set, accuracy=accuracy, overrides=overrides
     )
     return scene, Settings(**stored["settings"])
 
 
-def _read_provenance(path: Path) -> dict[str, Any]:
+def read_provenance(path: Path) -> dict[str, Any]:
+    """Reads provenance.json of a run folder.
+
+    Raises:
+      SceneError: If it is not a run folder.
+    """
     try:
         stored = json.loads((path / _PROVENANCE).read_text(encoding="utf-8"))
         Settings(**stored["settings"])

@@ -1,0 +1,64 @@
+"""`codesign report`."""
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+
+from codesign_jax import engines, runs
+from codesign_jax.commands import common
+from codesign_jax.engines import make_engine
+from codesign_jax.runs import Settings, choice
+from codesign_jax.runs.directory import read_provenance
+from codesign_jax.runs.record import Record
+from codesign_jax.scene import Scene, schema
+from codesign_jax.scene.parameters import design_space
+from codesign_jax.scene.schema import SceneError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Report
+    from codesign_jax.report import animation
+
+
+def main(options: "Report") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      SceneError: If the folder is no run, has no finished episode, or an extra is missing.
+    """
+    common.use_compilation_cache()
+    scene, settings = runs.read_run(options.folder)
+    name = options.engine or settings.engine
+    if name not in engines.NAMES:
+        hint = schema.nearest(name, engines.NAMES)
+        raise SceneError([f"--engine {name!r} is not valid; {hint}"])
+    try:
+        from codesign_jax.report import page
+    except ImportError as error:
+        message = f"a report needs {error.name}: pip install 'codesign-jax[report]'"
+        raise SceneError([message]) from error
+    record = choice.read_record(options.folder)
+    chosen = choice.choose(scene, record)
+    provenance = read_provenance(options.folder)
+    run = page.Run(options.folder, scene, settings, record, chosen, provenance)
+    console = Console(highlight=False, soft_wrap=True)
+    shown = None if options.no_replay else _best_grasp(scene, settings, record, name, console)
+    path = page.write(run, shown, options.out or options.folder / "report.html")
+    size = path.stat().st_size / 1e6
+    console.print(f"report: {path} ({size:.1f} MB, for any browser, offline)", markup=False)
+    return 0
+
+
+def _best_grasp(
+    scene: Scene, settings: Settings, record: Record, engine: str, console: Console
+) -> "tuple[choice.Grasp, animation.Replay]":
+    """The best grasp of the chosen design, simulated again to see how it moves."""
+    from codesign_jax.report import animation
+
+    grasp = choice.find_grasp(scene, record)
+    with console.status("simulating the best grasp again"):
+        params = design_space(scene.hand, settings.preset).params(jnp.asarray(grasp.design))
+        trials = jax.tree.map(lambda v: v[None], grasp.trial)
+        [replay] = animation.replay(scene, make_engine(engine, scene), params, trials)
+    return grasp, replay

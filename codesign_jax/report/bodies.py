@@ -1,0 +1,162 @@
+"""A grasp as meshes and motions: what a viewer needs to draw it at any time.
+
+Every vertex follows two bodies by linear blend skinning; those of rigid parts follow one.  Fingers
+are hulls (`codesign_jax.model.hull`), whatever surface the scene's contacts have.
+"""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from codesign_jax import model
+from codesign_jax.model import hull
+from codesign_jax.report.animation import Replay
+from codesign_jax.scene import Scene
+
+FINGER, OBJECT, PALM = (0.36, 0.57, 0.80), (0.95, 0.58, 0.20), (0.36, 0.38, 0.43)
+_SEGMENTS = 64  # of round objects
+_MOST_FACES = 40_000
+"""Faces of an object's mesh above which a coarser one is drawn: pages are to stay small."""
+
+
+class Part(NamedTuple):
+    """A skinned mesh.
+
+    Attributes:
+      name: Name, such as "finger 0", "palm" or "object".
+      color: Red, green and blue, from 0 to 1.
+      first: Vertices in the frame of their first body [m], shape (vertex, 3).
+      second: The same in the frame of their second body, same shape.
+      body: Rows of `Motion.pose` that the vertices follow, shape (vertex, 2).
+      weight: Weight of the second body, shape (vertex,); that of the first is the rest to 1.
+      face: Vertices of the triangles, counter-clockwise from outside, shape (face, 3).
+    """
+
+    name: str
+    color: tuple[float, float, float]
+    first: np.ndarray
+    second: np.ndarray
+    body: np.ndarray
+    weight: np.ndarray
+    face: np.ndarray
+
+
+class Motion(NamedTuple):
+    """Poses of all bodies over time.
+
+    Attributes:
+      pose: Position [m] and unit quaternion (w, x, y, z) in the world, shape (time, body, 7).
+      rate: Frames of a second.
+    """
+
+    pose: np.ndarray
+    rate: float
+
+
+def parts(scene: Scene, grasp: Replay) -> list[Part]:
+    """Meshes of fingers, palm and object; bodies are numbered as in MuJoCo's model."""
+    lay, palm = model.layout(scene), scene.hand.palm
+    found = [_finger(scene, grasp, f, lay) for f in range(scene.num_fingers)]
+    import trimesh  # takes a while to import
+
+    disc = trimesh.creation.cylinder(palm.radius, palm.thickness, sections=_SEGMENTS)
+    disc.apply_translation([0, 0, palm.thickness / 2])
+    found.append(_rigid("palm", PALM, disc.vertices, disc.faces, 1))
+    vertices, faces = object_mesh(scene, int(grasp.trial.shape))
+    return [*found, _rigid("object", OBJECT, vertices * float(grasp.trial.size), faces, lay.object)]
+
+
+def motion(scene: Scene, grasp: Replay, *, rate: float = 25.0) -> Motion:
+    """Poses of all bodies of a grasp by MuJoCo's kinematics.
+
+    Args:
+      scene: The scene.
+      grasp: The grasp.
+      rate: Wanted frames of a second; the nearest that whole time steps allow is taken.
+    """
+    h = scene.discretization.timestep
+    every = max(1, round(1 / (rate * h)))
+    compiled = model.compile_model(scene, grasp.params, grasp.trial)
+    data = mujoco.MjData(compiled)
+    poses = []
+    for q in grasp.qpos[::every]:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(compiled, data)
+        poses.append(np.concatenate([data.xpos, data.xquat], 1))
+    return Motion(np.array(poses, np.float32), 1 / (every * h))
+
+
+def object_mesh(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Surface of an object of the set, without noise, in its body's frame.
+
+    Args:
+      scene: The scene.
+      index: Index of the object.
+
+    Returns:
+      Vertices [m], shape (vertex, 3), and triangles, shape (face, 3).
+    """
+    import trimesh
+
+    shape = scene.objects.object[index]
+    if shape.mesh:
+        return _coarse(shape.mesh.vertices, shape.mesh.faces)
+    size = shape.half_sizes
+    if shape.type == "sphere":
+        body = trimesh.creation.icosphere(4, size[0])
+    elif shape.type == "cylinder":
+        body = trimesh.creation.cylinder(size[0], 2 * size[1], sections=_SEGMENTS)
+    else:
+        body = trimesh.creation.box(2 * np.asarray(size))
+    return np.asarray(body.vertices), np.asarray(body.faces)
+
+
+def vertices(part: Part, pose: np.ndarray) -> np.ndarray:
+    """Vertices of a part in the world [m], shape (vertex, 3).
+
+    Args:
+      part: The part.
+      pose: Poses of the bodies, shape (body, 7).
+    """
+    turn = np.zeros((len(pose), 9))
+    for body, quat in enumerate(pose[:, 3:]):
+        mujoco.mju_quat2Mat(turn[body], quat.astype(float))
+    turn, place = turn.reshape(-1, 3, 3), pose[:, :3]
+    moved = [
+        place[b] + np.einsum("vij,vj->vi", turn[b], local)
+        for b, local in zip(part.body.T, (part.first, part.second), strict=True)
+    ]
+    return (1 - part.weight[:, None]) * moved[0] + part.weight[:, None] * moved[1]
+
+
+def _finger(scene: Scene, grasp: Replay, f: int, lay: model.Layout) -> Part:
+    length, height = float(grasp.params.length[f]), float(grasp.params.height[f])
+    mesh, straight = hull.hull(scene), hull.rest(scene, length, height)
+    along = np.zeros((2, *straight.shape))
+    along[..., 0] = hull.link_origins(scene, length)[mesh.link.T]
+    bodies = np.array([lay.stubs[f], *lay.bodies[f]])
+    first, second = straight - along
+    return Part(
+        f"finger {f}", FINGER, first, second, bodies[mesh.link], mesh.weight[:, 1], mesh.face
+    )
+
+
+def _rigid(name: str, color, vertices: np.ndarray, faces: np.ndarray, body: int) -> Part:
+    rows = np.full((len(vertices), 2), body)
+    return Part(name, color, vertices, vertices, rows, np.zeros(len(vertices)), faces)
+
+
+def _coarse(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Merges the vertices in each cell of a grid, as fine as the number of faces allows."""
+    cells = 200
+    while len(faces) > _MOST_FACES:
+        cell = np.ptp(vertices, axis=0).max() / cells
+        _, index, merged = np.unique(
+            np.floor(vertices / cell), axis=0, return_index=True, return_inverse=True
+        )
+        faces = merged.ravel()[faces]
+        sides = np.roll(faces, 1, axis=1)
+        vertices, faces = vertices[index], faces[(faces != sides).all(1)]
+        cells = cells * 3 // 4
+    return vertices, faces

@@ -1,0 +1,70 @@
+"""The mean cost of designs over a grid of two parameters: its files and its figure."""
+
+import csv
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from codesign_jax import files
+from codesign_jax.scene.schema import SceneError
+
+FILE = "landscape.npz"
+TABLE = "landscape.csv"
+
+
+class Landscape(NamedTuple):
+    """The mean cost over a grid of two parameters.
+
+    Attributes:
+      names: Names of the two parameters, shape (2,).
+      units: Their units, shape (2,).
+      first: Values of the first one in its unit, shape (n,).
+      second: Values of the second one, shape (m,).
+      cost: Mean cost by the scene's rule for failed trials, shape (n, m).
+      kept: Trials that kept the object (cost below the limit of success), shape (n, m).
+      counted: Trials that did not fail, shape (n, m).
+      trials: Trials of a point, shape ().
+    """
+
+    names: np.ndarray
+    units: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    cost: np.ndarray
+    kept: np.ndarray
+    counted: np.ndarray
+    trials: np.ndarray
+
+
+def save(found: Landscape, folder: Path) -> list[Path]:
+    """Writes a landscape as arrays and as a table of its points; returns the files."""
+    npz, table = folder / FILE, folder / TABLE
+    with files.atomically(npz) as part, part.open("wb") as file:
+        np.savez(file, **found._asdict())
+    axes = [
+        f"{n}_{u}".replace("[", "_").replace("]", "")
+        for n, u in zip(found.names, found.units, strict=True)
+    ]
+    with files.atomically(table) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*axes, "mean_cost", "kept_trials", "counted_trials", "trials"])
+        for i, j in np.ndindex(*found.cost.shape):
+            point = [f"{v:.9g}" for v in (found.first[i], found.second[j], found.cost[i, j])]
+            counts = [found.kept[i, j], found.counted[i, j], found.trials]
+            writer.writerow(point + [int(v) for v in counts])
+    return [npz, table]
+
+
+def load(path: Path) -> Landscape:
+    """Reads the arrays of a landscape.
+
+    Raises:
+      SceneError: If the file holds none.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return Landscape(**{name: stored[name] for name in Landscape._fields})
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise SceneError([f"{path} is not a landscape: {error}"]) from error

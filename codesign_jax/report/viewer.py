@@ -1,0 +1,136 @@
+"""A grasp in 3D that plays in a browser, offline: one HTML file, or a piece of a page.
+
+The viewer is `web/replay.js`: fingers deform with their links, the camera turns while it plays.
+"""
+
+import base64
+import html
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign_jax import files
+from codesign_jax.report import bodies
+from codesign_jax.report.animation import Replay
+from codesign_jax.scene import Scene
+
+_WEB = Path(__file__).parent / "web"
+_TABLE = 0.6  # half side of the table that is drawn [m]
+
+_FRAGMENT = """
+<div class="replay" id="{name}">
+<canvas class="view"></canvas><p class="message"></p>
+<div class="controls">
+<button class="play" type="button">Play</button>
+<div class="track"><input class="time" type="range" min="0" step="0.01" aria-label="time [s]">
+<div class="phases"></div></div>
+<select class="speed" aria-label="speed"><option value="1">1 x</option>
+<option value="0.5">0.5 x</option><option value="0.25">0.25 x</option>
+<option value="0.1">0.1 x</option>
+</select>
+<button class="home" type="button">Reset view</button>
+</div>
+<div class="label"></div>
+</div>
+<p class="note">Drag to turn, scroll to zoom, shift-drag to move; click a phase to go there.
+A square of the table is 5 cm.</p>
+<script>startReplay(document.getElementById("{name}"), {data});</script>
+"""
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>{title}</title><style>
+{style}</style><script>
+{script}</script></head><body>
+{body}
+</body></html>
+"""
+
+
+def fragment(scene: Scene, grasp: Replay, name: str = "replay") -> str:
+    """HTML of a grasp, for a page that `page` makes.
+
+    Args:
+      scene: The scene.
+      grasp: The grasp.
+      name: Identifier of its element in the page.
+    """
+    # "<" appears in no JSON but inside strings, where its escape means the same.
+    data = json.dumps(_data(scene, grasp)).replace("<", "\\u003c")
+    return _FRAGMENT.format(name=html.escape(name), data=data)
+
+
+def page(title: str, body: str, *scripts: str) -> str:
+    """A whole page.
+
+    Args:
+      title: Its title, plain text.
+      body: HTML of its body.
+      scripts: JavaScript that the body calls, beside the viewer.
+    """
+    script = "\n".join([*scripts, (_WEB / "replay.js").read_text(encoding="utf-8")])
+    style = (_WEB / "style.css").read_text(encoding="utf-8")
+    return _PAGE.format(title=html.escape(title), style=style, script=script, body=body)
+
+
+def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str]) -> Path:
+    """Writes a grasp alone as an HTML file.
+
+    Args:
+      scene: The scene.
+      grasp: The grasp.
+      path: The file; its folder is made.
+      title: Title of the page, plain text.
+      text: Lines above the picture, plain text.
+
+    Returns:
+      The path.
+    """
+    lines = "".join(f"<p>{html.escape(line)}</p>\n" for line in text)
+    body = f"<h1>{html.escape(title)}</h1>\n{lines}{fragment(scene, grasp)}"
+    with files.atomically(path) as part:
+        part.write_text(page(title, body), encoding="utf-8")
+    return path
+
+
+def _data(scene: Scene, grasp: Replay) -> dict[str, Any]:
+    """What web/replay.js reads."""
+    motion, parts = bodies.motion(scene, grasp), bodies.parts(scene, grasp)
+    frames, count = motion.pose.shape[:2]
+    return {
+        "parts": [_part(part) for part in parts],
+        "poses": _encode(motion.pose, np.float32),
+        "frames": frames,
+        "bodies": count,
+        "rate": motion.rate,
+        "object": int(parts[-1].body[0, 0]),
+        "phases": phases(scene),
+        "still": scene.phases.lift,
+        "table": _TABLE,
+        "camera": {"target": [0.0, 0.0, 0.14], "distance": 0.54, "azimuth": -0.9, "elevation": 0.3},
+    }
+
+
+def phases(scene: Scene) -> list[tuple[str, float]]:
+    """Names and end times [s] of the phases that a scene has, in order."""
+    p, e = scene.phases, scene.effects
+    found = [("approach", p.approach), ("inflate", p.inflate), ("lift", p.lift)]
+    found += [("disturb", p.disturb)] if e.disturb else []
+    return found + ([("release", p.ungrasp)] if e.ungrasp else [])
+
+
+def _part(part: bodies.Part) -> dict[str, Any]:
+    kinds = {"body": np.uint16, "face": np.uint32}
+    arrays = {
+        name: _encode(getattr(part, name), kinds.get(name, np.float32))
+        for name in ("first", "second", "body", "weight", "face")
+    }
+    return {"name": part.name, "color": part.color} | arrays
+
+
+def _encode(array: np.ndarray, kind: type) -> str:
+    """Base64 of an array's bytes, little-endian as in every browser."""
+    little = np.dtype(kind).newbyteorder("<")
+    return base64.b64encode(np.ascontiguousarray(array, little).tobytes()).decode()

@@ -1,0 +1,274 @@
+// A grasp in 3D on a WebGL 2 canvas: skinned meshes over time, orbit camera, play, pause, slider.
+//
+// Why not a library: plotly redraws a figure of such meshes in 0.2 s and ignores the mouse while it
+// plays, and three.js is in no Python package of its own.
+//
+// startReplay(root, data) fills an element.  data has
+//   parts   name, color [r, g, b], and base64 arrays: first, second (float32, 3 a vertex: places in the
+//           frames of two bodies), body (uint16, 2 a vertex), weight (float32, of the second body) and
+//           face (uint32, 3 a triangle).  A vertex is (1 - w) T_first(first) + w T_second(second).
+//   poses   base64 float32 (frame, body, 7): position [m] and unit quaternion (w, x, y, z)
+//   bodies, frames, rate [frames/s], phases [[name, end time s], ...], camera, table, object
+"use strict";
+
+function startReplay(root, data) {
+  const decode = (text, type) => new type(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
+  const poses = decode(data.poses, Float32Array);
+  const end = (data.frames - 1) / data.rate;
+  const find = (name) => root.querySelector(`.${name}`);
+  const canvas = find("view"), slider = find("time"), button = find("play"), label = find("label");
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true,
+    preserveDrawingBuffer: true });
+  if (!gl) {
+    find("message").textContent =
+      "No 3D here: this browser offers no WebGL 2. Its settings may have hardware acceleration switched off.";
+    return null;
+  }
+
+  // ---- meshes: triangles with vertices of their own, so that faces are flat
+  const parts = data.parts.map((p) => {
+    const face = decode(p.face, Uint32Array), buffer = gl.createBuffer();
+    const first = decode(p.first, Float32Array), second = decode(p.second, Float32Array);
+    const vertices = new Float32Array(first.length), corners = new Float32Array(3 * face.length);
+    return { ...p, face, first, second, buffer, vertices, corners,
+      body: decode(p.body, Uint16Array), weight: decode(p.weight, Float32Array) };
+  });
+  const now = new Float32Array(7 * data.bodies);  // poses at the time shown
+
+  // Poses between two frames: positions and (normalised) quaternions are interpolated linearly.
+  function poseAt(time) {
+    const at = Math.min(Math.max(time * data.rate, 0), data.frames - 1);
+    const k = Math.min(Math.floor(at), Math.max(data.frames - 2, 0)), w = at - k;
+    const stride = 7 * data.bodies, next = Math.min(k + 1, data.frames - 1);
+    for (let b = 0; b < data.bodies; b++) {
+      const p = k * stride + 7 * b, q = next * stride + 7 * b, o = 7 * b;
+      let sign = 0, norm = 0;
+      for (let i = 3; i < 7; i++) sign += poses[p + i] * poses[q + i];
+      sign = sign < 0 ? -1 : 1;
+      for (let i = 0; i < 7; i++) now[o + i] = (1 - w) * poses[p + i] + w * (i < 3 ? 1 : sign) * poses[q + i];
+      for (let i = 3; i < 7; i++) norm += now[o + i] ** 2;
+      for (let i = 3; i < 7; i++) now[o + i] /= Math.sqrt(norm);
+    }
+  }
+
+  // Adds weight * T_body(local[3 v ...]) to out[3 v ...].
+  function add(out, v, local, body, weight) {
+    const o = 7 * body, x = local[3 * v], y = local[3 * v + 1], z = local[3 * v + 2];
+    const qw = now[o + 3], qx = now[o + 4], qy = now[o + 5], qz = now[o + 6];
+    const tx = 2 * (qy * z - qz * y), ty = 2 * (qz * x - qx * z), tz = 2 * (qx * y - qy * x);
+    out[3 * v] += weight * (now[o] + x + qw * tx + qy * tz - qz * ty);
+    out[3 * v + 1] += weight * (now[o + 1] + y + qw * ty + qz * tx - qx * tz);
+    out[3 * v + 2] += weight * (now[o + 2] + z + qw * tz + qx * ty - qy * tx);
+  }
+
+  function skin(time) {
+    poseAt(time);
+    for (const p of parts) {
+      p.vertices.fill(0);
+      for (let v = 0; v < p.weight.length; v++) {
+        add(p.vertices, v, p.first, p.body[2 * v], 1 - p.weight[v]);
+        if (p.weight[v] > 0) add(p.vertices, v, p.second, p.body[2 * v + 1], p.weight[v]);
+      }
+      for (let c = 0; c < p.face.length; c++)
+        for (let i = 0; i < 3; i++) p.corners[3 * c + i] = p.vertices[3 * p.face[c] + i];
+      gl.bindBuffer(gl.ARRAY_BUFFER, p.buffer);
+      gl.bufferData(gl.ARRAY_BUFFER, p.corners, gl.DYNAMIC_DRAW);
+    }
+  }
+
+  // ---- shaders: flat light from above; shadows are the meshes flattened along the light
+  const vertexShader = `#version 300 es
+    uniform mat4 camera; uniform vec3 sun; uniform float flatten; in vec3 position; out vec3 place;
+    void main() {
+      vec3 p = position - flatten * sun * (max(position.z, 0.0) / sun.z);
+      if (flatten > 0.0) p.z = 0.0;
+      place = p;
+      gl_Position = camera * vec4(p, 1.0);
+    }`;
+  const fragmentShader = `#version 300 es
+    precision highp float;
+    uniform vec4 color; uniform vec3 sun, eye; uniform int kind; in vec3 place; out vec4 result;
+    void main() {
+      if (kind == 1) { result = color; return; }                      // shadow
+      if (kind == 2) {                                                // table: a square is 5 cm
+        vec2 cell = floor(place.xy / 0.05);
+        float dark = mod(cell.x + cell.y, 2.0);
+        float fade = smoothstep(0.25, ${data.table.toFixed(3)}, length(place.xy));
+        result = vec4(mix(mix(color.rgb, color.rgb * 0.93, dark), vec3(0.965, 0.972, 0.98), fade), 1.0);
+        return;
+      }
+      vec3 n = normalize(cross(dFdx(place), dFdy(place)));
+      if (dot(n, eye - place) < 0.0) n = -n;
+      float light = 0.60 + 0.10 * n.z + 0.42 * max(dot(n, normalize(sun)), 0.0);
+      result = vec4(color.rgb * light, 1.0);
+    }`;
+  const program = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertexShader], [gl.FRAGMENT_SHADER, fragmentShader]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(program, shader);
+  }
+  gl.bindAttribLocation(program, 0, "position");
+  gl.linkProgram(program);
+  const uniform = Object.fromEntries(["camera", "sun", "eye", "color", "kind", "flatten"].map(
+    (name) => [name, gl.getUniformLocation(program, name)]));
+  const table = gl.createBuffer(), s = data.table;
+  gl.bindBuffer(gl.ARRAY_BUFFER, table);
+  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-s, -s, 0, s, -s, 0, s, s, 0, -s, -s, 0, s, s, 0, -s, s, 0]),
+    gl.STATIC_DRAW);
+
+  // ---- camera: orbits about a point; column-major matrices as WebGL has them
+  const home = () => ({ ...data.camera, target: [...data.camera.target] });
+  let camera = home();
+  const normal = (v) => { const n = Math.hypot(...v); return v.map((x) => x / n); };
+  const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  function axes() {
+    const [a, e] = [camera.azimuth, camera.elevation];
+    const back = [Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)];
+    const right = normal(cross([0, 0, 1], back));
+    return { back, right, up: cross(back, right), eye: camera.target.map((x, i) => x + camera.distance * back[i]) };
+  }
+  function matrix() {
+    const { back, right, up, eye } = axes(), near = 0.02, far = 10;
+    const f = 1 / Math.tan(0.36), g = f * canvas.height / canvas.width, depth = 1 / (near - far);
+    const row = (v, scale) => [...v.map((x) => scale * x), -scale * dot(v, eye)];
+    const [x, y, z] = [row(right, g), row(up, f), row(back, 1)];
+    const clip = z.map((v, i) => (near + far) * depth * v + (i === 3 ? 2 * near * far * depth : 0));
+    return { eye, flat: [0, 1, 2, 3].flatMap((i) => [x[i], y[i], clip[i], -z[i]]) };
+  }
+
+  // ---- drawing
+  const sun = [0.45, -0.25, 1.0];
+  function triangles(buffer, count, kind, color, flatten) {
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
+    gl.uniform1i(uniform.kind, kind);
+    gl.uniform4fv(uniform.color, color);
+    gl.uniform1f(uniform.flatten, flatten);
+    gl.drawArrays(gl.TRIANGLES, 0, count);
+  }
+  function draw() {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    canvas.width = Math.max(1, Math.round(ratio * canvas.clientWidth));
+    canvas.height = Math.max(1, Math.round(ratio * canvas.clientHeight));
+    const { flat, eye } = matrix();
+    gl.viewport(0, 0, canvas.width, canvas.height);
+    gl.clearColor(0.965, 0.972, 0.98, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
+    gl.useProgram(program);
+    gl.enableVertexAttribArray(0);
+    gl.uniformMatrix4fv(uniform.camera, false, flat);
+    gl.uniform3fv(uniform.sun, sun);
+    gl.uniform3fv(uniform.eye, eye);
+    gl.enable(gl.DEPTH_TEST);
+    triangles(table, 6, 2, [0.9, 0.88, 0.84, 1], 0);
+    // Shadows darken each pixel of the table once: the stencil counts.
+    gl.disable(gl.DEPTH_TEST);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.enable(gl.STENCIL_TEST);
+    gl.stencilFunc(gl.EQUAL, 0, 0xff);
+    gl.stencilOp(gl.KEEP, gl.KEEP, gl.INCR);
+    for (const p of parts) triangles(p.buffer, p.face.length, 1, [0.1, 0.12, 0.15, 0.25], 1);
+    gl.disable(gl.STENCIL_TEST);
+    gl.disable(gl.BLEND);
+    gl.enable(gl.DEPTH_TEST);
+    for (const p of parts) triangles(p.buffer, p.face.length, 0, [...p.color, 1], 0);
+  }
+
+  // ---- time
+  let time = data.still, playing = false, fresh = true, before = 0, queued = false;
+  const phase = (t) => (data.phases.find(([, until]) => t < until) || data.phases[data.phases.length - 1])[0];
+  function show() {
+    skin(time);
+    draw();
+    slider.value = time;
+    const height = 1000 * now[7 * data.object + 2];
+    label.textContent = `${time.toFixed(2)} s, ${phase(time)}; object's centre ${height.toFixed(0)} mm above the table`;
+  }
+  function step(stamp) {
+    queued = false;
+    if (playing) {
+      time += Math.min(stamp - before, 100) / 1000 * Number(find("speed").value);
+      before = stamp;
+      if (time >= end) { time = end; pause(); }
+      if (playing) request();
+    }
+    show();
+  }
+  function request() {
+    if (!queued) { queued = true; requestAnimationFrame(step); }
+  }
+  function play() {
+    if (fresh || time >= end) time = 0;
+    fresh = false;
+    playing = true;
+    before = performance.now();
+    button.textContent = "Pause";
+    request();
+  }
+  function pause() {
+    playing = false;
+    button.textContent = "Play";
+  }
+  function seek(t) {
+    fresh = false;
+    time = Math.min(Math.max(Number(t), 0), end);
+    request();
+  }
+
+  // ---- controls
+  slider.max = end;
+  button.addEventListener("click", () => (playing ? pause() : play()));
+  slider.addEventListener("input", () => { pause(); seek(slider.value); });
+  find("home").addEventListener("click", () => { camera = home(); request(); });
+  let start = 0;
+  for (const [name, until] of data.phases) {
+    const mark = document.createElement("button"), from = start;
+    mark.textContent = name;
+    mark.style.flex = `${until - from} 0 0`;
+    mark.addEventListener("click", () => { pause(); seek(from); });
+    find("phases").append(mark);
+    start = until;
+  }
+  const pointers = new Map();
+  canvas.addEventListener("pointerdown", (e) => {
+    pointers.set(e.pointerId, [e.clientX, e.clientY]);
+    canvas.setPointerCapture(e.pointerId);
+  });
+  for (const name of ["pointerup", "pointercancel"])
+    canvas.addEventListener(name, (e) => pointers.delete(e.pointerId));
+  const zoom = (factor) => { camera.distance = Math.min(Math.max(camera.distance * factor, 0.1), 3); };
+  canvas.addEventListener("pointermove", (e) => {
+    const last = pointers.get(e.pointerId);
+    if (!last) return;
+    const [dx, dy] = [e.clientX - last[0], e.clientY - last[1]];
+    if (pointers.size === 2) {  // two fingers on a touch screen
+      const other = [...pointers].find(([id]) => id !== e.pointerId)[1];
+      zoom(Math.hypot(last[0] - other[0], last[1] - other[1]) /
+        Math.max(Math.hypot(e.clientX - other[0], e.clientY - other[1]), 1));
+    } else if (e.shiftKey || e.buttons & 2) {
+      const { right, up } = axes(), scale = camera.distance / canvas.clientHeight;
+      camera.target = camera.target.map((x, i) => x - scale * dx * right[i] + scale * dy * up[i]);
+    } else {
+      camera.azimuth -= 0.01 * dx;
+      camera.elevation = Math.min(Math.max(camera.elevation + 0.01 * dy, 0.03), 1.55);
+    }
+    pointers.set(e.pointerId, [e.clientX, e.clientY]);
+    request();
+  });
+  canvas.addEventListener("contextmenu", (e) => e.preventDefault());
+  canvas.addEventListener("wheel", (e) => {
+    e.preventDefault();
+    zoom(Math.exp(0.001 * e.deltaY));
+    request();
+  }, { passive: false });
+  new ResizeObserver(request).observe(canvas);
+  show();
+  root.replay = { play, pause, seek, end, time: () => time, playing: () => playing, camera: () => camera,
+    vertices: (name) => Array.from(parts.find((p) => p.name === name).vertices) };
+  return root.replay;
+}

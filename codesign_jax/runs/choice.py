@@ -1,0 +1,137 @@
+"""The design that a run found: its final particle that tested best, and one grasp of it."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from codesign_jax.codesign import episode_trials
+from codesign_jax.cost import particle_cost
+from codesign_jax.runs.loop import load_record
+from codesign_jax.runs.record import Record
+from codesign_jax.scene import Scene
+from codesign_jax.scene.schema import SceneError, range_problem
+from codesign_jax.types import Outcome, Trial, failed
+
+
+class Grasp(NamedTuple):
+    """One trial of one particle of a run.
+
+    Attributes:
+      design: The particle as simulated [SI units], shape (parameter,).
+      trial: Object and noise, no leading axis.
+      outcome: How it ended in the run, numbers.
+      place: Number of the episode, from 1, and indices of particle and trial, as in trials.csv.
+    """
+
+    design: np.ndarray
+    trial: Trial
+    outcome: Outcome
+    place: tuple[int, int, int]
+
+
+class Chosen(NamedTuple):
+    """The design that a run found.
+
+    Attributes:
+      design: The design [SI units], shape (parameter,).
+      particle: Its index among the final particles, or in the last episode without a test.
+      cost: Its mean cost by the scene's rule for failed trials.
+      trials: Outcomes of its trials, every array of shape (trial,).
+      tested: Whether they are those of the final test, or the last episode's.
+      row: Its index in the last episode's population.
+    """
+
+    design: np.ndarray
+    particle: int
+    cost: float
+    trials: Outcome
+    tested: bool
+    row: int
+
+
+def read_record(folder: Path) -> Record:
+    """Reads a run's newest good checkpoint.
+
+    Raises:
+      SceneError: If it has no finished episode.
+    """
+    record = load_record(folder)
+    if record is None or record.done == 0:
+        raise SceneError([f"run {folder} has no finished episode yet"])
+    return record
+
+
+def choose(scene: Scene, record: Record) -> Chosen:
+    """The final particle that tested best, or the last episode's best without a test.
+
+    Args:
+      scene: The run's scene, with its rule for failed trials.
+      record: The run, with a finished episode at least.
+    """
+    history, last = record.history, record.done - 1
+    if record.test is None:
+        best = int(history.cost[last].argmin())
+        trials = jax.tree.map(lambda v: v[last, best], history.trials)
+        return Chosen(
+            history.population[last, best],
+            best,
+            float(history.cost[last, best]),
+            trials,
+            False,
+            best,
+        )
+    cost = np.asarray(particle_cost(scene, record.test))
+    best = int(cost.argmin())
+    trials = jax.tree.map(lambda v: np.asarray(v)[best], record.test)
+    design = np.asarray(record.state.particles)[best]
+    return Chosen(design, best, float(cost[best]), trials, True, int(history.ancestors[last, best]))
+
+
+def find_grasp(
+    scene: Scene,
+    record: Record,
+    *,
+    episode: int | None = None,
+    particle: int | None = None,
+    trial: int | None = None,
+) -> Grasp:
+    """A grasp of a run, by the numbers of trials.csv.
+
+    Args:
+      scene: The run's scene.
+      record: The run, with a finished episode at least.
+      episode: Number of the episode, from 1; None for the last.
+      particle: Index of the particle; None for the chosen one in the last episode, otherwise for
+        the episode's best.
+      trial: Index of the trial; None for its best one.
+
+    Raises:
+      SceneError: If the run has no such episode, particle or trial.
+    """
+    history = record.history
+    _, particles, trials = history.trials.cost.shape
+    asked = (
+        ("--episode", episode, 1, record.done),
+        ("--particle", particle, 0, particles - 1),
+        ("--trial", trial, 0, trials - 1),
+    )
+    found = [range_problem(n, v, "", low, high) for n, v, low, high in asked if v is not None]
+    if problems := [problem for problem in found if problem]:
+        raise SceneError(problems)
+    e = (episode or record.done) - 1
+    if particle is None:
+        is_last = e == record.done - 1
+        particle = choose(scene, record).row if is_last else int(history.cost[e].argmin())
+    of_particle = jax.tree.map(lambda v: v[e, particle], history.trials)
+    if trial is None:
+        trial = int(np.where(failed(of_particle.status), np.inf, of_particle.cost).argmin())
+    # One program, not one an operation.
+    noise = jax.jit(episode_trials, static_argnums=(0, 3))(scene, record.state.key, e, trials)
+    return Grasp(
+        history.population[e, particle],
+        jax.tree.map(lambda v: np.asarray(v)[trial], noise),
+        jax.tree.map(lambda v: v[trial], of_particle),
+        (e + 1, particle, trial),
+    )

@@ -15,6 +15,7 @@ from codesign_jax.commands import optimize
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.scene import parameters, schema
+from codesign_jax.scene.effects import ENGINES
 from scripts.accuracy import beam, decision, impulse, oracle, steps, study, tip, worlds
 from scripts.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
 from scripts.accuracy.store import Case, Store
@@ -255,7 +256,7 @@ def test_a_case_that_kills_its_process_counts_as_failed_after_two_attempts(tmp_p
 def test_cases_have_names_of_their_own():
     data = ROOT / "docs" / "data" / "reproduction"
     for size in study.SIZES.values():
-        every = study.cases(size, study.PARTS, study.ENGINES, data, gpu=True)
+        every = study.cases(size, study.PARTS, ENGINES, data, gpu=True)
         assert len({c.key for c in every}) == len(every)
         assert {c.part for c in every} == {*study.PARTS, "beam"}
 

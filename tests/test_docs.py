@@ -14,7 +14,8 @@ from codesign_jax import cli
 from codesign_jax.commands import evaluate, export, replay, report
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "scripts" / "README.md"]
+PAGES += sorted((ROOT / "docs").rglob("*.md"))
 SMALL = ["--particles", "2", "--trials", "3", "--episodes", "1", "--test-trials", "0"]
 
 
@@ -34,7 +35,7 @@ def examples(program):
     return found
 
 
-CODESIGN = [" ".join(words) for words in examples("codesign")]
+CODESIGN = list(dict.fromkeys(" ".join(words) for words in examples("codesign")))
 
 
 def test_the_pages_have_examples():
@@ -91,6 +92,29 @@ def test_every_command_runs_at_a_small_size(example, here):
     if arguments[0] == "optimize" and "switch" in example:
         size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]
     assert cli.main([*arguments, *size.get(arguments[0], [])]) == 0
+
+
+def test_the_front_page_is_read_in_three_minutes():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    assert next(i for i, line in enumerate(lines) if line.startswith("![")) < 5  # a picture first
+
+
+def links(text):
+    """Files that a page links to or shows, without what lies on other hosts and in the page."""
+    found = re.findall(r"\]\(([^)\s]+)\)|^\[[^\]]+\]: (\S+)", text, re.M)
+    return [a or b for a, b in found if not re.match(r"https?:|#", a or b)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_what_a_page_links_to_is_there(page):
+    missing = [x for x in links(page.read_text()) if not (page.parent / x.split("#")[0]).exists()]
+    assert not missing
+
+
+def test_links_are_found():
+    text = "![a](b.png) and [c](d.md#e), [f](https://g.h) [i](#j)\n[k]: l.md\n"
+    assert links(text) == ["b.png", "d.md#e", "l.md"]
 
 
 def test_every_target_of_make_is_there():

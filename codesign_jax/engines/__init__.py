@@ -4,8 +4,9 @@ import functools
 
 from codesign_jax.engines.base import Engine
 from codesign_jax.scene import Newton, Scene, Solver, library, load_accuracy, schema
+from codesign_jax.scene.effects import ENGINES
 
-NAMES = ("structured", "mujoco", "mjx")
+NAMES = ENGINES
 DEFAULT = "structured"
 
 

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 from codesign_jax.scene.schema import SceneError
 
-ENGINES = ("mjx", "mujoco", "structured")
+ENGINES = ("structured", "mujoco", "mjx")
+"""Names of the engines; `engines.make_engine` builds them."""
 
 
 class Effect(NamedTuple):

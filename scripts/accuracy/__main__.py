@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 
 import codesign_jax
+from codesign_jax.scene.effects import ENGINES
 from scripts.accuracy import study
 from scripts.accuracy.store import Store
 from scripts.shared import provenance
@@ -41,7 +42,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--report", action="store_true", help="draw what docs/data holds and stop")
     parser.add_argument("--docs", type=Path, default=Path("docs"))
     args = parser.parse_args()
-    for name, known in (("parts", study.PARTS), ("engines", study.ENGINES)):
+    for name, known in (("parts", study.PARTS), ("engines", ENGINES)):
         unknown = set(getattr(args, name)) - set(known)
         if unknown:
             parser.error(f"--{name}: {', '.join(sorted(unknown))} unknown; valid: {known}")

@@ -28,6 +28,19 @@ def presets_table(studies: dict[str, Study]) -> list[list[str]]:
     return rows
 
 
+def front_page(studies: dict[str, Study]) -> list[list[str]]:
+    """The presets in short, for a reader in a hurry: three errors and grasps a second."""
+    full = next(iter(studies.values()))
+    heads = [ERRORS[part][0] for part in JUDGED]
+    rows = [["preset", "setting", *heads, *(f"grasps/s, {name}" for name in studies)]]
+    for name, setting in PRESETS.items():
+        errors = [full.error(part, setting) for part in JUDGED]
+        cells = ["–" if e is None else f"{e:.2g}" for e in errors]
+        cells += [cost_cells(s.cost("structured", setting))[1] for s in studies.values()]
+        rows.append([f"`{name}`", setting.label, *cells])
+    return rows
+
+
 def standing(study: Study) -> list[list[str]]:
     """Whether the presets are on the Pareto fronts, and what beats those that are not."""
     rows = [["preset", *(ERRORS[p][0] for p in JUDGED), "in all three at once"]]

@@ -39,7 +39,7 @@ def make(docs: Path, found: dict[str, Study] | None = None) -> str:
 
 
 def make_summary(readme: Path, page: Path, scenes: Path, found: dict[str, Study]) -> None:
-    """Fills in the front page's table, the presets' tables and the comments of their files.
+    """Fills in the tables of the presets and of the errors wanted, and the comments of their files.
 
     Args:
       readme: The front page.
@@ -49,7 +49,8 @@ def make_summary(readme: Path, page: Path, scenes: Path, found: dict[str, Study]
     """
     named = {SHORT[n]: study for n, study in found.items()}
     full, *rest = named.values()
-    fill(readme, markdown(tables.front_page(full, rest[0] if rest else None)), "accuracy")
+    fill(readme, markdown(presets.front_page(named)), "accuracy")
+    fill(page, markdown(tables.wanted_here(full, rest[0] if rest else None)), "wanted")
     text = "\n\n".join(markdown(t) for t in (presets.presets_table(named), presets.standing(full)))
     fill(page, text, "presets")
     presets.annotate(scenes, named)

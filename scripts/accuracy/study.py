@@ -23,7 +23,6 @@ from scripts.accuracy.settings import (
 from scripts.accuracy.store import Case
 
 PARTS = ("tip", "step", "impulse", "decision", "time")
-ENGINES = ("structured", "mujoco", "mjx")
 
 
 @dataclasses.dataclass(frozen=True)

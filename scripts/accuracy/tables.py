@@ -96,7 +96,7 @@ def _found(study: Study, part: str, engine: str, limit: float) -> list[str]:
     return [named(p.label, engine), f"{p.error:.3g}", *cost_cells(p.cost)]
 
 
-def front_page(full: Study, small: Study | None) -> list[list[str]]:
+def wanted_here(full: Study, small: Study | None) -> list[list[str]]:
     """As `wanted` for the structured engine alone, with the same settings' costs on a CPU."""
     costs = ["one H200: wall s / simulated s", "grasps/s"]
     costs += ["2 CPU cores: wall s / simulated s", "grasps/s"] if small else []

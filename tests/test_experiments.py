@@ -121,6 +121,19 @@ def test_masks_open_one_domain_and_start_equally_often_in_either(name):
     assert strategies[-1] == "concurrent" and masks[-1].all()
 
 
+def test_an_experiment_of_fewer_strategies_and_other_runs():
+    fewer = plan.narrowed(PAPER["2d"], ["single", "concurrent"], 60)
+    assert isinstance(fewer, Strategies) and fewer.grasps == 2 * 60 * 60 * (64 + 6)
+    assert plan.narrowed(PAPER["2d"], None, None) is PAPER["2d"]
+    for name, strategies, runs, words in (
+        ("landscape", ["single"], None, "neither strategies nor runs"),
+        ("2d", ["singel"], None, "singel"),
+        ("2d", None, 0, "0 runs"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            plan.narrowed(PAPER[name], strategies, runs)
+
+
 def test_chunks_are_equal_and_waste_little():
     assert chunking(14_400) == (14_400, 1)
     assert chunking(32_400) == (16_200, 2)

@@ -38,6 +38,12 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
     parser.add_argument("--preset", dest="size", choices=list(plan.OVERRIDES), help="as --size")
+    parser.add_argument(
+        "--strategies",
+        type=lambda s: s.split(","),
+        help="only these, for example single,concurrent",
+    )
+    parser.add_argument("--runs", type=int, help="runs of each strategy")
     parser.add_argument("--engine", choices=NAMES, default="structured")
     parser.add_argument("--seed", type=int, default=0, help="seed of run 0")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -59,6 +65,10 @@ def parse() -> argparse.Namespace:
 def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], int]:
     """Returns the experiment, the settings its state must belong to, and its grasps."""
     the_plan = plan.experiment(args.experiment, args.size)
+    try:
+        the_plan = plan.narrowed(the_plan, args.strategies, args.runs)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
     overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
     the_scene = scene.load(args.scene, overrides=overrides)
     space = parameters.design_space(the_scene.hand, the_plan.preset)

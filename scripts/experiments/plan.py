@@ -1,6 +1,7 @@
 """Sizes of the experiments (paper Secs. VI.3 to VI.5) and what their runs differ in: the masks."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -163,3 +164,32 @@ def experiment(name: str, size: str = "paper") -> Strategies | Landscape:
         if PAPER[known].grasps != expected:
             raise RuntimeError(f"{known}: {PAPER[known].grasps} grasps, the paper has {expected}")
     return (PAPER if size == "paper" else SMALL[size])[name]
+
+
+def narrowed(
+    the_plan: Strategies | Landscape, strategies: Sequence[str] | None, runs: int | None
+) -> Strategies | Landscape:
+    """Returns an experiment with fewer strategies or another number of runs.
+
+    Run r of a strategy is the same run whatever is beside it, up to rounding: its keys come from
+    the seed of run r alone.
+
+    Args:
+      the_plan: The experiment.
+      strategies: Names of `optimize.schedule`; None keeps the experiment's.
+      runs: Runs of each strategy; None keeps the experiment's.
+
+    Raises:
+      ValueError: If the experiment has no strategies, or a name or number is wrong.
+    """
+    if strategies is None and runs is None:
+        return the_plan
+    if isinstance(the_plan, Landscape):
+        raise ValueError(f"{the_plan.name} is a grid: it has neither strategies nor runs")
+    if runs is not None and runs < 1:
+        raise ValueError(f"{runs} runs: there must be one at least")
+    chosen = the_plan.strategies if strategies is None else tuple(strategies)
+    new = dataclasses.replace(the_plan, strategies=chosen, runs=runs or the_plan.runs)
+    for name in chosen:
+        schedule(name, np.array([True, False]), new.episodes, "morphology")
+    return new

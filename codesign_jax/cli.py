@@ -125,7 +125,7 @@ class Evaluate:
 
 @dataclasses.dataclass
 class Export:
-    """Export a design: MuJoCo models with a player, commands of arm and valves, parts to cast.
+    """Export a design: MuJoCo models with a player, commands, parts to cast, a build sheet.
 
     docs/export.md has every file.
     """
@@ -173,6 +173,15 @@ class Export:
     """Gap between parts that are set into one another [mm]."""
     draft: float = 0.0
     """Slope of the moulds' side faces [deg]."""
+    no_sheet: Flag = False
+    """Leave out the build sheet."""
+    tolerance: Literal["all", "free", "off"] = "all"
+    """How far which parameters may drift, from simulated grasps: those of the hand's whole table,
+    the design space's free ones, or none, which is quick."""
+    tolerance_steps: int = 5
+    """Values of a parameter to try on each side."""
+    tolerance_trials: int = 36
+    """Grasps of each value; at 36 a value without a failure is above 90 % with 95 % confidence."""
     overwrite: Flag = False
     """Write into a folder that has files already."""
 

@@ -87,7 +87,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
 @pytest.mark.parametrize("example", [e for e in CODESIGN if not e.startswith("replay")])
 def test_every_command_runs_at_a_small_size(example, here):
     size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
-    size["export"] = ["--overwrite", "--trials", "0"]
+    size["export"] = ["--overwrite", "--trials", "0", "--tolerance", "off"]
     arguments = shlex.split(example)
     if arguments[0] == "optimize" and "switch" in example:
         size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]

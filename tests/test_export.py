@@ -217,7 +217,7 @@ def test_commands_are_the_key_frames(tmp_path):
 
 
 def export(*arguments):
-    return cli.main(["export", *map(str, arguments)])
+    return cli.main(["export", "--tolerance", "off", *map(str, arguments)])
 
 
 def test_command_writes_models_and_commands(tmp_path, capsys):

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import rollout, runs
+from codesign_jax import codesign, engines, provenance, rollout, runs
 from codesign_jax.commands import common
 from codesign_jax.commands.case import Case, find_case
+from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
 from codesign_jax.scene import schema
@@ -22,6 +23,7 @@ from codesign_jax.types import Params, Trial
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Export
+    from codesign_jax.export import sheet
 
 
 def main(options: "Export") -> int:
@@ -34,7 +36,7 @@ def main(options: "Export") -> int:
     case = find_case(options)
     _check(options, case)
     params = _params(case)
-    sizes = [] if options.no_parts else _sizes(case, params, options)
+    sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
     notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
@@ -67,26 +69,39 @@ def _check(options: "Export", case: Case) -> None:
     for name, value, high in (
         ("trials", options.trials, 10_000),
         ("seed", options.seed, 2**31 - 1),
+        ("tolerance-steps", options.tolerance_steps, 100),
+        ("tolerance-trials", options.tolerance_trials, 100_000),
     ):
-        problem = schema.range_problem(f"--{name}", value, "", 0, high)
+        low = 1 if name.startswith("tolerance") else 0
+        problem = schema.range_problem(f"--{name}", value, "", low, high)
         problems += [problem] if problem else []
     out = options.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not options.overwrite:
         problems.append(f"--out {out} exists; choose another folder, or give --overwrite")
     elif out.exists() and not out.is_dir():
         problems.append(f"--out {out} is a file")
-    problems += process.problems(_process(options)) + ([] if options.no_parts else _missing())
+    problems += process.problems(_process(options)) + _missing(options)
+    if case.engine not in engines.NAMES:
+        hint = schema.nearest(case.engine, engines.NAMES)
+        problems.append(f"--engine {case.engine!r} is not valid; {hint}")
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
     if problems:
         raise SceneError(problems)
 
 
-def _missing() -> list[str]:
-    """What is to be installed for the parts."""
-    names = ("manifold3d", "networkx", "lxml")
-    absent = [name for name in names if importlib.util.find_spec(name) is None]
-    install = "pip install 'codesign-jax[export]', or give --no-parts"
-    return [f"parts need {' and '.join(absent)}: {install}"] if absent else []
+def _missing(options: "Export") -> list[str]:
+    """What is to be installed for parts and sheet."""
+    needed = {"parts": ("manifold3d", "networkx", "lxml"), "sheet": ("matplotlib",)}
+    unwanted = {"parts": options.no_parts, "sheet": options.no_sheet}
+    found = []
+    for what, names in needed.items():
+        absent = [name for name in names if importlib.util.find_spec(name) is None]
+        if absent and not unwanted[what]:
+            found.append(
+                f"the {what} need{'s' * (what == 'sheet')} {' and '.join(absent)}: "
+                f"pip install 'codesign-jax[export]', or give --no-{what}"
+            )
+    return found
 
 
 def _write(
@@ -99,8 +114,10 @@ def _write(
     schedule = grasps.schedule(case.scene, params, nominal)
     path = tables.write_commands(options.out, case.scene, schedule)
     console.print(f"commands of arm and valves: {path}", markup=False)
-    if sizes:
+    if not options.no_parts:
         _parts(sizes, options, console)
+    if not options.no_sheet:
+        _sheet(case, params, sizes, options, console)
 
 
 def _parts(sizes: list[Size], options: "Export", console: Console) -> None:
@@ -152,3 +169,61 @@ def _trials(case: Case, options: "Export") -> list[tuple[str, Trial]]:
             trial = jax.tree.map(lambda v, t=t: v[t], noisy)
             found.append((f"trial_{t:03d}_{names[int(trial.shape)]}", trial))
     return [(name, jax.tree.map(np.asarray, trial)) for name, trial in found]
+
+
+def _sheet(
+    case: Case, params: Params, sizes: list[Size], options: "Export", console: Console
+) -> None:
+    from codesign_jax.export import drawing, sheet  # needs the extra
+
+    drift = None if options.tolerance == "off" else _drift(case, options, console)
+    content = sheet.sections(case.scene, params, sizes, drift)
+    title = f"Build sheet: {case.scene.hand.name}"
+    source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
+    code = provenance.git_state()
+    version = provenance.environment()["versions"]["codesign-jax"]  # type: ignore[index]
+    lines = [
+        f"{source}: {runs.describe(case.space, case.design)}",
+        f"Scene {case.scene.name}, objects {', '.join(s.name for s in case.scene.objects.object)}; "
+        f"codesign-jax {version}, commit {code['commit'] or 'unknown'}"
+        f"{' with changes' if code.get('modified') else ''}. Predictions of a simulation, not "
+        "measurements.",
+    ]
+    paths = [
+        sheet.write(options.out, title, lines, content),
+        drawing.write(
+            options.out,
+            title,
+            lines,
+            content,
+            scene=case.scene,
+            params=params,
+            sizes=sizes,
+            drift=drift,
+        ),
+    ]
+    for path in paths:
+        console.print(f"build sheet: {path}", markup=False)
+
+
+def _drift(case: Case, options: "Export", console: Console) -> "sheet.Drift":
+    """Tolerances of the design, all steps and trials in one batch."""
+    from codesign_jax.export import sheet, tolerance
+
+    steps, trials = options.tolerance_steps, options.tolerance_trials
+    planned = tolerance.study(
+        case.scene, case.space, case.design, steps, free=options.tolerance == "free"
+    )
+    console.print(
+        f"tolerance: simulating {len(planned.designs) * trials} grasps; --tolerance free or off "
+        "takes less time",
+        markup=False,
+    )
+    engine = make_engine(case.engine, case.scene)
+    evaluate = codesign.make_evaluate(case.scene, engine, planned.space, trials)
+    population = jnp.asarray(planned.designs, jnp.float32)
+    outcomes = jax.tree.map(np.asarray, evaluate(population, jax.random.key(options.seed)))
+    found = tolerance.shares(outcomes)
+    good = found[0].value >= tolerance.WANTED
+    rows = tolerance.tolerances(planned, found) if good else []
+    return sheet.Drift(found[0], trials, steps, case.engine, rows)

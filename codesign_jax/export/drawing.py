@@ -1,0 +1,194 @@
+"""The build sheet as one page of PDF, drawn by matplotlib."""
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.figure
+import matplotlib.patches
+import numpy as np
+from matplotlib.axes import Axes
+
+from codesign_jax.export.process import Size
+from codesign_jax.export.sheet import NAME, Drift, Section, places
+from codesign_jax.export.tolerance import Side
+from codesign_jax.scene import Scene
+from codesign_jax.types import Params
+
+_A4 = (8.27, 11.69)
+_SMALL = 5.6
+
+
+def write(
+    folder: Path,
+    title: str,
+    lines: Sequence[str],
+    content: Sequence[Section],
+    *,
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    drift: Drift | None,
+) -> Path:
+    """Draws the sheet on one page.
+
+    Args:
+      folder: An existing folder.
+      title: Its title.
+      lines: What it is about, below the title.
+      content: The sections, see `sheet.sections`.
+      scene: The scene.
+      params: Parameters of the design as concrete arrays.
+      sizes: Dimensions of the fingers.
+      drift: Tolerances, or None.
+
+    Returns:
+      The file's path.
+    """
+    # A figure of its own instead of pyplot's: no state and no display is touched.
+    figure = matplotlib.figure.Figure(figsize=_A4)
+    figure.text(0.06, 0.965, title, fontsize=13, weight="bold")
+    about = "\n".join(textwrap.fill(line, 130) for line in lines)
+    figure.text(0.06, 0.957, about, fontsize=_SMALL, va="top")
+    _section(figure.add_axes((0.04, 0.775, 0.24, 0.13)), sizes[0])
+    _side_view(figure.add_axes((0.30, 0.775, 0.38, 0.13)), sizes[0])
+    _palm(figure.add_axes((0.70, 0.755, 0.26, 0.17)), scene, params)
+    top = 0.745
+    for section in content:
+        if section.title.startswith("Tolerance") and drift and drift.rows:
+            top = _tolerance(figure, top, section, drift)
+        else:
+            top = _table(figure, top, section)
+    path = folder / f"{NAME}.pdf"
+    figure.savefig(path)
+    return path
+
+
+def _lines(text: str) -> list[str]:
+    return textwrap.wrap(text, 165)
+
+
+def _table(figure: matplotlib.figure.Figure, top: float, section: Section) -> float:
+    """Draws a section below `top` and returns where the next one begins, in figure's height."""
+    figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
+    top -= 0.015
+    if section.rows:
+        height = 0.0125 * (len(section.rows) + 1)
+        axes = figure.add_axes((0.06, top - height, 0.88, height))
+        axes.axis("off")
+        table = axes.table(section.rows, colLabels=section.head, bbox=[0, 0, 1, 1], cellLoc="left")
+        table.auto_set_font_size(False)
+        table.set_fontsize(_SMALL)
+        table.auto_set_column_width([*range(len(section.head))])
+        for (row, _), cell in table.get_celld().items():
+            cell.set_linewidth(0.3)
+            cell.PAD = 0.03
+            if row == 0:
+                cell.set_facecolor("0.9")
+        top -= height + 0.003
+    return _notes(figure, top, section.notes)
+
+
+def _notes(figure: matplotlib.figure.Figure, top: float, notes: Sequence[str]) -> float:
+    text = [line for note in notes for line in _lines(note)]
+    figure.text(0.06, top, "\n".join(text), fontsize=_SMALL, va="top", linespacing=1.3)
+    return top - 0.0095 * len(text) - 0.010
+
+
+def _tolerance(
+    figure: matplotlib.figure.Figure, top: float, section: Section, drift: Drift
+) -> float:
+    """A bar from the last good value on either side, a cross at the first bad one."""
+    figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
+    bottom = 0.02 + 0.0095 * sum(len(_lines(note)) for note in section.notes) + 0.015
+    bottom = max(bottom, top - 0.03 - 0.03 * len(drift.rows))
+    axes = figure.add_axes((0.14, bottom, 0.72, top - 0.018 - bottom))
+    for k, row in enumerate(drift.rows):
+        ends = [_end(side, row.value) for side in (row.down, row.up)]
+        span = row.up.limit - row.down.limit
+        at = [(end - row.down.limit) / span for end in (*ends, row.value)]
+        axes.plot([0, 1], [k, k], color="0.85", lw=0.6, zorder=0)
+        axes.plot(at[:2], [k, k], color="tab:blue", lw=3.5, solid_capstyle="butt")
+        axes.plot(at[2], k, "|", color="black", ms=7)
+        for side in (row.down, row.up):
+            if side.bad is not None:
+                x = (side.bad.value - row.down.limit) / span
+                axes.plot(x, k, "x", color="tab:red", ms=3.5, mew=0.9)
+        left, right = f"{row.down.limit:.4g}  ", f"  {row.up.limit:.4g}"
+        axes.text(0, k, left, ha="right", va="center", fontsize=4.5, color="0.4")
+        label = f"{right}    {ends[0]:.4g} … {row.value:.4g} … {ends[1]:.4g} {row.unit}"
+        axes.text(1, k, label, ha="left", va="center", fontsize=4.8)
+    axes.set(xlim=(0, 1.0), ylim=(len(drift.rows) - 0.5, -0.5), xticks=[])
+    axes.set_yticks(range(len(drift.rows)), [row.name for row in drift.rows], fontsize=_SMALL)
+    axes.tick_params(length=0, pad=22)
+    axes.spines[:].set_visible(False)
+    key = "bar: enough grasps succeed; |: the design; x: first value tried that fails; grey: range"
+    return _notes(figure, bottom - 0.006, [key, *section.notes])
+
+
+def _end(side: Side, value: float) -> float:
+    return value if side.good is None else side.good.value
+
+
+def _rectangle(axes: Axes, low: tuple[float, float], size: Sequence[float], color: str) -> None:
+    width, height = size
+    patch = matplotlib.patches.Rectangle(
+        low, width, height, facecolor=color, edgecolor="black", lw=0.7
+    )
+    axes.add_patch(patch)
+
+
+def _section(axes: Axes, size: Size) -> None:
+    """Cross-section of finger 0 with its measures."""
+    _rectangle(axes, (-size.width / 2, 0), (size.width, size.height), "0.8")
+    _rectangle(axes, (-size.chamber[1] / 2, size.wall), (size.chamber[1], size.chamber[2]), "white")
+    axes.plot([-size.width / 2, size.width / 2], [0, 0], color="tab:red", lw=2)
+    axes.text(0, -0.06 * size.height, f"{size.width:.1f}", ha="center", va="top", fontsize=6)
+    axes.text(-0.53 * size.width, size.height / 2, f"{size.height:.1f}", ha="right", fontsize=6)
+    axes.text(0, size.wall / 2, f"{size.wall:.1f}", ha="center", va="center", fontsize=6)
+    _finish(axes, "section of finger 0 [mm]; red: fabric")
+    axes.set(xlim=(-0.85 * size.width, 0.85 * size.width), ylim=(-5, size.height + 2))
+
+
+def _side_view(axes: Axes, size: Size) -> None:
+    """Longitudinal section of finger 0."""
+    _rectangle(axes, (0, 0), (size.length, size.height), "0.8")
+    chamber = (size.chamber[0], size.chamber[2])
+    _rectangle(axes, (size.end, size.wall), chamber, "white")
+    axes.plot([0, size.length], [0, 0], color="tab:red", lw=2)
+    axes.text(size.length / 2, -1.5, f"{size.length:.1f}", ha="center", va="top", fontsize=6)
+    text = f"chamber {size.chamber[0]:.1f} x {size.chamber[1]:.1f} x {size.chamber[2]:.1f}"
+    axes.text(size.length / 2, size.height / 2, text, ha="center", va="center", fontsize=6)
+    _finish(axes, "along finger 0 [mm], base on the left")
+    axes.set(xlim=(-3, size.length + 3), ylim=(-8, size.height + 3))
+
+
+def _palm(axes: Axes, scene: Scene, params: Params) -> None:
+    """The palm from above: base points, directions and the fingers' horizontal reach."""
+    radius, width = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.section.width
+    axes.add_patch(matplotlib.patches.Circle((0, 0), radius, facecolor="0.93", edgecolor="0.4"))
+    position, azimuth = places(scene, params)
+    for i, ((x, y), angle) in enumerate(zip(1e3 * position, azimuth, strict=True)):
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        side = np.array([-direction[1], direction[0]]) * width / 2
+        start = np.array([x, y])
+        axes.plot(*np.transpose([start - side, start + side]), color="tab:red", lw=1.5)
+        axes.annotate(
+            "",
+            start + 22 * direction,
+            start,
+            arrowprops={"arrowstyle": "->", "lw": 0.8, "color": "tab:blue"},
+        )
+        along, across = start + 28 * direction
+        axes.text(along, across, str(i), ha="center", va="center", fontsize=7)
+    axes.plot([0, 12], [0, 0], color="black", lw=0.6)
+    axes.text(13, 0, "x", fontsize=6, va="center")
+    _finish(axes, "palm from above: edges of the fingers' fabric")
+    reach = max(radius, 1e3 * float(np.abs(position).max()) + 32) + 2
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
+
+
+def _finish(axes: Axes, title: str) -> None:
+    axes.set_aspect("equal")
+    axes.axis("off")
+    axes.set_title(title, fontsize=6)

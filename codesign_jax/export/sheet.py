@@ -1,0 +1,230 @@
+"""The build sheet: what to build, how to drive it, and how far it may be off."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from codesign_jax import morphology
+from codesign_jax.export.grasps import phases
+from codesign_jax.export.process import Size
+from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
+from codesign_jax.model.layout import mounts
+from codesign_jax.scene import Scene
+from codesign_jax.statistics import Interval
+from codesign_jax.types import Params
+
+NAME = "build_sheet"
+
+
+class Section(NamedTuple):
+    """A part of the sheet: a title, a table (or none) and sentences below it."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    notes: list[str]
+
+
+class Drift(NamedTuple):
+    """What simulated grasps say about tolerances.
+
+    Attributes:
+      nominal: Success of the design itself.
+      trials: Trials of each step.
+      steps: Steps on each side.
+      engine: Engine that simulated.
+      rows: Tolerances; empty if the design itself has too few successes.
+    """
+
+    nominal: Interval
+    trials: int
+    steps: int
+    engine: str
+    rows: list[Tolerance]
+
+
+def sections(
+    scene: Scene, params: Params, sizes: Sequence[Size], drift: Drift | None
+) -> list[Section]:
+    """The sheet's content.
+
+    Args:
+      scene: The scene.
+      params: Parameters of the design as concrete arrays.
+      sizes: Dimensions of the fingers.
+      drift: Tolerances, or None if they were not asked for.
+    """
+    found = [_fingers(scene, params, sizes), _mounts(scene, params), _material(scene)]
+    found.append(_control(scene, params))
+    return found + ([tolerance_section(drift)] if drift else [])
+
+
+def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> Section:
+    density = scene.hand.material.density
+    rows = []
+    for i, (size, angle) in enumerate(zip(sizes, bends(scene, params), strict=True)):
+        pressure = float(params.pressure[i])
+        limit = scene.hand.pressure_limit.per_wall * float(params.wall[i])
+        chamber = " x ".join(f"{v:.1f}" for v in size.chamber)
+        numbers = [size.length, size.width, size.height, size.wall]
+        rows.append(
+            (
+                str(i),
+                *(f"{v:.1f}" for v in numbers),
+                chamber,
+                f"{size.volume / 1e3:.1f}",
+                f"{1e-6 * size.volume * density:.1f}",
+                f"{pressure / 1e3:.1f} ({limit / 1e3:.0f})",
+                f"{np.degrees(angle):.0f}",
+            )
+        )
+    head = ("finger", "length mm", "width mm", "height mm", "wall mm", "chamber mm")
+    head += ("silicone cm³", "mass g", "pressure kPa (limit)", "free bend °")
+    notes = [
+        f"Walls at base and tip: {', '.join(f'{s:g}' for s in dict.fromkeys(z.end for z in sizes))}"
+        " mm. Free bend: predicted by beam theory for a straight finger at its pressure, without "
+        "load; measure it first."
+    ]
+    return Section("Fingers", head, rows, notes)
+
+
+def bends(scene: Scene, params: Params) -> np.ndarray:
+    """Angles by which the free fingers bend at their pressures [rad], by the linear law."""
+    beam = morphology.finger_beams(scene.hand, Params(*(np.asarray(v, float) for v in params)))
+    curvature = np.asarray(params.pressure) * beam.moment_per_pressure / beam.bending
+    return np.asarray(curvature * np.asarray(params.length))
+
+
+def places(scene: Scene, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """Base points [m] and azimuths [rad] of the fingers, shape (finger, 2) and (finger,)."""
+    position, _ = mounts(scene, np.asarray(params.spread))
+    azimuth = [np.radians(f.azimuth) + f.spread * float(params.spread) for f in scene.hand.finger]
+    return np.asarray(position)[:, :2], np.array(azimuth)
+
+
+def _mounts(scene: Scene, params: Params) -> Section:
+    rows = []
+    position, azimuth = places(scene, params)
+    for i, (finger, (x, y), angle) in enumerate(
+        zip(scene.hand.finger, 1e3 * position, azimuth, strict=True)
+    ):
+        numbers = (f"{x:.1f}", f"{y:.1f}", f"{np.degrees(angle):.1f}", f"{finger.tilt:.1f}")
+        rows.append((str(i), *numbers))
+    palm = scene.hand.palm
+    notes = [
+        "Base point: middle of the inextensible layer's edge on the palm's underside, from the "
+        "palm's centre. A finger leaves in the direction of the azimuth (anticlockwise from x, "
+        "seen from above), tilted below the horizontal; its inextensible layer faces inwards.",
+        f"Palm: radius {1e3 * palm.radius:.0f} mm, thickness {1e3 * palm.thickness:.0f} mm, mass "
+        f"{palm.mass:g} kg. Spread {np.degrees(float(params.spread)):.1f}°.",
+    ]
+    head = ("finger", "base x mm", "base y mm", "azimuth °", "tilt °")
+    return Section("Mounts", head, rows, notes)
+
+
+def _material(scene: Scene) -> Section:
+    material, wrist = scene.hand.material, scene.hand.wrist
+    notes = [
+        f"Silicone: shear modulus {material.shear_modulus / 1e3:g} kPa, density "
+        f"{material.density:g} kg/m³, damping time {1e3 * material.damping_time:g} ms. Bottom "
+        "layer: inextensible fabric. Around the finger: thread hoops, which keep the section.",
+    ]
+    if scene.effects.wrist:
+        notes.append(
+            f"Wrist: {wrist.linear_stiffness:g} N/m and {wrist.angular_stiffness:g} N m/rad, "
+            f"damping {wrist.linear_damping:g} N s/m and {wrist.angular_damping:g} N m s/rad."
+        )
+    return Section("Material and wrist", (), [], notes)
+
+
+def _control(scene: Scene, params: Params) -> Section:
+    x, y, z, roll, pitch, yaw = np.asarray(params.arm, float)
+    palm = scene.arm.zero_height + z
+    top = f"{1e3 * scene.arm.start_height:.0f}"
+    heights = {"approach": f"{top} to {1e3 * palm:.1f}", "inflate": f"{1e3 * palm:.1f}"}
+    heights |= {"lift": f"{1e3 * palm:.1f} to {top}", "disturb": top, "ungrasp": top}
+    shares = {"approach": "0", "inflate": "0 to 1", "lift": "1", "disturb": "1"}
+    shares |= {"ungrasp": f"1 to 0 in {scene.phases.deflate_time:g} s"}
+    begin, rows = 0.0, []
+    for name, end in phases(scene):
+        rows.append((name, f"{begin:g} to {end:g}", heights[name], shares[name]))
+        begin = end
+    notes = [
+        f"Arm frame while grasping: x {1e3 * x:.1f} mm, y {1e3 * y:.1f} mm, height "
+        f"{1e3 * palm:.1f} mm above the table; roll {np.degrees(roll):.1f}°, pitch "
+        f"{np.degrees(pitch):.1f}°, yaw {np.degrees(yaw):.1f}° (Table I). Every time step: "
+        "commands.csv."
+    ]
+    head = ("phase", "time s", "palm above the table mm", "share of the pressures")
+    return Section("Grasp", head, rows, notes)
+
+
+def tolerance_section(drift: Drift) -> Section:
+    """Tolerances as a table."""
+    nominal = f"The design itself: {_percent(drift.nominal)} of {drift.trials} grasps succeed"
+    limit = f"{100 * WANTED:.0f} %"
+    if not drift.rows:
+        note = f"{nominal}, fewer than {limit}: it has no tolerance to give."
+        return Section("Tolerance", (), [], [note])
+    rows = []
+    for row in drift.rows:
+        sides = [part for side in (row.down, row.up) for part in _side(side)]
+        rows.append((row.name, row.unit, f"{row.value:.4g}", *sides))
+    factor = NEAREST ** (-1 / (drift.steps - 1)) if drift.steps > 1 else 1.0
+    notes = [
+        f"{nominal}. Each parameter alone; every value met the same {drift.trials} trials "
+        f"(engine {drift.engine}); in brackets the share of successes with its 95 % interval "
+        "(Wilson). A success keeps the object and lets go of it. Down to and up to: the last value "
+        f"before the share falls below {limit}; fails at: the next value tried.",
+        f"Resolution: {drift.steps} values a side, the first at {NEAREST:.3g} of the way to the "
+        f"limit, each {factor:.2g} times as far as the one before. The limits are Table I's, "
+        "or the design space's where that is wider, and the pressure limit.",
+    ]
+    head = ("parameter", "unit", "value", "down to", "fails at", "up to", "fails at")
+    return Section(f"Tolerance: drift until fewer than {limit} succeed", head, rows, notes)
+
+
+def _side(side: Side) -> tuple[str, str]:
+    if not side.room:
+        return "at its limit", "–"
+    good = "none" if side.good is None else f"{side.good.value:.4g} ({_percent(side.good.share)})"
+    if side.bad is None:
+        return good, "not within the limits"
+    return good, f"{side.bad.value:.4g} ({_percent(side.bad.share)})"
+
+
+def _percent(share: Interval) -> str:
+    value, low, high = (100 * v for v in share)
+    return f"{value:.0f} %, {low:.0f}–{high:.0f}"
+
+
+def markdown(title: str, lines: Sequence[str], content: Sequence[Section]) -> str:
+    """The sheet as Markdown.
+
+    Args:
+      title: Its title.
+      lines: What it is about, below the title.
+      content: The sections.
+    """
+    text = [f"# {title}", "", *(f"{line}  " for line in lines)]
+    for section in content:
+        text += ["", f"## {section.title}"]
+        if section.rows:
+            text += ["", _row(section.head), _row(["---"] * len(section.head))]
+            text += [_row(row) for row in section.rows]
+        for note in section.notes:
+            text += ["", note]
+    return "\n".join(text) + "\n"
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def write(folder: Path, title: str, lines: Sequence[str], content: Sequence[Section]) -> Path:
+    """Writes the Markdown sheet; arguments as `markdown`."""
+    path = folder / f"{NAME}.md"
+    path.write_text(markdown(title, lines, content), encoding="utf-8")
+    return path

@@ -1,0 +1,186 @@
+"""How far each parameter of a design may drift before grasps fail, from simulated grasps.
+
+Every parameter is moved alone, down and up, by steps that grow by a constant factor to the end of
+its range, and every design so made meets the same trials, all in one batch.  On each side the
+tolerance ends between the last step of an unbroken row of steps with at least `WANTED` successes
+and the step after it.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from codesign_jax import statistics
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.hand import UNITS
+from codesign_jax.parameters import DesignSpace, design_space
+from codesign_jax.scene import Scene
+from codesign_jax.statistics import Interval
+from codesign_jax.types import Outcome, failed
+
+WANTED = 0.9
+"""Share of successful grasps below which a design has drifted too far."""
+NEAREST = 1 / 32
+"""The first step, as a share of the way to the end of the range."""
+TRIALS = 36
+"""Trials of each step: if all succeed, the share is above 90 % with 95 % confidence."""
+_MARGIN = 1e-6  # of a range: a float32 of a bound is no room for a step
+
+
+class Step(NamedTuple):
+    """A value that a parameter was moved to, in the hand file's unit, and its successes."""
+
+    value: float
+    share: Interval
+
+
+class Side(NamedTuple):
+    """What was found in one direction.
+
+    Attributes:
+      good: The last step with enough successes, or None if the first one has too few.
+      bad: The first step with too few, or None if there is none up to the limit.
+      limit: The end of the range [hand file's unit].
+      room: Whether the range goes on in this direction at all.
+    """
+
+    good: Step | None
+    bad: Step | None
+    limit: float
+    room: bool
+
+
+class Tolerance(NamedTuple):
+    """Tolerance of a parameter.
+
+    Attributes:
+      name: The parameter.
+      unit: The hand file's unit, of all values.
+      value: The design's value.
+      down: What was found below it.
+      up: What was found above it.
+    """
+
+    name: str
+    unit: str
+    value: float
+    down: Side
+    up: Side
+
+
+class Study(NamedTuple):
+    """Designs to simulate.
+
+    Attributes:
+      space: Space of the designs.
+      designs: The design, then its steps [SI units], shape (1 + parameter * 2 * step, parameter);
+        steps on a side without room repeat the design.
+      low: Ends of the ranges downwards [SI units], shape (parameter,).
+      high: Ends upwards.
+    """
+
+    space: DesignSpace
+    designs: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def steps(self) -> int:
+        """Steps on each side of a parameter."""
+        return (len(self.designs) - 1) // (2 * self.space.num_parameters)
+
+
+def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, free: bool) -> Study:
+    """Plans the steps.
+
+    Args:
+      scene: The scene.
+      space: The design space in which the design was found.
+      design: The design [SI units], shape (parameter,).
+      steps: Steps on each side.
+      free: Whether to move the parameters of that space, or all of the hand's table.
+    """
+    whole = space if free else design_space(scene.hand)
+    centre, source = np.asarray(design, float), np.asarray(space.source)
+    if not free:
+        centre = np.where(source >= 0, centre[np.maximum(source, 0)], space.base)
+    low, high = _limits(whole, space, centre)
+    shares = np.geomspace(NEAREST, 1.0, steps) if steps > 1 else np.ones(1)
+    designs = [centre]
+    for i in range(whole.num_parameters):
+        for end in (low[i], high[i]):
+            moved = np.repeat(centre[None], steps, 0)
+            moved[:, i] += shares * (end - centre[i])
+            designs += [*moved]
+    return Study(whole, np.array(designs), low, high)
+
+
+def _limits(
+    whole: DesignSpace, space: DesignSpace, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the ranges: the table's or, where they are wider, the design space's own.
+
+    A wall ends where its pressure meets the pressure limit, and a pressure likewise.
+    """
+    low, high = np.array(whole.low), np.array(whole.high)
+    if space is not whole:
+        for j, name in enumerate(space.names):
+            for i in np.nonzero([n.split("[")[0] == name.split("[")[0] for n in whole.names])[0]:
+                low[i], high[i] = min(low[i], space.low[j]), max(high[i], space.high[j])
+    per_wall = whole.hand.pressure_limit.per_wall
+    params = whole.params(centre)
+    caps, floors = per_wall * np.asarray(params.wall), np.asarray(params.pressure) / per_wall
+    for i, name in enumerate(whole.names):
+        row, _, index = name.partition("[")
+        fingers = slice(int(index[:-1]), int(index[:-1]) + 1) if index else slice(None)
+        if row == "pressure":
+            high[i] = min(high[i], caps[fingers].min())
+        if row == "wall":
+            low[i] = max(low[i], floors[fingers].max())
+    return np.minimum(low, centre), np.maximum(high, centre)
+
+
+def shares(outcomes: Outcome) -> list[Interval]:
+    """Share of successful grasps of each design, with its 95 % interval.
+
+    A success keeps the object and lets go of it; a trial that failed, for whatever reason, is none.
+
+    Args:
+      outcomes: Outcomes, arrays of shape (design, trial).
+    """
+    kept = (np.asarray(outcomes.cost) < SUCCESS_COST) & ~failed(np.asarray(outcomes.status))
+    return [statistics.wilson(int(n), kept.shape[1]) for n in kept.sum(1)]
+
+
+def tolerances(planned: Study, found: Sequence[Interval]) -> list[Tolerance]:
+    """Reads the tolerances off the successes.
+
+    Args:
+      planned: The designs.
+      found: Their shares of successful grasps.
+    """
+    space, results = planned.space, []
+    factor = np.array([UNITS[unit][1] for unit in space.units])
+    values = planned.designs[1:].reshape(space.num_parameters, 2, planned.steps, -1)
+    steps = np.reshape(np.arange(1, len(planned.designs)), values.shape[:3])
+    for i, name in enumerate(space.names):
+        sides = []
+        for s, end in enumerate((planned.low[i], planned.high[i])):
+            moved = [
+                Step(float(v[i] / factor[i]), found[k])
+                for v, k in zip(values[i, s], steps[i, s], strict=True)
+            ]
+            room = abs(end - planned.designs[0, i]) > _MARGIN * (planned.high[i] - planned.low[i])
+            sides.append(_side(moved, float(end / factor[i]), bool(room)))
+        value = float(planned.designs[0, i] / factor[i])
+        results.append(Tolerance(name, space.units[i], value, *sides))
+    return results
+
+
+def _side(moved: list[Step], limit: float, room: bool) -> Side:
+    if not room:
+        return Side(None, None, limit, False)
+    count = next((k for k, step in enumerate(moved) if step.share.value < WANTED), len(moved))
+    good = moved[count - 1] if count else None
+    return Side(good, moved[count] if count < len(moved) else None, limit, True)

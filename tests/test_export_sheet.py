@@ -1,0 +1,190 @@
+"""Build sheet and tolerances: thresholds that are known are found, and the page says them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import TINY, ToyEngine, tiny
+
+from codesign_jax import cli, codesign, parameters, scene
+from codesign_jax.commands import export
+from codesign_jax.export import drawing, process, sheet, tolerance
+from codesign_jax.export.process import Process
+from codesign_jax.types import Outcome, Status
+
+STEPS = 5
+FACTOR = tolerance.NEAREST ** (-1 / (STEPS - 1))  # between a step and the next
+
+
+def outcomes(success, trials=40):
+    """Outcomes of designs of which a given share of trials succeeds."""
+    kept = np.arange(trials)[None] < np.round(np.asarray(success)[:, None] * trials)
+    zero = np.zeros(kept.shape, np.int32)
+    return Outcome(np.where(kept, 0.0, 3.0), zero, np.where(kept, np.inf, 1.0), zero - 1)
+
+
+def test_known_thresholds_are_bracketed():
+    """A rule for each parameter: the tolerance ends at the step before the rule's end."""
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "full")
+    design = space.default()
+    planned = tolerance.study(the_scene, space, design, STEPS, free=False)
+    moved = planned.designs - design
+    names = list(space.names)
+    length, z, x, wall = (names.index(n) for n in ("length[0]", "arm_z", "arm_x", "wall[2]"))
+    good = np.ones(len(moved), bool)
+    good &= moved[:, length] > -0.020  # 20 mm shorter at most
+    good &= (moved[:, z] < 0.03) | (moved[:, z] > 0.1)  # and good again behind: not counted
+    good &= np.abs(moved[:, wall]) == 0  # nothing off at all
+    found = tolerance.tolerances(planned, tolerance.shares(outcomes(0.925 * good)))
+    rows = {row.name: row for row in found}
+    assert list(rows) == names
+    short = rows["length[0]"].down
+    assert short.bad.value < 110 - 20 < short.good.value
+    assert (110 - short.bad.value) / (110 - short.good.value) == pytest.approx(FACTOR)
+    assert rows["length[0]"].up.bad is None  # up to the table's limit
+    assert rows["length[0]"].up.good.value == pytest.approx(180) == rows["length[0]"].up.limit
+    up = rows["arm_z"].up
+    assert up.good.value < 20 + 30 < up.bad.value < 20 + 100
+    assert rows["wall[2]"].up.good is None and rows["wall[2]"].up.bad.value > 5
+    assert rows["arm_x"].down.bad is None and rows["arm_x"].down.good.value == pytest.approx(-60)
+    share = rows["arm_x"].down.good.share  # 37 of 40: Wilson's interval by its formula
+    n, p, q = 40, 0.925, 1.959964
+    centre, half = (p + q**2 / 2 / n), q * np.sqrt(p * (1 - p) / n + q**2 / 4 / n**2)
+    np.testing.assert_allclose(share[1:], (centre + half * np.array([-1, 1])) / (1 + q**2 / n))
+    # Every design differs from the middle in one parameter.
+    assert (np.count_nonzero(moved, axis=1) <= 1).all() and x >= 0
+
+
+def test_walls_and_pressures_end_at_the_pressure_limit():
+    """120 kPa needs a wall of 3 mm, and 5 mm hold 200 kPa, beyond the table's 150."""
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "full")
+    design, names = space.default(), list(space.names)
+    design[names.index("wall[1]")] = 0.0033
+    planned = tolerance.study(the_scene, space, design, 1, free=False)
+    low, high = (dict(zip(names, v, strict=True)) for v in (planned.low, planned.high))
+    assert low["wall[0]"] == pytest.approx(0.003) and high["wall[0]"] == pytest.approx(0.007)
+    assert high["pressure[0]"] == pytest.approx(150e3)
+    assert high["pressure[1]"] == pytest.approx(40e6 * 0.0033)
+
+
+def test_the_design_space_widens_the_table():
+    """The paper's 2D space has -60 to 200 mm for arm_z, the table -50 to 150."""
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "2d")
+    planned = tolerance.study(the_scene, space, space.default(), 2, free=False)
+    assert planned.space.num_parameters == 23 and len(planned.designs) == 1 + 23 * 2 * 2
+    row = planned.space.names.index("arm_z")
+    assert (planned.low[row], planned.high[row]) == pytest.approx((-0.060, 0.200))
+    # What the 2D space fixes, the whole design has: a pitch of 15 degrees.
+    pitch = planned.space.names.index("arm_pitch")
+    assert planned.designs[0, pitch] == pytest.approx(np.radians(15))
+    free = tolerance.study(the_scene, space, space.default(), 2, free=True)
+    assert free.space.names == ("length", "arm_z") and len(free.designs) == 1 + 2 * 2 * 2
+
+
+def test_failed_trials_and_late_losses_are_no_successes():
+    found = outcomes([1.0, 1.0, 0.0])
+    stuck = np.zeros_like(found.status)
+    stuck[1, :20] = int(Status.STUCK)
+    stuck[0, :20] = int(Status.SOLVER_CAP)  # a warning
+    shares = tolerance.shares(found._replace(status=stuck))
+    assert [s.value for s in shares] == [1.0, 0.5, 0.0]
+
+
+def test_thirty_six_successes_are_enough_to_be_sure():
+    [share] = tolerance.shares(outcomes([1.0], tolerance.TRIALS))
+    assert share.low > tolerance.WANTED
+
+
+@pytest.fixture(scope="module")
+def toy():
+    """An engine that two tests share, and with it their program."""
+    return ToyEngine(tiny()[0])
+
+
+def test_rollouts_find_the_length_at_which_the_toy_loses(toy):
+    """All designs and trials in one batch; the toy engine loses later the longer the fingers."""
+    the_scene, space, _ = tiny(**{"objects.noise.position": 0.0})
+    design = space.from_units(np.array([100.0, 40.0]))
+    planned = tolerance.study(the_scene, space, design, STEPS, free=True)
+    evaluate = codesign.make_evaluate(the_scene, toy, planned.space, 4)
+    found = jax.tree.map(np.asarray, evaluate(jnp.asarray(planned.designs), jax.random.key(0)))
+    assert toy.traced == 1 and found.cost.shape == (len(planned.designs), 4)
+    length, _ = tolerance.tolerances(planned, tolerance.shares(found))
+    # toy.ToyEngine loses at 0.5 + 8 (length - 0.03) + 0.3 z, with z the palm's height.  Lost before
+    # 1 s, the end of the window, is a failure, and so is kept at 1.18 s, the last step: stuck.
+    palm = the_scene.arm.zero_height + design[1]
+    least, most = (1e3 * (0.03 + (end - 0.5 - 0.3 * palm) / 8) for end in (1.0, 1.18))
+    assert length.down.bad.value < least < length.down.good.value < 100
+    assert 100 < length.up.good.value < most < length.up.bad.value
+
+
+@pytest.fixture(scope="module")
+def page():
+    """Scene, parameters, sizes and tolerances of a design."""
+    the_scene = scene.load("paper_spheres")
+    space = parameters.design_space(the_scene.hand, "full")
+    params = jax.tree.map(np.asarray, space.params(space.default()))
+    width = the_scene.hand.section.width
+    sizes = process.sizes(params.length, width, params.height, params.wall, Process())
+    planned = tolerance.study(the_scene, space, space.default(), STEPS, free=False)
+    good = np.abs(planned.designs - space.default())[:, 0] < 0.02
+    shares = tolerance.shares(outcomes(np.where(good, 1.0, 0.4)))
+    drift = sheet.Drift(shares[0], 40, STEPS, "structured", tolerance.tolerances(planned, shares))
+    return the_scene, params, sizes, drift
+
+
+def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
+    content = sheet.sections(*page)
+    text = sheet.write(tmp_path, "Build sheet", ["Design: x"], content).read_text()
+    fingers = "| 0 | 110.0 | 20.0 | 20.0 | 5.0 | 100.0 x 10.0 x 10.0 | 34.0 | 36.4 | 120.0 (200) |"
+    assert fingers in text  # 110 x 20 x 20 - 100 x 10 x 10 = 34 cm^3 of 1.07 g
+    row = next(line for line in text.splitlines() if line.startswith("| length[0] | mm | 110 |"))
+    cells = [c.strip() for c in row.strip("|").split("|")]
+    assert cells[3].endswith("(100 %, 91–100)") and cells[4].endswith("(40 %, 26–55)")
+    assert "not within the limits" in text and "Resolution: 5 values a side" in text
+    assert "fewer than 90 %" in text
+
+
+def test_free_bend_is_the_beam_s(page):
+    """physics.md's section at G = 70 kPa: 58 degrees for 100 mm at 120 kPa; goes with 1 / G."""
+    the_scene, params, *_ = page
+    angles = np.degrees(sheet.bends(the_scene, params))
+    expected = 58 * 70e3 / the_scene.hand.material.shear_modulus * 1.1
+    np.testing.assert_allclose(angles, expected, rtol=0.01)  # 58 has two digits
+
+
+def test_a_design_that_fails_has_no_tolerance(page):
+    *_, drift = page
+    poor = drift._replace(nominal=drift.nominal._replace(value=0.5), rows=[])
+    section = sheet.tolerance_section(poor)
+    assert not section.rows and "no tolerance to give" in section.notes[0]
+
+
+def test_drawing_is_one_page(page, tmp_path):
+    the_scene, params, sizes, drift = page
+    content = sheet.sections(*page)
+    path = drawing.write(
+        *(tmp_path, "Build sheet", ["Design: x"], content),
+        **{"scene": the_scene, "params": params, "sizes": sizes, "drift": drift},
+    )
+    data = path.read_bytes()
+    assert data.startswith(b"%PDF") and b"/Count 1" in data and len(data) > 10_000
+
+
+def test_command_writes_the_sheet(tmp_path, capsys, monkeypatch, toy):
+    monkeypatch.setattr(export, "make_engine", lambda name, the_scene: toy)
+    flags = ["--tolerance", "free", "--tolerance-steps", str(STEPS), "--tolerance-trials", "4"]
+    run = ["export", "--scene", str(TINY), "--no-parts", "--design", "length=100", "arm_z=40"]
+    run += ["--set", "objects.noise.position=0"]
+    assert cli.main([*run, *flags, "--out", str(tmp_path / "out")]) == 0
+    grasps = (1 + 2 * 2 * STEPS) * 4
+    assert f"tolerance: simulating {grasps} grasps" in capsys.readouterr().out
+    text = (tmp_path / "out" / "build_sheet.md").read_text()
+    assert "The design itself: 100 %, 51–100 of 4 grasps succeed." in text
+    assert "| length | mm | 100 |" in text and "Design: length=100 mm arm_z=40 mm" in text
+    assert (tmp_path / "out" / "build_sheet.pdf").exists()
+    assert cli.main([*run, "--tolerance-steps", "0", "--out", str(tmp_path / "no")]) == 2
+    assert "--tolerance-steps" in capsys.readouterr().err and not (tmp_path / "no").exists()

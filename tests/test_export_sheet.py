@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from toy import TINY, ToyEngine, tiny
 
-from codesign_jax import cli, codesign, parameters, scene
+from codesign_jax import cli, codesign, scene
 from codesign_jax.commands import export
 from codesign_jax.export import drawing, process, sheet, tolerance
 from codesign_jax.export.process import Process
+from codesign_jax.scene import parameters
 from codesign_jax.types import Outcome, Status
 
 STEPS = 5

@@ -17,9 +17,10 @@ engines cost
 start
 rollout
 programs
-codesign fit export
+codesign fit
 runs
 report
+export
 commands
 cli
 """

@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax import morphology
 from codesign_jax.export.grasps import phases
 from codesign_jax.export.process import Size
 from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
+from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
+from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import Scene
-from codesign_jax.statistics import Interval
 from codesign_jax.types import Params
 
 NAME = "build_sheet"

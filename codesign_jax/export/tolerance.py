@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax import statistics
 from codesign_jax.codesign import SUCCESS_COST
-from codesign_jax.hand import UNITS
-from codesign_jax.parameters import DesignSpace, design_space
+from codesign_jax.report import statistics
+from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import Scene
-from codesign_jax.statistics import Interval
+from codesign_jax.scene.hand import UNITS
+from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.types import Outcome, failed
 
 WANTED = 0.9

@@ -126,7 +126,11 @@ def page() -> str:
     lines += [
         "`codesign optimize` writes a folder. Its tables are CSV in UTF-8: a line of names, numbers"
     ]
-    lines += ["with nine significant digits, which name a float32 exactly. Costs have no unit.", ""]
+    lines += ["with nine significant digits, which name a float32 exactly. Costs have no unit."]
+    lines += [
+        "`codesign export` writes a folder of its own: [export.md](export.md) has its files.",
+        "",
+    ]
     lines += ["| file | content |", "| --- | --- |"]
     lines += [f"| `{name}` | {text} |" for name, text in FILES.items()]
     lines += [f"| `{name}` | a row for {table.rows} |" for name, table in TABLES.items()]

@@ -144,7 +144,7 @@ def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
     assert fingers in text  # 110 x 20 x 20 - 100 x 10 x 10 = 34 cm^3 of 1.07 g
     row = next(line for line in text.splitlines() if line.startswith("| length[0] | mm | 110 |"))
     cells = [c.strip() for c in row.strip("|").split("|")]
-    assert cells[3].endswith("(100 %, 91–100)") and cells[4].endswith("(40 %, 26–55)")
+    assert cells[3].endswith(": 100 % [91, 100]") and cells[4].endswith(": 40 % [26, 55]")
     assert "not within the limits" in text and "Resolution: 5 values a side" in text
     assert "fewer than 90 %" in text
 
@@ -184,7 +184,7 @@ def test_command_writes_the_sheet(tmp_path, capsys, monkeypatch, toy):
     grasps = (1 + 2 * 2 * STEPS) * 4
     assert f"tolerance: simulating {grasps} grasps" in capsys.readouterr().out
     text = (tmp_path / "out" / "build_sheet.md").read_text()
-    assert "The design itself: 100 %, 51–100 of 4 grasps succeed." in text
+    assert "Of 4 grasps of the design itself 100 % [51, 100] succeed." in text
     assert "| length | mm | 100 |" in text and "Design: length=100 mm arm_z=40 mm" in text
     assert (tmp_path / "out" / "build_sheet.pdf").exists()
     assert cli.main([*run, "--tolerance-steps", "0", "--out", str(tmp_path / "no")]) == 2

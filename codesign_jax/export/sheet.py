@@ -163,7 +163,7 @@ def _control(scene: Scene, params: Params) -> Section:
 
 def tolerance_section(drift: Drift) -> Section:
     """Tolerances as a table."""
-    nominal = f"The design itself: {_percent(drift.nominal)} of {drift.trials} grasps succeed"
+    nominal = f"Of {drift.trials} grasps of the design itself {_percent(drift.nominal)} succeed"
     limit = f"{100 * WANTED:.0f} %"
     if not drift.rows:
         note = f"{nominal}, fewer than {limit}: it has no tolerance to give."
@@ -175,7 +175,7 @@ def tolerance_section(drift: Drift) -> Section:
     factor = NEAREST ** (-1 / (drift.steps - 1)) if drift.steps > 1 else 1.0
     notes = [
         f"{nominal}. Each parameter alone; every value met the same {drift.trials} trials "
-        f"(engine {drift.engine}); in brackets the share of successes with its 95 % interval "
+        f"(engine {drift.engine}); behind it the share of successes with its 95 % interval "
         "(Wilson). A success keeps the object and lets go of it. Down to and up to: the last value "
         f"before the share falls below {limit}; fails at: the next value tried.",
         f"Resolution: {drift.steps} values a side, the first at {NEAREST:.3g} of the way to the "
@@ -189,15 +189,15 @@ def tolerance_section(drift: Drift) -> Section:
 def _side(side: Side) -> tuple[str, str]:
     if not side.room:
         return "at its limit", "–"
-    good = "none" if side.good is None else f"{side.good.value:.4g} ({_percent(side.good.share)})"
+    good = "none" if side.good is None else f"{side.good.value:.4g}: {_percent(side.good.share)}"
     if side.bad is None:
         return good, "not within the limits"
-    return good, f"{side.bad.value:.4g} ({_percent(side.bad.share)})"
+    return good, f"{side.bad.value:.4g}: {_percent(side.bad.share)}"
 
 
 def _percent(share: Interval) -> str:
     value, low, high = (100 * v for v in share)
-    return f"{value:.0f} %, {low:.0f}–{high:.0f}"
+    return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
 
 def markdown(title: str, lines: Sequence[str], content: Sequence[Section]) -> str:

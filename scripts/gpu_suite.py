@@ -26,7 +26,7 @@ import pytest
 
 from codesign_jax import scene as scenes
 from codesign_jax.engines.structured import StructuredEngine
-from scripts.shared import provenance, work
+from scripts.shared import output, provenance, work
 
 RATES: dict[str, dict[str, Any]] = {
     "spheres": {},
@@ -189,7 +189,7 @@ def suite(arguments: argparse.Namespace) -> int:
     def write() -> None:
         result = {"provenance": made, "seconds": round(time.monotonic() - begin, 1)}
         result |= {"rates": rates, "tests": recorder.tests}
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        output.write_json(arguments.json, result)
 
     recorder, code = Recorder(write), 0
     chosen = arguments.rates if "rates" in arguments.parts else []

@@ -9,7 +9,6 @@ float64.
 """
 
 import dataclasses
-import json
 from pathlib import Path
 
 import jax
@@ -24,6 +23,7 @@ from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.scene import parameters
 from codesign_jax.types import Trial
 from scripts.shared import figures as pictures
+from scripts.shared import output
 
 DENSITIES = ((1, 4), (1, 8), (2, 8), (3, 12), (4, 16), (8, 32))
 DESIGN = np.array([0.148, -0.059])  # length and arm height [m] of a hand that holds all three
@@ -98,9 +98,8 @@ def main(options: Options) -> None:
         )
         print(rows[-1], flush=True)
     shapes = [o.name for o in cases[DENSITIES[0]].scene.objects.object]
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     record = {"shapes": shapes, "rows": rows}
-    options.out.write_text(json.dumps(record, indent=1) + "\n")
+    output.write_json(options.out, record)
     if options.figure:
         draw(record, options.figure)
 

@@ -18,7 +18,7 @@ from codesign_jax import rollout, scene, types
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status
-from scripts.shared import provenance
+from scripts.shared import output, provenance
 
 
 def particles(space: parameters.DesignSpace, seed: int, count: int) -> jax.Array:
@@ -50,7 +50,6 @@ def main() -> None:
         trials = rollout.sample_trials(the_scene, key, designs.shape[0])
         return rollout.simulate(the_scene, engine, jax.vmap(space.params)(designs), trials)[0]
 
-    args.json.parent.mkdir(parents=True, exist_ok=True)
     chunks = -(-args.worlds // args.chunk)
     seconds, status, cost, failures, result = [], [], [], [], {}
     for c in range(chunks):
@@ -68,7 +67,7 @@ def main() -> None:
             bad = int(result.bad_step[world])
             failures.append({"chunk": c, "world": int(world), "status": bits.name, "step": bad})
         result = summary(args, the_scene, status, cost, seconds) | {"failures": failures}
-        args.json.write_text(json.dumps(result, indent=2) + "\n")
+        output.write_json(args.json, result, indent=2)
     print(json.dumps(result | {"failures": len(failures)}, indent=2))
 
 

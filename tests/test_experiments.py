@@ -430,7 +430,17 @@ def test_the_script_stops_resumes_and_draws(tmp_path):
         command = [sys.executable, "-m", "scripts.experiments", *arguments]
         return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
-    run = ["2d", "--size", "tiny", "--engine", "mujoco", "--out", str(tmp_path)]
+    run = [
+        "2d",
+        "--size",
+        "tiny",
+        "--engine",
+        "mujoco",
+        "--scene",
+        "paper_spheres",
+        "--out",
+        str(tmp_path),
+    ]
     stopped = call(*run, "--minutes", "0")
     assert stopped.returncode == 3, stopped.stderr
     done = call(*run, "--trials", str(tmp_path / "trials.npz"), "--commit", "abc")

@@ -126,6 +126,7 @@ def test_without_pyarrow_nothing_is_simulated(finished, tmp_path, monkeypatch):
 def test_the_script_writes_rows_and_again_from_a_finished_state(tmp_path, monkeypatch):
     def run(*more):
         arguments = ["experiments", "landscape", "--size", "tiny", "--engine", "mujoco"]
+        arguments += ["--scene", "paper_spheres"]
         arguments += ["--out", str(tmp_path), *more]
         monkeypatch.setattr(sys, "argv", arguments)
         with pytest.raises(SystemExit) as end:

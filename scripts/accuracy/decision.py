@@ -13,13 +13,12 @@ from codesign_jax.scene import Scene, parameters
 from codesign_jax.types import failed
 from scripts.accuracy import worlds
 from scripts.accuracy.settings import Setting
+from scripts.shared import work
 
 KEPT, FAILED = -1, -2
 """Marks in place of the time of loss: kept to the end, and failed."""
 SEED = 5
 """Seed of the trials; no run of the reproduction tested its particles on it."""
-NUDGE = 1e-6
-"""Displacement of the objects that shows how much of a difference chaos alone makes [m]."""
 
 
 def populations(data: Path, count: int) -> dict[str, np.ndarray]:
@@ -53,7 +52,7 @@ def simulate(
       designs: Particles, shape (particle, 23).
       first: Number of the first trial.
       trials: Number of trials.
-      moved: Whether the objects are displaced by `NUDGE`.
+      moved: Whether the objects are displaced by `work.NUDGE`.
     """
     with worlds.floats(setting.wide) as dtype:
         scene = setting.scene()
@@ -61,7 +60,7 @@ def simulate(
         drawn = worlds.trials(scene, first + trials, seed=SEED)
         drawn = worlds.cast(jax.tree.map(lambda x: x[first:], drawn), dtype)
         if moved:
-            drawn = drawn._replace(position=drawn.position + np.asarray(NUDGE, dtype))
+            drawn = work.nudged(drawn)
         engine = setting.make(scene)
 
         @jax.jit

@@ -1,11 +1,11 @@
 """From committed records to figures, tables and CSV."""
 
-import csv
 from pathlib import Path
 from typing import Any
 
 from scripts.accuracy import analysis, figures, presets, tables
 from scripts.accuracy.results import ERRORS, Study
+from scripts.shared import output
 from scripts.shared.tables import fill, markdown
 
 MACHINES = {"h200": "NVIDIA H200 and 16 CPU cores", "cpu": "2 CPU cores"}
@@ -97,7 +97,5 @@ def table(study: Study, path: Path) -> None:
             row |= {"wall_s_per_simulated_s": study.cost(setting.engine, setting)}
             row |= {"not_measured": analysis.bad(r), key: r.get(key)}
     names = list(dict.fromkeys(k for row in values.values() for k in row))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["label", *names], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({"label": label, **row} for (_, label), row in values.items())
+    rows = ({"label": label, **row} for (_, label), row in values.items())
+    output.write_csv(path, ["label", *names], rows)

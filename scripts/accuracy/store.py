@@ -8,10 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from codesign_jax import files
 from codesign_jax.scene.schema import SceneError
 from scripts.accuracy.settings import Setting
-from scripts.shared import provenance
+from scripts.shared import output, provenance
 
 ATTEMPTS = 2
 """Times that a case is begun before it counts as failed where it never ends."""
@@ -100,5 +99,4 @@ class Store:
 
     def write(self) -> None:
         """Writes the file as a whole or not at all."""
-        with files.atomically(self.path) as part:
-            part.write_text(json.dumps(self.data, separators=(",", ":")) + "\n")
+        output.write_json(self.path, self.data, indent=None)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from scripts.benchmark import report
-from scripts.shared import peers, provenance
+from scripts.shared import output, peers, provenance
 
 PARTS = ("grasp", "window", "residual", "quality", "growth")
 # Worlds of the sizes measured; stock MJX and Warp get what their speed and memory allow.
@@ -202,8 +202,7 @@ def main() -> None:
         for record in records:
             report.add(results, record, costs)
             print(f"[{number}/{len(cases)}]", report.line(record), flush=True)
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps(results, indent=1) + "\n")
+        output.write_json(args.json, results)
     print(report.tables(results))
 
 

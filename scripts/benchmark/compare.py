@@ -1,47 +1,83 @@
-"""Compares the costs of the engines over many trials at equal settings.
+"""Compares the costs of the engines over many trials: how much of a difference is chaos?
 
 python -m scripts.benchmark.compare --trials 2000 --json docs/data/compare_engines.json
+python -m scripts.benchmark.compare --designs grid --trials 2400 --mjx-trials 0 \
+    --limits 24/14/1e-6 12/10/1e-5 --json runs/tolerances.json
 
 Single grasps differ after contact, where trajectories are chaotic; what must agree are the shares
-of successes, the costs' distributions and the designs' ranks.  Engines are compared in pairs over
-the same worlds; "mujoco, perturbed" is MuJoCo C against itself with the objects moved by a
-micrometre, which shows how much of a difference chaos alone makes.
+of successes, the costs' distributions and the designs' ranks.  Engines are compared with MuJoCo C
+over the same worlds, at equal settings; "mujoco, perturbed" is MuJoCo C against itself with the
+objects moved by a micrometre, which shows how much of a difference chaos alone makes.  --limits
+adds the structured engine with other limits of its solver: Newton iterations of a step, line-search
+evaluations of an iteration, relative decrement.
 """
 
 import argparse
-import json
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax.codesign import SUCCESS_COST
-from codesign_jax.scene import Scene
-from scripts.shared import peers, provenance, statistics, work
+from codesign_jax.engines import Engine
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.scene import Scene, parameters
+from scripts.shared import output, peers, provenance, statistics, work
 
-NUDGE = 1e-6
-"""Displacement of the objects of the perturbed runs [m]."""
+Limits = tuple[int, int, float]
+"""Newton iterations, line-search evaluations, relative decrement."""
+GRID = 20
+"""Designs along a side of the grid over the 2D design space."""
 
 
-def costs(scene: Scene, name: str, count: int, chunk: int) -> tuple[np.ndarray, float]:
-    """Costs of the first worlds, shape (world,), and seconds with one compile."""
-    engine = peers.build(
-        "structured" if name == "structured" else name.split(",")[0],
-        "default" if name == "structured" else "equal",
-        scene,
+def limits(text: str) -> Limits:
+    """Reads 24/14/1e-6."""
+    iterations, evaluations, decrement = text.split("/")
+    return int(iterations), int(evaluations), float(decrement)
+
+
+def grid_worlds(scene: Scene, count: int) -> work.Worlds:
+    """The first worlds of a grid of 2D designs, each in `work.TRIALS` trials; then they repeat."""
+    space = parameters.design_space(scene.hand, "2d")
+    axes = [np.linspace(a, b, GRID) for a, b in zip(space.low, space.high, strict=True)]
+    designs = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    params = jax.vmap(space.params)(jnp.asarray(designs, jnp.float32))
+    trials = rollout.sample_trials(scene, jax.random.key(0), work.TRIALS)
+    index = np.arange(count) % (len(designs) * work.TRIALS)
+    return work.Worlds(
+        jax.tree.map(lambda x: x[index // work.TRIALS], params),
+        jax.tree.map(lambda x: x[index % work.TRIALS], trials),
     )
+
+
+def engines(scene: Scene, chosen: list[Limits], *, mjx: bool) -> dict[str, Callable[[], Engine]]:
+    """What builds each engine, by the name in the file; MuJoCo C, which stands for all, first."""
+    found: dict[str, Callable[[], Engine]] = {
+        "mujoco": lambda: peers.build("mujoco", "equal", scene),
+        "mujoco, perturbed": lambda: peers.build("mujoco", "equal", scene),
+        "structured": lambda: peers.build("structured", "default", scene),
+    }
+    for i, e, d in chosen:
+        build = partial(StructuredEngine, scene, iterations=i, evaluations=e, tolerance=d)
+        found[f"structured, {i}/{e}/{d:g}"] = build
+    return found | ({"mjx": lambda: peers.build("mjx", "equal", scene)} if mjx else {})
+
+
+def costs(
+    scene: Scene, engine: Engine, worlds: work.Worlds, chunk: int
+) -> tuple[np.ndarray, float]:
+    """Costs of worlds, shape (world,), and seconds with one compile; chunks divide the worlds."""
     run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t)[0].cost)
-    worlds = work.make_worlds(scene, -(-count // chunk) * chunk)
-    if name.endswith("perturbed"):
-        moved = worlds.trials._replace(position=worlds.trials.position + NUDGE)
-        worlds = worlds._replace(trials=moved)
     begin, found = time.perf_counter(), []
-    for first in range(0, count, chunk):
+    for first in range(0, worlds.trials.yaw.shape[0], chunk):
         part = jax.tree.map(lambda x, a=first: x[a : a + chunk], worlds)
         found.append(np.asarray(run(*part)))
-    return np.concatenate(found)[:count], time.perf_counter() - begin
+    return np.concatenate(found), time.perf_counter() - begin
 
 
 def compare(a: np.ndarray, b: np.ndarray) -> dict:
@@ -76,20 +112,26 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=2000)
     parser.add_argument("--mjx-trials", type=int, default=120, help="0 leaves stock MJX out")
     parser.add_argument("--chunk", type=int, default=500)
+    parser.add_argument("--designs", choices=("usual", "grid"), default="usual")
+    parser.add_argument("--limits", type=limits, nargs="+", default=[], metavar="24/14/1e-6")
     provenance.add_commit(parser)
     parser.add_argument("--json", type=Path, required=True)
     args = parser.parse_args()
     scene = work.variant()
-    sizes = {n: args.trials for n in ("mujoco", "mujoco, perturbed", "structured")}
-    sizes |= {"mjx": min(args.mjx_trials, args.trials)} if args.mjx_trials else {}
+    draw = grid_worlds if args.designs == "grid" else work.make_worlds
     found, seconds = {}, {}
-    for name, count in sizes.items():
-        found[name], seconds[name] = costs(scene, name, count, min(args.chunk, count))
+    for name, build in engines(scene, args.limits, mjx=args.mjx_trials > 0).items():
+        count = min(args.mjx_trials, args.trials) if name == "mjx" else args.trials
+        chunk = min(args.chunk, count)
+        worlds = draw(scene, -(-count // chunk) * chunk)
+        if name.endswith("perturbed"):
+            worlds = worlds._replace(trials=work.nudged(worlds.trials))
+        each, seconds[name] = costs(scene, build(), worlds, chunk)
+        found[name] = each[:count]
         print(f"{name}: {count} grasps in {seconds[name]:.0f} s", flush=True)
     pairs = {n: compare(found[n], found["mujoco"]) for n in found if n != "mujoco"}
-    result = {**provenance.measurement(args.commit), "seconds": seconds, "against_mujoco": pairs}
-    args.json.parent.mkdir(parents=True, exist_ok=True)
-    args.json.write_text(json.dumps(result, indent=1) + "\n")
+    made = provenance.measurement(args.commit)
+    output.write_json(args.json, {**made, "seconds": seconds, "against_mujoco": pairs})
     for name, pair in pairs.items():
         print(show(name, pair))
 

@@ -7,7 +7,6 @@ two idle cores.
 """
 
 import argparse
-import csv
 import json
 import os
 import time
@@ -20,7 +19,7 @@ from codesign_jax import scene
 from codesign_jax.commands import common
 from scripts.effects import page as effects_page
 from scripts.effects import study as effects
-from scripts.shared import provenance
+from scripts.shared import output, provenance
 
 DOCS = Path(__file__).parents[2] / "docs"
 AS_IT_IS = effects_page.REFERENCE
@@ -116,14 +115,10 @@ def _programs(
 
 
 def _store(results: dict[str, Any], path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    output.write_json(path, results)
     rows = [{"effect": name, **record} for name, record in results["effects"].items()]
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
+    output.write_csv(path.with_suffix(".csv"), columns, rows)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from codesign_jax.scene import keypaths, parameters
 from codesign_jax.scene.schema import SceneError
 from scripts.experiments import Batch, Grid, Stop, Worlds, drive, parquet, plan, results
 from scripts.experiments.worlds import LIMIT, chunking
-from scripts.shared import provenance, record
+from scripts.shared import output, provenance, record
 
 
 def parse() -> argparse.Namespace:
@@ -53,7 +53,11 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--minutes", type=float, help="save and stop after this time")
     parser.add_argument("--fresh", action="store_true", help="delete an earlier state")
     provenance.add_commit(parser)
-    parser.add_argument("--trials", type=Path, help="write every trial to this .npz")
+    parser.add_argument(
+        "--trials",
+        type=Path,
+        help="write every trial to this .npz",
+    )
     parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
     parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
@@ -107,7 +111,7 @@ def simulate(args: argparse.Namespace) -> int:
         for path in results.write(args.out, args.experiment, kept, made):
             print(path)
     if args.trials:
-        print(results.write_trials(args.trials, done.record))
+        print(output.write_arrays(args.trials, done.record))
     if args.parquet:
         print(parquet.write(args.parquet, experiment, done.record, json.loads(notes.read_text())))
     return 0

@@ -20,7 +20,7 @@ import numpy as np
 
 from scripts.experiments import plan
 from scripts.experiments.worlds import LIMIT, chunking
-from scripts.shared import provenance
+from scripts.shared import output, provenance
 
 TIMES = ("seconds", "processes", "_settings", "_digest")
 """What may differ between two records of an experiment."""
@@ -96,8 +96,7 @@ def main() -> int:
     args = parse()
     with tempfile.TemporaryDirectory() as folder:
         found = compare(args, Path(folder))
-    args.json.parent.mkdir(parents=True, exist_ok=True)
-    args.json.write_text(json.dumps(found, indent=2) + "\n")
+    output.write_json(args.json, found, indent=2)
     for count, row in found["devices"].items():
         text = f"{len(row['different_arrays'])} of {found['compared']['arrays']} arrays differ"
         print(f"{count} device(s): {row['speedup']:.2f} times the first's grasps/s, {text}")

@@ -1,7 +1,6 @@
 """From the record of an experiment to what is kept: small arrays, and where they come from."""
 
 import datetime
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from codesign_jax.scene import Scene
 from codesign_jax.types import Status, failed
 from scripts.experiments.batch import Batch
 from scripts.experiments.landscape import Grid
-from scripts.shared import provenance
+from scripts.shared import output, provenance
 from scripts.shared.driver import Drive
 from scripts.shared.record import KEPT, Arrays
 
@@ -126,18 +125,10 @@ def describe(
     }
 
 
-def write_trials(path: Path, record: Arrays) -> Path:
-    """Writes every trial: step of loss (`KEPT` if never) and status, with the final particles."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, **record)  # type: ignore[arg-type]
-    return path
-
-
 def write(folder: Path, name: str, arrays: Arrays, notes: dict[str, object]) -> list[Path]:
     """Writes NAME.npz and NAME.json; returns their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    data, text = folder / f"{name}.npz", folder / f"{name}.json"
-    np.savez_compressed(data, **arrays)  # type: ignore[arg-type]
     made = {"written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
-    text.write_text(json.dumps(notes | made, indent=2) + "\n")
-    return [data, text]
+    return [
+        output.write_arrays(folder / f"{name}.npz", arrays),
+        output.write_json(folder / f"{name}.json", notes | made, indent=2),
+    ]

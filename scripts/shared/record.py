@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax import files
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome
+from scripts.shared import output
 
 Arrays = dict[str, Any]
 """NumPy arrays by name, `step` (the steps done) among them."""
@@ -63,13 +63,8 @@ def settings(plan: Any, scene: Scene, engine: str, seed: int, chunk: int) -> dic
 
 def save(path: Path, record: Arrays, settings: dict[str, object]) -> None:
     """Writes a record with the settings it belongs to and a digest; as a whole or not at all."""
-    with files.atomically(path) as part, part.open("wb") as file:
-        np.savez_compressed(
-            file,
-            **record,  # type: ignore[arg-type]
-            _settings=np.array(json.dumps(settings, sort_keys=True)),
-            _digest=np.array(digest(record)),
-        )
+    notes = {"_settings": np.array(json.dumps(settings, sort_keys=True))}
+    output.write_arrays(path, record | notes | {"_digest": np.array(digest(record))})
 
 
 def load(path: Path, settings: dict[str, object]) -> Arrays:

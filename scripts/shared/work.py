@@ -18,6 +18,8 @@ TRIALS = 6
 GOOD = {"length": (64.0, 8.0), "arm_z": (0.0, 8.0)}
 """Middle and half range [mm] of 2D designs that hold their objects, by parameter."""
 SEED = 2017
+NUDGE = 1e-6
+"""Displacement of the objects that shows how much of a difference chaos alone makes [m]."""
 
 
 class Worlds(NamedTuple):
@@ -106,6 +108,11 @@ def make_worlds(chosen: Scene, count: int, *, repeat: int | None = None) -> Worl
         jax.tree.map(lambda x: x[index // TRIALS], params),
         jax.tree.map(lambda x: x[index % TRIALS], trials),
     )
+
+
+def nudged(trials: Trial) -> Trial:
+    """The trials with every object displaced by `NUDGE`."""
+    return trials._replace(position=trials.position + np.asarray(NUDGE, trials.position.dtype))
 
 
 def inputs(chosen: Scene, worlds: Worlds) -> tuple[ModelFields, jax.Array]:

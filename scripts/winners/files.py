@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax import files
+from scripts.shared import output
 from scripts.shared import record as records
 from scripts.shared.record import Arrays, StateError
 
@@ -65,8 +65,7 @@ def note(runs: list[Run], key: str) -> None:
 def write_runs(path: Path, settings: dict[str, Any], runs: Sequence[Run]) -> None:
     """Writes the .json of a results file; as a whole or not at all."""
     kept = [run for run in runs if run["calls"]]
-    with files.atomically(path.with_suffix(".json")) as part:
-        part.write_text(json.dumps({"settings": settings, "runs": kept}, indent=2) + "\n")
+    output.write_json(path.with_suffix(".json"), {"settings": settings, "runs": kept}, indent=2)
 
 
 def merge(paths: Sequence[Path], out: Path) -> list[str]:

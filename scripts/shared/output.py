@@ -1,0 +1,42 @@
+"""Writes what studies found: as a whole or not at all, whenever a process ends."""
+
+import csv
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign_jax import files
+
+
+def write_json(path: Path, content: Any, *, indent: int | None = 1) -> Path:
+    """Writes a JSON file, its folder included.
+
+    Args:
+      path: The file.
+      content: What `json.dumps` takes.
+      indent: Spaces of a level; None for no white space at all.
+    """
+    separators = (",", ":") if indent is None else None
+    with files.atomically(path) as part:
+        text = json.dumps(content, indent=indent, separators=separators)
+        part.write_text(text + "\n", encoding="utf-8")
+    return path
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
+    """Writes arrays by name as a compressed .npz file, its folder included."""
+    with files.atomically(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    return path
+
+
+def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> Path:
+    """Writes a table, its folder included; what a row does not have stays empty."""
+    with files.atomically(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(columns), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return path

@@ -20,7 +20,7 @@ from codesign_jax.export import grasps, mjcf, plain, tables
 from codesign_jax.export.play import play
 from codesign_jax.model import build_spec
 from codesign_jax.scene import parameters
-from codesign_jax.types import Trial, failed
+from codesign_jax.types import Status, Trial, failed
 
 # A grasp in 2.2 s, with all joints and contacts.
 HURRIED = {
@@ -175,6 +175,17 @@ def test_a_rigid_wrist_leaves_the_binary_model_alone(tmp_path):
     assert errors(states, trace, 0).max() < 1e-3
 
 
+def test_a_grasp_that_mujoco_warns_of_has_failed(tmp_path, monkeypatch):
+    """Its key frames end where MuJoCo refused the numbers: of a pressure that is no number."""
+    monkeypatch.chdir(tmp_path)  # where MuJoCo logs its warnings
+    the_scene = pinch("box", **HURRIED)
+    params, trial = hand_world(the_scene, pressure=1e12)
+    found = grasps.grasp(the_scene, params, trial)
+    assert found.outcome.status & Status.NONFINITE and found.outcome.bad_step == 51
+    loaded = mujoco.MjModel.from_xml_string(found.xml)
+    assert [loaded.key(i).name for i in range(loaded.nkey)] == ["start", "after_approach"]
+
+
 def test_a_number_that_is_lost_is_noticed():
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(size=[1 / 3, 0, 0])  # without a name its numbers are not found
@@ -242,6 +253,12 @@ def test_command_refuses_in_words_and_writes_nothing(tmp_path, capsys):
     text = capsys.readouterr().err
     assert "--design 'lenght' is not a parameter; did you mean 'length'" in text
     assert "arm_z" in text and not out.exists()
+    (tmp_path / "file").touch()
+    assert export("--scene", TINY, "--out", tmp_path / "file" / "out") == 2
+    assert "Not a directory" in capsys.readouterr().err
+    hull = ("--set", "effects.surface=hull", "--engine", "mujoco", "--tolerance", "all")
+    assert export("--scene", TINY, "--out", out, *hull) == 2
+    assert "not supported by engine mujoco: effects.surface" in capsys.readouterr().err
     assert export("--trials", "-1", "--out", out) == 2
     assert "--trials" in capsys.readouterr().err and not out.exists()
 

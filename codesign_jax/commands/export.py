@@ -39,13 +39,19 @@ def main(options: "Export") -> int:
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
     notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
+    simulating = options.tolerance != "off" and not options.no_sheet
+    engine = make_engine(case.engine, case.scene) if simulating else None
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
         console.print(f"best final design of {options.run_folder}", markup=False)
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
     for note in notes:
         console.print(note, markup=False)
-    _write(case, params, sizes, options, console)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SceneError([f"--out {options.out}: {error.strerror}"]) from error
+    _write(case, params, sizes, engine, options, console)
     return 0
 
 
@@ -106,10 +112,14 @@ def _missing(options: "Export") -> list[str]:
 
 
 def _write(
-    case: Case, params: Params, sizes: list[Size], options: "Export", console: Console
+    case: Case,
+    params: Params,
+    sizes: list[Size],
+    engine: engines.Engine | None,
+    options: "Export",
+    console: Console,
 ) -> None:
-    """Writes all that is asked for."""
-    options.out.mkdir(parents=True, exist_ok=True)
+    """Writes all that is asked for; tolerances if there is an engine to simulate them."""
     _models(case, params, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
     schedule = grasps.schedule(case.scene, params, nominal)
@@ -118,7 +128,8 @@ def _write(
     if not options.no_parts:
         _parts(sizes, options, console)
     if not options.no_sheet:
-        _sheet(case, params, sizes, options, console)
+        drift = _drift(case, engine, options, console) if engine else None
+        _sheet(case, params, sizes, drift, options, console)
 
 
 def _parts(sizes: list[Size], options: "Export", console: Console) -> None:
@@ -173,11 +184,15 @@ def _trials(case: Case, options: "Export") -> list[tuple[str, Trial]]:
 
 
 def _sheet(
-    case: Case, params: Params, sizes: list[Size], options: "Export", console: Console
+    case: Case,
+    params: Params,
+    sizes: list[Size],
+    drift: "sheet.Drift | None",
+    options: "Export",
+    console: Console,
 ) -> None:
     from codesign_jax.export import drawing, sheet  # needs the extra
 
-    drift = None if options.tolerance == "off" else _drift(case, options, console)
     content = sheet.sections(case.scene, params, sizes, drift)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
@@ -207,7 +222,9 @@ def _sheet(
         console.print(f"build sheet: {path}", markup=False)
 
 
-def _drift(case: Case, options: "Export", console: Console) -> "sheet.Drift":
+def _drift(
+    case: Case, engine: engines.Engine, options: "Export", console: Console
+) -> "sheet.Drift":
     """Tolerances of the design: its own grasps, then those of all steps in one batch."""
     from codesign_jax.export import sheet, tolerance
 
@@ -215,7 +232,6 @@ def _drift(case: Case, options: "Export", console: Console) -> "sheet.Drift":
     planned = tolerance.study(
         case.scene, case.space, case.design, steps, free=options.tolerance == "free"
     )
-    engine = make_engine(case.engine, case.scene)
     evaluate = codesign.make_evaluate(case.scene, engine, planned.space, trials)
 
     def simulate(designs: np.ndarray) -> "list[Interval]":

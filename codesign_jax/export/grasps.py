@@ -113,6 +113,8 @@ def _add_keys(scene: Scene, spec: mujoco.MjSpec, controls: np.ndarray, states: n
     nq = (states.shape[1] + 1) // 2
     for name, end in phases(scene)[:-1]:
         k = round(end / scene.discretization.timestep)
+        if not np.isfinite(states[k]).all():
+            return  # a grasp that failed has no states to go on from
         spec.add_key(
             name=f"after_{name}",
             time=controls[k, 0],

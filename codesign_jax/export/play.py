@@ -17,7 +17,8 @@ def play(model, controls):
         data.ctrl = row[1:]
         mujoco.mj_step(model, data)  # leaves the bodies' centres of before the step in xipos
         away = np.linalg.norm(data.body("object").xipos - weights @ data.xipos)
-        record.append([away, *before])
+        sound = np.nan if any(data.warning.number) else 1.0  # MuJoCo warns of bad numbers
+        record.append(sound * np.array([away, *before]))
     distance, states = np.array(record)[:, 0], np.array(record)[:, 1:]
     steps = np.arange(len(times))
     away = (distance >= lost) & (steps >= begin) & (steps < end)
@@ -29,5 +30,6 @@ if __name__ == "__main__":
         binary = path.endswith(".mjb")
         load = mujoco.MjModel.from_binary_path if binary else mujoco.MjModel.from_xml_path
         controls = np.loadtxt(path[:-4] + "_controls.csv", delimiter=",", skiprows=1)
-        when = play(load(path), controls)[0]
-        print(f"{path}: {'kept' if np.isinf(when) else f'lost at {when:.2f} s'}")
+        when, distance, _ = play(load(path), controls)
+        kept = "failed: MuJoCo warned" if np.isnan(distance).any() else "kept"
+        print(f"{path}: {kept if np.isinf(when) else f'lost at {when:.2f} s'}")

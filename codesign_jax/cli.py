@@ -7,25 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-# A flag given twice adds to what was given before.
-Overrides = Annotated[
-    tuple[tuple[str, ...], ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(
-        name="set",
-        metavar="KEY=VALUE ...",
-        help="Values that replace those of the scene, hand and objects files, by key path: "
-        "gravity=3.7 discretization.links=5 hand.material.shear_modulus=60e3 "
-        "objects.object.sphere.mass=0.2",
-        help_behavior_hint="",
-    ),
-]
-
-# Without a default of its own: the help text says what takes its place.
-Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
-Count = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
-File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+from codesign_jax.commands.flags import Count, File, Flag, Overrides, Shown, Subject, Text
 
 
 @dataclasses.dataclass
@@ -81,34 +63,9 @@ class Optimize:
 
 
 @dataclasses.dataclass
-class Evaluate:
+class Evaluate(Subject):
     """Evaluate one design: costs of each object, how sure they are, an animation if asked for."""
 
-    design: Annotated[
-        tuple[tuple[str, ...], ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint=""),
-    ] = ()
-    """The design in the hand file's units, e.g. length=148 arm_z=-59; the rest is the default."""
-    run_folder: Annotated[
-        Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
-    ] = None
-    """Take scene, design space and best particle from this run folder; --accuracy, --objects, --set
-    and --engine then replace the run's."""
-    preset: str = "2d"
-    """Design space that the names belong to."""
-    hand: Text = None
-    """Hand: a built-in name or a .toml file; default: the scene's."""
-    objects: Text = None
-    """Object set: a built-in name or a .toml file; default: the scene's."""
-    scene: str = "paper"
-    """Scene: a built-in name or a .toml file."""
-    accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, reference (their errors and
-    costs: docs/accuracy.md), or a .toml."""
-    overrides: Overrides = ()
-    engine: Text = None
-    """Engine that simulates; default: the run's, or structured."""
     trials: int = 6
     """Trials, taking turns between the objects."""
     seed: int = 0
@@ -193,6 +150,54 @@ class Export:
 
 
 @dataclasses.dataclass
+class Landscape(Subject):
+    """Draw the mean cost over a grid of two parameters: a figure, a table and arrays.
+
+    With --run the files go to the run folder, and its report shows them.
+    """
+
+    parameters: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="NAME NAME", help_behavior_hint="")
+    ] = ()
+    """The two parameters; default: those of a design space of two. The others stay as they are in
+    the design."""
+    points: int = 20
+    """Points along each parameter's range, its ends included."""
+    trials: int = 6
+    """Trials of each point, taking turns between the objects; all points have the same ones."""
+    seed: int = 0
+    """Root of the trials' noise."""
+    out: File = None
+    """Folder of the files; default: the run folder, or landscape."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import landscape
+
+        return landscape.main(self)
+
+
+@dataclasses.dataclass
+class Render(Shown):
+    """Draw one grasp, of a design or of a run: an animation (.gif) or a film strip (.png)."""
+
+    out: Path = Path("grasp.gif")
+    """The picture, .gif or .png."""
+    times: Annotated[
+        tuple[float, ...], tyro.conf.arg(metavar="SECONDS ...", help_behavior_hint="")
+    ] = ()
+    """Times of a strip's pictures [s]; default: the end of each phase."""
+    size: int = 320
+    """Width and height of a picture in pixels."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import render
+
+        return render.main(self)
+
+
+@dataclasses.dataclass
 class Report:
     """Write the report of a run: one HTML file, with the best grasp in 3D, that works offline.
 
@@ -235,19 +240,32 @@ class Scenes:
 
 
 @dataclasses.dataclass
-class Replay:
-    """Replay a failed world of a run: simulate it again, and its last good state in MuJoCo C."""
+class Replay(Shown):
+    """Show one grasp in 3D in a browser, or say how a failed world of a run failed.
 
-    path: Annotated[Path, tyro.conf.Positional]
-    """A file of the run folder's failures/, or the run folder, whose failed worlds are listed."""
-    engine: Text = None
-    """Engine that simulates; default: the run's."""
+    A page of its own that works offline: the best grasp of a run, any row of its trials.csv, or a
+    design. A failed world (a file of the run folder's failures/) is simulated again, and its last
+    good state goes on in MuJoCo C.
+    """
+
+    path: Annotated[
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="PATH", help_behavior_hint="")
+    ] = None
+    """A run folder (as --run), or a file of its failures/."""
+    out: File = None
+    """The page; default: replay.html in the run folder, or here."""
+    open: Flag = False
+    """Open it in the browser."""
 
     def run(self) -> int:
         """Runs the command and returns the exit status."""
         from codesign_jax.commands import replay
 
         return replay.main(self)
+
+
+COMMANDS = Optimize | Evaluate | Landscape | Report | Replay | Render | Export | Scenes
+"""The commands, in the order of the help text."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -260,7 +278,7 @@ def main(arguments: list[str] | None = None) -> int:
       arguments: Arguments without the program's name; default: those of the process.
     """
     command = tyro.cli(
-        Optimize | Evaluate | Report | Export | Scenes | Replay,  # type: ignore[arg-type]
+        COMMANDS,  # type: ignore[arg-type]
         args=arguments,
         prog="codesign",
         description="Co-design of soft hand morphology and control.",

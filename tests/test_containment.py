@@ -262,8 +262,9 @@ def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
     # From the last good state MuJoCo C itself takes the step beyond the limit.
     speed = float(text.rsplit("to a speed of ", 1)[1])
     assert speed > scene.limits.speed
-    assert cli.main(["replay", str(folder)]) == 0
+    assert cli.main(["replay", str(folder), "--engine", "mujoco"]) == 0
     assert files[0].name in capsys.readouterr().out
+    assert (folder / "replay.html").exists()
 
 
 def test_what_is_no_failed_world_is_refused(failing_run, tmp_path, capsys):

@@ -6,12 +6,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from toy import TINY
 
 from codesign_jax import cli
-from codesign_jax.commands import evaluate, export, replay, report
+from codesign_jax.commands import evaluate, export, landscape, render, replay, report
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "scripts" / "README.md"]
@@ -40,7 +41,8 @@ CODESIGN = list(dict.fromkeys(" ".join(words) for words in examples("codesign"))
 
 def test_the_pages_have_examples():
     kinds = {example.split()[0] for example in CODESIGN}
-    assert kinds == {"optimize", "evaluate", "report", "export", "scenes", "replay"}
+    flags = [argument.__name__.lower() for argument in get_args(cli.COMMANDS)]
+    assert kinds == {*flags} and len(CODESIGN) > 10
 
 
 @pytest.fixture(scope="module")
@@ -77,17 +79,25 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
         monkeypatch.setattr(export, "_write", lambda *rest: reached.append(rest))
     elif arguments[0] == "report":
         monkeypatch.setattr(report, "_best_grasp", lambda *rest: reached.append(rest))
+    elif arguments[0] == "landscape":
+        for name in ("_simulate", "summarize", "_report", "_write"):
+            monkeypatch.setattr(landscape, name, lambda *rest: reached.append(rest))
+    elif arguments[0] == "render":
+        monkeypatch.setattr(render, "_draw", lambda *rest: reached.append(rest))
+    elif arguments[0] == "replay" and "failures" in example:
+        monkeypatch.setattr(replay.failure, "main", lambda *rest: reached.append(rest) or 0)
     elif arguments[0] == "replay":
-        monkeypatch.setattr(replay, "main", lambda options: reached.append(options) or 0)
+        monkeypatch.setattr(replay, "_write", lambda *rest: reached.append(rest))
     assert cli.main(arguments) == 0
-    assert bool(reached) == (arguments[0] in ("evaluate", "report", "export", "replay"))
+    assert bool(reached) == (arguments[0] not in ("optimize", "scenes"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("example", [e for e in CODESIGN if not e.startswith("replay")])
+@pytest.mark.parametrize("example", [e for e in CODESIGN if "failures" not in e])
 def test_every_command_runs_at_a_small_size(example, here):
     size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
     size["export"] = ["--overwrite", "--trials", "0", "--tolerance", "off"]
+    size["landscape"] = ["--points", "2", "--trials", "1"]
     arguments = shlex.split(example)
     if arguments[0] == "optimize" and "switch" in example:
         size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]

@@ -59,6 +59,17 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
     return np.clip(space.from_units(np.array(list(values.values()))), space.low, space.high)
 
 
+def check_engine(name: str) -> None:
+    """Refuses an engine that there is not.
+
+    Raises:
+      SceneError: With the nearest name.
+    """
+    if name not in engines.NAMES:
+        hint = schema.nearest(name, engines.NAMES)
+        raise SceneError([f"--engine {name!r} is not valid; {hint}"])
+
+
 def solver_problems(pairs: Sequence[str], engine: str) -> list[str]:
     """Refuses values of the [solver] table given to an engine that does not read it.
 

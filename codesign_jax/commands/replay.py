@@ -1,21 +1,12 @@
 """`codesign replay`."""
 
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
-import mujoco
-import numpy as np
+from rich.console import Console
 
-from codesign_jax import control, engines, model, rollout, runs
-from codesign_jax.commands import common
-from codesign_jax.engines import make_engine
-from codesign_jax.engines.mujoco import world_model
-from codesign_jax.runs import failures
-from codesign_jax.runs.failures import Failure
-from codesign_jax.scene import Scene, schema
-from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.commands import common, failure, grasp
 from codesign_jax.scene.schema import SceneError
 
 if TYPE_CHECKING:
@@ -29,83 +20,35 @@ def main(options: "Replay") -> int:
       SceneError: If something is wrong with the input.
     """
     common.use_compilation_cache()
-    path = options.path
-    if path.is_dir():
-        return _list(path)
-    failure = failures.load(path)
-    scene, settings = runs.read_run(path.resolve().parent.parent)
-    name = options.engine or settings.engine
-    if name not in engines.NAMES:
-        hint = schema.nearest(name, engines.NAMES)
-        raise SceneError([f"--engine {name!r} is not valid; {hint}"])
-    space = design_space(scene.hand, settings.preset)
-    h = scene.discretization.timestep
-    print(f"design: {runs.describe(space, failure.design)}")
-    print(f"recorded by {settings.engine}: {_verdict(failure.status, failure.bad_step, h)}")
-    _again(scene, space, failure, name)
-    if failure.state.size and all(not s.mesh for s in scene.objects.object):
-        _one_step(scene, space, failure)
+    if options.path is not None:
+        if options.run_folder is not None:
+            raise SceneError([f"{options.path} and --run {options.run_folder}: give one of them"])
+        if not options.path.is_dir():
+            return failure.main(options.path, options.engine)
+        options.run_folder = options.path
+    if options.out is not None and options.out.suffix != ".html":
+        raise SceneError([f"--out {options.out} must end in .html"])
+    asked = grasp.find(options)
+    console = Console(highlight=False, soft_wrap=True)
+    if options.run_folder is not None:
+        failure.show_list(options.run_folder)
+    path = _write(asked, options.out or _default(options.run_folder), console)
+    console.print(f"replay: {path} (for any browser, offline)", markup=False)
+    if options.open:
+        webbrowser.open(path.resolve().as_uri())
     return 0
 
 
-def _list(folder: Path) -> int:
-    """Prints the failed worlds of a run folder."""
-    scene, _ = runs.read_run(folder)
-    found = sorted((folder / failures.FOLDER).glob("*.npz"))
-    for path in found:
-        failure = failures.load(path)
-        verdict = _verdict(failure.status, failure.bad_step, scene.discretization.timestep)
-        print(f"{path}: {verdict}")
-    if not found:
-        print(f"no failed world in {folder}")
-    return 0
+def _default(folder: Path | None) -> Path:
+    """Where the page goes if the flags do not say."""
+    return Path("replay.html") if folder is None else folder / "replay.html"
 
 
-def _verdict(status: int, bad_step: int, h: float) -> str:
-    when = f", first bad step {bad_step} ({bad_step * h:.2f} s)" if bad_step >= 0 else ""
-    return runs.status_names(status) + when
+def _write(asked: grasp.Asked, path: Path, console: Console) -> Path:
+    with console.status("simulating the grasp"):
+        shown = grasp.simulate(asked)
+    from codesign_jax.report import viewer
 
-
-def _world(scene: Scene, space: DesignSpace, failure: Failure):
-    return space.params(jnp.asarray(failure.design)), jax.tree.map(jnp.asarray, failure.trial)
-
-
-def _again(scene: Scene, space: DesignSpace, failure: Failure, name: str) -> None:
-    """Simulates the grasp from its start."""
-    engine = make_engine(name, scene)
-    worlds = jax.tree.map(lambda v: v[None], _world(scene, space, failure))
-    run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t))
-    outcome, trace = jax.tree.map(lambda v: np.asarray(v)[0], run(*worlds))
-    h = scene.discretization.timestep
-    print(f"again in {name}: {_verdict(int(outcome.status), int(outcome.bad_step), h)}")
-    if outcome.bad_step < 0:
-        print(f"  cost {outcome.cost:.3f}, largest speed {np.nanmax(trace.speed):.3g}")
-        return
-    first = max(int(outcome.bad_step) - 3, 0)
-    for k in range(first, int(outcome.bad_step) + 1):
-        print(
-            f"  step {k}: speed {trace.speed[k]:.4g}, object {trace.height[k]:.4f} m above the "
-            f"table, {trace.distance[k]:.4f} m from the hand"
-        )
-
-
-def _one_step(scene: Scene, space: DesignSpace, failure: Failure) -> None:
-    """Takes the step after the last good state in MuJoCo C: is it the state or the engine?"""
-    params, trial = _world(scene, space, failure)
-    compiled = world_model(scene, model.model_fields(scene, params, trial))
-    ctrl = np.asarray(control.commands(scene, params, trial))
-    data = mujoco.MjData(compiled)
-    nq = compiled.nq
-    data.qpos[:], data.qvel[:] = failure.state[:nq], failure.state[nq:]
-    if not np.isfinite(failure.state).all():
-        print("the world was not finite from its start")
-        return
-    data.ctrl[:] = ctrl[np.clip(failure.bad_step - 1, 0, len(ctrl) - 1)]
-    mujoco.mj_forward(compiled, data)
-    depth = -min(data.contact.dist.min(), 0.0) if data.ncon else 0.0
-    before, acc = np.abs(data.qvel).max(), np.abs(data.qacc).max()
-    after = np.abs(data.qvel + compiled.opt.timestep * data.qacc).max()
-    print(
-        f"last good state: speed {before:.4g}, {data.ncon} contacts, deepest {1e3 * depth:.2f} mm; "
-        f"MuJoCo C goes on with an acceleration of {acc:.4g} to a speed of {after:.4g}"
-    )
+    lines = grasp.description(asked, shown)
+    console.print("\n".join(lines), markup=False)
+    return viewer.write(asked.case.scene, shown, path, title="A grasp in 3D", text=lines)

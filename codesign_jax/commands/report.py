@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
-from codesign_jax import engines, runs
+from codesign_jax import runs
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.directory import read_provenance
 from codesign_jax.runs.record import Record
-from codesign_jax.scene import Scene, schema
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import SceneError
 
@@ -30,9 +30,7 @@ def main(options: "Report") -> int:
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
     name = options.engine or settings.engine
-    if name not in engines.NAMES:
-        hint = schema.nearest(name, engines.NAMES)
-        raise SceneError([f"--engine {name!r} is not valid; {hint}"])
+    common.check_engine(name)
     try:
         from codesign_jax.report import page
     except ImportError as error:

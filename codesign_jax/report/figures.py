@@ -6,7 +6,8 @@ import matplotlib.figure
 import numpy as np
 from numpy.typing import ArrayLike
 
-from codesign_jax.codesign import CONVERGED_COST
+from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST
+from codesign_jax.report.landscape import Landscape
 
 
 def cost_evolution(
@@ -40,6 +41,37 @@ def cost_evolution(
     axes.set(xlabel="episode", ylabel="cost", title=title, xlim=(0, len(cost) + 1))
     axes.set_ylim(bottom=-0.05)
     axes.legend(loc="upper right", frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    return path
+
+
+def landscape(found: Landscape, path: Path) -> Path:
+    """Draws the mean cost over a grid of two parameters as Fig. 8 of the paper: white where low.
+
+    Lines enclose where the mean cost is below the thresholds of convergence and of success.
+
+    Args:
+      found: The landscape.
+      path: File to write; its folder is made.
+
+    Returns:
+      The path.
+    """
+    figure = matplotlib.figure.Figure(figsize=(5.6, 4.4), dpi=120, layout="constrained")
+    axes = figure.add_subplot()
+    x, y, cost = found.first, found.second, found.cost.T
+    image = axes.pcolormesh(x, y, cost, cmap="gray_r", shading="nearest", vmin=0)
+    figure.colorbar(image, label=f"mean cost of {int(found.trials)} trials")
+    lines = ((CONVERGED_COST, "tab:orange", "--"), (SUCCESS_COST, "tab:red", "-"))
+    for level, color, style in lines:
+        if cost.min() < level <= cost.max():
+            axes.contour(x, y, cost, [level], colors=color, linestyles=style, linewidths=1.2)
+            axes.plot([], [], color=color, ls=style, lw=1.2, label=f"below {level:g}")
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc="upper left", fontsize=8)
+    labels = [f"{n} [{u}]" for n, u in zip(found.names, found.units, strict=True)]
+    axes.set(xlabel=labels[0], ylabel=labels[1])
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     return path

@@ -14,7 +14,7 @@ from codesign_jax import codesign, files, types
 from codesign_jax.report import charts, landscape, viewer
 from codesign_jax.report.animation import Replay
 from codesign_jax.report.statistics import wilson
-from codesign_jax.runs import Settings, tables
+from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.choice import Chosen, Grasp
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.scene_files import NAMES
@@ -236,7 +236,7 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
     planned, shown = grasp
     episode, particle, trial = planned.place
     name = run.scene.objects.object[int(planned.trial.shape)].name
-    before, again = (_verdict(o) for o in (planned.outcome, shown.outcome))
+    before, again = (choice.verdict(o) for o in (planned.outcome, shown.outcome))
     note = (
         f"The chosen design with the object {name}: trial {trial} of particle {particle} in "
         f"episode {episode}, simulated again. In the run: {before}; here: {again}."
@@ -249,13 +249,6 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
         )
         parts = [_paragraph(text, "warning"), *parts]
     return _section("Best grasp", _paragraph(note), *parts)
-
-
-def _verdict(outcome: types.Outcome) -> str:
-    if types.failed(int(outcome.status)):
-        return f"failed ({tables.status_names(int(outcome.status))})"
-    lost = float(outcome.lost_time)
-    return f"object lost at {lost:.2f} s" if np.isfinite(lost) else "object kept"
 
 
 def _cost_note(run: Run) -> str:

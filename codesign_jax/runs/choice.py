@@ -10,6 +10,7 @@ from codesign_jax.codesign import episode_trials
 from codesign_jax.cost import particle_cost
 from codesign_jax.runs.loop import load_record
 from codesign_jax.runs.record import Record
+from codesign_jax.runs.tables import status_names
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError, range_problem
 from codesign_jax.types import Outcome, Trial, failed
@@ -135,3 +136,11 @@ def find_grasp(
         jax.tree.map(lambda v: v[trial], of_particle),
         (e + 1, particle, trial),
     )
+
+
+def verdict(outcome: Outcome) -> str:
+    """How a trial ended, in words; its entries are numbers."""
+    if failed(int(outcome.status)):
+        return f"failed ({status_names(int(outcome.status))})"
+    lost = float(outcome.lost_time)
+    return f"object lost at {lost:.2f} s" if np.isfinite(lost) else "object kept"

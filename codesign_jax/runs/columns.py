@@ -111,6 +111,11 @@ FILES = {
     "events.log": "what happened when, with the wall time of each episode",
     "failures": "worlds that failed, at most ten an episode, for `codesign replay`",
     "figures": "pictures",
+    "landscape.npz": "the cost over a grid of two parameters, of `codesign landscape --run`, as "
+    "arrays (`codesign_jax.report.landscape.Landscape`)",
+    "landscape.csv": "the same, a row for a point: the two parameters with units, mean cost, "
+    "trials that kept the object, trials that did not fail, trials",
+    "replay.html": "a grasp in 3D, of `codesign replay`: opens in any browser, without a network",
     "report.html": "the report of `codesign report`: opens in any browser, without a network",
 }
 

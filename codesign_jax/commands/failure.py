@@ -1,0 +1,106 @@
+"""`codesign replay` of a failed world: simulated again, and its last good state in MuJoCo C."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from codesign_jax import control, model, rollout, runs
+from codesign_jax.commands import common
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.runs import failures
+from codesign_jax.runs.failures import Failure
+from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace, design_space
+
+MOST = 10
+"""Failed worlds that a list shows."""
+
+
+def main(path: Path, engine: str | None) -> int:
+    """Replays a failed world; returns the exit status.
+
+    Args:
+      path: A file of a run folder's failures/.
+      engine: Engine that simulates; None for the run's.
+
+    Raises:
+      SceneError: If the file is no failed world of a run, or the engine is unknown.
+    """
+    failure = failures.load(path)
+    scene, settings = runs.read_run(path.resolve().parent.parent)
+    name = engine or settings.engine
+    common.check_engine(name)
+    space = design_space(scene.hand, settings.preset)
+    h = scene.discretization.timestep
+    print(f"design: {runs.describe(space, failure.design)}")
+    print(f"recorded by {settings.engine}: {_verdict(failure.status, failure.bad_step, h)}")
+    _again(scene, space, failure, name)
+    if failure.state.size and all(not s.mesh for s in scene.objects.object):
+        _one_step(scene, space, failure)
+    return 0
+
+
+def show_list(folder: Path) -> None:
+    """Prints the first failed worlds of a run folder."""
+    scene, _ = runs.read_run(folder)
+    found = sorted((folder / failures.FOLDER).glob("*.npz"))
+    for path in found[:MOST]:
+        failure = failures.load(path)
+        verdict = _verdict(failure.status, failure.bad_step, scene.discretization.timestep)
+        print(f"failed world {path}: {verdict}")
+    if found[MOST:]:
+        print(f"and {len(found) - MOST} more in {folder / failures.FOLDER}")
+
+
+def _verdict(status: int, bad_step: int, h: float) -> str:
+    when = f", first bad step {bad_step} ({bad_step * h:.2f} s)" if bad_step >= 0 else ""
+    return runs.status_names(status) + when
+
+
+def _world(scene: Scene, space: DesignSpace, failure: Failure):
+    return space.params(jnp.asarray(failure.design)), jax.tree.map(jnp.asarray, failure.trial)
+
+
+def _again(scene: Scene, space: DesignSpace, failure: Failure, name: str) -> None:
+    """Simulates the grasp from its start."""
+    engine = make_engine(name, scene)
+    worlds = jax.tree.map(lambda v: v[None], _world(scene, space, failure))
+    run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t))
+    outcome, trace = jax.tree.map(lambda v: np.asarray(v)[0], run(*worlds))
+    h = scene.discretization.timestep
+    print(f"again in {name}: {_verdict(int(outcome.status), int(outcome.bad_step), h)}")
+    if outcome.bad_step < 0:
+        print(f"  cost {outcome.cost:.3f}, largest speed {np.nanmax(trace.speed):.3g}")
+        return
+    first = max(int(outcome.bad_step) - 3, 0)
+    for k in range(first, int(outcome.bad_step) + 1):
+        print(
+            f"  step {k}: speed {trace.speed[k]:.4g}, object {trace.height[k]:.4f} m above the "
+            f"table, {trace.distance[k]:.4f} m from the hand"
+        )
+
+
+def _one_step(scene: Scene, space: DesignSpace, failure: Failure) -> None:
+    """Takes the step after the last good state in MuJoCo C: is it the state or the engine?"""
+    params, trial = _world(scene, space, failure)
+    compiled = world_model(scene, model.model_fields(scene, params, trial))
+    ctrl = np.asarray(control.commands(scene, params, trial))
+    data = mujoco.MjData(compiled)
+    nq = compiled.nq
+    data.qpos[:], data.qvel[:] = failure.state[:nq], failure.state[nq:]
+    if not np.isfinite(failure.state).all():
+        print("the world was not finite from its start")
+        return
+    data.ctrl[:] = ctrl[np.clip(failure.bad_step - 1, 0, len(ctrl) - 1)]
+    mujoco.mj_forward(compiled, data)
+    depth = -min(data.contact.dist.min(), 0.0) if data.ncon else 0.0
+    before, acc = np.abs(data.qvel).max(), np.abs(data.qacc).max()
+    after = np.abs(data.qvel + compiled.opt.timestep * data.qacc).max()
+    print(
+        f"last good state: speed {before:.4g}, {data.ncon} contacts, deepest {1e3 * depth:.2f} mm; "
+        f"MuJoCo C goes on with an acceleration of {acc:.4g} to a speed of {after:.4g}"
+    )

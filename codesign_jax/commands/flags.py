@@ -1,0 +1,72 @@
+"""Flags that commands share.  Nothing heavy is imported here: `--help` is to be quick."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+# A flag given twice adds to what was given before.
+Overrides = Annotated[
+    tuple[tuple[str, ...], ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(
+        name="set",
+        metavar="KEY=VALUE ...",
+        help="Values that replace those of the scene, hand and objects files, by key path: "
+        "gravity=3.7 discretization.links=5 hand.material.shear_modulus=60e3 "
+        "objects.object.sphere.mass=0.2",
+        help_behavior_hint="",
+    ),
+]
+
+# Without a default of its own: the help text says what takes its place.
+Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
+Count = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+
+
+@dataclasses.dataclass
+class Subject:
+    """Which design, of what scene, simulated by which engine."""
+
+    design: Annotated[
+        tuple[tuple[str, ...], ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint=""),
+    ] = ()
+    """The design in the hand file's units, e.g. length=148 arm_z=-59; the rest is the default."""
+    run_folder: Annotated[
+        Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
+    ] = None
+    """Take scene, design space and best particle from this run folder; --accuracy, --objects, --set
+    and --engine then replace the run's."""
+    preset: str = "2d"
+    """Design space that the names belong to."""
+    hand: Text = None
+    """Hand: a built-in name or a .toml file; default: the scene's."""
+    objects: Text = None
+    """Object set: a built-in name or a .toml file; default: the scene's."""
+    scene: str = "paper"
+    """Scene: a built-in name or a .toml file."""
+    accuracy: Text = None
+    """Instead of the scene's discretization and solver: fast, standard, reference (their errors and
+    costs: docs/accuracy.md), or a .toml."""
+    overrides: Overrides = ()
+    engine: Text = None
+    """Engine that simulates; default: the run's, or structured."""
+
+
+@dataclasses.dataclass
+class Shown(Subject):
+    """Which one grasp to show."""
+
+    object: Text = None
+    """Object to grasp, without noise; default: the set's first, or the trial of the run."""
+    episode: Count = None
+    """With --run: number of an episode, as in trials.csv; default: the last."""
+    particle: Count = None
+    """With --run: index of a particle; default: the chosen design's, or the episode's best."""
+    trial: Count = None
+    """With --run: index of a trial; default: the particle's best."""

@@ -1,0 +1,109 @@
+"""The one grasp that `render` and `replay` show: of a design, or a row of a run's trials.csv."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import rollout, runs
+from codesign_jax.commands import common
+from codesign_jax.commands.case import Case, find_case
+from codesign_jax.engines import make_engine
+from codesign_jax.runs import choice
+from codesign_jax.scene.schema import SceneError
+from codesign_jax.types import Trial
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Shown
+    from codesign_jax.report.animation import Replay
+
+
+class Asked(NamedTuple):
+    """A grasp to simulate.
+
+    Attributes:
+      case: Scene, design and engine.
+      trial: Object and noise, no leading axis.
+      text: What grasp it is, in words.
+      recorded: How it ended in its run, in words; None if it is of no run.
+    """
+
+    case: Case
+    trial: Trial
+    text: str
+    recorded: str | None
+
+
+def find(options: "Shown") -> Asked:
+    """The grasp that the flags name; simulates nothing.
+
+    Raises:
+      SceneError: If something is wrong with the flags, the run or the files.
+    """
+    places = {"--episode": options.episode, "--particle": options.particle}
+    places |= {"--trial": options.trial}
+    given = " and ".join(flag for flag, value in places.items() if value is not None)
+    if given and not options.run_folder:
+        raise SceneError([f"{given}: numbers of a run's trials.csv, so --run must say of which"])
+    if options.trial is not None and options.object is not None:
+        raise SceneError(["--trial and --object exclude each other: a trial has its object"])
+    case = find_case(options)
+    common.check_engine(case.engine)
+    if options.run_folder is None:
+        return _nominal(case, options.object or 0)
+    return _of_run(case, options, options.run_folder)
+
+
+def _of_run(case: Case, options: "Shown", folder: Path) -> Asked:
+    """A row of trials.csv, or its design with an object of the scene's, without noise."""
+    if options.objects is not None and options.object is None:
+        raise SceneError(["--objects replaces the run's: --object must say which one to grasp"])
+    place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
+    record = choice.read_record(folder)
+    found = choice.find_grasp(runs.read_run(folder)[0], record, **place)
+    case = case._replace(design=found.design)
+    if options.object is not None:
+        return _nominal(case, options.object)
+    name = case.scene.objects.object[int(found.trial.shape)].name
+    episode, particle, trial = found.place
+    text = f"episode {episode}, particle {particle}, trial {trial}: object {name}"
+    return Asked(case, found.trial, text, choice.verdict(found.outcome))
+
+
+def _nominal(case: Case, shape: int | str) -> Asked:
+    trial = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene, shape))
+    name = case.scene.objects.object[int(trial.shape)].name
+    return Asked(case, trial, f"object {name}, without noise", None)
+
+
+def simulate(asked: Asked) -> "Replay":
+    """Simulates the grasp and keeps its trajectory.
+
+    Raises:
+      SceneError: If the extra for pictures is missing.
+    """
+    try:
+        from codesign_jax.report import animation
+    except ImportError as error:
+        message = f"pictures need {error.name}: pip install 'codesign-jax[viz]'"
+        raise SceneError([message]) from error
+    case = asked.case
+    params = case.space.params(jnp.asarray(case.design, jnp.float32))
+    trials = jax.tree.map(lambda v: v[None], asked.trial)
+    return animation.replay(case.scene, make_engine(case.engine, case.scene), params, trials)[0]
+
+
+def description(asked: Asked, shown: "Replay") -> list[str]:
+    """Lines that say which grasp it is and how it ended."""
+    again = choice.verdict(shown.outcome)
+    ending = f"in the run: {asked.recorded}; here: {again}" if asked.recorded else again
+    design = runs.describe(asked.case.space, asked.case.design)
+    lines = [f"design: {design}", f"{asked.text}; {ending}"]
+    if asked.recorded not in (None, again):
+        lines.append(
+            "The two differ: contact is chaotic, and a batch of another size, another machine or "
+            "other settings lead elsewhere."
+        )
+    return lines

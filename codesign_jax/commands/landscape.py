@@ -1,0 +1,188 @@
+"""`codesign landscape`."""
+
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress, TimeRemainingColumn
+
+from codesign_jax import codesign, runs
+from codesign_jax.commands import common
+from codesign_jax.commands.case import Case, find_case
+from codesign_jax.cost import particle_cost
+from codesign_jax.engines import make_engine
+from codesign_jax.report import landscape
+from codesign_jax.report.landscape import Landscape
+from codesign_jax.scene import schema
+from codesign_jax.scene.schema import SceneError
+from codesign_jax.types import Outcome, failed
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Landscape as Options
+
+WORLDS = {"cpu": 512}
+"""Most worlds of one call by platform: few enough to see progress, enough to fill the cores."""
+_WORLDS = 16_384  # of an accelerator
+
+
+class Grid(NamedTuple):
+    """Designs over a grid of two parameters.
+
+    Attributes:
+      columns: Indices of the two parameters, shape (2,).
+      axes: Their values [SI units], shapes (n,) and (m,).
+      designs: The designs [SI units], shape (n * m, parameter), the first parameter slowest.
+    """
+
+    columns: tuple[int, int]
+    axes: tuple[np.ndarray, np.ndarray]
+    designs: np.ndarray
+
+
+def main(options: "Options") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      SceneError: If something is wrong with the input; nothing is written then.
+    """
+    common.use_compilation_cache()
+    case = find_case(options)
+    _check(options, case)
+    folder = options.out or options.run_folder or Path("landscape")
+    if folder.exists() and not folder.is_dir():
+        raise SceneError([f"--out {folder} is a file"])
+    made = grid(case, _columns(case, options.parameters), options.points)
+    console = Console(highlight=False, soft_wrap=True)
+    others = [k for k in range(case.space.num_parameters) if k not in made.columns]
+    if others:
+        console.print(f"around: {runs.describe(case.space, case.design)}", markup=False)
+    for note in common.mesh_notes(case.scene):
+        console.print(note, markup=False)
+    outcomes = _simulate(case, made.designs, options, console)
+    found = summarize(case, made, outcomes)
+    _report(case, found, console)
+    _write(found, folder, console)
+    return 0
+
+
+def _check(options: "Options", case: Case) -> None:
+    ranges = (
+        ("--points", options.points, 2, 1000),
+        ("--trials", options.trials, 1, 100_000),
+        ("--seed", options.seed, 0, 2**31 - 1),
+    )
+    found = [schema.range_problem(name, v, "", low, high) for name, v, low, high in ranges]
+    problems = [problem for problem in found if problem]
+    problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
+    if problems:
+        raise SceneError(problems)
+    common.check_engine(case.engine)
+
+
+def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
+    """Indices of the two parameters."""
+    known = case.space.names
+    chosen = names or (known if len(known) == 2 else ())
+    unknown = [name for name in chosen if name not in known]
+    if unknown:
+        raise SceneError(
+            [
+                f"--parameters {name!r} is not a parameter; {schema.nearest(name, known)}"
+                for name in unknown
+            ]
+        )
+    if len(set(chosen)) != 2 or len(chosen) != 2:
+        raise SceneError([f"--parameters must name two of {', '.join(known)}"])
+    return known.index(chosen[0]), known.index(chosen[1])
+
+
+def grid(case: Case, columns: tuple[int, int], points: int) -> Grid:
+    """A regular grid over the ranges of two parameters, ends included.
+
+    Pressures are lowered under the limit that the walls set, as of every particle.
+
+    Args:
+      case: The design, whose other parameters stay as they are.
+      columns: Indices of the two parameters.
+      points: Points along each.
+    """
+    space = case.space
+    axes = [np.linspace(space.low[k], space.high[k], points) for k in columns]
+    first, second = np.meshgrid(*axes, indexing="ij")
+    designs = np.tile(np.asarray(case.design, np.float32), (first.size, 1))
+    designs[:, columns[0]], designs[:, columns[1]] = first.ravel(), second.ravel()
+    projected = jax.jit(jax.vmap(space.project))(designs)
+    return Grid(columns, (axes[0], axes[1]), np.asarray(projected))
+
+
+def _simulate(case: Case, designs: np.ndarray, options: "Options", console: Console) -> Outcome:
+    """Simulates all designs in the same trials, some at a time; outcomes (design, trial)."""
+    engine = make_engine(case.engine, case.scene)
+    evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
+    most = WORLDS.get(jax.default_backend(), _WORLDS)
+    size = min(len(designs), max(1, most // options.trials))
+    calls = -(-len(designs) // size)
+    size = -(-len(designs) // calls)  # equal calls: a short last one would be filled up
+    key, parts = jax.random.key(options.seed), []
+    console.print(f"grasps: {designs.shape[0] * options.trials} in {calls} calls")
+    columns = (*Progress.get_default_columns()[:-1], TimeRemainingColumn())
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+        for start in progress.track(range(0, len(designs), size), description="simulating"):
+            rows = np.minimum(np.arange(start, start + size), len(designs) - 1)
+            outcome = evaluate(jnp.asarray(designs[rows]), key)
+            parts.append(jax.tree.map(np.asarray, outcome))
+    return jax.tree.map(lambda *v: np.concatenate(v)[: len(designs)], *parts)
+
+
+def summarize(case: Case, made: Grid, outcomes: Outcome) -> Landscape:
+    """The landscape of a grid's outcomes, arrays of shape (design, trial)."""
+    space, shape = case.space, tuple(len(axis) for axis in made.axes)
+    counted = ~failed(outcomes.status)
+    kept = counted & (outcomes.cost < codesign.SUCCESS_COST)
+    scale = np.asarray(space.scale)[[*made.columns]]
+    return Landscape(
+        names=np.array([space.names[k] for k in made.columns]),
+        units=np.array([space.units[k] for k in made.columns]),
+        first=made.axes[0] / scale[0],
+        second=made.axes[1] / scale[1],
+        cost=np.asarray(particle_cost(case.scene, outcomes)).reshape(shape),
+        kept=kept.sum(1).reshape(shape),
+        counted=counted.sum(1).reshape(shape),
+        trials=np.array(outcomes.cost.shape[1]),
+    )
+
+
+def _report(case: Case, found: Landscape, console: Console) -> None:
+    i, j = np.unravel_index(int(found.cost.argmin()), found.cost.shape)
+    good = int((found.cost < codesign.SUCCESS_COST).sum())
+    place = " ".join(
+        f"{name}={value:.4g} {unit}"
+        for name, value, unit in zip(
+            found.names, (found.first[i], found.second[j]), found.units, strict=True
+        )
+    )
+    console.print(
+        f"{good} of {found.cost.size} points have a mean cost below {codesign.SUCCESS_COST}; "
+        f"lowest: {found.cost[i, j]:.4f} at {place}",
+        markup=False,
+    )
+    bad = int((int(found.trials) - found.counted).sum())
+    if bad:
+        console.print(f"{bad} of {found.cost.size * int(found.trials)} trials failed")
+
+
+def _write(found: Landscape, folder: Path, console: Console) -> None:
+    for path in landscape.save(found, folder):
+        console.print(f"landscape: {path}", markup=False)
+    try:
+        from codesign_jax.report import figures
+    except ImportError:
+        console.print("no figure: pip install 'codesign-jax[viz]'", markup=False)
+        return
+    path = figures.landscape(found, folder / "figures" / "landscape.png")
+    console.print(f"figure: {path}", markup=False)

@@ -1,0 +1,139 @@
+"""The report and its 3D replay in a headless Chromium: `make test-browser`."""
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_run import small_run  # noqa: F401
+
+from codesign_jax.report import bodies, viewer
+from tests import small
+from tests.test_bodies import bent_grasp
+
+pytest.importorskip("plotly", reason="the extra 'report' is not installed")
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium of the system, or one that playwright installed."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    program = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
+    flags += [f"--disable-{what}" for what in ("background-networking", "component-update", "sync")]
+    with api.sync_playwright() as play:
+        try:
+            started = play.chromium.launch(executable_path=program, args=flags)
+        except api.Error as error:
+            if program is None:
+                pytest.skip("no Chromium: apt-get install chromium, or playwright install chromium")
+            raise error
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def opened(run, browser):
+    """The report in a browser, and what it complained about or asked a network for."""
+    page = browser.new_page(viewport={"width": 1000, "height": 900})
+    complaints = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
+    page.on("request", lambda r: None if r.url.startswith("file:") else complaints.append(r.url))
+    page.goto((run / "report.html").as_uri())
+    page.wait_for_selector("#cost .main-svg")
+    yield page, complaints
+    page.close()
+
+
+def picture(page, tmp_path):
+    """Pixels of the 3D view."""
+    path = tmp_path / "view.png"
+    page.locator("#replay .view").screenshot(path=path)
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def assert_hand_and_object(pixels):
+    r, g, b = np.moveaxis(pixels, -1, 0)
+    assert ((r > 140) & (b < 80)).sum() > 100, "an orange object"
+    assert ((b > r + 40) & (b > 90)).sum() > 100, "blue fingers"
+
+
+def test_replay_plays_in_a_browser(opened, tmp_path):
+    page, complaints = opened
+    play = page.locator("#replay .play")
+    view = "document.getElementById('replay').replay"
+    page.evaluate(f"{view}.seek(0)")
+    page.wait_for_timeout(200)
+    first = picture(page, tmp_path)
+    assert_hand_and_object(first)
+    page.locator("#replay .speed").select_option("0.25")  # the grasp has 1.2 s
+    play.click()
+    page.wait_for_function(f"{view}.time() > 0.4")
+    assert play.inner_text() == "Pause"
+    play.click()
+    assert play.inner_text() == "Play"
+    later = picture(page, tmp_path)
+    assert_hand_and_object(later)
+    assert (np.abs(later - first).max(-1) > 20).sum() > 500, "frames differ"
+    at = page.evaluate(f"{view}.time()")
+    page.wait_for_timeout(300)
+    assert page.evaluate(f"{view}.time()") == at, "it stands still"
+    page.locator("#replay .time").fill("1")
+    assert page.evaluate(f"{view}.time()") == 1
+    page.wait_for_function(
+        "document.querySelector('#replay .label').innerText.startsWith('1.00 s')"
+    )
+    assert page.locator(".js-plotly-plot").count() >= 3
+    assert complaints == []
+
+
+def test_camera_turns_while_it_plays(opened, tmp_path):
+    page, complaints = opened
+    camera = "document.getElementById('replay').replay.camera()"
+    before = page.evaluate(camera)
+    page.locator("#replay .speed").select_option("0.1")
+    page.locator("#replay .play").click()  # scrolls there, too
+    box = page.locator("#replay .view").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 100, y + 30, steps=5)
+    page.mouse.up()
+    page.mouse.wheel(0, -300)
+    page.wait_for_timeout(200)
+    after = page.evaluate(camera)
+    assert after["azimuth"] == pytest.approx(before["azimuth"] - 1.0)
+    assert after["elevation"] == pytest.approx(before["elevation"] + 0.3)
+    assert after["distance"] < before["distance"]
+    assert page.evaluate("document.getElementById('replay').replay.playing()")
+    assert_hand_and_object(picture(page, tmp_path))
+    page.locator("#replay .home").click()
+    assert page.evaluate(camera) == before
+    assert complaints == []
+
+
+def test_browser_skins_as_python_does(browser, tmp_path):
+    """Vertices on the page at its frames against those of `bodies`, and between them continuous."""
+    the_scene = small.pinch("box", links=4, effects__surface="hull")
+    grasp = bent_grasp(the_scene)
+    path = viewer.write(the_scene, grasp, tmp_path / "r.html", title="<b>", text=["a & b"])
+    page = browser.new_page()
+    page.goto(path.as_uri())
+    view = "document.getElementById('replay').replay"
+    assert page.locator("h1").inner_text() == "<b>"
+    motion = bodies.motion(the_scene, grasp)
+    for k, pose in enumerate(motion.pose):
+        page.evaluate(f"{view}.seek({k / motion.rate})")
+        page.wait_for_timeout(100)
+        for part in bodies.parts(the_scene, grasp):
+            theirs = page.evaluate(f"{view}.vertices('{part.name}')")
+            ours = bodies.vertices(part, pose)
+            np.testing.assert_allclose(np.reshape(theirs, (-1, 3)), ours, atol=2e-6)  # float32
+    page.close()

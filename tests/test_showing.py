@@ -1,0 +1,186 @@
+"""`codesign render`, `replay` and `landscape`: one grasp is simulated, a grid is complete."""
+
+import csv
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_run import small_run  # noqa: F401
+from toy import TINY
+
+from codesign_jax import cli, codesign, runs, scene
+from codesign_jax.commands import landscape as command
+from codesign_jax.commands.case import Case
+from codesign_jax.engines import make_engine
+from codesign_jax.report import animation, landscape
+from codesign_jax.runs import choice
+from codesign_jax.scene.parameters import design_space
+from codesign_jax.types import Outcome, Status
+
+DESIGN = ["--scene", str(TINY), "--engine", "mujoco", "--design", "length=100", "arm_z=0"]
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path, monkeypatch):
+    """An empty working directory, a cache of its own, and no OpenGL, which is slow."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(animation, "_opengl", lambda: None)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "work"
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+    """Worlds that were simulated for pictures."""
+    counts, own = [], animation.replay
+
+    def replay(the_scene, engine, params, trials):
+        counts.append(trials.yaw.shape[0])
+        return own(the_scene, engine, params, trials)
+
+    monkeypatch.setattr(animation, "replay", replay)
+    return counts
+
+
+def test_render_draws_one_grasp_of_a_design(workplace, simulated, capsys):
+    assert (
+        cli.main(["render", *DESIGN, "--out", "s.png", "--times", "0", "1.1", "--size", "40"]) == 0
+    )
+    with Image.open(workplace / "s.png") as image:
+        assert image.size == (80, 40)
+    assert simulated == [1]
+    assert "length=100 mm arm_z=0 mm" in capsys.readouterr().out
+
+
+def test_render_draws_a_row_of_the_table(run, workplace, simulated, capsys):
+    place = ["--episode", "1", "--particle", "2", "--trial", "1"]
+    assert cli.main(["render", "--run", str(run), *place, "--out", "g.gif", "--size", "32"]) == 0
+    with Image.open(workplace / "g.gif") as image:
+        assert image.size == (32, 32) and image.n_frames > 2
+    assert simulated == [1]
+    said = capsys.readouterr().out
+    with (run / "trials.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    [row] = [r for r in rows if [r["episode"], r["particle"], r["trial"]] == ["1", "2", "1"]]
+    lost = float(row["lost_time_s"])
+    verdict = "object kept" if np.isinf(lost) else f"object lost at {lost:.2f} s"
+    # MuJoCo C in float64 meets the same grasp again, whatever the batch.
+    assert f"in the run: {verdict}; here: {verdict}" in said
+
+
+def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys):
+    out = tmp_path / "new" / "r.html"
+    assert cli.main(["replay", str(run), "--out", str(out)]) == 0
+    assert simulated == [1]
+    the_scene, _ = runs.read_run(run)
+    best = choice.find_grasp(the_scene, choice.read_record(run))
+    assert "episode {}, particle {}, trial {}:".format(*best.place) in capsys.readouterr().out
+    page = out.read_text(encoding="utf-8")
+    [data] = re.findall(r"startReplay\(.*?, (\{.*\})\);", page)
+    parts = json.loads(data)["parts"]
+    assert [p["name"] for p in parts] == ["finger 0", "finger 1", "palm", "object"]
+    assert not re.search(r"(src|href)\s*=\s*[\"']", page), "nothing is loaded from elsewhere"
+
+
+def test_replay_of_a_design_goes_here_unless_told(workplace, simulated):
+    assert cli.main(["replay", *DESIGN, "--object", "sphere"]) == 0
+    assert (workplace / "replay.html").exists() and simulated == [1]
+
+
+def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
+    own = ["--run", str(run)]
+    cases = {
+        ("render", *DESIGN, "--trial", "0"): "--trial: numbers of a run's trials.csv",
+        ("render", *DESIGN, "--object", "spheer"): "did you mean 'sphere'",
+        ("render", *DESIGN, "--out", "a.jpg"): "must end in .gif or .png",
+        ("render", *DESIGN, "--out", "a.png", "--times", "5"): "outside [0, 1.2] s",
+        ("render", *own, "--trial", "0", "--object", "sphere"): "exclude each other",
+        ("render", *own, "--trial", "2"): "--trial = 2 is outside [0, 1]",
+        ("render", "--run", str(workplace)): "is not a run folder",
+        ("replay", str(run), *own): "give one of them",
+        ("replay", *own, "--objects", "household"): "--object must say",
+        ("replay", *own, "--out", "a.gif"): "must end in .html",
+        ("replay", *DESIGN, "--engine", "mujoko"): "did you mean 'mujoco'",
+        ("landscape", *DESIGN, "--parameters", "length", "arm_q"): "did you mean 'arm_z'",
+        (
+            "landscape",
+            *DESIGN,
+            "--parameters",
+            "length",
+            "length",
+        ): "must name two of length, arm_z",
+        ("landscape", *DESIGN[:4], "--preset", "full"): "must name two of length[0]",
+        ("landscape", *DESIGN, "--points", "1"): "--points = 1 is outside",
+    }
+    for arguments, words in cases.items():
+        assert cli.main([*arguments]) == 2, arguments
+        assert words in capsys.readouterr().err
+    assert not list(workplace.iterdir()), "nothing was written"
+
+
+def test_landscape_has_every_point(run, monkeypatch, capsys):
+    """Cut into calls, it is what one evaluation of all designs says; files and report agree."""
+    monkeypatch.setitem(command.WORLDS, "cpu", 10)  # five designs; the last call is filled up
+    sizes = ["--points", "3", "--trials", "2", "--seed", "5"]
+    assert cli.main(["landscape", "--run", str(run), *sizes]) == 0
+    assert "grasps: 18 in 2 calls" in capsys.readouterr().out
+    found = landscape.load(run / landscape.FILE)
+    the_scene, settings = runs.read_run(run)
+    space = design_space(the_scene.hand, settings.preset)
+    low, high = (space.in_units(np.array(v)) for v in (space.low, space.high))
+    np.testing.assert_allclose(found.first, np.linspace(low[0], high[0], 3))
+    np.testing.assert_allclose(found.second, np.linspace(low[1], high[1], 3))
+    designs = space.from_units([[a, b] for a in found.first for b in found.second])
+    engine = make_engine("mujoco", the_scene)
+    evaluate = codesign.make_evaluate(the_scene, engine, space, 2)
+    # As many designs in a call as the command has: the same program, which is there already.
+    parts = [evaluate(np.float32(part), jax.random.key(5)) for part in (designs[:5], designs[4:])]
+    assert not any(np.asarray(part.status).any() for part in parts)
+    cost = np.concatenate([parts[0].cost, parts[1].cost[1:]]).mean(1)
+    np.testing.assert_allclose(found.cost.ravel(), cost, rtol=1e-6)
+    assert len(np.unique(cost.round(3))) > 3, "points differ"
+    np.testing.assert_array_equal(found.counted, 2)
+    with (run / landscape.TABLE).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 9
+    assert float(rows[5]["length_mm"]) == pytest.approx(found.first[1])
+    assert float(rows[5]["arm_z_mm"]) == pytest.approx(found.second[2])
+    assert float(rows[5]["mean_cost"]) == pytest.approx(found.cost[1, 2], rel=1e-8)
+    assert (run / "figures" / "landscape.png").exists()
+    pytest.importorskip("plotly")
+    assert cli.main(["report", str(run), "--no-replay"]) == 0
+    assert '"type":"heatmap"' in (run / "report.html").read_text(encoding="utf-8")
+
+
+def test_landscape_varies_two_of_many_and_counts_what_it_should():
+    """Other parameters stay; failed trials are left out of the mean, and warnings are none."""
+    the_scene = scene.load(TINY)
+    space = design_space(the_scene.hand)
+    start = np.asarray(space.default(), np.float32)
+    case = Case(the_scene, space, start, "mujoco")
+    columns = (space.names.index("pressure[0]"), space.names.index("wall[0]"))
+    made = command.grid(case, columns, 4)
+    others = np.delete(np.arange(space.num_parameters), columns)
+    np.testing.assert_array_equal(made.designs[:, others], np.tile(start[others], (16, 1)))
+    np.testing.assert_allclose(made.designs[:, columns[1]], np.tile(made.axes[1], 4), rtol=1e-6)
+    limit = the_scene.hand.pressure_limit.per_wall * made.designs[:, columns[1]]
+    assert (made.designs[:, columns[0]] <= limit).all()
+    status = np.zeros((16, 3), np.int32)
+    status[0] = [Status.SPEED, Status.SOLVER_CAP, 0]
+    cost = np.tile(np.float32([3.0, 0.0, 1.0]), (16, 1))
+    found = command.summarize(case, made, Outcome(cost, status, cost, status))
+    assert found.cost[0, 0] == pytest.approx(0.5) and found.cost[1, 0] == pytest.approx(4 / 3)
+    assert found.kept[0, 0] == 1 and found.counted[0, 0] == 2 and found.counted[3, 3] == 3
+    assert [*found.units] == ["kPa", "mm"]
+    assert found.first[-1] == pytest.approx(made.axes[0][-1] / 1e3)
+
+
+def test_a_file_that_is_no_landscape_is_refused(tmp_path):
+    for content in (b"", b"nothing"):
+        (tmp_path / "x.npz").write_bytes(content)
+        with pytest.raises(scene.SceneError, match="is not a landscape"):
+            landscape.load(tmp_path / "x.npz")

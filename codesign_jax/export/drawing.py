@@ -102,7 +102,7 @@ def _tolerance(
     figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
     bottom = 0.02 + 0.0095 * sum(len(_lines(note)) for note in section.notes) + 0.015
     bottom = max(bottom, top - 0.03 - 0.03 * len(drift.rows))
-    axes = figure.add_axes((0.14, bottom, 0.72, top - 0.018 - bottom))
+    axes = figure.add_axes((0.14, bottom, 0.63, top - 0.018 - bottom))
     for k, row in enumerate(drift.rows):
         ends = [_end(side, row.value) for side in (row.down, row.up)]
         span = row.up.limit - row.down.limit
@@ -113,16 +113,16 @@ def _tolerance(
         for side in (row.down, row.up):
             if side.bad is not None:
                 x = (side.bad.value - row.down.limit) / span
-                axes.plot(x, k, "x", color="tab:red", ms=3.5, mew=0.9)
+                axes.plot(x, k, "x", color="tab:red", ms=3.5, mew=0.9, clip_on=False)
         left, right = f"{row.down.limit:.4g}  ", f"  {row.up.limit:.4g}"
         axes.text(0, k, left, ha="right", va="center", fontsize=4.5, color="0.4")
-        label = f"{right}    {ends[0]:.4g} … {row.value:.4g} … {ends[1]:.4g} {row.unit}"
+        label = f"{right}    {ends[0]:.3g} … {row.value:.3g} … {ends[1]:.3g} {row.unit}"
         axes.text(1, k, label, ha="left", va="center", fontsize=4.8)
     axes.set(xlim=(0, 1.0), ylim=(len(drift.rows) - 0.5, -0.5), xticks=[])
     axes.set_yticks(range(len(drift.rows)), [row.name for row in drift.rows], fontsize=_SMALL)
     axes.tick_params(length=0, pad=22)
     axes.spines[:].set_visible(False)
-    key = "bar: enough grasps succeed; |: the design; x: first value tried that fails; grey: range"
+    key = "Bar: down to and up to; |: the design; x: fails at; grey: range. Shares: build_sheet.md."
     return _notes(figure, bottom - 0.006, [key, *section.notes])
 
 

@@ -1,8 +1,10 @@
 """`codesign render`, `replay` and `landscape`: one grasp is simulated, a grid is complete."""
 
 import csv
+import importlib
 import json
 import re
+import sys
 
 import jax
 import numpy as np
@@ -172,7 +174,7 @@ def test_landscape_varies_two_of_many_and_counts_what_it_should():
     status = np.zeros((16, 3), np.int32)
     status[0] = [Status.SPEED, Status.SOLVER_CAP, 0]
     cost = np.tile(np.float32([3.0, 0.0, 1.0]), (16, 1))
-    found = command.summarize(case, made, Outcome(cost, status, cost, status))
+    found = command.summarize(case, made, Outcome(cost, status, cost, status), 7)
     assert found.cost[0, 0] == pytest.approx(0.5) and found.cost[1, 0] == pytest.approx(4 / 3)
     assert found.kept[0, 0] == 1 and found.counted[0, 0] == 2 and found.counted[3, 3] == 3
     assert [*found.units] == ["kPa", "mm"]
@@ -184,3 +186,39 @@ def test_a_file_that_is_no_landscape_is_refused(tmp_path):
         (tmp_path / "x.npz").write_bytes(content)
         with pytest.raises(scene.SceneError, match="is not a landscape"):
             landscape.load(tmp_path / "x.npz")
+
+
+def test_a_landscape_of_another_scene_stays_out_of_the_run(run, workplace, monkeypatch):
+    simulated = []
+
+    def simulate(case, designs, *rest):
+        simulated.append(case.scene.gravity)
+        zero = np.zeros((len(designs), 1))
+        return Outcome(zero, zero.astype(int), zero, zero.astype(int))
+
+    monkeypatch.setattr(command, "_simulate", simulate)
+    before = (run / landscape.FILE).exists()
+    sizes = ["--points", "2", "--trials", "1"]
+    assert cli.main(["landscape", "--run", str(run), *sizes, "--set", "gravity=3.7"]) == 0
+    assert (run / landscape.FILE).exists() == before
+    assert simulated == [3.7] == [scene.load(workplace / "landscape" / "scene.toml").gravity]
+    assert landscape.load(workplace / "landscape" / landscape.FILE).cost.shape == (2, 2)
+
+
+def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
+    def stop(*rest):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "_simulate", stop)
+    assert cli.main(["landscape", *DESIGN, "--points", "2"]) == 130
+    assert not list(workplace.iterdir()) and "stopped" in capsys.readouterr().out
+
+
+def test_missing_extra_is_one_line(monkeypatch, capsys):
+    monkeypatch.delitem(sys.modules, "codesign_jax.report.animation")
+    monkeypatch.delattr(importlib.import_module("codesign_jax.report"), "animation")
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    for name in ("render", "replay"):
+        assert cli.main([name, *DESIGN]) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert "PIL" in line and "pip install 'codesign-jax[viz]'" in line

@@ -38,6 +38,9 @@ def main(path: Path, engine: str | None) -> int:
     h = scene.discretization.timestep
     print(f"design: {runs.describe(space, failure.design)}")
     print(f"recorded by {settings.engine}: {_verdict(failure.status, failure.bad_step, h)}")
+    numbers = zip(("--episode", "--particle", "--trial"), failure.place, strict=True)
+    place = " ".join(f"{flag} {number}" for flag, number in numbers)
+    print(f"in 3D: codesign replay {path.parent.parent} {place}")
     _again(scene, space, failure, name)
     if failure.state.size and all(not s.mesh for s in scene.objects.object):
         _one_step(scene, space, failure)

@@ -17,6 +17,8 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
+from codesign_jax.runs.directory import PROVENANCE
+from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Outcome, failed
@@ -52,9 +54,7 @@ def main(options: "Options") -> int:
     common.use_compilation_cache()
     case = find_case(options)
     _check(options, case)
-    folder = options.out or options.run_folder or Path("landscape")
-    if folder.exists() and not folder.is_dir():
-        raise SceneError([f"--out {folder} is a file"])
+    folder = _folder(options, case)
     made = grid(case, _columns(case, options.parameters), options.points)
     console = Console(highlight=False, soft_wrap=True)
     others = [k for k in range(case.space.num_parameters) if k not in made.columns]
@@ -62,11 +62,32 @@ def main(options: "Options") -> int:
         console.print(f"around: {runs.describe(case.space, case.design)}", markup=False)
     for note in common.mesh_notes(case.scene):
         console.print(note, markup=False)
-    outcomes = _simulate(case, made.designs, options, console)
-    found = summarize(case, made, outcomes)
+    try:
+        outcomes = _simulate(case, made.designs, options, console)
+    except KeyboardInterrupt:
+        console.print("stopped; nothing was written")
+        return 130
+    found = summarize(case, made, outcomes, options.seed)
     _report(case, found, console)
-    _write(found, folder, console)
+    _write(case, found, folder, console)
     return 0
+
+
+def _folder(options: "Options", case: Case) -> Path:
+    """Where the files go: to the run, if it is the run's scene that is simulated.
+
+    Raises:
+      SceneError: If it is a file.
+    """
+    own = options.run_folder
+    folder = Path("landscape")
+    if own is not None and case.scene == runs.read_run(own)[0]:
+        folder = own
+    if options.out is not None:
+        folder = options.out
+    if folder.exists() and not folder.is_dir():
+        raise SceneError([f"--out {folder} is a file"])
+    return folder
 
 
 def _check(options: "Options", case: Case) -> None:
@@ -139,8 +160,8 @@ def _simulate(case: Case, designs: np.ndarray, options: "Options", console: Cons
     return jax.tree.map(lambda *v: np.concatenate(v)[: len(designs)], *parts)
 
 
-def summarize(case: Case, made: Grid, outcomes: Outcome) -> Landscape:
-    """The landscape of a grid's outcomes, arrays of shape (design, trial)."""
+def summarize(case: Case, made: Grid, outcomes: Outcome, seed: int) -> Landscape:
+    """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
     space, shape = case.space, tuple(len(axis) for axis in made.axes)
     counted = ~failed(outcomes.status)
     kept = counted & (outcomes.cost < codesign.SUCCESS_COST)
@@ -154,6 +175,8 @@ def summarize(case: Case, made: Grid, outcomes: Outcome) -> Landscape:
         kept=kept.sum(1).reshape(shape),
         counted=counted.sum(1).reshape(shape),
         trials=np.array(outcomes.cost.shape[1]),
+        seed=np.array(seed),
+        design=np.asarray(case.design),
     )
 
 
@@ -176,7 +199,10 @@ def _report(case: Case, found: Landscape, console: Console) -> None:
         console.print(f"{bad} of {found.cost.size * int(found.trials)} trials failed")
 
 
-def _write(found: Landscape, folder: Path, console: Console) -> None:
+def _write(case: Case, found: Landscape, folder: Path, console: Console) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / PROVENANCE).exists():  # a run has its scene already
+        write_scene(case.scene, folder)
     for path in landscape.save(found, folder):
         console.print(f"landscape: {path}", markup=False)
     try:

@@ -72,9 +72,13 @@ def cost_evolution(history: History) -> go.Figure:
         hovertemplate="episode %{x}: cost %{y:.3f}<extra></extra>",
     )
     mean = {"color": _ORANGE, "width": 3}
-    figure.add_scatter(x=number, y=history.cost.mean(1), name="mean of the particles", line=mean)
+    figure.add_scatter(
+        x=number, y=history.cost.mean(1), mode="lines", name="mean of the particles", line=mean
+    )
     best = {"color": _GREY, "width": 1.5}
-    figure.add_scatter(x=number, y=history.cost.min(1), name="best particle", line=best)
+    figure.add_scatter(
+        x=number, y=history.cost.min(1), mode="lines", name="best particle", line=best
+    )
     figure.add_hline(CONVERGED_COST, line={"dash": "dash", "width": 1})
     figure.update_layout(xaxis_title="episode", yaxis_title="cost", height=380, **_LAYOUT)
     return figure
@@ -106,6 +110,7 @@ def parameters(history: History, space: DesignSpace, chosen: np.ndarray) -> go.F
             figure.add_scatter(
                 x=np.concatenate([number, number[::-1]]),
                 y=np.concatenate([high_line, low_line[::-1]]),
+                mode="lines",
                 fill="toself",
                 fillcolor=f"rgba(47, 111, 171, {shade})",
                 line={"width": 0},
@@ -118,6 +123,7 @@ def parameters(history: History, space: DesignSpace, chosen: np.ndarray) -> go.F
         figure.add_scatter(
             x=number,
             y=np.median(values[..., k], 1),
+            mode="lines",
             name="median",
             line=median,
             legendgroup="m",

@@ -26,6 +26,8 @@ class Landscape(NamedTuple):
       kept: Trials that kept the object (cost below the limit of success), shape (n, m).
       counted: Trials that did not fail, shape (n, m).
       trials: Trials of a point, shape ().
+      seed: Root of their noise, shape ().
+      design: What the other parameters stay at: the whole design [SI units], shape (parameter,).
     """
 
     names: np.ndarray
@@ -36,6 +38,8 @@ class Landscape(NamedTuple):
     kept: np.ndarray
     counted: np.ndarray
     trials: np.ndarray
+    seed: np.ndarray
+    design: np.ndarray
 
 
 def save(found: Landscape, folder: Path) -> list[Path]:

@@ -26,7 +26,8 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
 
 _LOCK = ".lock"
-_PROVENANCE = "provenance.json"
+PROVENANCE = "provenance.json"
+"""File that makes a folder a run."""
 _OURS = {*FILES, *TABLES, _LOCK}
 
 
@@ -75,7 +76,7 @@ def open_run(
         notes = []
         if fresh:
             _clear(path)
-        if (path / _PROVENANCE).exists():
+        if (path / PROVENANCE).exists():
             stored = read_provenance(path)
             _refuse_other(path, scene, settings, stored)
             notes = _differences(stored["environment"], environment())
@@ -110,7 +111,7 @@ def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = 
       SceneError: See `open_run`.
     """
     _refuse_foreign(path)
-    if (path / _PROVENANCE).exists() and not fresh:
+    if (path / PROVENANCE).exists() and not fresh:
         _refuse_other(path, scene, settings, read_provenance(path))
 
 
@@ -146,10 +147,10 @@ def read_provenance(path: Path) -> dict[str, Any]:
       SceneError: If it is not a run folder.
     """
     try:
-        stored = json.loads((path / _PROVENANCE).read_text(encoding="utf-8"))
+        stored = json.loads((path / PROVENANCE).read_text(encoding="utf-8"))
         Settings(**stored["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SceneError([f"{path} is not a run folder: {_PROVENANCE} cannot be read"]) from error
+        raise SceneError([f"{path} is not a run folder: {PROVENANCE} cannot be read"]) from error
     return stored
 
 
@@ -211,7 +212,7 @@ def _start(command: list[str]) -> dict[str, Any]:
 
 
 def _write_provenance(path: Path, content: dict[str, Any]) -> None:
-    with files.atomically(path / _PROVENANCE) as part:
+    with files.atomically(path / PROVENANCE) as part:
         part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

@@ -160,6 +160,8 @@ def test_command_refuses_in_words(tmp_path, monkeypatch, capsys):
     assert cli.main(["export", *out, "--draft", "30", "--mould-wall", "0"]) == 2
     text = capsys.readouterr().err
     assert "--draft = 30.0 is outside [0, 10] deg" in text and "--mould-wall" in text
+    assert cli.main(["export", *out, "--design", "length=30", "--end-wall", "15"]) == 2
+    assert "finger 0 of 30 mm has no room" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "manifold3d", None)
     assert cli.main(["export", *out]) == 2
     [line] = capsys.readouterr().err.splitlines()

@@ -87,7 +87,7 @@ def sizes(
         if size.chamber[0] < 1.0:
             problems.append(
                 f"finger {i} of {length:g} mm has no room for a chamber of 1 mm between end walls "
-                f"of {size.end:g} mm; give --end-wall (mm), or --no-parts"
+                f"of {size.end:g} mm; give --end-wall (mm), or --no-parts and --no-sheet"
             )
     if problems:
         raise SceneError(problems)

@@ -36,25 +36,24 @@ class Inexpressible(ValueError):
 def obstacles(scene: Scene) -> list[str]:
     """What of a scene plain MuJoCo does not simulate, a sentence each; empty if nothing."""
     found = [
-        f"effects.{name} = {effects.setting(scene.effects, name)} ({reason}); "
-        f"{_INSTEAD.get(name, 'switch it off')} for another scene that it simulates"
+        f"effects.{name} = {effects.setting(scene.effects, name)} ({reason}); {_instead(name)}"
         for name, reason in effects.refusals(scene.effects, "mujoco").items()
     ]
     if scene.effects.neo_hookean:
         found.append(
             "effects.neo_hookean = true (its moments follow the angles by a law that MuJoCo's "
-            "joints do not have); --set effects.neo_hookean=false for another scene that it "
-            "simulates"
+            f"joints do not have); {_instead('neo_hookean')}"
         )
     return found + [
-        f"object {shape.name!r} is a mesh (MuJoCo takes its convex hull); --objects with "
-        "primitives for another scene that it simulates"
+        f"object {shape.name!r} is a mesh (MuJoCo takes its convex hull); leave it out by --objects"
         for shape in scene.objects.object
         if shape.mesh
     ]
 
 
-_INSTEAD = {"surface": "--set effects.surface=spheres"}
+def _instead(name: str) -> str:
+    value = "spheres" if name == "surface" else "false"
+    return f"--set effects.{name}={value} exports another scene (docs/export.md says how other)"
 
 
 def single_object(scene: Scene, trial: Trial) -> tuple[Scene, Trial]:

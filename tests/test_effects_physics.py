@@ -196,14 +196,14 @@ def test_force_and_inertia_are_derivatives_of_the_cost(friction):
         a = jnp.asarray(a)
 
         def costs(a):
-            return contact.respond(c, c.relative(a)).cost
+            return contact.constraint_update(c, c.relative(a)).cost
 
         def gradient(a):
             return jax.grad(lambda a: costs(a).sum())(a)
 
         along = jnp.eye(6)[:, :, None, None] * jnp.ones_like(a)
         hessian = jax.jit(jax.vmap(lambda v: jax.jvp(gradient, (a,), (v,))[1]))(along)
-        answer = contact.respond(c, c.relative(a))
+        answer = contact.constraint_update(c, c.relative(a))
         wrench = contact.contact_wrench(c, answer.force)
         inertia = contact.contact_inertia(c, answer.hessian)
         size = float(jnp.abs(hessian).max())
@@ -222,7 +222,7 @@ def test_normal_motion_needs_no_friction_model():
     forces = []
     for friction in ("none", "coulomb", "full"):
         c = some_contacts(friction, np.random.default_rng(1), 1)
-        answer = contact.respond(c, -2.0 * c.direction)
+        answer = contact.constraint_update(c, -2.0 * c.direction)
         forces.append(np.asarray(contact.contact_wrench(c, answer.force)))
     np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6)
     np.testing.assert_allclose(forces[2], forces[0], rtol=1e-6)

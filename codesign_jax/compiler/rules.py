@@ -203,7 +203,7 @@ def _reverse(w: "Writer", equation: Any, x: Value) -> Value:
     if x.is_known:
         known = np.broadcast_to(np.asarray(x.known), (w.lanes,))[source]
         return x._replace(known=known if np.ndim(x.known) else x.known)
-    return w.swap_lanes(w.spread(x), source)
+    return w.swap_lanes(w.splat(x), source)
 
 
 def _over_lanes(name: str) -> Rule:
@@ -212,7 +212,7 @@ def _over_lanes(name: str) -> Rule:
             raise NotImplementedError(
                 f"a kernel reduces int32 over its lanes, not {equation.invars[0].aval.dtype}"
             )
-        return w.over_lanes(name, w.spread(x))
+        return w.over_lanes(name, w.splat(x))
 
     return rule
 

@@ -54,7 +54,7 @@ class ThreadWriter(Writer):
         """See `Writer`."""
         return self.lane
 
-    def spread(self, value: Value) -> Value:
+    def splat(self, value: Value) -> Value:
         """See `Writer`; the register stays."""
         if not value.wide and value.text is not None:
             self.scalar_of[value.text] = value._replace(known=0)

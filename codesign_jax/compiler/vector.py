@@ -34,7 +34,7 @@ class VectorWriter(Writer):
             return self._known(value.kind, True, value.known)
         return super().operand(value)
 
-    def spread(self, value: Value) -> Value:
+    def splat(self, value: Value) -> Value:
         """See `Writer`."""
         if value.wide:
             return value
@@ -87,7 +87,7 @@ class VectorWriter(Writer):
         """See `Writer`."""
         *rows, lane = indices
         if any(i.wide for i in rows) or (lane.wide and not lane.is_known):
-            self._scatter(ref, indices, self.spread(value))
+            self._scatter(ref, indices, self.splat(value))
             return
         address, align = self._address(ref, indices), SIZES[ref.kind]
         if not lane.wide:
@@ -95,7 +95,7 @@ class VectorWriter(Writer):
                 raise NotImplementedError("a kernel stores a value of each lane in one place")
             self.lines.append(f"store {self.typed(value)}, ptr {address}, align {align}")
             return
-        value = self.spread(value)
+        value = self.splat(value)
         pattern = np.asarray(lane.known) - np.min(lane.known)
         places, first = np.unique(pattern, return_index=True)
         if (places != np.arange(places.size)).any():
@@ -128,7 +128,7 @@ class VectorWriter(Writer):
         total = "zeroinitializer"
         rows = f"<{self.lanes} x i64>"
         for index, stride in zip(indices, strides, strict=True):
-            wide = self.spread(index)
+            wide = self.splat(index)
             if wide.kind != "i64":
                 wide = self.convert("sext", wide, "i64")
             step = self.emit(f"mul nsw {self.typed(wide)}, {self._known('i64', True, int(stride))}")

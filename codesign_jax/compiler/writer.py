@@ -60,7 +60,7 @@ class Writer:
         """The index of each lane."""
         raise NotImplementedError
 
-    def spread(self, value: Value) -> Value:
+    def splat(self, value: Value) -> Value:
         """A scalar on all lanes."""
         raise NotImplementedError
 
@@ -166,7 +166,7 @@ class Writer:
     def alike(self, *values: Value) -> list[Value]:
         """The values, all wide if one is."""
         if any(v.wide for v in values):
-            return [self.spread(v) for v in values]
+            return [self.splat(v) for v in values]
         return list(values)
 
     # Arithmetic
@@ -230,7 +230,7 @@ class Writer:
             return yes if which.known else no
         yes, no = self.alike(yes, no)
         if which.wide:
-            yes, no = self.spread(yes), self.spread(no)
+            yes, no = self.splat(yes), self.splat(no)
         parts = [self.typed(v) for v in (which, yes, no)]
         return Value(yes.kind, yes.wide, self.emit(f"select {', '.join(parts)}"))
 
@@ -254,8 +254,7 @@ class Writer:
     def _carried(self, variables: Any, values: list[Value]) -> list[Value]:
         """Values as wide as the variables that hold them, each with a name or known."""
         wide = [
-            self.spread(v) if var.aval.shape else v
-            for var, v in zip(variables, values, strict=True)
+            self.splat(v) if var.aval.shape else v for var, v in zip(variables, values, strict=True)
         ]
         return [v if v.text is None or not v.known else self._plain(v) for v in wide]
 
@@ -411,7 +410,7 @@ class Writer:
             inner = params.get("jaxpr", params.get("call_jaxpr"))
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
         if name in _SAME:
-            return [self.spread(args[0]) if equation.outvars[0].aval.shape else args[0]]
+            return [self.splat(args[0]) if equation.outvars[0].aval.shape else args[0]]
         control = {"scan": self.loop, "while": self.while_loop, "cond": self.branch}
         if name in control:
             return control[name](equation, args)

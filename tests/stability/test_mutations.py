@@ -13,7 +13,7 @@ from typing import NamedTuple
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PARTS = ("codesign_jax", "hands", "objects", "tests", "pyproject.toml")
+PARTS = ("codesign_jax", "scripts", "hands", "objects", "tests", "pyproject.toml")
 
 
 class Fault(NamedTuple):
@@ -41,8 +41,8 @@ FAULTS = {
         "tests/test_beam_oracles.py::test_free_fall",
     ),
     "NaN guard": Fault(
-        "cost.py",
-        (("_bit(~finite, Status", "_bit(finite & ~finite, Status"),),
+        "verdict.py",
+        (("as_bit(~numbers, Status", "as_bit(numbers & ~numbers, Status"),),
         "tests/test_cost.py::test_failures_are_flagged_with_their_step",
     ),
     "key reuse": Fault(
@@ -56,7 +56,7 @@ FAULTS = {
         "tests/test_particle_filter.py::test_weights_follow_the_paper",
     ),
     "checksum": Fault(
-        "checkpoint.py",
+        "runs/checkpoint.py",
         (
             ("if _file_digest(self.folder / name) != expected_file", "if not expected_file"),
             ("if digest(arrays) == expected else", "if expected else"),

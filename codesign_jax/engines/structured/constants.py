@@ -177,8 +177,8 @@ def _palm(fields: ModelFields, stubs: np.ndarray, mount: jax.Array, stub_centre:
     principal = jnp.concatenate([palm_principal, stub_principal], 1)
     mass = masses.sum(0, keepdims=True)
     centre = (masses * centres).sum(1, keepdims=True) / mass
-    arm = centres - centre
+    away = centres - centre
     own = total([principal[k] * frames[k][:, None] * frames[k][None] for k in range(3)])
     unit = jnp.eye(3, dtype=masses.dtype)[:, :, None, None]
-    shift = masses * (dot(arm, arm) * unit - arm[:, None] * arm[None])
+    shift = masses * (dot(away, away) * unit - away[:, None] * away[None])
     return mass, centre, (own + shift).sum(2, keepdims=True)

@@ -61,8 +61,8 @@ class Contacts(NamedTuple):
       normal: Unit normals, shape (3, ...).
       distance: Signed distance [m], negative in contact, shape (...).
       cone: Their parameters.
-      lever: Of points that follow a joint's rotation in part, see `hull`, the arm at which they do,
-        shape (3, ...).
+      lever: Of points that follow a joint's rotation in part, see `hull`: their velocity is the
+        joint's angular velocity x lever, shape (3, ...).
       ends: Of contacts between fingers their links, see `finger_pairs`.
     """
 
@@ -130,7 +130,7 @@ class Response(NamedTuple):
     cost: jax.Array
 
 
-def respond(contacts: Contacts, jar: jax.Array) -> Response:
+def constraint_update(contacts: Contacts, jar: jax.Array) -> Response:
     """Evaluates MuJoCo's elliptic cone (engine_core_constraint.c, mj_constraintUpdate) at jar.
 
     With w_n and w_t the normal and tangential parts of jar: the bottom zone is quadratic in both,
@@ -139,7 +139,7 @@ def respond(contacts: Contacts, jar: jax.Array) -> Response:
     """
     cone, n = contacts.cone, contacts.direction
     if cone.friction is None:
-        return _respond_frictionless(contacts, jar)
+        return _update_frictionless(contacts, jar)
     normal = dot(n, jar)
     tangent = jar - normal * n
     length = jnp.sqrt(dot(tangent, tangent) + 1e-30)
@@ -169,7 +169,7 @@ def respond(contacts: Contacts, jar: jax.Array) -> Response:
     return Response(force, hessian, cost)
 
 
-def _respond_frictionless(contacts: Contacts, jar: jax.Array) -> Response:
+def _update_frictionless(contacts: Contacts, jar: jax.Array) -> Response:
     """One row a contact: quadratic in the normal part where that is negative."""
     n = contacts.normal
     normal = dot(n, jar)
@@ -250,9 +250,9 @@ def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
     k = [jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])]
     r = contacts.point
     if contacts.lever is not None:
-        arm = contacts.lever
-        rows = [*_crossed(r, k), *k, *_crossed(arm, k)]
-        return jnp.stack([jnp.concatenate([cross(r, w), w, cross(arm, w)]) for w in rows])
+        lever = contacts.lever
+        rows = [*_crossed(r, k), *k, *_crossed(lever, k)]
+        return jnp.stack([jnp.concatenate([cross(r, w), w, cross(lever, w)]) for w in rows])
     # Rows of [r]K, then of -[r]K[r]: cross products, never the skew matrix's zeros.
     y = _crossed(r, k)
     upper = [jnp.concatenate([cross(r, row), row]) for row in y]
@@ -291,8 +291,8 @@ def _full_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
     e = [contacts.turning(row(i, range(3, 6))) for i in range(3)]
     c = jnp.stack([contacts.turning(row(3 + i, range(3, 6))) for i in range(3)])  # C S
     turned = [contacts.turning(jnp.stack([c[i][j] for i in range(3)])) for j in range(3)]
-    arm = [r[1] * e[2] - r[2] * e[1], r[2] * e[0] - r[0] * e[2], r[0] * e[1] - r[1] * e[0]]
-    corner = [[arm[i][j] + arm[j][i] + turned[j][i] for j in range(3)] for i in range(3)]
+    moment = [r[1] * e[2] - r[2] * e[1], r[2] * e[0] - r[0] * e[2], r[0] * e[1] - r[1] * e[0]]
+    corner = [[moment[i][j] + moment[j][i] + turned[j][i] for j in range(3)] for i in range(3)]
     none = jnp.zeros_like(matrix[0, 0])
     upper = [jnp.stack([*corner[i], *(e[j][i] for j in range(3))]) for i in range(3)]
     lower = [jnp.stack([*e[i], none, none, none]) for i in range(3)]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.contact import Contacts, respond
+from codesign_jax.engines.structured.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.finger_pairs import (
     each_block,
     ends_of,
@@ -60,7 +60,7 @@ def coupling(run: Stages, c: Contacts, jar: jax.Array) -> Coupling:
     """Evaluates the contacts between fingers at jar."""
 
     def add(hessian: jax.Array, at: jax.Array, part: Contacts, jar: jax.Array) -> jax.Array:
-        return store(hessian, run(lambda c, j: respond(c, j).hessian, part, jar), at)
+        return store(hessian, run(lambda c, j: constraint_update(c, j).hessian, part, jar), at)
 
     empty = jnp.zeros((6, *c.distance.shape), jar.dtype)
     return Coupling(c, each_block(c, add, (jar,), empty))

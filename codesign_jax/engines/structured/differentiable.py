@@ -53,10 +53,10 @@ def step(scene: Scene, hand: WorldConstants, state: State, ctrl: jax.Array) -> M
     run = Stages(hand.object_id[0, 0] >= 0 if jax.default_backend() == "cpu" else None)
     assembled, velocity = problem(scene, run, hand, state, ctrl)
     acc = implicit.accelerations(run.predicate, assembled, velocity, state.acc)
-    if assembled.arm is not None:
-        acc = acc._replace(wrist=assembled.arm)
+    if assembled.palm_acc is not None:
+        acc = acc._replace(wrist=assembled.palm_acc)
     h = scene.discretization.timestep
-    new = run(lambda s, k, a: integrate(s, k, a, h), state, assembled.kin, acc)
+    new = run(lambda s, o, a: integrate(s, o, a, h), state, assembled.kin.object, acc)
     centre = _centre(hand, assembled.kin, assembled.body) + state.wrist[:3]
     return Moved(new, centre)
 
@@ -71,10 +71,10 @@ def problem(
     matrix = Matrices(*(run(lambda b: b.matrix(), b) for b in body))
     found = contacts(scene, run, hand, kin, state.wrist[2])
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-    h, arm = scene.discretization.timestep, None
+    h, palm_acc = scene.discretization.timestep, None
     if not scene.effects.wrist:
-        arm = rigid_arm(ctrl[:6, None], state.wrist, state.wrist_vel, h)
-    return Problem(hand, kin, body, matrix, smooth, found, arm), velocity
+        palm_acc = rigid_arm(ctrl[:6, None], state.wrist, state.wrist_vel, h)
+    return Problem(hand, kin, body, matrix, smooth, found, palm_acc), velocity
 
 
 def contacts(

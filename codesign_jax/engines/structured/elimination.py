@@ -3,9 +3,9 @@
 The objective of a subtree, as a function of its base link's spatial acceleration v and the object's
 v_o, is
   1/2 v'P v - v'C v_o + 1/2 v_o'Q v_o - r'v - r_o'v_o.
-With v = v_parent + S a and the joint's own 1/2 a'(arm)a - tau'a, minimising over the joint
-accelerations a gives the same form in v_parent: Featherstone's articulated-body recursion (Rigid
-Body Dynamics Algorithms, 2008, ch. 7) extended by the object that every finger may touch.
+With v = v_parent + S a and the joint's own 1/2 a' diag(armature) a - tau'a, minimising over the
+joint accelerations a gives the same form in v_parent: Featherstone's articulated-body recursion
+(Rigid Body Dynamics Algorithms, 2008, ch. 7) extended by the object that every finger may touch.
 """
 
 from typing import NamedTuple
@@ -84,7 +84,7 @@ def eliminate(
     run: Stages,
     node: Quadratic,
     axes: jax.Array,
-    arm: jax.Array,
+    armature: jax.Array,
     tau: jax.Array,
     terms: JointTerms | None = None,
 ) -> tuple[Quadratic, Factors]:
@@ -94,14 +94,14 @@ def eliminate(
       run: Runs the stages.
       node: The subtree's objective in its base link's acceleration.
       axes: Motion subspace S, shape (axis, 6, finger, world).
-      arm: Diagonal joint inertia (armature with implicit terms), shape (axis, finger, world).
+      armature: Diagonal joint inertia (armature with implicit terms), shape (axis, finger, world).
       tau: Joint force, same shape.
       terms: More of the objective that the joint's accelerations are in.
 
     Returns:
       The objective in the parent's acceleration and the factors for `substitute`.
     """
-    node, kept = eliminate_and_keep(run, node, axes, arm, tau, terms)
+    node, kept = eliminate_and_keep(run, node, axes, armature, tau, terms)
     return node, kept.factors
 
 
@@ -109,16 +109,16 @@ def eliminate_and_keep(
     run: Stages,
     node: Quadratic,
     axes: jax.Array,
-    arm: jax.Array,
+    armature: jax.Array,
     tau: jax.Array,
     terms: JointTerms | None = None,
 ) -> tuple[Quadratic, Kept]:
     """`eliminate`, with all that `eliminate_again` needs."""
     u, h, y = run(_project, node.p, node.c, node.r, axes, tau)
     if terms is None:
-        inverse = run(_joint_inverse, axes, u, arm)
+        inverse = run(_joint_inverse, axes, u, armature)
     else:
-        inverse = run(_joint_inverse, axes, u, arm, terms.d)
+        inverse = run(_joint_inverse, axes, u, armature, terms.d)
         u, y = u + terms.u, y + terms.y
         h = None if h is None else h + terms.h
     factors = Factors(*run(_factor, inverse, u, h, y))
@@ -161,12 +161,12 @@ def _project(p: jax.Array, c: jax.Array | None, r: jax.Array, axes: jax.Array, t
 
 
 def _joint_inverse(
-    axes: jax.Array, u: jax.Array, arm: jax.Array, more: jax.Array | None = None
+    axes: jax.Array, u: jax.Array, armature: jax.Array, more: jax.Array | None = None
 ) -> jax.Array:
-    """D^-1 with D = S'P S + arm, and more if there is more."""
+    """D^-1 with D = S'P S + armature, and more if there is more."""
     n = axes.shape[0]
     eye = jnp.eye(n, dtype=axes.dtype)[:, :, None, None]
-    own = contract(axes[:, None], u[None], 2) + eye * arm[:, None]
+    own = contract(axes[:, None], u[None], 2) + eye * armature[:, None]
     return inverse_spd(own if more is None else own + more)
 
 

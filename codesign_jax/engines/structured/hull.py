@@ -5,10 +5,10 @@ has the images x1 = T_i(v) and x0 = T_{i-1}(v) and lies at x = (1 - w) x0 + w x1
 rigid bodies are affine in the point, so that the blend of the two images' velocities is exactly
   dx = V_{i-1}(x) + w dtheta x (x1 - p),
 the parent's velocity at the vertex itself and a share of the joint's own rotation dtheta = S_i dq_i
-about the image on the link: no common point has to be assumed.  A contact adds its arm from the
+about the image on the link: no common point has to be assumed.  A contact adds its offset from the
 vertex to the contact point to both.  With the relative motion m = (angular, linear, joint's
 rotation) of nine components a contact is the matrix X'KX, X = [-[r], 1, -[lever]] with lever =
-w (x1 + arm - p); the sums over a joint's vertices enter the elimination of that joint.
+w (x1 + offset - p); the sums over a joint's vertices enter the elimination of that joint.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
 from codesign_jax.engines.structured.contact import (
     Contacts,
+    constraint_update,
     contact_inertia,
-    respond,
 )
 from codesign_jax.engines.structured.elimination import JointTerms
 from codesign_jax.engines.structured.kinematics import Kinematics
@@ -117,7 +117,7 @@ def inertia(run: Stages, c: Contacts, jar: jax.Array) -> jax.Array:
     def evaluate(point, normal, distance, lever, stiff, tangent, jar) -> jax.Array:
         cone = c.cone._replace(normal=stiff, tangent=tangent)
         vertex = Contacts(point, normal, distance, cone, lever)
-        matrix = contact_inertia(vertex, respond(vertex, jar).hessian)
+        matrix = contact_inertia(vertex, constraint_update(vertex, jar).hessian)
         return jnp.stack([matrix[i, j] for i, j in _UPPER])
 
     each = (c.point, c.normal, c.distance, c.lever, c.cone.normal, c.cone.tangent, jar)

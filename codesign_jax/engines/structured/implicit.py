@@ -12,7 +12,7 @@ factored form gives without J or M.
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.contact import Contacts, respond
+from codesign_jax.engines.structured.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.kinematics import Acc
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, sum_items
 from codesign_jax.engines.structured.newton import linear_solve
@@ -21,9 +21,9 @@ from codesign_jax.engines.structured.problem import (
     Problem,
     Spatial,
     inertial_forces,
+    inner,
     propagate,
     relative,
-    work,
 )
 
 
@@ -85,17 +85,17 @@ def residual_power(
     run: Stages, problem: Problem, velocity: Spatial, acc: Acc, virtual: Acc
 ) -> jax.Array:
     """Power lambda' F of the unbalanced forces at acc along virtual, shape (1, world)."""
-    if problem.arm is not None:  # data of the step, not a solution
-        acc = acc._replace(wrist=problem.arm)
+    if problem.palm_acc is not None:  # data of the step, not a solution
+        acc = acc._replace(wrist=problem.palm_acc)
     motion = propagate(run, problem.kin, acc)
     along = propagate(run, problem.kin, virtual)
     inertial = inertial_forces(run, problem, acc, motion)
     force = Forces(*(m - s for m, s in zip(inertial, problem.smooth, strict=True)))
-    power = work(run, force, virtual, along)
+    power = inner(run, force, virtual, along)
     for name, c in problem.contacts.items():
 
         def pushed(c: Contacts, motion: Spatial, velocity: Spatial, along: Spatial, name=name):
-            force = respond(c, _jar(name, c, motion, velocity)).force
+            force = constraint_update(c, _jar(name, c, motion, velocity)).force
             return sum_items(dot(force, c.relative(relative(name, along, c))))
 
         power = power - run(pushed, c, motion, velocity, along)

@@ -3,15 +3,20 @@
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kinematics import Acc, Kinematics, State
+from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanes import total
 
 
-def integrate(state: State, kin: Kinematics, acc: Acc, h: float) -> State:
-    """Semi-implicit Euler: velocities first, then positions with the new velocities."""
-    local = jnp.stack(
-        [total([kin.object[k, i] * acc.object[i] for i in range(3)]) for k in range(3)]
-    )
+def integrate(state: State, columns: jax.Array, acc: Acc, h: float) -> State:
+    """Semi-implicit Euler: velocities first, then positions with the new velocities.
+
+    Args:
+      state: Positions and velocities before the step.
+      columns: Columns of the object's rotation matrix before the step, shape (3, 3, ...).
+      acc: Accelerations.
+      h: Time step [s].
+    """
+    local = jnp.stack([total([columns[k, i] * acc.object[i] for i in range(3)]) for k in range(3)])
     wrist_vel, finger_vel = state.wrist_vel + h * acc.wrist, state.finger_vel + h * acc.finger
     linear, angular = state.linear_vel + h * acc.object[3:], state.angular_vel + h * local
     return State(

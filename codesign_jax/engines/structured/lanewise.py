@@ -174,11 +174,11 @@ def _fold(equation: Any, parts: tuple) -> Any:
 def _bind(equation: Any, parts: tuple) -> Any:
     """The operation on lanes, to which numbers are spread."""
     shape = next(p.shape for p in parts if not _is_number(p))
-    arrays = [spread(p, shape, v.aval.dtype) for p, v in zip(parts, equation.invars, strict=True)]
+    arrays = [splat(p, shape, v.aval.dtype) for p, v in zip(parts, equation.invars, strict=True)]
     return equation.primitive.bind(*arrays, **equation.params)
 
 
-def spread(part: Any, shape: tuple[int, ...], dtype: Any) -> jax.Array:
+def splat(part: Any, shape: tuple[int, ...], dtype: Any) -> jax.Array:
     """A number as lanes; lanes as they are."""
     return jax.lax.full(shape, np.asarray(part, dtype)) if _is_number(part) else part
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import coupling, hull
 from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured.contact import Contacts, contact_inertia, respond
+from codesign_jax.engines.structured.contact import Contacts, constraint_update, contact_inertia
 from codesign_jax.engines.structured.kinematics import Acc
 from codesign_jax.engines.structured.lanes import Stages, scan_links, sum_axis, sum_fingers
 from codesign_jax.engines.structured.problem import (
@@ -20,9 +20,9 @@ from codesign_jax.engines.structured.problem import (
     Matrices,
     Problem,
     Spatial,
+    inner,
     object_acceleration,
     on_links,
-    work,
 )
 
 
@@ -68,7 +68,7 @@ def linear_solve(run: Stages, problem: Problem, force: Forces, jar: dict[str, ja
     def again(links: jax.Array) -> tuple[Acc, Spatial]:
         return substitute(run, problem, eliminate_again(run, problem, done, links))
 
-    return coupling.correct(run, pairs, (x, motion), work(run, force, x, motion), again)[0]
+    return coupling.correct(run, pairs, (x, motion), inner(run, force, x, motion), again)[0]
 
 
 def eliminate(
@@ -91,8 +91,9 @@ def eliminate(
     kin, hand = problem.kin, problem.hand
 
     def next_joint(node: el.Quadratic, link: tuple):
-        (axes, arm, tau), (own, joint) = link
-        node, kept = el.eliminate_and_keep(run, run(add_link, node, own), axes, arm, tau, joint)
+        (axes, armature, tau), (own, joint) = link
+        node = run(add_link, node, own)
+        node, kept = el.eliminate_and_keep(run, node, axes, armature, tau, joint)
         return node, kept if keep else kept._replace(inverse=())
 
     # Sums over all links at once: the recursion then slices fewer arrays.
@@ -110,11 +111,11 @@ def eliminate(
         zero = jnp.zeros_like(node.p), jnp.zeros_like(node.r)
         node = run(lambda n, s: add_link(n, link_terms(*zero, _of_links(s, 0))), node, skin)
     node = run(add_palm, node, problem.matrix, force, others)
-    if problem.arm is not None:  # known: no step
+    if problem.palm_acc is not None:  # known: no step
         return Eliminated(fingers, None, None, node.q, node.r_object)
-    arm, wrist = hand.wrist_armature, force.wrist
-    node, hinges = el.eliminate_and_keep(run, node, kin.wrist_axes, arm[3:], wrist[3:])
-    node, slides = el.eliminate_and_keep(run, node, wrist_slides(arm), arm[:3], wrist[:3])
+    armature, wrist = hand.wrist_armature, force.wrist
+    node, hinges = el.eliminate_and_keep(run, node, kin.wrist_axes, armature[3:], wrist[3:])
+    node, slides = el.eliminate_and_keep(run, node, wrist_slides(armature), armature[:3], wrist[:3])
     return Eliminated(fingers, hinges, slides, node.q, node.r_object)
 
 
@@ -257,7 +258,7 @@ def _inertia(run: Stages, name: str, c: Contacts, jar: jax.Array) -> jax.Array:
     """Contact inertia of a pair of bodies, summed over the contacts of each body."""
 
     def summed(c: Contacts, jar: jax.Array) -> jax.Array:
-        matrix = contact_inertia(c, respond(c, jar).hessian)
+        matrix = contact_inertia(c, constraint_update(c, jar).hessian)
         return sum_axis(matrix, 3) if on_links(name) else sum_fingers(matrix)
 
     return hull.inertia(run, c, jar) if c.lever is not None else run(summed, c, jar)

@@ -50,7 +50,7 @@ class Problem(NamedTuple):
       matrix: The same as matrices.
       smooth: Smooth forces.
       contacts: Contacts by pair of bodies.
-      arm: Prescribed accelerations of the palm's coordinates, shape (6, 1, world); None with a
+      palm_acc: Prescribed accelerations of the palm's coordinates, shape (6, 1, world); None with a
         compliant wrist, whose accelerations are unknowns.
     """
 
@@ -60,7 +60,7 @@ class Problem(NamedTuple):
     matrix: Matrices
     smooth: Smooth
     contacts: dict[str, Contacts]
-    arm: jax.Array | None = None
+    palm_acc: jax.Array | None = None
 
 
 def palm_motion(wrist: jax.Array, axes: jax.Array) -> jax.Array:
@@ -142,16 +142,17 @@ class Forces(NamedTuple):
 def inertial_forces(run: Stages, problem: Problem, acc: Acc, motion: Spatial) -> Forces:
     """M a in factored form: spatial forces of the bodies and armature forces of the joints."""
     body, hand = problem.body, problem.hand
+    moves = problem.palm_acc is None
     return Forces(
         body.palm.times(motion.palm),
         run(lambda b, m: b.times(m), body.link, motion.link),
         body.object.times(motion.object),
-        jnp.zeros_like(acc.wrist) if problem.arm is not None else hand.wrist_armature * acc.wrist,
+        hand.wrist_armature * acc.wrist if moves else jnp.zeros_like(acc.wrist),
         hand.armature * acc.finger,
     )
 
 
-def work(run: Stages, force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
+def inner(run: Stages, force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
     """Product of forces and accelerations over all bodies and joints, shape (1, world)."""
 
     def product(force: Forces, acc: Acc, motion: Spatial) -> jax.Array:

@@ -18,7 +18,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     upper,
 )
 from codesign_jax.engines.structured.kernel.objects import WorldObject
-from codesign_jax.engines.structured.kernel.solver import along
+from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
@@ -162,21 +162,21 @@ class BoundContacts:
     def _push(self, item: Any, alpha: Lanes) -> list[Lanes]:
         def response(place, cone, jar):
             c = self.set.contacts(place, cone)
-            r = contact.respond(c, jar)
+            r = contact.constraint_update(c, jar)
             matrix = contact.contact_inertia(c, r.hessian)
             return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
 
         jar, step = self.read("jar", item), self.read("step", item)
-        jar = lanewise(along, alpha, jar, step)
+        jar = lanewise(tree_add_scaled, alpha, jar, step)
         self.write("jar", jar, item)
         matrix, wrench = lanewise(response, self.place(item), self.cone, jar)
         return [upper(matrix), wrench]
 
-    def aim(self, item: Any, step: Lanes) -> Lanes:
+    def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
         """Stores the line along a relative motion (6, ...); returns the cost's slope at 0."""
-        return self.if_touching(item, lambda: [self._aim(item, step)], [()])[0]
+        return self.if_touching(item, lambda: [self._prepare_linesearch(item, step)], [()])[0]
 
-    def _aim(self, item: Any, step: Lanes) -> Lanes:
+    def _prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
         def relative(place, cone, step):
             return self.set.contacts(place, cone).relative(step[:, None])
 

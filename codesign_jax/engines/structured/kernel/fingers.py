@@ -326,10 +326,10 @@ def _inside(vertex, own: tuple, theirs: tuple, size, last) -> tuple[tuple, tuple
     axes = (turned[1], turned[2], turned[0])
     normal = total([s * g * a for s, g, a in zip(signs, slope, axes, strict=True)])
     normal = normal / jnp.sqrt(jnp.maximum(dot(normal, normal), 1e-12))
-    arm = -0.5 * gap * normal
-    lever = weight * (image + arm)
-    behind = along * (apply_columns(after, local) + arm)
-    at, gap, share = (point + arm)[:, None], gap[None, None], 0.5 * share
+    to_contact = -0.5 * gap * normal  # from the point on the skin
+    lever = weight * (image + to_contact)
+    behind = along * (apply_columns(after, local) + to_contact)
+    at, gap, share = (point + to_contact)[:, None], gap[None, None], 0.5 * share
     mine = at, normal[:, None], gap, lever[:, None], share
     return mine, (at, -normal[:, None], gap, behind[:, None], share)
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.lanewise import Lanes, lanes, spread
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, splat
 
 
 class MemoryLayout:
@@ -96,7 +96,7 @@ class MemoryLayout:
         """Stores items that differ from lane to lane; arguments as in `gather`."""
         row, _ = self._row(name, item)
         for k, part in enumerate(value.parts.ravel()):
-            ref[row + k, lane] = spread(part, lane.shape, value.dtype)
+            ref[row + k, lane] = splat(part, lane.shape, value.dtype)
 
     def write(self, ref: Any, name: str, value: Lanes, item: Any = 0, world: Any = None) -> None:
         """Stores an item; the lanes of a world store the same number."""
@@ -104,7 +104,7 @@ class MemoryLayout:
         where = () if self.wide else (world,)
         size = ref.shape[-1:] if self.wide else world.shape
         for k, part in enumerate(value.parts.ravel()):
-            ref[(row + k, *where)] = spread(part, size, value.dtype)
+            ref[(row + k, *where)] = splat(part, size, value.dtype)
 
 
 def choose(which: jax.Array, compute: Callable, otherwise: Any, size: int) -> Any:
@@ -119,7 +119,7 @@ def solid(tree: Any, size: int) -> tuple[list[jax.Array], Callable]:
     leaves, structure = jax.tree.flatten(tree, is_leaf=lambda x: isinstance(x, Lanes))
     arrays: list[jax.Array] = []
     for leaf in leaves:
-        arrays += [spread(p, (size,), leaf.dtype) for p in leaf.parts.ravel()]
+        arrays += [splat(p, (size,), leaf.dtype) for p in leaf.parts.ravel()]
 
     def rebuild(values: Any) -> Any:
         rest, new = list(values), []

@@ -116,7 +116,7 @@ class Newton:
           block: The lanes.
           m: The memory.
           palm: Palm, wrist and object.
-          rigid: Whether the wrist's accelerations are known, see `Problem.arm`.
+          rigid: Whether the wrist's accelerations are known, see `Problem.palm_acc`.
         """
         self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
         self.pairs: BoundPairs | None = m.contacts.get("finger_finger")  # type: ignore[assignment]
@@ -145,7 +145,7 @@ class Newton:
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
         """Moves a link's "acc" or "motion" along its step and returns it."""
-        value = lanewise(solver.along, alpha, *self.read(name, f"step_{name}", item=item))
+        value = lanewise(solver.tree_add_scaled, alpha, *self.read(name, f"step_{name}", item=item))
         self.write(name, value, item)
         return value
 
@@ -181,18 +181,18 @@ class Newton:
           The sum over the fingers, and the product of their forces with the step so far.
         """
         if self.pairs:
-            self.pairs.respond(alpha)
+            self.pairs.update_constraints(alpha)
 
-        def eliminate(node, body, motion, smooth, tau, axes, arm, acc, pushes, terms, pairs):
+        def eliminate(node, body, motion, smooth, tau, axes, armature, acc, pushes, terms, pairs):
             link = make_body(*body)
-            push, tau = smooth - link.times(motion), tau - arm * acc
+            push, tau = smooth - link.times(motion), tau - armature * acc
             if pairs is not None:
                 wrench, turned = pairs
                 push = push + wrench
                 tau = tau if turned is None else tau + contract(axes[:, :3], turned[None], 1)
             node = newton.add_link(node, newton.link_terms(link.matrix(), push, pushes))
             y = contract(axes, node.r[None], 1) + tau
-            node, kept = el.eliminate_and_keep(direct, node, axes, arm, tau, terms)
+            node, kept = el.eliminate_and_keep(direct, node, axes, armature, tau, terms)
             if terms is not None:
                 y = y + terms.y
             return node, kept, dot(y, kept.factors.z)
@@ -201,12 +201,12 @@ class Newton:
             node, work = carry
             acc, motion = self.move("acc", i, alpha), self.move("motion", i, alpha)
             pushes = {c.set.name: c.push(i, alpha) for c in self.fingers}
-            smooth, tau, axes, arm = self.read("smooth", "tau", "axes", "armature", item=i)
+            smooth, tau, axes, armature = self.read("smooth", "tau", "axes", "armature", item=i)
             node = node._replace(p=full(node.p), q=full(node.q))
             rows = [self.row(c, i, axes, alpha) for c in self.skin]
             terms = add_terms([r.terms for r in rows]) if rows else None
             pairs = self.pair_push(i) if self.pairs else None
-            forces = (motion, smooth, tau, axes, arm, acc, pushes, terms, pairs)
+            forces = (motion, smooth, tau, axes, armature, acc, pushes, terms, pairs)
             node, kept, more = lanewise(eliminate, node, self.body_of(i), *forces)
             for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
                 self.write(name, value, i)
@@ -296,11 +296,11 @@ class Newton:
                 none = jnp.zeros_like(obj)
                 step = Iterate(none, object_acceleration(obj, palm.position), none, obj)
                 return step, Eliminated(None, None, node.q, dot(node.r_object, obj))
-            arm, work = palm.armature, []
-            axes = (palm.axes, newton.wrist_slides(arm))
+            armature, work = palm.armature, []
+            axes = (palm.axes, newton.wrist_slides(armature))
             kept = []
             for subspace, inertia, twist in zip(
-                axes, (arm[3:], arm[:3]), (force.wrist[3:], force.wrist[:3]), strict=True
+                axes, (armature[3:], armature[:3]), (force.wrist[3:], force.wrist[:3]), strict=True
             ):
                 y = contract(subspace, node.r[None], 1) + twist
                 node, new = el.eliminate_and_keep(direct, node, subspace, inertia, twist)
@@ -343,13 +343,13 @@ class Newton:
           Slope and curvature of the smooth part, and the contacts' slope, all at 0, (1, world).
         """
 
-        def substitute(parent, obj, body, motion, smooth, tau, axes, arm, acc, factors):
+        def substitute(parent, obj, body, motion, smooth, tau, axes, armature, acc, factors):
             a, moved = el.substitute(axes, el.Factors(*factors), parent, obj)
             link = make_body(*body)
             force = smooth - link.times(motion)
-            joints = [(arm[k] * acc[k] - tau[k]) * a[k] for k in range(a.shape[0])]
+            joints = [(armature[k] * acc[k] - tau[k]) * a[k] for k in range(a.shape[0])]
             slope = total(joints) - dot(force, moved)
-            stiff = total([arm[k] * a[k] * a[k] for k in range(a.shape[0])])
+            stiff = total([armature[k] * a[k] * a[k] for k in range(a.shape[0])])
             return a, moved, slope, stiff + dot(link.times(moved), moved)
 
         def one(i: Any, carry: tuple) -> tuple:
@@ -370,8 +370,8 @@ class Newton:
             terms = [touch]
             for contacts in self.fingers:
                 rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
-                terms.append(contacts.aim(i, rel))
-            terms += self.aim_row(i, parent, moved, step)
+                terms.append(contacts.prepare_linesearch(i, rel))
+            terms += self.prepare_row(i, parent, moved, step)
             touch = lanewise(lambda t: total(t), terms)
             slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
             return moved, slope, curvature, touch
@@ -383,21 +383,21 @@ class Newton:
         last, slope, curvature, touch = loop(
             self.links, one, (parent, none, none, none), self.block.size
         )
-        tip = self.aim_row(self.links, last, last, step)
-        between = [self.pairs.aim_all()] if self.pairs else []
+        tip = self.prepare_row(self.links, last, last, step)
+        between = [self.pairs.prepare_all()] if self.pairs else []
         touch = lanewise(lambda t: total(t), [touch, *tip, *between])
         for contacts in self.slots:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
                 rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)
-                return lanewise(jnp.add, sum_, contacts.aim(i, rel))
+                return lanewise(jnp.add, sum_, contacts.prepare_linesearch(i, rel))
 
             touch = loop(contacts.set.count, add, touch, self.block.size)
         slope, curvature, touch = self.block.sum((slope, curvature, touch))
         slope, curvature = lanewise(self._rest, now, step, self.palm, slope, curvature)
         return slope, curvature, touch
 
-    def aim_row(self, row: Any, before: Lanes, after: Lanes, step: Iterate) -> list[Lanes]:
+    def prepare_row(self, row: Any, before: Lanes, after: Lanes, step: Iterate) -> list[Lanes]:
         """Slopes of a row's contacts along the step of the links before and behind it."""
         if not self.skin:
             return []
@@ -406,7 +406,7 @@ class Newton:
             (c, relative(c.set.name, moved, step.palm_motion, step.object_motion))
             for c in self.skin
         ]
-        return [c.aim(row, motion) for c, motion in names]
+        return [c.prepare_linesearch(row, motion) for c, motion in names]
 
     @staticmethod
     def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
@@ -504,7 +504,7 @@ class Newton:
             floor = jnp.where(waiting & (before.lane > tolerance), floor, solver.FAR)
             alpha = self.line_search(slope, curvature, first, floor, evaluations)
             alpha, residual = lanewise(hold, before, alpha, residual)
-            now = lanewise(solver.along, alpha, now, step)
+            now = lanewise(solver.tree_add_scaled, alpha, now, step)
             return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:

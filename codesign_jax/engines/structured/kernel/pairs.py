@@ -19,7 +19,7 @@ from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, ze
 from codesign_jax.engines.structured.kernel.hull import across
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop, solid
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet
-from codesign_jax.engines.structured.kernel.solver import along
+from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
@@ -298,16 +298,16 @@ class BoundPairs(BoundSlots):
 
     # Newton's method
 
-    def respond(self, alpha: Lanes) -> None:
+    def update_constraints(self, alpha: Lanes) -> None:
         """Moves jar along the last line; Hessians to the slots, wrenches to the sides."""
         self.rest()
 
         def response(place, cone, jar):
-            found = contact.respond(self.set.contacts(place, cone), jar)
+            found = contact.constraint_update(self.set.contacts(place, cone), jar)
             return found.hessian, found.force
 
         def store(item: Any, pairing: Pairing) -> None:
-            jar = lanewise(along, alpha, self.read("jar", item), self.read("step", item))
+            jar = lanewise(tree_add_scaled, alpha, self.read("jar", item), self.read("step", item))
             self.write("jar", jar, item)
             hessian, force = lanewise(response, self.place(item), self.cone, jar)
             self.write("hessian", hessian, item)
@@ -319,7 +319,7 @@ class BoundPairs(BoundSlots):
         """The slot's Hessian times a relative motion."""
         return lanewise(_times, self.read("hessian", item), change)
 
-    def aim_all(self) -> Lanes:
+    def prepare_all(self) -> Lanes:
         """Stores the lines along the links' motion; returns the sum of the slopes at 0."""
 
         def add(item: Any, pairing: Pairing, sums: Lanes) -> Lanes:

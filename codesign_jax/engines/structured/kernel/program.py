@@ -437,13 +437,13 @@ class Program:
         def body(carry: tuple) -> tuple:
             t, alive, speed = carry
 
-            def judge(distance: jax.Array, height: jax.Array) -> jax.Array:
+            def undecided(distance: jax.Array, height: jax.Array) -> jax.Array:
                 return verdict.goes_on(bounds, distance, height, speed, t, to_end=to_end)
 
             record(t)
             commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)
             chamber = lanes([pressure[t]], (), wide=True)
-            entry, new_speed, moved = step.advance(commands, chamber, judge, alive > 0, speed)
+            entry, new_speed, moved = step.advance(commands, chamber, undecided, alive > 0, speed)
             alive = jnp.where(moved, alive, 0.0)
             for k, value in enumerate((*entry[:2], speed, *entry[2:4], alive, *entry[4:])):
                 trace[t, k, own] = value

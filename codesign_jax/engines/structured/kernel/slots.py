@@ -145,11 +145,11 @@ class BoundSlots(BoundContacts):
         triangle, wrench = self.fold(item, add, self._zeros((45,), (9,)))
         return full(triangle), wrench
 
-    def aim(self, item: Any, step: Lanes) -> Lanes:
+    def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
         """Stores the line along a relative motion (9, ...); returns the cost's slope at 0."""
 
         def add(slot: Any, sums: Lanes) -> Lanes:
-            return lanewise(jnp.add, sums, self._aim(slot, step))
+            return lanewise(jnp.add, sums, self._prepare_linesearch(slot, step))
 
         return self.fold(item, add, self._zeros(())[0])
 

@@ -16,7 +16,7 @@ FAR = 3e38
 """No upper end of a bracket yet; finite, as a GPU kernel has no test for infinity."""
 
 
-def along(alpha: jax.Array, value: Any, step: Any) -> Any:
+def tree_add_scaled(alpha: jax.Array, value: Any, step: Any) -> Any:
     """A tree of arrays moved by alpha times another one."""
     return jax.tree.map(lambda v, s: v + alpha * s, value, step)
 

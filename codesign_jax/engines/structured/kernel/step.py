@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -73,13 +72,13 @@ class Step:
         """Magnitude of gravity; None without the effect."""
         return self.constant("gravity") if "gravity" in self.p.world.groups else None
 
-    def advance(self, arm: Lanes, pressure: Lanes, judge: Callable, waiting: Any, speed: Any):
+    def advance(self, arm: Lanes, pressure: Lanes, undecided: Callable, waiting: Any, speed: Any):
         """Advances the block.
 
         Args:
           arm: Commands of the arm frame, shape (6, 1, world).
           pressure: Chamber pressures, lanes.
-          judge: Whether a world takes this step, from distance and height before it.
+          undecided: Whether a world takes this step, from distance and height before it.
           waiting: Worlds whose convergence is waited for.
           speed: Largest velocity before the step.
 
@@ -105,13 +104,13 @@ class Step:
         now, quality = newton.solve(now, waiting, *p.limits)
         distance = lanewise(_distance, state["position"], state["wrist"], centre).lane
         height = state["position"][2].lane
-        goes_on, slots = waiting & judge(distance, height), []
+        goes_on, slots = waiting & undecided(distance, height), []
         if p.slotted:
             slots = [self._overflow(bound, waiting)]
             goes_on &= slots[0] == 0
         new_speed, good = self._integrate(state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
-        # A decided world is not iterated for: what it is short of says nothing.
+        # Residuals of decided worlds are reported as 0; no iterations are spent on them.
         residual = jnp.where(waiting, quality.residual.lane, 0.0)
         return (distance, height, residual, count, *slots), new_speed, good
 
@@ -397,7 +396,7 @@ def _moved(h: float, state: dict, columns, wrist, obj) -> dict:
     names = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
     # The fingers' joints are moved link by link, see `_turned`.
     old = State(finger=0.0, finger_vel=0.0, acc=None, **{n: state[n] for n in names})  # type: ignore[arg-type]
-    new = integrate(old, SimpleNamespace(object=columns), kin.Acc(wrist, 0.0, obj), h)  # type: ignore[arg-type]
+    new = integrate(old, columns, kin.Acc(wrist, 0.0, obj), h)  # type: ignore[arg-type]
     return {n: getattr(new, n) for n in names}
 
 

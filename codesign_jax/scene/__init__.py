@@ -5,10 +5,12 @@
 effect means, `schema` the checks of files, `meshes` objects of any shape.
 """
 
-from codesign_jax.scene.description import (
+from codesign_jax.scene.description import Constants, Scene, by_structure
+from codesign_jax.scene.loading import check_together, load, load_accuracy
+from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.tables import (
     Accuracy,
     Arm,
-    Constants,
     Contact,
     Cost,
     Discretization,
@@ -17,12 +19,8 @@ from codesign_jax.scene.description import (
     Newton,
     Phases,
     Pneumatics,
-    Scene,
     Solver,
-    by_structure,
 )
-from codesign_jax.scene.loading import check_together, load, load_accuracy
-from codesign_jax.scene.schema import SceneError
 
 __all__ = [
     "Accuracy",

@@ -11,161 +11,21 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 from codesign_jax.scene import hand, objects, schema
-from codesign_jax.scene.schema import choice, quantity
+from codesign_jax.scene.schema import quantity
+from codesign_jax.scene.tables import (
+    Arm,
+    Contact,
+    Cost,
+    Discretization,
+    Effects,
+    Limits,
+    Newton,
+    Phases,
+    Pneumatics,
+    Solver,
+)
 
 T = TypeVar("T")
-
-
-@dataclasses.dataclass(frozen=True)
-class Effects:
-    """What is simulated; an effect that is off has no joint, contact or branch in the program.
-
-    `codesign_jax.scene.effects` says what each means and which engines have it.
-    """
-
-    lateral_bending: bool = True
-    twist: bool = True
-    wrist: bool = True
-    finger_object: bool = True
-    palm_object: bool = True
-    finger_table: bool = True
-    palm_table: bool = True
-    object_table: bool = True
-    finger_finger: bool = False
-    surface: str = choice("spheres", "hull", default="spheres")
-    friction: str = choice("none", "coulomb", "full", default="coulomb")
-    disturb: bool = True
-    ungrasp: bool = True
-    neo_hookean: bool = False
-    pressure_dynamics: bool = False
-    gravity: bool = True
-
-
-@dataclasses.dataclass(frozen=True)
-class Phases:
-    """End times of the phases of one grasp (paper Fig. 3) [s].
-
-    The number of time steps is structure: the end of the last phase may not be changed by
-    `Constants`.
-    """
-
-    approach: float = quantity("s", 0.01, 60)
-    inflate: float = quantity("s", 0.01, 60)
-    lift: float = quantity("s", 0.01, 60)
-    disturb: float = quantity("s", 0.01, 60)
-    ungrasp: float = quantity("s", 0.01, 60, structure=True)
-    deflate_time: float = quantity("s", 0.001, 60)
-
-
-@dataclasses.dataclass(frozen=True)
-class Arm:
-    """Start pose, reference height and disturbance of the arm frame X_D."""
-
-    start_height: float = quantity("m", 0.05, 2)
-    zero_height: float = quantity("m", 0, 1)
-    shake_frequency: float = quantity("Hz", 0, 20)
-    shake_amplitude: float = quantity("deg", 0, 90)
-
-
-@dataclasses.dataclass(frozen=True)
-class Cost:
-    """Cost of a trial (paper Fig. 3): `maximum` if lost as the lift begins, 0 if kept."""
-
-    maximum: float = quantity("", 0.1, 100)
-    lost_distance: float = quantity("m", 0.001, 1)
-    failure: str = choice("exclude", "worst")
-
-
-@dataclasses.dataclass(frozen=True)
-class Contact:
-    """MuJoCo's soft contact as the rubber skin's own numbers; see `model.contact_invweight`.
-
-    A contact of normal force N resists spin with `torsional_friction` N and rolling with
-    `rolling_friction` N, both lengths as in MuJoCo, if the effect `friction` is "full".
-    """
-
-    normal_stiffness: float = quantity("N/m", 10, 1e6)
-    time_constant: float = quantity("s", 1e-4, 1)
-    impedance: float = quantity("", 0.01, 0.9999)
-    friction_ratio: float = quantity("", 0.01, 1000)
-    finger_table_friction: float = quantity("", 0, 5)
-    torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
-    rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
-    finger_finger_friction: float = quantity("", 0, 5, default=0.8)
-
-
-@dataclasses.dataclass(frozen=True)
-class Pneumatics:
-    """Dynamics of the chambers' pressure, used with the effect `pressure_dynamics`."""
-
-    lag: float = quantity("s", 0, 10, default=0.1)
-    rate: float = quantity("Pa/s", 1e3, 1e9, default=400e3)
-    maximum: float = quantity("Pa", 1e3, 1e6, default=200e3)
-
-
-@dataclasses.dataclass(frozen=True)
-class Discretization:
-    """Time step, segments a finger (the paper's ten links) and density of the contact points.
-
-    Each link has `spheres_per_link` spheres or, with the surface "hull", `hull_rings` rings of
-    `hull_points` vertices, a multiple of four.
-    """
-
-    timestep: float = quantity("s", 1e-5, 0.05, structure=True)
-    links: int = quantity("", 1, 200, structure=True)
-    spheres_per_link: int = quantity("", 1, 20, structure=True)
-    hull_rings: int = quantity("", 1, 20, structure=True, default=2)
-    hull_points: int = quantity("", 4, 80, structure=True, default=8)
-
-
-@dataclasses.dataclass(frozen=True)
-class Solver:
-    """MuJoCo's options of its contact solver, which the engines `mujoco` and `mjx` read.
-
-    Largest numbers of Newton iterations and of line-search iterations, and MuJoCo's tolerance: the
-    improvement or gradient of the cost, scaled by the model's inertia.  The engine `structured`
-    measures convergence otherwise, see `Newton`, and refuses other values than a preset's where
-    `[newton]` is not set as well.
-
-    The tolerance must not be zero: MuJoCo's line search may then return no step at all.
-    """
-
-    iterations: int = quantity("", 1, 1000, structure=True, default=30)
-    ls_iterations: int = quantity("", 1, 1000, structure=True, default=20)
-    tolerance: float = quantity("", 1e-16, 1, structure=True, default=1e-8)
-
-
-@dataclasses.dataclass(frozen=True)
-class Newton:
-    """Limits of the contact solver of the engine `structured`.
-
-    Largest numbers of Newton iterations of a step and of line-search evaluations of an iteration,
-    and the relative Newton decrement at which a world has converged, a share of the cost's scale;
-    a step that ends above it sets SOLVER_CAP.  Where no kernel runs a line search has at most six
-    evaluations.
-    """
-
-    iterations: int = quantity("", 1, 1000, structure=True, default=24)
-    evaluations: int = quantity("", 1, 1000, structure=True, default=14)
-    decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-6)
-
-
-@dataclasses.dataclass(frozen=True)
-class Accuracy:
-    """Values of a preset of accuracy; docs/accuracy.md has its measured errors and cost."""
-
-    description: str
-    discretization: dict
-    solver: dict
-    newton: dict = dataclasses.field(default_factory=dict)
-
-
-@dataclasses.dataclass(frozen=True)
-class Limits:
-    """Bounds beyond which a world has failed although its numbers are finite."""
-
-    speed: float = quantity("rad/s or m/s", 1, 1e9)
-    penetration: float = quantity("m", 1e-4, 1)
 
 
 class Constants(NamedTuple):

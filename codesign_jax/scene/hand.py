@@ -1,189 +1,26 @@
-"""A hand as data: fingers, material, palm, wrist and the parameter table (paper Table I)."""
+"""Hand files: read, and checked as a whole; `hand_tables` has what is in them."""
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from codesign_jax.scene import keypaths, library, schema
-from codesign_jax.scene.schema import choice, quantity
-
-# Unit of a file -> (SI unit, factor).
-UNITS = {
-    "mm": ("m", 1e-3),
-    "m": ("m", 1.0),
-    "deg": ("rad", math.pi / 180.0),
-    "rad": ("rad", 1.0),
-    "kPa": ("Pa", 1e3),
-    "Pa": ("Pa", 1.0),
-}
-
-
-class Kind(NamedTuple):
-    """What a parameter is: per finger or hand, its SI unit and the range that makes sense."""
-
-    per: str
-    unit: str
-    low: float
-    high: float
-
-
-# Every parameter that the hand model understands.
-PARAMETERS = {
-    "length": Kind("finger", "m", 1e-3, 1.0),
-    "height": Kind("finger", "m", 1e-3, 0.1),
-    "wall": Kind("finger", "m", 1e-4, 0.05),
-    "spread": Kind("hand", "rad", -2 * math.pi, 2 * math.pi),
-    "arm_roll": Kind("hand", "rad", -math.pi, math.pi),
-    "arm_yaw": Kind("hand", "rad", -math.pi, math.pi),
-    "arm_pitch": Kind("hand", "rad", -math.pi, math.pi),
-    "arm_z": Kind("hand", "m", -1.0, 1.0),
-    "arm_x": Kind("hand", "m", -1.0, 1.0),
-    "arm_y": Kind("hand", "m", -1.0, 1.0),
-    "pressure": Kind("finger", "Pa", 0.0, 1e6),
-}
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Finger:
-    """Mount of a finger, which leaves the palm at azimuth + spread * gamma, tilted downwards.
-
-    Its base point is the middle of the inextensible layer's edge, on the palm's underside. It is
-    given either as `base`, (x, y) in the palm's frame, which stays where it is when the spread
-    gamma turns the finger's direction; or as `radius` of a circle around the palm's centre, on
-    which it moves with the direction. The other one is None.
-    """
-
-    azimuth: float = quantity("deg", -360, 360)
-    spread: float = quantity("", -1, 1)
-    tilt: float = quantity("deg", -90, 90)
-    radius: float | None = quantity("m", 0, 0.2, default=None)
-    base: tuple[float, ...] | None = quantity("m", -0.2, 0.2, default=None)
-
-    def base_point(self, cosine: Any, sine: Any) -> tuple[Any, Any]:
-        """Base point (x, y) in the palm's frame [m].
-
-        Args:
-          cosine: Cosine of azimuth + spread * gamma, of any shape; may be traced.
-          sine: Its sine.
-        """
-        if self.base is not None:
-            return self.base[0], self.base[1]
-        return self.radius * cosine, self.radius * sine
-
-    @property
-    def base_distance(self) -> Any:
-        """Distance of the base point from the palm's centre [m], at any spread."""
-        if self.base is not None:
-            return (self.base[0] ** 2 + self.base[1] ** 2) ** 0.5
-        return self.radius
-
-
-@dataclasses.dataclass(frozen=True)
-class Section:
-    """Rectangular hollow cross-section; height and wall are parameters of the table."""
-
-    width: float = quantity("m", 0.005, 0.1)
-
-
-@dataclasses.dataclass(frozen=True)
-class Material:
-    """Silicone of the fingers: shear modulus, density and Kelvin-Voigt damping time beta.
-
-    The two factors scale the stiffness that `morphology` derives for bending sideways and for
-    torsion: for the former the fabric's side is the neutral line, which is an upper bound; for the
-    latter walls are thin, which is a lower one.
-    """
-
-    shear_modulus: float = quantity("Pa", 1e3, 1e7)
-    density: float = quantity("kg/m^3", 100, 10000)
-    damping_time: float = quantity("s", 0, 1)
-    lateral_factor: float = quantity("", 0.05, 20, default=1.0)
-    torsion_factor: float = quantity("", 0.05, 20, default=1.0)
-
-
-@dataclasses.dataclass(frozen=True)
-class Palm:
-    """Rigid palm; spheres of `contact_radius`, tangent to its underside, carry its contacts."""
-
-    mass: float = quantity("kg", 0.01, 10)
-    radius: float = quantity("m", 0.005, 0.2)
-    thickness: float = quantity("m", 0.002, 0.1)
-    contact_radius: float = quantity("m", 0.001, 0.05)
-    contact_ring: float = quantity("m", 0, 0.2)
-
-
-@dataclasses.dataclass(frozen=True)
-class Wrist:
-    """Passively compliant joint between arm frame X_D and wrist frame X_A."""
-
-    linear_stiffness: float = quantity("N/m", 1, 1e5)
-    angular_stiffness: float = quantity("N m/rad", 0.01, 1e4)
-    linear_damping: float = quantity("N s/m", 0, 1e4, typical=20.0)
-    angular_damping: float = quantity("N m s/rad", 0, 1e3, typical=0.1)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Parameter:
-    """A row of the parameter table, in the row's own unit."""
-
-    name: str = choice(*PARAMETERS)
-    per: str = choice("finger", "hand")
-    domain: str = choice("morphology", "control")
-    unit: str = choice(*UNITS)
-    low: float
-    high: float
-    default: float
-
-
-@dataclasses.dataclass(frozen=True)
-class PressureLimit:
-    """Upper limit of the pressure, proportional to the hull thickness (Table I).
-
-    It bounds the design space, not the simulation.
-    """
-
-    per_wall: float = quantity("Pa/m", 1e5, 1e9, structure=True)
-
-
-@dataclasses.dataclass(frozen=True)
-class Free:
-    """A parameter that a preset leaves free, optionally tied over fingers, with other bounds."""
-
-    name: str = choice(*PARAMETERS)
-    tied: bool = False
-    low: float | None = None
-    high: float | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Preset:
-    """A design space: the free parameters; the rest is fixed at `fixed` or the table's default."""
-
-    name: str
-    free: tuple[Free, ...]
-    fixed: dict = dataclasses.field(default_factory=dict)
-
-    def __hash__(self) -> int:
-        """Hashes the preset although TOML gives `fixed` as a dict."""
-        return hash((self.name, self.free, tuple(sorted(self.fixed.items()))))
-
-
-@dataclasses.dataclass(frozen=True)
-class Hand:
-    """A soft hand read from a file in hands/; see `load`."""
-
-    name: str
-    description: str
-    finger: tuple[Finger, ...]
-    section: Section
-    material: Material
-    palm: Palm
-    wrist: Wrist
-    parameter: tuple[Parameter, ...]
-    pressure_limit: PressureLimit
-    preset: tuple[Preset, ...] = ()
+from codesign_jax.scene.hand_tables import (
+    PARAMETERS,
+    UNITS,
+    Finger,
+    Free,
+    Hand,
+    Kind,
+    Material,
+    Palm,
+    Parameter,
+    Preset,
+    PressureLimit,
+    Section,
+    Wrist,
+)
 
 
 def structure(hand: Hand) -> Hand:
@@ -361,3 +198,22 @@ def _bounds(row: Parameter, preset: Preset) -> tuple[float, float]:
     low = row.low if free.low is None else free.low
     high = row.high if free.high is None else free.high
     return low * factor, high * factor
+
+
+__all__ = [
+    "PARAMETERS",
+    "UNITS",
+    "Finger",
+    "Free",
+    "Hand",
+    "Kind",
+    "Material",
+    "Palm",
+    "Parameter",
+    "Preset",
+    "PressureLimit",
+    "Section",
+    "Wrist",
+    "load",
+    "structure",
+]

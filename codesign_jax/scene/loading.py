@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from codesign_jax.scene import hand, keypaths, library, objects, schema
-from codesign_jax.scene.description import (
+from codesign_jax.scene.description import Scene
+from codesign_jax.scene.schema import quantity
+from codesign_jax.scene.tables import (
     Accuracy,
     Arm,
     Contact,
@@ -17,15 +19,22 @@ from codesign_jax.scene.description import (
     Newton,
     Phases,
     Pneumatics,
-    Scene,
     Solver,
 )
-from codesign_jax.scene.schema import quantity
 
 
 @dataclasses.dataclass(frozen=True)
 class _SceneFile:
-    """Schema of a scene file: as `Scene`, with hand and objects by name."""
+    """Schema of a scene file: as `Scene`, with hand and objects by name.
+
+    Attributes:
+      name: Name of the scene, as in results.
+      description: What the scene is, in a line.
+      hand: Name of a built-in hand, or the path of a hand file, relative to the scene file.
+      objects: Name of a built-in object set, or the path of an object file, relative to the scene
+        file.
+      gravity: Acceleration of gravity, only with `effects.gravity`.
+    """
 
     name: str
     description: str

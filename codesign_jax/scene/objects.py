@@ -23,6 +23,16 @@ class Noise:
     Mass and size of the object have factors 1 + sigma z, which the upper bounds keep positive.  The
     friction of all contacts, the shear modulus of the fingers and the masses of fingers and palm
     have factors exp(sigma z) [ours].
+
+    Attributes:
+      position: Of the object's position on the table, in x and y.
+      orientation: Of the object's rotation about the vertical, and of the arm frame's about roll
+        and pitch.
+      mass: Of the object's mass, relative.
+      size: Of the object's size, relative.
+      friction: Of the friction of all contacts, relative.
+      stiffness: Of the fingers' shear modulus, relative.
+      hand_mass: Of the masses of fingers and palm, relative.
     """
 
     position: float = quantity("m", 0, 0.1)
@@ -36,7 +46,11 @@ class Noise:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """The plane z = 0 and its friction with the object."""
+    """The plane z = 0 and its friction with the object.
+
+    Attributes:
+      friction: Coulomb coefficient of the object on the table.
+    """
 
     friction: float = quantity("", 0, 5)
 
@@ -91,7 +105,12 @@ class Shape(_ShapeFile):
 
 @dataclasses.dataclass(frozen=True)
 class _ObjectSetFile:
-    """Schema of an object file."""
+    """Schema of an object file.
+
+    Attributes:
+      name: Name of the set, as in results.
+      description: What the set is, in a line.
+    """
 
     name: str
     description: str

@@ -1,0 +1,255 @@
+"""The tables of a hand file: fingers, material, palm, wrist, parameters (paper Table I), presets.
+
+The `Attributes` of each docstring are the meanings that `docs/reference.md` shows beside the units
+and ranges of the fields, see `scripts/reference_page.py`.
+"""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+from codesign_jax.scene.schema import choice, quantity
+
+# Unit of a file -> (SI unit, factor).
+UNITS = {
+    "mm": ("m", 1e-3),
+    "m": ("m", 1.0),
+    "deg": ("rad", math.pi / 180.0),
+    "rad": ("rad", 1.0),
+    "kPa": ("Pa", 1e3),
+    "Pa": ("Pa", 1.0),
+}
+
+
+class Kind(NamedTuple):
+    """A parameter: per finger or hand, its SI unit, the range that makes sense, its meaning."""
+
+    per: str
+    unit: str
+    low: float
+    high: float
+    meaning: str
+
+
+PARAMETERS = {
+    "length": Kind("finger", "m", 1e-3, 1.0, "length of a finger"),
+    "height": Kind("finger", "m", 1e-3, 0.1, "outer height of a finger's section"),
+    "wall": Kind("finger", "m", 1e-4, 0.05, "thickness of a finger's walls"),
+    "spread": Kind("hand", "rad", -2 * math.pi, 2 * math.pi, "spread gamma of the fingers"),
+    "arm_roll": Kind("hand", "rad", -math.pi, math.pi, "roll of the arm frame X_D"),
+    "arm_yaw": Kind("hand", "rad", -math.pi, math.pi, "yaw of the arm frame X_D"),
+    "arm_pitch": Kind(
+        "hand", "rad", -math.pi, math.pi, "pitch of the arm frame X_D; positive: fingers towards +x"
+    ),
+    "arm_z": Kind("hand", "m", -1.0, 1.0, "height of the arm frame X_D over `arm.zero_height`"),
+    "arm_x": Kind("hand", "m", -1.0, 1.0, "position x of the arm frame X_D"),
+    "arm_y": Kind("hand", "m", -1.0, 1.0, "position y of the arm frame X_D"),
+    "pressure": Kind("finger", "Pa", 0.0, 1e6, "gauge pressure of a chamber while grasping"),
+}
+"""Every parameter that the hand model understands."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Finger:
+    """Mount of a finger, which leaves the palm at azimuth + spread * gamma, tilted downwards.
+
+    Its base point is the middle of the inextensible layer's edge, on the palm's underside. It is
+    given either as `base`, (x, y) in the palm's frame, which stays where it is when the spread
+    gamma turns the finger's direction; or as `radius` of a circle around the palm's centre, on
+    which it moves with the direction. The other one is None.
+
+    Attributes:
+      azimuth: Direction in which the finger leaves the palm at no spread, about the vertical.
+      spread: Share of the hand's spread gamma by which that direction turns.
+      tilt: Angle between the finger and the palm's plane, downwards.
+      radius: Distance of the base point from the palm's centre; instead of `base`.
+      base: Base point (x, y) in the palm's frame; instead of `radius`.
+    """
+
+    azimuth: float = quantity("deg", -360, 360)
+    spread: float = quantity("", -1, 1)
+    tilt: float = quantity("deg", -90, 90)
+    radius: float | None = quantity("m", 0, 0.2, default=None)
+    base: tuple[float, ...] | None = quantity("m", -0.2, 0.2, default=None)
+
+    def base_point(self, cosine: Any, sine: Any) -> tuple[Any, Any]:
+        """Base point (x, y) in the palm's frame [m].
+
+        Args:
+          cosine: Cosine of azimuth + spread * gamma, of any shape; may be traced.
+          sine: Its sine.
+        """
+        if self.base is not None:
+            return self.base[0], self.base[1]
+        return self.radius * cosine, self.radius * sine
+
+    @property
+    def base_distance(self) -> Any:
+        """Distance of the base point from the palm's centre [m], at any spread."""
+        if self.base is not None:
+            return (self.base[0] ** 2 + self.base[1] ** 2) ** 0.5
+        return self.radius
+
+
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """Rectangular hollow cross-section; height and wall are parameters of the table.
+
+    Attributes:
+      width: Outer width of the section.
+    """
+
+    width: float = quantity("m", 0.005, 0.1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+    """Silicone of the fingers.
+
+    The two factors scale the stiffness that `morphology` derives for bending sideways and for
+    torsion: for the former the fabric's side is the neutral line, which is an upper bound; for the
+    latter walls are thin, which is a lower one.
+
+    Attributes:
+      shear_modulus: Shear modulus G.
+      density: Density.
+      damping_time: Kelvin-Voigt damping time beta: a joint's damping is beta times its stiffness.
+      lateral_factor: Factor on the stiffness of bending sideways.
+      torsion_factor: Factor on the stiffness of twist.
+    """
+
+    shear_modulus: float = quantity("Pa", 1e3, 1e7)
+    density: float = quantity("kg/m^3", 100, 10000)
+    damping_time: float = quantity("s", 0, 1)
+    lateral_factor: float = quantity("", 0.05, 20, default=1.0)
+    torsion_factor: float = quantity("", 0.05, 20, default=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Palm:
+    """Rigid palm; spheres of `contact_radius`, tangent to its underside, carry its contacts.
+
+    Attributes:
+      mass: Mass of the palm.
+      radius: Radius of the palm, a disc.
+      thickness: Thickness of the palm.
+      contact_radius: Radius of the five contact spheres.
+      contact_ring: Radius of the circle on which the centres of four of them lie; the fifth is in
+        the middle.
+    """
+
+    mass: float = quantity("kg", 0.01, 10)
+    radius: float = quantity("m", 0.005, 0.2)
+    thickness: float = quantity("m", 0.002, 0.1)
+    contact_radius: float = quantity("m", 0.001, 0.05)
+    contact_ring: float = quantity("m", 0, 0.2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Wrist:
+    """Passively compliant joint between arm frame X_D and wrist frame X_A.
+
+    Attributes:
+      linear_stiffness: Stiffness of the three slides.
+      angular_stiffness: Stiffness of the three hinges.
+      linear_damping: Damping of the three slides.
+      angular_damping: Damping of the three hinges.
+    """
+
+    linear_stiffness: float = quantity("N/m", 1, 1e5)
+    angular_stiffness: float = quantity("N m/rad", 0.01, 1e4)
+    linear_damping: float = quantity("N s/m", 0, 1e4, typical=20.0)
+    angular_damping: float = quantity("N m s/rad", 0, 1e3, typical=0.1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """A row of the parameter table, in the row's own unit.
+
+    Attributes:
+      name: Which parameter; every one is given once.
+      per: Whether each finger has a value of its own, or the hand has one.
+      domain: What a schedule counts the parameter among.
+      unit: Unit of the row's numbers, and of presets, commands and CSV columns.
+      low: Lower bound.
+      high: Upper bound.
+      default: Value where a design or a preset gives none; within the bounds.
+    """
+
+    name: str = choice(*PARAMETERS)
+    per: str = choice("finger", "hand")
+    domain: str = choice("morphology", "control")
+    unit: str = choice(*UNITS)
+    low: float
+    high: float
+    default: float
+
+
+@dataclasses.dataclass(frozen=True)
+class PressureLimit:
+    """Upper limit of the pressure, proportional to the hull thickness (Table I).
+
+    It bounds the design space, not the simulation.
+
+    Attributes:
+      per_wall: Limit of the pressure for a metre of wall.
+    """
+
+    per_wall: float = quantity("Pa/m", 1e5, 1e9, structure=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Free:
+    """A parameter that a preset leaves free, optionally tied over fingers, with other bounds.
+
+    Attributes:
+      name: Which parameter.
+      tied: Whether all fingers share one value.
+      low: Lower bound in the table's unit; that of the table if not given.
+      high: Upper bound in the table's unit; that of the table if not given.
+    """
+
+    name: str = choice(*PARAMETERS)
+    tied: bool = False
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Preset:
+    """A design space: the free parameters; the rest is fixed at `fixed` or the table's default.
+
+    Attributes:
+      name: Name of the preset, as for `--preset`; "full" is the whole table.
+      free: The free parameters.
+      fixed: Values of other parameters by name, in the table's units.
+    """
+
+    name: str
+    free: tuple[Free, ...]
+    fixed: dict = dataclasses.field(default_factory=dict)
+
+    def __hash__(self) -> int:
+        """Hashes the preset although TOML gives `fixed` as a dict."""
+        return hash((self.name, self.free, tuple(sorted(self.fixed.items()))))
+
+
+@dataclasses.dataclass(frozen=True)
+class Hand:
+    """A soft hand read from a file in hands/; see `hand.load`.
+
+    Attributes:
+      name: Name of the hand, as in results.
+      description: What the hand is, in a line.
+    """
+
+    name: str
+    description: str
+    finger: tuple[Finger, ...]
+    section: Section
+    material: Material
+    palm: Palm
+    wrist: Wrist
+    parameter: tuple[Parameter, ...]
+    pressure_limit: PressureLimit
+    preset: tuple[Preset, ...] = ()

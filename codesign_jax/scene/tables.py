@@ -1,0 +1,228 @@
+"""The tables of a scene file, and a preset of accuracy.
+
+The `Attributes` of each docstring are the meanings that `docs/reference.md` shows beside the units
+and ranges of the fields, see `scripts/reference_page.py`.
+"""
+
+import dataclasses
+
+from codesign_jax.scene.schema import choice, quantity
+
+
+@dataclasses.dataclass(frozen=True)
+class Effects:
+    """What is simulated; an effect that is off has no joint, contact or branch in the program.
+
+    `codesign_jax.scene.effects` says what each means and which engines have it.
+    """
+
+    lateral_bending: bool = True
+    twist: bool = True
+    wrist: bool = True
+    finger_object: bool = True
+    palm_object: bool = True
+    finger_table: bool = True
+    palm_table: bool = True
+    object_table: bool = True
+    finger_finger: bool = False
+    surface: str = choice("spheres", "hull", default="spheres")
+    friction: str = choice("none", "coulomb", "full", default="coulomb")
+    disturb: bool = True
+    ungrasp: bool = True
+    neo_hookean: bool = False
+    pressure_dynamics: bool = False
+    gravity: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Phases:
+    """End times of the phases of one grasp (paper Fig. 3) [s].
+
+    Each phase ends later than the one before it.  The number of time steps is structure: the end of
+    the last phase may not be changed by `Constants`.
+
+    Attributes:
+      approach: End of the approach: the arm is at the grasp's height.
+      inflate: End of inflation: the chambers have their pressures. Losing the object costs from
+        here on.
+      lift: End of the lift: the arm is at `arm.start_height` again.
+      disturb: End of the disturbance, and of the time in which losing the object costs.
+      ungrasp: End of the grasp.
+      deflate_time: Time that the chambers take to empty from the start of the un-grasp phase on;
+        fits into that phase.
+    """
+
+    approach: float = quantity("s", 0.01, 60)
+    inflate: float = quantity("s", 0.01, 60)
+    lift: float = quantity("s", 0.01, 60)
+    disturb: float = quantity("s", 0.01, 60)
+    ungrasp: float = quantity("s", 0.01, 60, structure=True)
+    deflate_time: float = quantity("s", 0.001, 60)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """Start pose, reference height and disturbance of the arm frame X_D.
+
+    Attributes:
+      start_height: Height of the arm frame above the table at the start and after the lift.
+      zero_height: Height of the arm frame above the table at which the parameter `arm_z` is zero.
+      shake_frequency: Frequency of the disturbance, whose whole periods alternate between roll and
+        pitch.
+      shake_amplitude: Amplitude of the disturbance at its end, to which it grows linearly.
+    """
+
+    start_height: float = quantity("m", 0.05, 2)
+    zero_height: float = quantity("m", 0, 1)
+    shake_frequency: float = quantity("Hz", 0, 20)
+    shake_amplitude: float = quantity("deg", 0, 90)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """Cost of a trial (paper Fig. 3).
+
+    Attributes:
+      maximum: Cost of a trial that loses its object as the lift begins, and what a failed trial
+        shows; a kept object costs 0.
+      lost_distance: Distance between the centres of object and hand from which on the object is
+        lost.
+      failure: What a failed trial counts in its particle's mean cost: "exclude" leaves it out (the
+        paper's rule), "worst" scores it with `maximum`.
+    """
+
+    maximum: float = quantity("", 0.1, 100)
+    lost_distance: float = quantity("m", 0.001, 1)
+    failure: str = choice("exclude", "worst")
+
+
+@dataclasses.dataclass(frozen=True)
+class Contact:
+    """MuJoCo's soft contact as the rubber skin's own numbers; see `model.contact_invweight`.
+
+    A contact of normal force N resists spin with `torsional_friction` N and rolling with
+    `rolling_friction` N, both lengths as in MuJoCo, if the effect `friction` is "full".
+
+    Attributes:
+      normal_stiffness: Normal stiffness of one finger-object contact, the same for every morphology
+        and time step; a contact with the table is twice as stiff.
+      time_constant: MuJoCo's `solref` time constant, with damping ratio 1; at least two time steps.
+      impedance: MuJoCo's `solimp` impedance, constant over the depth.
+      friction_ratio: MuJoCo's `impratio`: how much harder friction is than the normal direction.
+      finger_table_friction: Coulomb coefficient of fingers and palm on the table.
+      torsional_friction: Length by which a contact's normal force resists spin, only with
+        `effects.friction = "full"`.
+      rolling_friction: Length by which a contact's normal force resists rolling, only with
+        `effects.friction = "full"`.
+      finger_finger_friction: Coulomb coefficient of fingers on fingers, only with
+        `effects.finger_finger`.
+    """
+
+    normal_stiffness: float = quantity("N/m", 10, 1e6)
+    time_constant: float = quantity("s", 1e-4, 1)
+    impedance: float = quantity("", 0.01, 0.9999)
+    friction_ratio: float = quantity("", 0.01, 1000)
+    finger_table_friction: float = quantity("", 0, 5)
+    torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
+    rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
+    finger_finger_friction: float = quantity("", 0, 5, default=0.8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pneumatics:
+    """Dynamics of the chambers' pressure, used with the effect `pressure_dynamics`.
+
+    Attributes:
+      lag: Time constant of the first-order lag of valve and tube.
+      rate: Fastest change of pressure.
+      maximum: Highest pressure of the supply.
+    """
+
+    lag: float = quantity("s", 0, 10, default=0.1)
+    rate: float = quantity("Pa/s", 1e3, 1e9, default=400e3)
+    maximum: float = quantity("Pa", 1e3, 1e6, default=200e3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Discretization:
+    """Time step, segments of a finger and density of the contact points.
+
+    Attributes:
+      timestep: Time step.
+      links: Segments of a finger, with joints at their midpoints; the paper has ten.
+      spheres_per_link: Contact spheres of a link, only with `effects.surface = "spheres"`.
+      hull_rings: Rings of vertices of a link, only with `effects.surface = "hull"`.
+      hull_points: Vertices of a ring, a multiple of four, only with `effects.surface = "hull"`.
+    """
+
+    timestep: float = quantity("s", 1e-5, 0.05, structure=True)
+    links: int = quantity("", 1, 200, structure=True)
+    spheres_per_link: int = quantity("", 1, 20, structure=True)
+    hull_rings: int = quantity("", 1, 20, structure=True, default=2)
+    hull_points: int = quantity("", 4, 80, structure=True, default=8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Solver:
+    """MuJoCo's options of its contact solver, which the engines `mujoco` and `mjx` read.
+
+    The engine `structured` measures convergence otherwise, see `Newton`, and refuses other values
+    than a preset's where `[newton]` is not set as well.
+
+    Attributes:
+      iterations: Largest number of Newton iterations.
+      ls_iterations: Largest number of line-search iterations.
+      tolerance: MuJoCo's tolerance: the improvement or gradient of the cost, scaled by the model's
+        inertia. It must not be zero: MuJoCo's line search may then return no step at all.
+    """
+
+    iterations: int = quantity("", 1, 1000, structure=True, default=30)
+    ls_iterations: int = quantity("", 1, 1000, structure=True, default=20)
+    tolerance: float = quantity("", 1e-16, 1, structure=True, default=1e-8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Newton:
+    """Limits of the contact solver of the engine `structured`.
+
+    Attributes:
+      iterations: Largest number of Newton iterations of a step.
+      evaluations: Largest number of line-search evaluations of an iteration; where no kernel runs
+        a line search has at most six.
+      decrement: Relative Newton decrement at which a world has converged, a share of the cost's
+        scale; a step that ends above it sets the bit SOLVER_CAP.
+    """
+
+    iterations: int = quantity("", 1, 1000, structure=True, default=24)
+    evaluations: int = quantity("", 1, 1000, structure=True, default=14)
+    decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-6)
+
+
+@dataclasses.dataclass(frozen=True)
+class Accuracy:
+    """Values of a preset of accuracy; docs/accuracy.md has its measured errors and cost.
+
+    Attributes:
+      description: What the preset is for.
+      discretization: Values of the scene's table `[discretization]` that the preset replaces.
+      solver: Values of the scene's table `[solver]` that the preset replaces.
+      newton: Values of the scene's table `[newton]` that the preset replaces.
+    """
+
+    description: str
+    discretization: dict
+    solver: dict
+    newton: dict = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Bounds beyond which a world has failed although its numbers are finite.
+
+    Attributes:
+      speed: Largest velocity of any joint.
+      penetration: How far the object's centre may be below the table.
+    """
+
+    speed: float = quantity("rad/s or m/s", 1, 1e9)
+    penetration: float = quantity("m", 1e-4, 1)

@@ -13,6 +13,7 @@ from scipy import stats
 from tiny_run import small_run  # noqa: F401
 
 from codesign_jax import cli, runs
+from codesign_jax.report import landscape
 from codesign_jax.runs import choice
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import failed
@@ -98,6 +99,26 @@ def test_unfinished_run_reports_its_finished_episodes(run, tmp_path, capsys):
     assert "2 of 3 episodes" in page and "not tested" in page
     assert "startReplay(document" not in page
     assert f"report: {tmp_path / 'r.html'}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_landscape_of_two_among_many_says_around_what_it_is(run, tmp_path, moved):
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    the_scene, _ = runs.read_run(run)
+    design = choice.choose(the_scene, choice.read_record(run)).design
+    names, units = np.array(["wall[0]", "arm_z"]), np.array(["mm", "mm"])
+    cost, count = np.array([[2.9, 3.0], [3.0, 3.0]]), np.full((2, 2), 4)
+    found = landscape.Landscape(
+        names, units, np.arange(2.0), np.arange(2.0), cost, 0 * count, count,
+        np.array(4), np.array(0), design * (0.9 if moved else 1.0),
+    )  # fmt: skip
+    landscape.save(found, copy)
+    assert cli.main(["report", str(copy), "--no-replay"]) == 0
+    page = (copy / "report.html").read_text(encoding="utf-8")
+    own = "The other parameters are those of the chosen design." in page
+    assert "The other parameters are those of" in page and own != moved
+    assert '"zmin":0.0,"zmax":3.0' in page or '"zmax":3.0,"zmin":0.0' in page
 
 
 def test_errors_are_words(run, tmp_path, capsys, monkeypatch):

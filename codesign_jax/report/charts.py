@@ -193,10 +193,11 @@ def landscape_figure(found: Landscape) -> go.Figure:
 
 
 def _heatmap(found: Landscape) -> go.Heatmap:
+    # plotly heeds limits of the colours as a pair only.
+    limits = {"zmin": 0.0, "zmax": max(float(found.cost.max()), 1e-3)}
     bar = {"title": "mean cost", "x": 1.12}
-    return go.Heatmap(
-        x=found.first, y=found.second, z=found.cost.T, colorscale="Greys", zmin=0, colorbar=bar
-    )
+    x, y, z = found.first, found.second, found.cost.T
+    return go.Heatmap(x=x, y=y, z=z, colorscale="Greys", colorbar=bar, **limits)
 
 
 def failures(status: np.ndarray) -> go.Figure:

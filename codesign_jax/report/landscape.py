@@ -71,4 +71,7 @@ def load(path: Path) -> Landscape:
         with np.load(path, allow_pickle=False) as stored:
             return Landscape(**{name: stored[name] for name in Landscape._fields})
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise SceneError([f"{path} is not a landscape: {error}"]) from error
+        problem = (
+            f"{path} is not a landscape of this version ({error}); codesign landscape writes one"
+        )
+        raise SceneError([problem]) from error

@@ -14,7 +14,7 @@ from codesign_jax import codesign, files, types
 from codesign_jax.report import charts, landscape, viewer
 from codesign_jax.report.animation import Replay
 from codesign_jax.report.statistics import wilson
-from codesign_jax.runs import Settings, choice
+from codesign_jax.runs import Settings, choice, tables
 from codesign_jax.runs.choice import Chosen, Grasp
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.scene_files import NAMES
@@ -269,24 +269,27 @@ def _parameters(run: Run) -> str:
 
 
 def _landscape(run: Run) -> str:
-    path = run.folder / landscape.FILE
+    """The particles of a run with two parameters, and the landscape where there is one."""
+    path, space = run.folder / landscape.FILE, run.space
     found = landscape.load(path) if path.exists() else None
-    same = found is not None and tuple(found.names) == run.space.names
-    pair = run.space.num_parameters == 2
-    if not pair and found is None:
-        return ""
-    words, command = "A dot is a particle of any episode, coloured by its cost.", []
-    if found is not None:
-        count = int(found.trials)
-        words += f" In grey the mean cost over {count} trials a point, white where all are kept."
+    words, command = "A dot is a particle of any episode, coloured by its cost. ", []
+    if found is None:
+        if space.num_parameters != 2:
+            return ""
+        words, command = words + "The whole landscape: ", ["landscape", "--run", str(run.folder)]
+        figure = charts.designs(run.history, space, run.chosen.design, None)
     else:
-        words, command = words + " The whole landscape: ", ["landscape", "--run", str(run.folder)]
-    if pair and (found is None or same):
-        figure = charts.designs(run.history, run.space, run.chosen.design, found)
-    else:
-        assert found is not None
-        figure = charts.landscape_figure(found)
-    return _section("Landscape", _paragraph(words, "", command), charts.html(figure, "landscape"))
+        grey = f"the mean cost over {int(found.trials)} trials a point, white where all are kept."
+        if tuple(found.names) == space.names:
+            words += f"In grey {grey}"
+            figure = charts.designs(run.history, space, run.chosen.design, found)
+        else:
+            own = np.allclose(found.design, run.chosen.design)
+            around = "the chosen design" if own else tables.describe(space, found.design)
+            words = f"In grey {grey} The other parameters are those of {around}."
+            figure = charts.landscape_figure(found)
+    section = _paragraph(words, "", command), charts.html(figure, "landscape")
+    return _section("Landscape", *section)
 
 
 def _failures(run: Run) -> str:

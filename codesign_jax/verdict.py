@@ -76,7 +76,7 @@ def slow(bounds: Bounds, speed: Any) -> Any:
 def goes_on(
     bounds: Bounds, distance: Any, height: Any, speed: Any, step: Any, *, to_end: bool
 ) -> Any:
-    """Whether a world whose state is so takes the next step; arguments as above.
+    """Whether a world in this state takes the next step.
 
     The step is kept if the state after it is `slow` as well, else the world stays where it was.
 

@@ -22,14 +22,14 @@ class Kernel(NamedTuple):
     """What a kernel is.
 
     Attributes:
-      origin: What determines its code besides the compiler's own code and the types and shapes of
-        its blocks. Kernels of one origin and layout are taken to be the same; the code that writes
-        the kernel belongs into it, see `cache.sources`.
+      origin: Cache key, beyond the source of the compiler and the types and shapes of the blocks.
+        Kernels of one origin and layout are taken to be the same, so the origin must hold a digest
+        of the code that writes the kernel, see `cache.sources`.
       backend: "gpu" or "cpu".
       lanes: Lanes of a block, see `block_lanes`.
       shared: Places of inputs of one block that all blocks read; their leading axis is 1.
-      scratch: Places among the outputs of memory that no block leaves to anybody. On a CPU every
-        thread has one block of it, on a GPU every block has its own.
+      scratch: Places among the outputs of scratch memory. Scratch does not outlive a block, so one
+        buffer a thread suffices on a CPU; on a GPU every block has its own.
     """
 
     origin: str
@@ -125,7 +125,8 @@ def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:
 
 def kernel_jaxpr(call: Callable, avals: list) -> Any:
     """The jaxpr of a `pallas_call`'s kernel; its arguments are references to a block each."""
-    # A block knows nothing of the devices that share the worlds, and traces sooner without.
+    # The kernel of a block does not depend on how devices share the worlds (shard_map); tracing it
+    # without that information is faster.
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
         return _pallas_call(jax.make_jaxpr(call)(*avals).jaxpr).params["jaxpr"]
 

@@ -189,15 +189,15 @@ class ThreadWriter(Writer):
         return place
 
     def branch(self, equation: Any, args: list) -> list:
-        """See `Writer`; addresses of a branch are unknown behind it."""
+        """See `Writer`; addresses computed in a branch are unknown after it."""
         return self._scoped(super().branch, equation, args)
 
     def while_loop(self, equation: Any, args: list) -> list:
-        """See `Writer`; addresses of a loop are unknown behind it."""
+        """See `Writer`; addresses computed in a loop are unknown after it."""
         return self._scoped(super().while_loop, equation, args)
 
     def loop(self, equation: Any, args: list) -> list:
-        """See `Writer`; addresses of a loop are unknown behind it."""
+        """See `Writer`; addresses computed in a loop are unknown after it."""
         return self._scoped(super().loop, equation, args)
 
     def _scoped(self, write: Any, equation: Any, args: list) -> list:
@@ -234,7 +234,7 @@ class ThreadWriter(Writer):
         return ref.shape[-1] == self.lanes and lane.wide and lane != self.lane
 
     def _meet(self) -> None:
-        """What every thread of the warp has stored before is seen by the others behind this."""
+        """Warp barrier: what threads stored before it is visible to all of them after it."""
         self.declared.add("declare void @llvm.nvvm.bar.warp.sync(i32)")
         self.lines.append(f"call void @llvm.nvvm.bar.warp.sync({_ALL})")
 
@@ -252,7 +252,7 @@ class ThreadWriter(Writer):
         self.growth |= {name: 1 for name in counters}
 
     def end_loop(self) -> None:
-        """Asks for the rows of later rounds of a loop as soon as their addresses are known.
+        """Prefetches the rows of later rounds of a loop as soon as their addresses are known.
 
         Without it every round waits for memory: a kernel of this size leaves room for two warps on
         a scheduler, which cannot hide it.
@@ -268,7 +268,7 @@ class ThreadWriter(Writer):
             self.lines += behind
 
     def _prefetch(self, address: str, offset: int, rows: int) -> None:
-        """Asks for rows: lane k for the k-th of them, lanes behind the last one for the last."""
+        """Prefetches rows: lane k the k-th of them, all further lanes the last one."""
         if rows > 1:
             self.spans.add(rows)
             address = self.emit(f"getelementptr i8, ptr addrspace(1) {address}, i64 %span{rows}")
@@ -280,7 +280,7 @@ class ThreadWriter(Writer):
 
 
 def rounds_ahead(lines: int, length: int) -> int:
-    """How many rounds before it is read a loop asks for a row.
+    """How many rounds ahead of its use a loop prefetches a row.
 
     As many as memory takes, but few against the loop's length: what is asked for in the last rounds
     lies behind the rows that the loop reads.
@@ -293,7 +293,7 @@ def rounds_ahead(lines: int, length: int) -> int:
 
 
 def adjacent(offsets: list[int], row: int) -> list[tuple[int, int]]:
-    """Rows that follow each other: first offset and number, at most as many as lanes."""
+    """Runs of adjacent rows: first offset and number, at most as many as lanes."""
     found: list[tuple[int, int]] = []
     for offset in offsets:
         if found and offset == found[-1][0] + row * found[-1][1] and found[-1][1] < LANES:

@@ -48,7 +48,7 @@ class Writer:
         self.following: list[Any] = []  # operations behind the present one
         self.last_of_group = True
         self.read: set[Any] = set()  # variables that some operation needs
-        self.scalar_of: dict[str, Value] = {}  # what was spread over the lanes, by its new name
+        self.scalar_of: dict[str, Value] = {}  # splatted scalars, by vector
 
     # What vectors and threads do differently
 
@@ -103,7 +103,7 @@ class Writer:
         """Called before the body of a loop of some length; counters grow by one in every round."""
 
     def end_loop(self) -> None:
-        """Called behind the body of a loop."""
+        """Called after the body of a loop."""
 
     # Text
 

@@ -1,4 +1,4 @@
-"""The structured engine: MuJoCo's contact problem solved at the cost of a chain (see solver)."""
+"""The structured engine: MuJoCo's contact problem solved at the cost of a chain (see `newton`)."""
 
 from codesign_jax.engines.structured.engine import StructuredEngine
 

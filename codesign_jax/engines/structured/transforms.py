@@ -1,4 +1,4 @@
-"""What JAX's transformations make of a rollout: `vmap` one larger batch, `grad` an adjoint.
+"""JAX's transformations of a rollout: `vmap` simulates one larger batch, `grad` runs an adjoint.
 
 Batching: a mapped axis is folded into the axis of the worlds, so that one kernel simulates all of
 them whatever the nesting (`jax.custom_batching.custom_vmap`).
@@ -8,9 +8,9 @@ before each step and the accelerations of the step.  The backward pass is one re
 steps.  Each step is repeated from its stored accelerations as plain JAX (`differentiable`) and
 pulled back by the implicit function theorem (`implicit`): one linear solve a step.
 
-The derivative is that of the trace as it was computed.  A world that is decided stands still, and
-so does its derivative: what later entries repeat counts for the state that they repeat.  A step
-that failed passes nothing.
+The derivative is that of the trace as it was computed.  The trace of a decided world repeats its
+last state, and the cotangents of the repeated entries are added to that state's.  A step that
+failed passes no cotangent back.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,7 @@
-"""Contacts of a kernel: one item at a time, and nothing computed where no lane touches."""
+"""Contacts in the kernel, one item (a link, or a group of slots) at a time.
+
+Where no lane of the block has an active contact, the item is skipped.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -154,7 +157,11 @@ class BoundContacts:
         return tuple(self.read(field, item) for field in self.set.places)
 
     def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
-        """Moves jar along the last line; contact inertia (6, 6) and wrench (6,), summed over k."""
+        """Adds the last step of the line search to jar.
+
+        Returns:
+          Contact inertia (6, 6) and wrench (6,) at the new jar, summed over the item's contacts.
+        """
         shapes: list[tuple] = [(21,), (6,)]
         triangle, wrench = self.if_touching(item, lambda: self._push(item, alpha), shapes)
         return full(triangle), wrench
@@ -173,7 +180,7 @@ class BoundContacts:
         return [upper(matrix), wrench]
 
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
-        """Stores the line along a relative motion (6, ...); returns the cost's slope at 0."""
+        """Stores the contacts' cost along a relative motion (6, ...); returns its slope at 0."""
         return self.if_touching(item, lambda: [self._prepare_linesearch(item, step)], [()])[0]
 
     def _prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
@@ -183,7 +190,7 @@ class BoundContacts:
         return self.line(item, lanewise(relative, self.place(item), self.cone, step))
 
     def line(self, item: Any, change: Lanes) -> Lanes:
-        """Stores the line along a change of jar; returns the cost's slope at 0."""
+        """Stores the contacts' cost along a change of jar; returns its slope at 0."""
 
         def ray(place, cone, jar, change):
             c = self.set.contacts(place, cone)
@@ -197,7 +204,7 @@ class BoundContacts:
         return slope
 
     def slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        """First and second derivative of the item's cost along the line."""
+        """First and second derivative of the item's cost by the step length, at alpha."""
         return self.if_touching(item, lambda: self._slopes(item, alpha), [(), ()])
 
     def _slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:

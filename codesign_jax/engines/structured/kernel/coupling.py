@@ -89,7 +89,7 @@ class Coupling:
             length = jnp.where(sound, size / jnp.where(sound, curvature, one), none)
             work = work + length * self._advance(length, turn)
             new, bent = self._products()
-            # A world that is done stays, so that it does not depend on its neighbours.
+            # A world that has converged keeps its values: they must not depend on other worlds.
             kept = jnp.where(sound, jnp.maximum(new, 0.0), none)
             return count + 1, kept, bent, jnp.where(sound, size, one), length, work
 
@@ -105,9 +105,9 @@ class Coupling:
         return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), step, more)
 
     def _begin(self, busy: Lanes) -> None:
-        """Stores the first residual, and how the step without it moves the contacts."""
+        """Stores the first residual, and the contacts' relative motion by the uncorrected step."""
         pairs = self.pairs
-        pairs.rest()
+        pairs.clear_wrenches()
 
         def store(item: Any, pairing: Pairing) -> None:
             change = pairs.relative(item, pairing)
@@ -121,7 +121,7 @@ class Coupling:
         pairs.do(store)
 
     def _products(self) -> tuple[jax.Array, jax.Array]:
-        """Answers the residual that lies on the sides: "answer" is how P^-1 J' of it moves.
+        """Applies P^-1 J' to the residual; "answer" is the contacts' relative motion by that.
 
         Returns:
           The product of the residual with it, and its curvature, shape (lane,) each.
@@ -134,7 +134,7 @@ class Coupling:
             pairs.write("answer", answer, item)
 
             def both(sums, left, answer, force):
-                # Both lanes of a contact count it.
+                # A contact lies on two lanes: each counts half of it.
                 product, stiff = (0.5 * sum_axis(dot(v, answer), 0) for v in (left, force))
                 return [sums[0] + product, sums[1] + product + stiff]
 
@@ -156,7 +156,7 @@ class Coupling:
           What the direction gains of the right side's work, shape (lane,).
         """
         pairs = self.pairs
-        pairs.rest()
+        pairs.clear_wrenches()
         alpha, beta = (lanes([v], (), wide=False) for v in (length, turn))
         names = ("left", "answer", "along", "moved", "sum")
 
@@ -179,9 +179,9 @@ class Coupling:
         return self.block.fold(gain.lane, jnp.add)
 
     def _result(self, kept: Lanes) -> "Iterate":
-        """Eliminates the sum of the steps; what does not descend gives way to the first step."""
+        """Solves once more, with the sum of all steps; where that is no descent, without it."""
         pairs = self.pairs
-        pairs.rest()
+        pairs.clear_wrenches()
 
         def store(item: Any, pairing: Pairing) -> None:
             value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, pairs.read("sum", item))

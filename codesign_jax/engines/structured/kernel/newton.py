@@ -144,7 +144,7 @@ class Newton:
             m.scratch.write(m.scratch_ref, name, value, item)
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
-        """Moves a link's "acc" or "motion" along its step and returns it."""
+        """Adds the last step to a link's "acc" or "motion", and returns the sum."""
         value = lanewise(solver.tree_add_scaled, alpha, *self.read(name, f"step_{name}", item=item))
         self.write(name, value, item)
         return value
@@ -462,7 +462,7 @@ class Newton:
             count, old = carry[0], rebuild(carry[1:])
             one, two = evaluate(old[0])
             new = (*lanewise(solver.refine, *old[:3], one, two), one)
-            # A world that has its minimum stays, so that it does not depend on its neighbours.
+            # A world that has found its step length keeps it: it must not depend on other worlds.
             searching = lanes([jnp.abs(carry[-1]) > goal], (), wide=False)
             new = [lanewise(jnp.where, searching, a, b) for a, b in zip(new, old, strict=True)]
             return [count + 1, *solid(tuple(new), self.block.size)[0]]
@@ -480,18 +480,18 @@ class Newton:
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
     ) -> tuple[Iterate, Quality]:
-        """Iterates until every world that is waited for has converged.
+        """Iterates until every undecided world has converged.
 
         Args:
           now: Warm start.
-          waiting: Lanes of worlds that must converge.
+          waiting: Lanes of the undecided worlds, which must converge.
           iterations: Largest number of iterations.
           evaluations: Largest number of line-search evaluations.
           tolerance: Relative Newton decrement.
         """
 
         def hold(before, alpha, residual):
-            # A world that had converged stays, so that it does not depend on its neighbours.
+            # A world that has converged keeps its iterate: it must not depend on other worlds.
             going = before > tolerance
             return jnp.where(going, alpha, 0.0), jnp.where(going, residual, before)
 

@@ -1,10 +1,11 @@
-"""Contacts between fingers in a kernel: both fingers' lanes keep every contact, each its own side.
+"""Contacts between fingers in the kernel.
 
-Fingers pair up by an exclusive or of their numbers with 1, 2, and so on, which reaches every pair
-of fingers; a row of slots is one such number.  Both lanes of a pair fill the same slot with the
-same contact, so that they work on it at the same time and exchange what they need in registers.
-A side is a joint's row as in `codesign_jax.engines.structured.hull`, and the link before it is what
-a sphere follows.
+A contact is stored on the lanes of both fingers; each lane keeps its own finger's side of it.
+Fingers are paired by the exclusive or of their indices with 1, 2, and so on, which reaches every
+pair; a row of slots belongs to one such number.  Both lanes of a pair put the same contact into the
+same slot, so that they process it at the same time and exchange numbers in registers.  The side of
+a contact is a joint's row as in `codesign_jax.engines.structured.hull`; a sphere follows the link
+before that joint.
 """
 
 from collections.abc import Callable
@@ -26,7 +27,7 @@ from codesign_jax.scene import Scene
 
 
 def pair_slots(scene: Scene) -> int:
-    """Slots of a pair of fingers; a world in which more touch is a failed one."""
+    """Slots of a pair of fingers; a world with more contacts fails (CONTACT_OVERFLOW)."""
     d = scene.discretization
     if scene.effects.surface == "hull":
         return 8 * (d.links + 1) * max(1, d.hull_rings * d.hull_points // 16)
@@ -266,8 +267,8 @@ class BoundPairs(BoundSlots):
     def _moved(self, place, cone, parts):
         return self.set.contacts(place, cone).relative(jnp.concatenate(parts)[:, None])
 
-    def rest(self) -> None:
-        """Takes all wrenches off the sides."""
+    def clear_wrenches(self) -> None:
+        """Sets the wrenches of all sides to zero."""
         like = jnp.zeros((self.set.size,), self.ref.dtype)
 
         def clear(row: Any, x: jax.Array) -> jax.Array:
@@ -299,8 +300,8 @@ class BoundPairs(BoundSlots):
     # Newton's method
 
     def update_constraints(self, alpha: Lanes) -> None:
-        """Moves jar along the last line; Hessians to the slots, wrenches to the sides."""
-        self.rest()
+        """Adds the last step of the line search to jar; stores Hessians and adds up wrenches."""
+        self.clear_wrenches()
 
         def response(place, cone, jar):
             found = contact.constraint_update(self.set.contacts(place, cone), jar)
@@ -320,7 +321,7 @@ class BoundPairs(BoundSlots):
         return lanewise(_times, self.read("hessian", item), change)
 
     def prepare_all(self) -> Lanes:
-        """Stores the lines along the links' motion; returns the sum of the slopes at 0."""
+        """Prepares the line search of all slots; returns the sum of the slopes at 0."""
 
         def add(item: Any, pairing: Pairing, sums: Lanes) -> Lanes:
             slope = self.line(item, self.relative(item, pairing))
@@ -329,7 +330,7 @@ class BoundPairs(BoundSlots):
         return self.each(add, self._zeros(())[0])
 
     def slopes_of_all(self, alpha: Lanes, sums: list[Lanes]) -> list[Lanes]:
-        """Adds first and second derivative of the cost along the line."""
+        """Sums of the first and second derivative of the cost by the step length."""
 
         def add(item: Any, pairing: Pairing, sums: list[Lanes]) -> list[Lanes]:
             new = self._slopes(item, alpha)

@@ -1,8 +1,8 @@
 """The whole rollout as one kernel: a block simulates a few worlds from start to end.
 
-A lane is a finger of a world; a block is one warp of a GPU or one vector of a CPU.  Blocks do not
-wait for each other: each does the Newton iterations that its own worlds need, and stops when they
-are all decided.
+A lane is a finger of a world; a block is one warp of a GPU or one vector of a CPU.  Blocks are
+independent: each does as many Newton iterations as its own worlds need, and stops when all of its
+worlds are decided.
 """
 
 from collections.abc import Callable

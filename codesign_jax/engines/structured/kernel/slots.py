@@ -1,7 +1,8 @@
-"""Lists of contacts that grow: of many places that may touch, few do, and those get a slot each.
+"""Contacts in slots: few of the many places that may touch do, and only those get a slot.
 
-Every lane fills the slots of a row from the first one on; a pass through a row ends after the most
-that any lane of the block has filled, so that it costs what touches and not what might.
+Every lane fills the slots of a row from the first one on.  A pass through a row ends after the
+largest number of slots that any lane of the block has filled, so its cost grows with the contacts
+that exist and not with those that are possible.
 """
 
 from collections.abc import Callable
@@ -137,7 +138,7 @@ class BoundSlots(BoundContacts):
         return rebuild(jax.lax.while_loop(lambda c: c[0] < used, step, [jnp.int32(0), *arrays])[1:])
 
     def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
-        """Moves jar along the last line; the row's contact inertia (9, 9) and wrench (9,)."""
+        """Adds the last step to jar; the row's contact inertia (9, 9) and wrench (9,)."""
 
         def add(slot: Any, sums: list[Lanes]) -> list[Lanes]:
             return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, self._push(slot, alpha))
@@ -146,7 +147,7 @@ class BoundSlots(BoundContacts):
         return full(triangle), wrench
 
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
-        """Stores the line along a relative motion (9, ...); returns the cost's slope at 0."""
+        """Stores the contacts' cost along a relative motion (9, ...); returns its slope at 0."""
 
         def add(slot: Any, sums: Lanes) -> Lanes:
             return lanewise(jnp.add, sums, self._prepare_linesearch(slot, step))
@@ -154,7 +155,7 @@ class BoundSlots(BoundContacts):
         return self.fold(item, add, self._zeros(())[0])
 
     def slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        """First and second derivative of the row's cost along the line."""
+        """First and second derivative of the row's cost by the step length, at alpha."""
 
         def add(slot: Any, sums: list[Lanes]) -> list[Lanes]:
             return lanewise(

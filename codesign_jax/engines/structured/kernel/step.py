@@ -79,7 +79,7 @@ class Step:
           arm: Commands of the arm frame, shape (6, 1, world).
           pressure: Chamber pressures, lanes.
           undecided: Whether a world takes this step, from distance and height before it.
-          waiting: Worlds whose convergence is waited for.
+          waiting: Undecided worlds, which must converge.
           speed: Largest velocity before the step.
 
         Returns:

@@ -148,13 +148,34 @@ def test_contacts_have_the_declared_stiffness(friction):
 
 
 def test_what_plain_mujoco_does_not_simulate_is_named():
-    hull = pinch(effects__surface="hull", effects__neo_hookean=True)
-    surface, rubber = plain.obstacles(hull)
-    assert 'effects.surface = "hull"' in surface and "--set effects.surface=spheres" in surface
+    [rubber] = plain.obstacles(pinch(effects__neo_hookean=True))
     assert "effects.neo_hookean = true" in rubber
     household = scene.load("paper", object_set="household")
     assert any("'mug' is a mesh" in text for text in plain.obstacles(household))
-    assert not plain.obstacles(pinch())
+    assert not plain.obstacles(pinch()) and not plain.stand_in(pinch())
+    assert 'effects.surface = "hull" is not in the model' in plain.stand_in(household)
+
+
+def test_a_box_stands_in_for_the_hull_around_each_link():
+    """It has the link's ends and section, and contacts as stiff as declared."""
+    the_scene = pinch("box", links=2, effects__surface="hull", **HURRIED)
+    params, trial = hand_world(the_scene, length=0.08)
+    found = grasps.grasp(the_scene, params, trial)
+    assert np.isfinite(found.states).all()
+    model, data = mujoco.MjModel.from_xml_string(found.xml), None
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_kinematics(model, data)
+    # Half a segment stays with the palm; the links end at 60 and 80 mm along the straight finger.
+    base, tip = data.body("finger_0_link_0"), data.geom("finger_0_box_2")
+    corner = tip.xpos + tip.xmat.reshape(3, 3) @ model.geom("finger_0_box_2").size
+    expected = [0.08, the_scene.hand.section.width / 2, params.height[0]]
+    np.testing.assert_allclose(base.xmat.reshape(3, 3).T @ (corner - base.xpos), expected)
+    assert model.geom("finger_1_box_1").size[0] == pytest.approx(0.02)
+    when, _, states = play(model, found.controls)
+    # The file and the declared model part by rounding, which boxes' changing corners let grow.
+    assert np.isinf(when) == np.isinf(found.outcome.lost_time)
+    assert np.abs(states[:70] - found.states[:70]).max() < 1e-6
 
 
 def test_a_rigid_wrist_leaves_the_binary_model_alone(tmp_path):
@@ -240,9 +261,9 @@ def test_command_writes_models_and_commands(tmp_path, capsys):
     assert "in plain MuJoCo: sphere: " in capsys.readouterr().out
     assert export("--scene", TINY, "--out", out) == 2
     assert "choose another folder, or give --overwrite" in capsys.readouterr().err
-    hull = ["--set", "effects.surface=hull", "--overwrite"]
-    assert export("--scene", TINY, "--out", out, *hull) == 0
-    assert 'no model: plain MuJoCo does not simulate effects.surface = "hull"' in (
+    rubber = ["--set", "effects.surface=hull", "effects.neo_hookean=true", "--overwrite"]
+    assert export("--scene", TINY, "--out", out, *rubber) == 0
+    assert "no model: plain MuJoCo does not simulate effects.neo_hookean = true" in (
         capsys.readouterr().out
     )
 

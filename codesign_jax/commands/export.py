@@ -154,6 +154,8 @@ def _models(case: Case, params: Params, options: "Export", console: Console) -> 
         for text in found:
             console.print(f"no model: plain MuJoCo does not simulate {text}", markup=False)
         return
+    if other := plain.stand_in(case.scene):
+        console.print(f"note: {other}", markup=False)
     folder = options.out / tables.MODELS
     folder.mkdir(exist_ok=True)
     trials = _trials(case, options)

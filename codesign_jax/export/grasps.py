@@ -47,10 +47,13 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
       params: Parameters as concrete arrays.
       trial: The trial as concrete arrays.
     """
-    scene, trial = plain.single_object(scene, trial)
+    skinned = scene.effects.surface == "hull"
+    scene, trial = plain.single_object(plain.rigid_links(scene) if skinned else scene, trial)
     wide = _wide(params), _wide(trial)
     start, controls = _float64(_start, scene, *wide), schedule(scene, params, trial)
     spec = model.build_spec(scene, *wide, visual=True)
+    if skinned:
+        plain.boxes(scene, spec, wide[0])
     limits = verdict.bounds(scene)
     spec.add_numeric(name="hand_centre", data=model.layout(scene).centre_weights)
     spec.add_numeric(name="lost", data=[limits.lost_distance, limits.start, limits.end])

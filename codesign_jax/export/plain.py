@@ -22,8 +22,8 @@ import numpy as np
 from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
 from codesign_jax.model.spec import SOLIMP
-from codesign_jax.scene import Scene, effects
-from codesign_jax.types import Trial
+from codesign_jax.scene import Scene
+from codesign_jax.types import Params, Trial
 
 _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 """Of (1 - d) / d, as MuJoCo keeps an impedance d between 0.0001 and 0.9999."""
@@ -35,14 +35,11 @@ class Inexpressible(ValueError):
 
 def obstacles(scene: Scene) -> list[str]:
     """What of a scene plain MuJoCo does not simulate, a sentence each; empty if nothing."""
-    found = [
-        f"effects.{name} = {effects.setting(scene.effects, name)} ({reason}); {_instead(name)}"
-        for name, reason in effects.refusals(scene.effects, "mujoco").items()
-    ]
+    found = []
     if scene.effects.neo_hookean:
         found.append(
             "effects.neo_hookean = true (its moments follow the angles by a law that MuJoCo's "
-            f"joints do not have); {_instead('neo_hookean')}"
+            "joints do not have); --set effects.neo_hookean=false exports another scene"
         )
     return found + [
         f"object {shape.name!r} is a mesh (MuJoCo takes its convex hull); leave it out by --objects"
@@ -51,9 +48,55 @@ def obstacles(scene: Scene) -> list[str]:
     ]
 
 
-def _instead(name: str) -> str:
-    value = "spheres" if name == "surface" else "false"
-    return f"--set effects.{name}={value} exports another scene (docs/export.md says how other)"
+def stand_in(scene: Scene) -> str:
+    """What of a scene the model has in another form, a sentence; empty if nothing.
+
+    A vertex of the skinned hull follows two links.  MuJoCo's geoms are rigid parts of one body, so
+    that each link becomes the box that the hull is around it.
+    """
+    if scene.effects.surface != "hull":
+        return ""
+    return (
+        'effects.surface = "hull" is not in the model: plain MuJoCo\'s geoms are rigid parts of '
+        "single bodies, and a box for each link stands in, so that grasps may end otherwise "
+        "(docs/export.md)"
+    )
+
+
+def rigid_links(scene: Scene) -> Scene:
+    """The scene with a contact geom on each link, which `boxes` gives its shape."""
+    return dataclasses.replace(
+        scene,
+        effects=dataclasses.replace(scene.effects, surface="spheres"),
+        discretization=dataclasses.replace(scene.discretization, spheres_per_link=1),
+    )
+
+
+def boxes(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
+    """Turns the contact sphere of each link into the link's box.
+
+    Args:
+      scene: A scene of `rigid_links`.
+      spec: Its spec, which is changed.
+      params: Parameters of the hand as concrete arrays.
+    """
+    links, width = scene.discretization.links, scene.hand.section.width
+    for geom in spec.geoms:
+        if "_sphere_" not in geom.name:
+            continue
+        _, finger, _, link, _ = geom.name.split("_")
+        length, height = float(params.length[int(finger)]), float(params.height[int(finger)])
+        extent = length / links * (0.5 if int(link) == links else 1.0)
+        geom.type = mujoco.mjtGeom.mjGEOM_BOX
+        geom.size, geom.pos = [extent / 2, width / 2, height / 2], [extent / 2, 0, height / 2]
+        geom.name = f"finger_{finger}_box_{link}"
+    for pair in spec.pairs:
+        for key in ("geomname1", "geomname2"):
+            setattr(pair, key, _box_name(getattr(pair, key)))
+
+
+def _box_name(name: str) -> str:
+    return name.replace("_sphere_", "_box_").rpartition("_")[0] if "_sphere_" in name else name
 
 
 def single_object(scene: Scene, trial: Trial) -> tuple[Scene, Trial]:

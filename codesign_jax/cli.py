@@ -44,6 +44,9 @@ class Optimize:
     """Episodes; the paper's 64 in 2d, 128 otherwise."""
     test_trials: Count = None
     """Further trials that test each final particle; the paper's 36 in 2d, 72 otherwise; 0: none."""
+    reference_trials: Count = None
+    """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine
+    structured; 0: none."""
     seed: int = 0
     """Root of all random numbers."""
     seeds: Text = None

@@ -13,7 +13,18 @@ from pathlib import Path
 from codesign_jax import cli
 
 FOLDER = Path("runs") / "demo"
-SIZES = ["--particles", "10", "--trials", "6", "--episodes", "64", "--test-trials", "18"]
+SIZES = [
+    "--particles",
+    "10",
+    "--trials",
+    "6",
+    "--episodes",
+    "64",
+    "--test-trials",
+    "18",
+    "--reference-trials",
+    "0",
+]
 
 
 def main() -> int:

@@ -1,5 +1,6 @@
 """The command line: errors create nothing, runs resume bit for bit, whatever ended them."""
 
+import dataclasses
 import fcntl
 import json
 import os
@@ -16,7 +17,7 @@ import pytest
 from toy import TINY
 
 from codesign_jax import cli, runs
-from codesign_jax.commands import common, preflight
+from codesign_jax.commands import common, preflight, reference
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import columns
 from codesign_jax.runs.checkpoint import Checkpoints, digest
@@ -276,7 +277,21 @@ def test_fresh_starts_anew(finished, tmp_path, capsys):
     assert not (folder / "tests.csv").exists()
 
 
+def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, capsys):
+    """Here shortened to a few coarse steps, as everything else of the run is."""
+    folder = shutil.copytree(finished, tmp_path / "run")
+    assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("on 2 fresh"))
+    assert "accuracy reference (1 ms, 20 links): mean cost" in line and "95 % interval" in line
+    settings = runs.read_run(folder)[1]
+    assert reference.number_of_trials(None, settings) == 0  # MuJoCo C would take minutes
+    quick = dataclasses.replace(settings, engine="structured")
+    assert reference.number_of_trials(None, quick) == 24
+    assert reference.number_of_trials(None, dataclasses.replace(quick, test_trials=0)) == 0
+
+
 WRONG = {
+    "wrong reference trials": (["--reference-trials", "-1"], ["--reference-trials = -1 is outs"]),
     "unknown hand": (["--hand", "pneuflex5"], ["did you mean 'pneuflex4'?"]),
     "no hand file": (["--hand", "no.toml"], ["no file 'no.toml'"]),
     "unknown scene": (["--scene", "papr"], ["did you mean 'paper'?"]),

@@ -377,6 +377,27 @@ def test_paired_tests():
     assert statistics.trend(np.zeros((4, 30))) == 1.0
 
 
+def test_unpaired_tests_and_several_comparisons():
+    a, b = np.arange(10) < 9, np.arange(10) < 1
+    # All tables of these margins that are no likelier: 2 (1 * 1 + 10 * 10) of C(20, 10).
+    assert statistics.fisher(a, b) == pytest.approx(2 * 101 / 184756)
+    slow, fast = np.full(30, np.inf), np.arange(30.0)
+    assert statistics.mann_whitney(slow, fast) < 1e-3
+    assert statistics.mann_whitney(slow, slow) == 1.0
+    # The step-down procedure by hand: 4 * 0.005, 3 * 0.01, 2 * 0.03, and no smaller than that.
+    found = statistics.holm([0.01, 0.04, 0.03, 0.005])
+    np.testing.assert_allclose(found, [0.03, 0.06, 0.06, 0.02])
+
+
+def test_both_readings_of_converged():
+    """Below 1 in the second episode, above in the third, and below from the fourth on."""
+    means = np.array([[[2.0, 0.5, 1.5, 0.9, 0.2], [2.0] * 5]])
+    one = study.Study({}, {}, {"mean_exclude": means})
+    np.testing.assert_array_equal(one.first_below(), [[2.0, np.inf]])
+    np.testing.assert_array_equal(one.convergence(), [[4.0, np.inf]])
+    np.testing.assert_array_equal(one.convergence(episodes=3), [[np.inf, np.inf]])
+
+
 def test_regions_are_counted_and_specks_are_not():
     x, y = np.arange(20.0), np.arange(10.0)
     cost = np.full((20, 10), 3.0)
@@ -416,6 +437,17 @@ def test_figures_and_page_are_made_from_files_alone(finished, landscape, tmp_pat
     assert text in filled and "old" not in filled
     assert filled.startswith("before") and filled.endswith("after\n")
     assert json.loads((tmp_path / "2d.json").read_text())["grasps"] == PLAN.grasps
+    both = report.make(tmp_path, tmp_path / "figures", touching=tmp_path)
+    assert "with it" in both.split(text)[1]
+
+
+def test_an_experiment_that_was_stopped_has_no_test(setup):
+    batch, _ = setup
+    record_ = batch.start()
+    batch.step(record_)
+    kept = results.summarize(batch, record_)
+    stopped = study.Study(dataclasses.asdict(PLAN), {}, kept)
+    assert stopped.episodes == 1 and not stopped.tested and not stopped.success().any()
 
 
 def test_what_was_not_run_is_said(tmp_path):

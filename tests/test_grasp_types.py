@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from codesign_jax import rollout, scene
 from codesign_jax.engines import make_engine
@@ -60,16 +61,19 @@ def test_the_silhouette_is_rousseeuw_s():
 def test_postures_are_the_fingers_angles_at_the_end_of_the_lift(setup):
     the_scene, engine, space = setup
     designs = space.from_units(np.array([[60.0, 0.0], [120.0, -20.0], [20.0, 190.0]]))
-    bend, kept = grasp_types.postures(
+    bend, kept, tilt = grasp_types.postures(
         the_scene, engine, space, designs, chunk=5, say=lambda _: None
     )
-    assert bend.shape == kept.shape == (3, 3)
+    assert bend.shape == kept.shape == tilt.shape == (3, 3)
     assert not kept[2].any()  # far above the objects
     trials = grasp_types.stack([rollout.nominal_trial(the_scene, 1)])
     replay = animation.replay(the_scene, engine, space.params(designs[1]), trials)[0]
     joints = replay.qpos[450][6:-7].reshape(4, 2, 3)  # finger, link, axis: bending first
     assert bend[1, 1] == pytest.approx(joints[..., 0].sum(1).mean(), abs=1e-6)
     assert bool(kept[1, 1]) == bool(replay.outcome.cost == 0)
+    turned = Rotation.from_quat(replay.qpos[:451, -4:], scalar_first=True).apply([0, 0, 1])
+    # arccos of float32 near 1 resolves 5e-4.
+    assert tilt[1, 1] == pytest.approx(np.arccos(turned[:, 2]).max(), abs=1e-3)
     assert bend[1].mean() > bend[0].mean() > 0.1  # longer fingers curl further
 
 
@@ -84,9 +88,8 @@ def test_types_stand_at_the_points_that_were_simulated(setup, monkeypatch):
         length = 1e3 * np.asarray(designs)[:, 0]
         kept = np.ones((len(designs), 3), bool)
         kept[np.argmax(length > 115), 1] = False
-        return np.repeat(np.where(length > 85, 1.5, 0.5)[:, None], 3, 1) + 1e-4 * length[
-            :, None
-        ], kept
+        bend = np.repeat(np.where(length > 85, 1.5, 0.5)[:, None], 3, 1) + 1e-4 * length[:, None]
+        return bend, kept, 2 * bend
 
     monkeypatch.setattr(grasp_types, "postures", postures)
     found = grasp_types.study(grid, the_scene, engine, space, 1.0)
@@ -96,6 +99,7 @@ def test_types_stand_at_the_points_that_were_simulated(setup, monkeypatch):
     np.testing.assert_array_equal(found["type"], expected)
     np.testing.assert_array_equal(np.isnan(found["bend"][..., 0]), cost > 1)
     assert found["bend"][1, 2, 0] == pytest.approx(0.5 + 1e-4 * 50)
+    np.testing.assert_allclose(found["tilt"], 2 * found["bend"])
 
 
 def small():
@@ -115,10 +119,12 @@ def small():
 
 def test_a_type_is_shown_by_its_best_and_most_typical_design(tmp_path):
     grid, found = small()
-    assert grasp_types.typical(grid, found, 0) == (1, 0)  # 0.6 is nearer the mean than 0.9
-    assert grasp_types.typical(grid, found, 1) == (2, 1)
+    assert grasp_types.typical(grid, found, 0)[0] == (1, 0)  # 0.6 is nearer the mean than 0.9
+    assert grasp_types.typical(grid, found, 1)[0] == (2, 1)
     table = grasp_types.describe(grid, found)
-    assert "| 1 | 3 | 50 to 60 | -20 to 0 | 38° [29, 52] | 0.03 |" in table
+    assert "| 1 | 3 | 50 to 60 | -20 to 0 | 38° [29, 52] | – | 0.03 |" in table
+    tilted = grasp_types.describe(grid, found | {"tilt": found["bend"] / 2})
+    assert "| 38° [29, 52] | 17° [14, 26] | 0.03 |" in tilted
     assert "2: 0.70, 3: 0.50" in table
     path = figures.landscape(grid, tmp_path / "map.png", types=found["type"])
     plain = figures.landscape(grid, tmp_path / "plain.png")
@@ -151,5 +157,5 @@ def test_videos_are_of_grasps_that_hold(setup, tmp_path, monkeypatch):
         assert len(lengths) == 3
         np.testing.assert_allclose(lengths, expected, rtol=1e-5)
     monkeypatch.setattr(animation, "replay", replay(0.5))
-    with pytest.raises(ValueError, match="type 1 loses an object"):
+    with pytest.raises(ValueError, match="designs of type 1 lose an object"):
         grasp_types.videos(grid, found, the_scene, engine, space, tmp_path)

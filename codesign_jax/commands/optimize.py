@@ -12,11 +12,11 @@ from rich.console import Console
 
 from codesign_jax import codesign, engines, runs
 from codesign_jax import scene as scenes
-from codesign_jax.commands import common, seeds
+from codesign_jax.commands import common, reference, seeds
 from codesign_jax.runs import AllFailed, Plan, RunResult, Settings, rates
 from codesign_jax.runs.progress import duration
 from codesign_jax.runs.scene_files import scene_texts
-from codesign_jax.scene import Scene, keypaths
+from codesign_jax.scene import Scene, keypaths, schema
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import SceneError
 
@@ -33,6 +33,11 @@ def main(options: "Optimize") -> int:
     common.use_compilation_cache()
     scene, settings = resolve(options)
     chosen = [settings.seed] if options.seeds is None else seeds.parse(options.seeds)
+    problem = schema.range_problem(
+        "--reference-trials", options.reference_trials or 0, "", 0, 100_000
+    )
+    if problem:
+        raise SceneError([problem])
     # Everything that speaks against the runs, before anything that takes time.
     plan = runs.prepare(scene, settings)
     folders = {seed: _folder(options, scene, settings, seed) for seed in chosen}
@@ -49,6 +54,10 @@ def main(options: "Optimize") -> int:
         result = results[seed] = _run(runs.with_seed(plan, seed), folder, options.fresh)
         if result is not None and result.signum:
             return 128 + result.signum
+        count = reference.number_of_trials(options.reference_trials, settings)
+        if count and result is not None and result.test is not None:
+            own = dataclasses.replace(settings, seed=seed)
+            reference.test(folder, own, count, Console(highlight=False, soft_wrap=True))
     if options.seeds is not None:
         seeds.compare(results, Console(highlight=False, soft_wrap=True))
     return int(any(result is None for result in results.values()))
@@ -179,7 +188,8 @@ def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:
         console.print(f"its test: {common.verdict(float(cost[best]), trials.cost, trials.status)}")
         again = f"codesign evaluate --run {folder} --trials 150 --accuracy reference"
         console.print(
-            f"chosen as the best of {cost.size} by these trials; on new ones: {again}", markup=False
+            f"chosen as the best of {cost.size} by these trials; for more new ones: {again}",
+            markup=False,
         )
     _figures(plan, result, folder, console)
     console.print(f"results: {folder}", markup=False)

@@ -51,6 +51,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--devices", type=int, help="by default all that are visible")
     parser.add_argument("--every", type=int, help="steps between saves; by default 20 s")
     parser.add_argument("--minutes", type=float, help="save and stop after this time")
+    parser.add_argument("--partial", action="store_true", help="also write results when stopped")
     parser.add_argument("--fresh", action="store_true", help="delete an earlier state")
     provenance.add_commit(parser)
     parser.add_argument(
@@ -60,6 +61,7 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
     parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
+    parser.add_argument("--touching", type=Path, help="the same with contact between fingers")
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--videos", type=Path, help="folder for a video of each grasp type")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
@@ -100,6 +102,10 @@ def simulate(args: argparse.Namespace) -> int:
         state.unlink(missing_ok=True)
     stop = Stop(every=args.every, minutes=args.minutes)
     done = drive(experiment, state, settings, stop=stop, say=lambda s: print(s, flush=True))
+    if not done.finished and args.partial and done.record:
+        made = results.describe(settings, done, done.grasps, commit=args.commit)
+        made |= {"steps": int(done.record["step"]), "steps_of_all": experiment.steps}
+        results.write(args.out, args.experiment, results.summarize(experiment, done.record), made)
     if not done.finished:
         print(f"stopped; the same command resumes from {state}")
         return 3
@@ -162,7 +168,7 @@ def main() -> int:
         from scripts.experiments import report
     except ModuleNotFoundError as error:
         sys.exit(f"error: {error.name} is missing: pip install 'codesign-jax[study]'")
-    print(report.make(args.data, args.figures, args.page))
+    print(report.make(args.data, args.figures, args.page, args.touching))
     return 0
 
 

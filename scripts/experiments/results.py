@@ -55,6 +55,8 @@ def _batch(batch: Batch, record: Arrays) -> Arrays:
     quartiles = np.quantile(cost, [0.25, 0.5, 0.75], axis=-1).astype(np.float32)
     means = both_means(scene, trial_cost, status)
     test = both_means(scene, record["test_cost"], record["test_status"])
+    if int(record["step"]) < batch.steps:  # not a number: the final test is not complete
+        test = {rule: np.full_like(v, np.nan) for rule, v in test.items()}
     return {
         "strategies": np.array(plan.strategies),
         "first": np.array(plan.first()),

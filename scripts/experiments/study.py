@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codesign_jax.codesign import SUCCESS_COST, convergence_episode
+from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST, convergence_episode
 
 RULES = ("exclude", "worst")
 """Rules for failed trials under which results are evaluated; see `cost.particle_cost`."""
@@ -37,21 +37,43 @@ class Study:
         """Simulations of one run in one episode."""
         return self.plan["particles"] * self.plan["trials"]
 
+    @property
+    def tested(self) -> bool:
+        """Whether the final test was made; an experiment that was stopped before has none."""
+        return not np.isnan(self.data["test_exclude"]).all()
+
+    @property
+    def episodes(self) -> int:
+        """Episodes that were simulated."""
+        return self.data["mean"].shape[-1]
+
     def success(self, rule: str = "exclude") -> np.ndarray:
         """Whether any final particle's mean test cost is below 0.01, bool, (strategy, run)."""
         return np.any(self.data[f"test_{rule}"] < SUCCESS_COST, axis=-1)
 
-    def convergence(self, rule: str = "exclude") -> np.ndarray:
+    def convergence(self, rule: str = "exclude", *, episodes: int | None = None) -> np.ndarray:
         """Episodes simulated when the mean cost is below 1.0 for good, (strategy, run).
 
         The episode that converged is counted; infinite where a run did not converge.
+
+        Args:
+          rule: Rule for failed trials.
+          episodes: As if the runs had ended after so many; None for all.
         """
 
         def count(means: np.ndarray) -> float:
             episode = convergence_episode(means)
             return np.inf if episode is None else episode + 1.0
 
-        return np.apply_along_axis(count, -1, self.data[f"mean_{rule}"])
+        return np.apply_along_axis(count, -1, self.data[f"mean_{rule}"][..., :episodes])
+
+    def first_below(self, rule: str = "exclude") -> np.ndarray:
+        """Episodes simulated when the mean cost is below 1.0 for the first time, (strategy, run).
+
+        The paper's "converged" may be read so as well; infinite where a run never got there.
+        """
+        below = self.data[f"mean_{rule}"] < CONVERGED_COST
+        return np.where(below.any(-1), below.argmax(-1) + 1.0, np.inf)
 
 
 def load(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:

@@ -185,6 +185,38 @@ def wilcoxon(a: np.ndarray, b: np.ndarray, episodes: int) -> float:
     return float(scipy.stats.wilcoxon(a, b, method="approx", zero_method="pratt").pvalue)
 
 
+def fisher(a: np.ndarray, b: np.ndarray) -> float:
+    """Fisher's exact two-sided test of unpaired successes, shape (run,): the p-value."""
+    table = [[int(v.sum()), int((~v).sum())] for v in (a, b)]
+    return float(scipy.stats.fisher_exact(table).pvalue)
+
+
+def mann_whitney(a: np.ndarray, b: np.ndarray) -> float:
+    """Two-sided rank test of episodes that are not paired, shape (run,): the p-value.
+
+    A run that did not converge, infinite, ranks behind every other one.
+    """
+    if (a[:, None] == b).all():
+        return 1.0
+    return float(scipy.stats.mannwhitneyu(a, b, method="asymptotic").pvalue)
+
+
+def holm(p: ArrayLike) -> np.ndarray:
+    """P-values of several comparisons, adjusted by Holm's step-down method.
+
+    S. Holm, A simple sequentially rejective multiple test procedure, Scand. J. Statist. 6, 1979.
+
+    Args:
+      p: P-values, shape (comparison,).
+    """
+    values = np.asarray(p, float)
+    order = np.argsort(values)
+    scaled = values[order] * np.arange(values.size, 0, -1)
+    adjusted = np.empty_like(values)
+    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    return adjusted
+
+
 def trend(values: np.ndarray) -> float:
     """Page's test that values grow along the strategies: the one-sided p-value.
 

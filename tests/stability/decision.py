@@ -18,7 +18,7 @@ from tests.stability.bench import floats, refined
 from tests.stability.table import Found, case
 
 DESIGNS, TRIALS = 40, 6
-DATA = Path(__file__).parents[2] / "docs" / "data" / "random_particles.json"
+DATA = Path(__file__).parents[2] / "docs" / "data" / "random_particles_spheres.json"
 
 
 @functools.cache

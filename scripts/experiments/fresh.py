@@ -1,0 +1,200 @@
+"""Every strategy's best final particles on fresh trials, at several accuracies.
+
+python -m scripts.experiments.fresh --data docs/data/paper --set effects.finger_finger=false
+python -m scripts.experiments.fresh --accuracies standard --engine mujoco ...   # adds to the file
+python -m scripts.experiments.fresh --report --page docs/results.md
+
+An optimiser picks what the errors of its simulation favour (the winner's curse), so the order of
+the strategies is looked at once more: the particle of each run that tested best meets trials that
+no run has met, once as it was designed and once at a finer accuracy, the same trials in each.
+Results go to fresh.npz and fresh.json beside the experiments; what is there is not run again.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import rollout, scene
+from codesign_jax.codesign import stream_key
+from codesign_jax.engines import NAMES, make_engine
+from codesign_jax.report.statistics import wilson
+from codesign_jax.scene import keypaths, parameters
+from codesign_jax.types import failed
+from scripts.experiments import figures, results, study
+from scripts.shared import provenance, statistics, tables
+
+STREAM_FRESH = 0x66726573
+"""Stream of the noise of these trials ("fres"): none of them was met in a run."""
+
+EXPERIMENTS = ("2d", "23d")
+
+
+def winners(data: Path, name: str) -> tuple[list[str], np.ndarray]:
+    """The final particle of each run that tested best.
+
+    Args:
+      data: Folder of the experiments.
+      name: Name of the experiment.
+
+    Returns:
+      Names of the strategies, and particles [SI units] of shape (strategy, run, parameter).
+
+    Raises:
+      FileNotFoundError: If the experiment is not there or has no final test.
+    """
+    found = study.load_study(data, name)
+    if found is None or not found.tested:
+        raise FileNotFoundError(f"{data} holds no {name} with a final test")
+    best = np.argmin(found.data["test_exclude"], axis=-1)
+    chosen = np.take_along_axis(found.data["final_particles"], best[..., None, None], axis=2)
+    return found.strategies, chosen[:, :, 0]
+
+
+def simulate(
+    the_scene: scene.Scene, engine: str, every: dict[str, np.ndarray], trials: int
+) -> dict[str, Any]:
+    """Simulates the particles of all experiments as one batch of worlds.
+
+    Args:
+      the_scene: The scene.
+      engine: Name of the engine.
+      every: Particles of each experiment, shape (strategy, run, parameter).
+      trials: Trials, the same for all particles.
+
+    Returns:
+      `NAME|cost` (float16) and `NAME|status`, shape (strategy, run, trial).
+    """
+    params = []
+    for name, particles in every.items():
+        space = parameters.design_space(the_scene.hand, name)
+        flat = jnp.asarray(particles.reshape(-1, particles.shape[-1]), jnp.float32)
+        params.append(jax.jit(jax.vmap(space.params))(flat))
+    joined = jax.tree.map(lambda *v: jnp.concatenate(v), *params)
+    drawn = rollout.sample_trials(the_scene, stream_key(jax.random.key(0), STREAM_FRESH, 0), trials)
+    made = make_engine(engine, the_scene)
+    outcome = jax.jit(lambda p, t: rollout.evaluate(the_scene, made, p, t))(joined, drawn)
+    found, start = {}, 0
+    for name, particles in every.items():
+        shape, count = particles.shape[:2], int(np.prod(particles.shape[:2]))
+        part = slice(start, start + count)
+        found[f"{name}|cost"] = np.asarray(outcome.cost[part], np.float16).reshape(*shape, trials)
+        found[f"{name}|status"] = np.asarray(outcome.status[part], np.uint8).reshape(*shape, trials)
+        start += count
+    return found
+
+
+def run(args: argparse.Namespace) -> None:
+    """Simulates at the accuracies that the file does not have yet."""
+    path = args.data / "fresh.npz"
+    arrays = dict(np.load(path)) if path.exists() else {}
+    notes = json.loads(path.with_suffix(".json").read_text()) if path.exists() else {"runs": []}
+    found = {name: winners(args.data, name) for name in args.experiments}
+    arrays |= {f"{name}|strategies": np.array(names) for name, (names, _) in found.items()}
+    every = {name: particles for name, (_, particles) in found.items()}
+    for accuracy in args.accuracies:
+        label = accuracy if args.engine == "structured" else f"{args.engine}, {accuracy}"
+        label += f", {args.label}" if args.label else ""
+        if all(f"{name}|{label}|cost" in arrays for name in every):
+            continue
+        overrides = keypaths.parse(args.set)
+        the_scene = scene.load(args.scene, accuracy=accuracy, overrides=overrides)
+        new = simulate(the_scene, args.engine, every, args.trials)
+        for key, value in new.items():
+            name, what = key.split("|")
+            arrays[f"{name}|{label}|{what}"] = value
+        notes["runs"].append({"label": label, **provenance.results(args.commit)})
+        results.write(args.data, "fresh", arrays, notes)
+        print(f"{label}: {sum(new[f'{n}|cost'].size for n in every):,} grasps", flush=True)
+
+
+def report(data: Path) -> str:
+    """The tables of what was simulated, one an experiment."""
+    found = study.load(data, "fresh")
+    if found is None:
+        raise FileNotFoundError(f"{data} holds no fresh.npz")
+    arrays, text = found[0], []
+    for name in EXPERIMENTS:
+        labels = [k.split("|")[1] for k in arrays if k.startswith(f"{name}|") and "cost" in k]
+        if labels:
+            text += [_table(name, arrays, labels)]
+    return "\n\n".join(text)
+
+
+def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> str:
+    """Kept grasps and runs of each strategy; differences to the first label, run by run."""
+    head = ["strategy"]
+    for i, label in enumerate(labels):
+        head += [f"{label}: grasps kept", "runs whose particle keeps all"]
+        head += [f"change from {labels[0]}, points"] if i else []
+    rows = [head]
+    for s, strategy in enumerate(arrays[f"{name}|strategies"]):
+        kept = [_kept(arrays, name, label)[s] for label in labels]
+        cells = [figures.label(str(strategy))]
+        for i, share in enumerate(kept):
+            whole = wilson(int((share == 1).sum()), share.size)
+            cells += [f"{100 * share.mean():.1f} %"]
+            cells += [f"{int((share == 1).sum())} of {share.size} [{100 * whole.low:.0f}, "]
+            cells[-1] += f"{100 * whole.high:.0f} %]"
+            if i:
+                change = 100 * (share - kept[0])
+                middle = statistics.bootstrap(lambda k, c=change: c[k].mean(-1), change.size)
+                cells += [f"{middle.value:+.1f} [{middle.low:+.1f}, {middle.high:+.1f}]"]
+        rows.append(cells)
+    trials = arrays[f"{name}|{labels[0]}|cost"].shape[-1]
+    return f"{name}: {trials} fresh trials of each run's best particle\n\n{tables.markdown(rows)}"
+
+
+def _kept(arrays: dict[str, np.ndarray], name: str, label: str) -> np.ndarray:
+    """Share of grasps that kept the object, failed trials left out, shape (strategy, run)."""
+    cost, status = (arrays[f"{name}|{label}|{what}"] for what in ("cost", "status"))
+    good = ~failed(status)
+    return ((cost == 0) & good).sum(-1) / np.maximum(good.sum(-1), 1)
+
+
+def parse() -> argparse.Namespace:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names = lambda text: text.split(",")  # noqa: E731 - three options read the same
+    parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
+    parser.add_argument("--scene", default="paper", help="that of the experiments")
+    parser.add_argument("--experiments", type=names, default=list(EXPERIMENTS))
+    parser.add_argument("--accuracies", type=names, default=["standard", "reference"])
+    parser.add_argument("--engine", choices=NAMES, default="structured")
+    parser.add_argument("--trials", type=int, default=24)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--label", help="what --set changes, in the names of the results")
+    parser.add_argument("--report", action="store_true", help="print the tables and stop")
+    parser.add_argument("--page", type=Path, help="page whose table is filled in")
+    provenance.add_commit(parser)
+    return parser.parse_args()
+
+
+def main() -> int:
+    """Runs the command and returns the exit status."""
+    from codesign_jax.commands import common
+
+    args = parse()
+    try:
+        if not args.report:
+            common.use_compilation_cache()
+            run(args)
+        text = report(args.data)
+    except (scene.SceneError, FileNotFoundError) as error:
+        sys.exit(f"error: {error}")
+    print(text)
+    if args.page:
+        tables.fill(args.page, text, "fresh")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

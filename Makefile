@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
-.PHONY: demo test test-browser test-gpu test-slow stability notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo docs test test-browser test-gpu test-slow stability notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
@@ -21,6 +21,7 @@ help:
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
 	@echo "make effects     what each effect costs and decides: docs/effects.md"
 	@echo "make accuracy    what accuracy costs in time: ACCURACY=docs/data/accuracy_cpu.json, SIZE=full"
+	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make format      ruff format          make clean       remove what make built"
 
 demo: $(STAMP)
@@ -64,6 +65,11 @@ SIZE ?= quick
 accuracy: $(STAMP)
 	$(BIN)/python -m scripts.accuracy --json $(ACCURACY) --size $(SIZE) $(ARGS)
 
+# NO_MKDOCS_2_WARNING: mkdocs-material's notice about the future of MkDocs.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	@echo "site/index.html opens in a browser as it is"
+
 lint: $(STAMP)
 	$(BIN)/ruff check $(CHECKED)
 	$(BIN)/ruff format --check $(CHECKED)
@@ -80,9 +86,9 @@ $(STAMP): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found: apt-get install python3 python3-venv" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
 		{ echo "No venv module: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[notebooks,report,test,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[notebooks,report,test,docs,dev]'
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -236,7 +236,7 @@ class Preset:
 
 @dataclasses.dataclass(frozen=True)
 class Hand:
-    """A soft hand read from a file in hands/; see `hand.load`.
+    """A hand file: fingers, palm, wrist and the table of what a search may change.
 
     Attributes:
       name: Name of the hand, as in results.

@@ -25,7 +25,7 @@ from codesign_jax.scene.tables import (
 
 @dataclasses.dataclass(frozen=True)
 class _SceneFile:
-    """Schema of a scene file: as `Scene`, with hand and objects by name.
+    """A scene file: a `Scene` with its hand and objects by name.
 
     Attributes:
       name: Name of the scene, as in results.

@@ -57,7 +57,7 @@ class Table:
 
 @dataclasses.dataclass(frozen=True)
 class _ShapeFile:
-    """Schema of an object in a file.
+    """An object of the set: a primitive or a mesh.
 
     Attributes:
       name: Name, unique in the set.
@@ -105,7 +105,7 @@ class Shape(_ShapeFile):
 
 @dataclasses.dataclass(frozen=True)
 class _ObjectSetFile:
-    """Schema of an object file.
+    """An object file: the objects that trials take turns with, and the noise of a trial.
 
     Attributes:
       name: Name of the set, as in results.

@@ -1,0 +1,125 @@
+"""What MkDocs asks for when it builds the site: pages from files that lie outside of docs/.
+
+README.md becomes the front page, CONTRIBUTING.md, CHANGELOG.md and scripts/README.md become pages,
+and so does each notebook. Links between them and docs/ are those of the repository; here they
+are turned into those of the site. mkdocs.yml names this file.
+"""
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+import jupytext
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parent.parent
+
+# Page of the site for each file outside of docs/; notebooks are added by their names.
+PAGES = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "scripts/README.md": "scripts.md",
+}
+PAGES |= {
+    f"notebooks/{path.name}": f"notebooks/{path.stem}.md"
+    for path in sorted((ROOT / "notebooks").glob("*.py"))
+}
+# Grasps that move, for the front page, with what each shows.
+MOVING = {
+    "figures/grasp_type_1.gif": "A top grasp: short fingers close on the object's sides.",
+    "figures/grasp_type_2.gif": "A wrap: long fingers splay on the table and snap together.",
+}
+
+_LINK = re.compile(r"(\]\(|^\[[^\]]+\]: )([^)\s#]+)", re.M)
+_FILE_NAME = re.compile(r"\[`(?:docs/)?([\w-]+)(?:/README)?\.md`\](?=[(\[])")
+_CODE = re.compile(r"(^```.*?^```)", re.S | re.M)
+_DIAGRAM = re.compile(r"^```mermaid\n.*?^```", re.S | re.M)
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Adds the pages that are made here, and the files of the repository that pages link to."""
+    for source, page in PAGES.items():
+        files.append(File.generated(config, page, content=_page(ROOT / source)))
+    for source in sorted({s for p in _sources() for s in _links_out(p)}):
+        kept = File.generated(config, f"repository/{source}", abs_src_path=str(ROOT / source))
+        files.append(kept)
+    return files
+
+
+def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Files) -> str:
+    """Turns the repository's links into the site's."""
+    made = {target: source for source, target in PAGES.items()}
+    source = made.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    picture = posixpath.relpath("figures/way_of_data.svg", posixpath.dirname(page.file.src_uri))
+    markdown = _DIAGRAM.sub(f"![The way of data]({picture})", markdown)
+    parts = _CODE.split(markdown)
+    parts[::2] = [_relinked(text, source, page.file.src_uri) for text in parts[::2]]
+    return "".join(parts)
+
+
+def _page(path: Path) -> str:
+    """The Markdown of a file outside of docs/."""
+    if path.suffix == ".py":
+        return jupytext.writes(jupytext.read(path), "md")
+    text = path.read_text(encoding="utf-8")
+    if path.name == "README.md" and path.parent == ROOT:
+        blocks = text.split("\n\n")
+        caption = next(i for i, block in enumerate(blocks) if block.startswith("![")) + 1
+        text = "\n\n".join([*blocks[: caption + 1], _moving(), *blocks[caption + 1 :]])
+    return text
+
+
+def _moving() -> str:
+    """The pictures that move and are there, side by side."""
+    found = {name: text for name, text in MOVING.items() if (ROOT / "docs" / name).is_file()}
+    figures = [f"![{text}](docs/{name})" for name, text in found.items()]
+    if not figures:
+        return ""
+    heads, rule = " | ".join(found.values()), " | ".join("---" for _ in found)
+    return f"| {heads} |\n| {rule} |\n| {' | '.join(figures)} |\n"
+
+
+def _sources() -> list[Path]:
+    return [*(ROOT / "docs").rglob("*.md"), *(ROOT / s for s in PAGES if s.endswith(".md"))]
+
+
+def _links_out(path: Path) -> list[str]:
+    """Files of the repository that a page links to and that are no pages of the site."""
+    text = "".join(_CODE.split(path.read_text(encoding="utf-8"))[::2])
+    folder = path.parent.relative_to(ROOT).as_posix()
+    targets = (_target(folder, link) for _, link in _LINK.findall(text))
+    outside = (t for t in targets if t and t not in PAGES and _shown(t) is None)
+    return [t for t in outside if (ROOT / t).is_file()]
+
+
+def _relinked(text: str, source: str, page: str) -> str:
+    folder, here = posixpath.dirname(source), posixpath.dirname(page)
+
+    def replace(match: re.Match) -> str:
+        target = _target(folder, match[2])
+        if target is None:
+            return match[0]
+        there = PAGES.get(target) or _shown(target)
+        if there is None and (ROOT / target).is_file():
+            there = f"repository/{target}"
+        return match[0] if there is None else match[1] + posixpath.relpath(there, here or ".")
+
+    # In the repository a link's text is the file's name, in the site it is in words.
+    named = _FILE_NAME.sub(lambda m: f"[{m[1].replace('_', ' ').lower()}]", text)
+    return _LINK.sub(replace, named)
+
+
+def _target(folder: str, link: str) -> str | None:
+    """Path in the repository that a link leads to, None if it leads elsewhere."""
+    if re.match(r"[a-z]+:", link):
+        return None
+    return posixpath.normpath(posixpath.join(folder, link))
+
+
+def _shown(target: str) -> str | None:
+    """Path in the site of a file in docs/, None if it is not one that the site has."""
+    if not target.startswith("docs/") or target.startswith("docs/data/"):
+        return None
+    return target.removeprefix("docs/")

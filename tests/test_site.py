@@ -1,0 +1,137 @@
+"""The site of the documentation: the reference is up to date, links, search without a network."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from test_browser import browser  # noqa: F401
+
+from codesign_jax import model
+from scripts import reference_page, site_pages
+from tests import small
+
+ROOT = Path(__file__).parent.parent
+BUILT_IN = {
+    "Scene files": ROOT / "codesign_jax" / "scenes",
+    "Hand files": ROOT / "hands",
+    "Object files": ROOT / "objects",
+    "Presets of accuracy": ROOT / "codesign_jax" / "scenes" / "accuracy",
+}
+
+
+def test_the_committed_reference_is_what_the_code_says():
+    again = "python -m scripts.reference_page"
+    assert reference_page.PAGE.read_text(encoding="utf-8") == reference_page.page(), again
+
+
+def documented(page):
+    """Keys of each kind of file on the page: (heading, table, key), with "" for the top level."""
+    found, heading, table = set(), "", ""
+    for line in page.splitlines():
+        if line.startswith("## "):
+            heading, table = line[3:], ""
+        elif name := re.match(r"### `\[+([a-z_.]+)\]+`", line):
+            table = name[1]
+        elif key := re.match(r"\| `([a-z_]+)` \|", line):
+            found.add((heading, table, key[1]))
+    return found
+
+
+def used(heading, table, values):
+    """Keys of a TOML file as `documented` has them, without those of tables of free keys."""
+    for key, value in values.items():
+        rows = value if isinstance(value, list) else [value]
+        if not isinstance(rows[0], dict) or key == "fixed" or heading.startswith("Presets"):
+            yield heading, table, key
+            continue
+        for row in rows:
+            yield from used(heading, f"{table}.{key}".lstrip("."), row)
+
+
+@pytest.mark.parametrize("heading", BUILT_IN)
+def test_every_key_of_the_built_in_files_is_in_the_reference(heading):
+    on_page = documented(reference_page.PAGE.read_text(encoding="utf-8"))
+    files = sorted(BUILT_IN[heading].glob("*.toml"))
+    keys = {key for f in files for key in used(heading, "", tomllib.loads(f.read_text("utf-8")))}
+    assert files and keys and not keys - on_page
+
+
+def test_a_key_without_a_meaning_is_an_error():
+    @dataclasses.dataclass
+    class Unexplained:
+        """A table.
+
+        Attributes:
+          known: What it is.
+        """
+
+        known: float
+        unknown: float
+
+    with pytest.raises(KeyError, match="unknown"):
+        reference_page._tables(Unexplained, "")
+
+
+def test_the_layout_of_qpos_is_that_of_mujocos_model():
+    scene = small.pinch()
+    compiled = model.compile_template(scene)
+    sizes = {"F": scene.num_fingers, "N": scene.discretization.links}
+    sizes["A"] = (compiled.nv - 12) // (sizes["F"] * sizes["N"])
+    expected = {}
+    for joint, index, entries, _ in reference_page.qpos(scene):
+        many = joint.startswith("finger_f")
+        for f in range(sizes["F"] if many else 1):
+            for i in range(1, sizes["N"] + 1 if many else 2):
+                formula = re.sub(r"(?<=[a-zA-Z)]) (?=[A-Z])", " * ", index.replace("−", "-"))
+                name = joint.replace("_f_", f"_{f}_").replace("_i", f"_{i}") if many else joint
+                expected[name] = eval(formula, sizes | {"f": f, "i": i}), entries
+    ends = [*compiled.jnt_qposadr[1:], compiled.nq]
+    joints = [compiled.joint(j) for j in range(compiled.njnt)]
+    starts = compiled.jnt_qposadr
+    found = {j.name: (s, e - s) for j, s, e in zip(joints, starts, ends, strict=True)}
+    assert found == expected
+
+
+@pytest.mark.parametrize(
+    "link, page, expected",
+    [
+        ("[a](../CONTRIBUTING.md#rules)", "extending.md", "[a](contributing.md#rules)"),
+        ("[`CONTRIBUTING.md`](../CONTRIBUTING.md)", "limits.md", "[contributing](contributing.md)"),
+        ("[`a_b.md`](a_b.md)", "limits.md", "[a b](a_b.md)"),
+        ("[a](docs/effects.md)", "index.md", "[a](effects.md)"),
+        ("[a](../physics.md)", "notes/x.md", "[a](../physics.md)"),
+        ("[a](../hands/tripod3.toml)", "limits.md", "[a](repository/hands/tripod3.toml)"),
+        ("[a](https://b.c/d.md)", "limits.md", "[a](https://b.c/d.md)"),
+        ("[a](nowhere.md)", "limits.md", "[a](nowhere.md)"),  # MkDocs says that it is broken
+    ],
+)
+def test_links_of_the_repository_become_links_of_the_site(link, page, expected):
+    source = {"index.md": "README.md"}.get(page, f"docs/{page}")
+    assert site_pages._relinked(link, source, page) == expected
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    place = tmp_path_factory.mktemp("site")
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", place]
+    subprocess.run(build, cwd=ROOT, check=True, timeout=300)
+    return place
+
+
+@pytest.mark.browser
+def test_the_site_is_read_and_searched_without_a_network(site, browser):  # noqa: F811
+    page, complaints = browser.new_page(viewport={"width": 1300, "height": 900}), []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("request", lambda r: None if r.url.startswith("file:") else complaints.append(r.url))
+    page.goto((site / "index.html").as_uri())
+    shown = "e => e.complete && e.naturalWidth > 0"
+    assert all(picture.evaluate(shown) for picture in page.locator("article img").all())
+    assert page.locator("article img[src$='.gif']").count() >= 1
+    page.locator("input.md-search__input").fill("shear modulus")
+    page.wait_for_selector(".md-search-result__item a[href*='reference.html']", timeout=20_000)
+    page.close()
+    assert not complaints

@@ -25,6 +25,7 @@ commands
 cli
 """
 ORDER = {name: level for level, line in enumerate(LAYERS.split("\n")) for name in line.split()}
+TOPS = ("codesign_jax", "scripts")
 STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "winners"}
 # Studies of results: they take up what these left.
 BUILD_ON = {"winners": {"experiments"}, "calibration": {"experiments"}}
@@ -33,7 +34,7 @@ BUILD_ON = {"winners": {"experiments"}, "calibration": {"experiments"}}
 def modules(root=ROOT):
     """Files by the dotted names of their modules."""
     found = {}
-    for top in ("codesign_jax", "scripts"):
+    for top in TOPS:
         for path in sorted((root / top).rglob("*.py")):
             parts = path.relative_to(root).with_suffix("").parts
             found[".".join(parts).removesuffix(".__init__")] = path
@@ -129,6 +130,36 @@ def test_no_modules_import_in_a_circle():
         tuple(TopologicalSorter(links).static_order())
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
+
+
+def defined(path):
+    """Names that a module's own text defines, its imports among them."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            found |= {(a.asname or a.name).split(".")[0] for a in node.names}
+    return found
+
+
+def test_what_is_imported_is_there():
+    """Also inside of functions, of studies that no quick test runs, and of tests and notebooks."""
+    names = modules()
+    known = {name: defined(path) for name, path in names.items()}
+    others = [path for top in ("tests", "notebooks") for path in (ROOT / top).rglob("*.py")]
+    missing = [
+        f"{path.relative_to(ROOT)}: {node.module}.{alias.name}"
+        for path in [*names.values(), *others]
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in TOPS
+        for alias in node.names
+        if f"{node.module}.{alias.name}" not in names
+        and alias.name not in known.get(node.module, ())
+    ]
+    assert not missing, "\n".join(missing)
 
 
 def test_what_imports_are_seen_in_a_file():

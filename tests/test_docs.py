@@ -127,6 +127,16 @@ def test_links_are_found():
     assert links(text) == ["b.png", "d.md#e", "l.md"]
 
 
+def test_the_files_that_contributing_names_are_there():
+    """As paths in the checkout, the package, its engines or the structured engine."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    paths = re.findall(r"`((?:[a-z_]+/)+(?:[a-z_]+\.[a-z]+)?)`", text)
+    package = ROOT / "codesign_jax"
+    places = [ROOT, package, package / "engines", package / "engines" / "structured"]
+    missing = [p for p in paths if not any((place / p).exists() for place in places)]
+    assert len(paths) > 30 and not missing
+
+
 def test_every_target_of_make_is_there():
     named = {word for words in examples("make") for word in words}
     rules = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.M))

@@ -8,7 +8,7 @@ import numpy as np
 
 from codesign_jax.engines.structured import StructuredEngine, coordinates, differentiable
 from codesign_jax.engines.structured.constants import WorldConstants, world_constants
-from codesign_jax.engines.structured.contact import respond
+from codesign_jax.engines.structured.contact import constraint_update
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import Stages, dot
 from codesign_jax.engines.structured.problem import propagate, relative
@@ -86,8 +86,8 @@ def _structured(engine: StructuredEngine, fields: ModelFields, ctrl: np.ndarray)
 def grip(scene: Scene, hand: WorldConstants, state: State, ctrl: jax.Array) -> jax.Array:
     """Sum of the normal forces of fingers and palm on the object [N], shape (world,).
 
-    The cone's response (`contact.respond`) at the accelerations that a step found, as the engine
-    itself pushes: of spheres or of the hull, which MuJoCo C does not know.
+    The force of the cones (`contact.constraint_update`) at the accelerations that a step found,
+    with which the engine itself pushes: of spheres, or of the hull, which MuJoCo C does not have.
 
     Args:
       scene: The scene.
@@ -102,7 +102,7 @@ def grip(scene: Scene, hand: WorldConstants, state: State, ctrl: jax.Array) -> j
     for name, contacts in problem.contacts.items():
         if name.endswith("_object"):
             moved, moving = (contacts.relative(relative(name, m)) for m in (motion, velocity))
-            force = respond(contacts, moved - contacts.reference(moving)).force
+            force = constraint_update(contacts, moved - contacts.reference(moving)).force
             normal = dot(force[:3], contacts.normal)
             found = found + normal.sum(tuple(range(normal.ndim - 1)))
     return found

@@ -34,6 +34,9 @@ class Optimize:
     """Strategy: concurrent, single, switch-K (K switches), morphology or control."""
     first: Literal["morphology", "control"] = "morphology"
     """Domain of the first episode with single and switch-K."""
+    optimizer: str = "particle-filter"
+    """Optimiser: particle-filter (the paper's), cma-es, pso or random, all on one budget of grasps
+    (what differs: docs/command_line.md)."""
     engine: Text = None
     """Engine that simulates: structured (ours, the default), mujoco (C, float64) or mjx (stock)."""
     particles: Count = None
@@ -52,7 +55,8 @@ class Optimize:
     seeds: Text = None
     """Several seeds, such as 0-9 or 1,3,5: a run of each, one after another, and a comparison."""
     out: File = None
-    """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED. With --seeds a folder of run folders."""
+    """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED, with the optimiser before the seed if
+    it is another. With --seeds a folder of run folders."""
     fresh: Flag = False
     """Delete an earlier run in the folder and start anew."""
     dry_run: Flag = False

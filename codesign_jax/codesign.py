@@ -1,4 +1,4 @@
-"""Co-design: one episode, that is move, simulate, weigh and resample, as one jitted program.
+"""Co-design: one episode, that is ask, simulate and tell, as one jitted program.
 
 Source: Deimel, Irmisch, Wall, Brock (2017), section VI.1 and Fig. 5; the measures are those of
 section VI.4.  Everything here is a pure function of arrays; files and progress are the caller's.
@@ -12,10 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import rollout
+from codesign_jax import optimize, rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
-from codesign_jax.optimize import Info, ParticleFilter, Space, State, rejection_sample
+from codesign_jax.optimize import (
+    Info,
+    Optimizer,
+    ParticleFilter,
+    Space,
+    State,
+    rejection_sample,
+)
 from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
@@ -46,7 +53,7 @@ class EpisodeInfo(NamedTuple):
     Attributes:
       population: Particles as simulated [SI units], shape (particle, parameter).
       trials: Cost, status, time of loss and first bad step, each of shape (particle, trial).
-      selection: Particle costs, weights and ancestors of the resampling; see `optimize.Info`.
+      selection: Particle costs, and weights and ancestors of a resampling; see `optimize.Info`.
       last: States at which the worlds ended, failed ones frozen at their last good one, shape
         (particle, trial, nq + nv), or None if the engine does not tell.
     """
@@ -89,8 +96,25 @@ def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) 
       sigma: Standard deviation of a move as a fraction of the parameter's range.
       alpha: Cost offset of the weight 1 / (alpha + cost).
     """
-    box = Space(np.asarray(space.low), np.asarray(space.high), _Projection(space))
-    return ParticleFilter(box, sigma=sigma, alpha=alpha)
+    return ParticleFilter(_box(space), sigma=sigma, alpha=alpha)
+
+
+def make_optimizer(name: str, space: DesignSpace) -> Optimizer:
+    """Returns an optimiser over a design space; see `optimize.make_optimizer`.
+
+    Args:
+      name: One of `optimize.NAMES`.
+      space: Free parameters with bounds and pressure limit.
+
+    Raises:
+      ValueError: If there is no such optimiser.
+      ModuleNotFoundError: If it needs evosax, which is not installed.
+    """
+    return optimize.make_optimizer(name, _box(space))
+
+
+def _box(space: DesignSpace) -> Space:
+    return Space(np.asarray(space.low), np.asarray(space.high), _Projection(space))
 
 
 def make_evaluate(
@@ -150,7 +174,7 @@ def make_episode(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
-    optimizer: ParticleFilter,
+    optimizer: Optimizer,
     num_trials: int,
     *,
     trajectory: bool = False,
@@ -169,7 +193,7 @@ def make_episode(
       scene: The scene.
       engine: Engine that simulates.
       space: Design space of the particles.
-      optimizer: Particle filter over the same space.
+      optimizer: Optimiser over the same space, see `optimize.Optimizer`.
       num_trials: Trials of each particle in an episode.
       trajectory: As in `rollout.simulate`.
       cost: As in `rollout.simulate`.
@@ -191,7 +215,7 @@ def _episode(
         state: State,
         mask: jax.typing.ArrayLike,
         constants: Constants,
-        optimizer: ParticleFilter,
+        optimizer: Optimizer,
     ) -> tuple[State, EpisodeInfo]:
         population = optimizer.ask(state, mask)
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
@@ -200,7 +224,7 @@ def _episode(
             scene, engine, hands, noise, trajectory=trajectory, cost=cost, constants=constants
         )
         costs = particle_cost(scene.with_constants(constants), trials)
-        new, selection = optimizer.tell(state, population, costs)
+        new, selection = optimizer.tell(state, population, costs, mask)
         return new, EpisodeInfo(population, trials, selection, last)
 
     return episode
@@ -210,7 +234,7 @@ def make_run(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
-    optimizer: ParticleFilter,
+    optimizer: Optimizer,
     num_trials: int,
     *,
     trajectory: bool = False,
@@ -229,7 +253,7 @@ def make_run(
       scene: The scene.
       engine: Engine that simulates; with `jax.vmap` it has to be one that composes, as the default.
       space: Design space of the particles.
-      optimizer: Particle filter over the same space.
+      optimizer: Optimiser over the same space, see `optimize.Optimizer`.
       num_trials: Trials of each particle in an episode.
       trajectory: As in `rollout.simulate`.
       cost: As in `rollout.simulate`.
@@ -245,7 +269,7 @@ def _run(scene: Scene, *how: Any) -> EpisodeFunction:
         state: State,
         masks: jax.typing.ArrayLike,
         constants: Constants,
-        optimizer: ParticleFilter,
+        optimizer: Optimizer,
     ) -> tuple[State, EpisodeInfo]:
         def one(state: State, mask: jax.Array) -> tuple[State, EpisodeInfo]:
             return episode(state, mask, constants, optimizer)
@@ -268,7 +292,7 @@ def episode_trials(
     return rollout.sample_trials(scene, own, num_trials, constants=constants)
 
 
-def evaluate_by(episode: EpisodeFunction, num_parameters: int) -> EvaluateFunction:
+def evaluate_by(episode: EpisodeFunction, optimizer: Optimizer) -> EvaluateFunction:
     """Returns an evaluation (population, key) -> outcomes that uses an episode's own program.
 
     With every parameter closed nothing moves, so that seeds and final particles are simulated
@@ -276,13 +300,13 @@ def evaluate_by(episode: EpisodeFunction, num_parameters: int) -> EvaluateFuncti
 
     Args:
       episode: See `make_episode`; works for as many particles as it was compiled for.
-      num_parameters: Number of parameters of a particle.
+      optimizer: The episode's optimiser.
     """
-    closed = np.zeros(num_parameters, bool)
+    closed = np.zeros(np.shape(optimizer.space.low), bool)
 
     def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
-        state = State(population, jnp.zeros((), jnp.int32), key)
-        return episode(state, closed)[1].trials
+        state = optimizer.init(key, population[0], len(population))
+        return episode(state._replace(particles=population), closed)[1].trials
 
     return evaluate
 
@@ -295,7 +319,7 @@ def stream_key(key: jax.Array, stream: int, index: jax.typing.ArrayLike = 0) -> 
 def find_seed(
     scene: Scene,
     evaluate: EvaluateFunction,
-    optimizer: ParticleFilter,
+    optimizer: Optimizer,
     key: jax.Array,
     *,
     batch: int,
@@ -306,7 +330,7 @@ def find_seed(
     Args:
       scene: The scene.
       evaluate: See `make_evaluate`.
-      optimizer: Particle filter whose space is sampled.
+      optimizer: Optimiser whose space is sampled.
       key: Root key of the run.
       batch: Candidates simulated at once.
       threshold: Cost above which a candidate is poor enough.

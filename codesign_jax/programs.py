@@ -1,6 +1,6 @@
 """Jitted programs that every scene of one structure shares within a process.
 
-A program takes the scene's numbers (`Scene.constants`) and the particle filter as arguments, so
+A program takes the scene's numbers (`Scene.constants`) and the optimiser as arguments, so
 that neither JAX nor XLA sees what hand, objects or bounds they come from: another file of the same
 structure traces and compiles nothing, and a new process finds the program in JAX's cache on disk.
 """

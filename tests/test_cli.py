@@ -299,6 +299,11 @@ WRONG = {
     "unknown schedule": (["--schedule", "concurent"], ["did you mean 'concurrent'?"]),
     "too many switches": (["--schedule", "switch-64"], ["--schedule", "65 episodes"]),
     "unknown engine": (["--engine", "mujco"], ["--engine", "did you mean 'mujoco'?"]),
+    "unknown optimizer": (["--optimizer", "cmaes"], ["--optimizer", "did you mean 'cma-es'?"]),
+    "nothing to rank": (
+        ["--optimizer", "cma-es", "--particles", "1"],
+        ["--optimizer: cma-es ranks its particles: it needs at least 2, got 1"],
+    ),
     "out of range": (["--particles", "0"], ["--particles = 0 is outside [1, 32768]"]),
     "wrong type of a flag": (["--particles", "ten"], ["ten"]),
     "unknown flag": (["--particle", "10"], ["--particle"]),
@@ -442,11 +447,13 @@ def test_a_verdict_comes_with_its_interval():
     assert "every trial failed" in broken and "%" not in broken
 
 
-def test_more_episodes_extend_a_run_bit_for_bit(tmp_path, capsys):
+@pytest.mark.parametrize("optimizer", ["particle-filter", "cma-es"])
+def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
+    run = [*RUN, "--optimizer", optimizer]
     long, grown = tmp_path / "long", tmp_path / "grown"
-    assert command(*RUN, "--episodes", "5", "--out", long) == 0
-    assert command(*RUN, "--episodes", "3", "--out", grown) == 0
-    assert command(*RUN, "--episodes", "5", "--out", grown) == 0
+    assert command(*run, "--episodes", "5", "--out", long) == 0
+    assert command(*run, "--episodes", "3", "--out", grown) == 0
+    assert command(*run, "--episodes", "5", "--out", grown) == 0
     assert "extended from 3 to 5 episodes" in capsys.readouterr().out
     assert_same_run(grown, long)
     provenance = json.loads((grown / "provenance.json").read_text())
@@ -454,7 +461,7 @@ def test_more_episodes_extend_a_run_bit_for_bit(tmp_path, capsys):
     ((step, command_line),) = [(e, e.pop("command")) for e in provenance["extended"]]
     assert (step["from"], step["to"]) == (3, 5) and command_line
     before = snapshot(grown)
-    assert command(*RUN, "--episodes", "4", "--out", grown) == 2
+    assert command(*run, "--episodes", "4", "--out", grown) == 2
     assert "a run can be extended, not shortened" in capsys.readouterr().err
     assert snapshot(grown) == before
 

@@ -46,7 +46,7 @@ def test_one_compile_serves_every_schedule_and_seed(setup):
         episode(state, mask[-1])
     codesign.find_seed(
         the_scene,
-        codesign.evaluate_by(episode, space.num_parameters),
+        codesign.evaluate_by(episode, optimizer),
         optimizer,
         jax.random.key(0),
         batch=PARTICLES,
@@ -89,7 +89,7 @@ def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     closed = np.zeros(2, bool)
     first, info = episode(start(optimizer), closed)
     seen = [info, episode(first, closed)[1], episode(start(optimizer, seed=1), closed)[1]]
-    evaluate = codesign.evaluate_by(episode, 2)
+    evaluate = codesign.evaluate_by(episode, optimizer)
     test = codesign.final_test(
         the_scene, evaluate, first.particles, first.key, num_trials=2 * TRIALS
     )
@@ -133,7 +133,7 @@ def test_evaluate_by_an_episode_equals_evaluate(setup):
     the_scene, space, engine, optimizer, episode = setup
     population = jnp.asarray(np.random.default_rng(0).uniform([0.03, -0.05], [0.17, 0.1], (8, 2)))
     key = jax.random.key(3)
-    by_episode = codesign.evaluate_by(episode, 2)(population, key)
+    by_episode = codesign.evaluate_by(episode, optimizer)(population, key)
     evaluate = codesign.make_evaluate(the_scene, engine, space, TRIALS)
     direct = evaluate(population, codesign.stream_key(key, codesign.STREAM_TRIAL))
     # Two programs round the noise differently, which may move a loss by one time step.
@@ -143,7 +143,7 @@ def test_evaluate_by_an_episode_equals_evaluate(setup):
 
 def test_seed_is_poor_and_reproducible(setup):
     the_scene, space, _, optimizer, episode = setup
-    evaluate = codesign.evaluate_by(episode, 2)
+    evaluate = codesign.evaluate_by(episode, optimizer)
 
     def find(seed):
         key = jax.random.key(seed)
@@ -160,7 +160,7 @@ def test_final_test_counts_the_last_episode(setup):
     the_scene, _, _, optimizer, episode = setup
     state, info = episode(start(optimizer), np.ones(2, bool))
     kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.trials)
-    evaluate = codesign.evaluate_by(episode, 2)
+    evaluate = codesign.evaluate_by(episode, optimizer)
     result = codesign.final_test(
         the_scene, evaluate, state.particles, state.key, num_trials=4, previous=kept
     )

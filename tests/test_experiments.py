@@ -208,7 +208,7 @@ def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
     """As `codesign optimize --seed` does it: seed, episodes, final test."""
     _, got = finished
     (scene, space, optimizer, episode), key = single, jax.random.key(SEED + run)
-    evaluate = codesign.evaluate_by(episode, 2)
+    evaluate = codesign.evaluate_by(episode, optimizer)
     seed, cost, drawn = codesign.find_seed(scene, evaluate, optimizer, key, batch=PLAN.particles)
     mask = schedule(
         PLAN.strategies[strategy],

@@ -57,7 +57,7 @@ def run():
         records.report(record.history, e, info)
     test = codesign.final_test(
         the_scene,
-        codesign.evaluate_by(episode, 2),
+        codesign.evaluate_by(episode, optimizer),
         record.state.particles,
         record.state.key,
         num_trials=s.test_trials,

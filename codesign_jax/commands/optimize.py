@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, runs
+from codesign_jax import codesign, engines, optimize, runs
 from codesign_jax import scene as scenes
 from codesign_jax.commands import common, reference, seeds
 from codesign_jax.runs import AllFailed, Plan, RunResult, Settings, rates
@@ -109,6 +109,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         trials=options.trials,
         episodes=options.episodes,
         test_trials=options.test_trials,
+        optimizer=options.optimizer,
     )
     if options.seeds is not None and options.seed != 0:
         problems.append("--seed and --seeds exclude each other")
@@ -122,7 +123,10 @@ def _folder(options: "Optimize", scene: Scene, settings: Settings, seed: int) ->
     """Folder of one run: --out, with a folder inside for each of --seeds."""
     if options.out is not None:
         return options.out if options.seeds is None else options.out / f"seed-{seed}"
-    return Path("runs") / f"{scene.hand.name}-{settings.preset}-{settings.schedule}-{seed}"
+    names = [scene.hand.name, settings.preset, settings.schedule, str(seed)]
+    if settings.optimizer != optimize.NAMES[0]:
+        names.insert(3, settings.optimizer)
+    return Path("runs") / "-".join(names)
 
 
 def _preflight(scene: Scene, settings: Settings) -> list[str]:

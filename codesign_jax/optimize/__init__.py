@@ -1,18 +1,26 @@
 """Optimisers behind ``init``, ``ask`` and ``tell``; they know arrays and costs, no physics."""
 
 from codesign_jax.optimize.bounds import Space, reflect, strictly_below
-from codesign_jax.optimize.particle_filter import Info, ParticleFilter, State
+from codesign_jax.optimize.evolution import Evolution
+from codesign_jax.optimize.names import NAMES, make_optimizer, problem
+from codesign_jax.optimize.particle_filter import ParticleFilter
+from codesign_jax.optimize.protocol import Info, Optimizer, State
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
 from codesign_jax.optimize.schedule import schedule
 from codesign_jax.optimize.seeding import candidates, rejection_sample
 
 __all__ = [
     "MAX_PARTICLES",
+    "NAMES",
+    "Evolution",
     "Info",
+    "Optimizer",
     "ParticleFilter",
     "Space",
     "State",
     "candidates",
+    "make_optimizer",
+    "problem",
     "reflect",
     "rejection_sample",
     "schedule",

@@ -5,18 +5,25 @@ Source: Deimel, Irmisch, Wall, Brock (2017), section VI.1 and Fig. 5. One episod
     population = filter.ask(state, mask)                    # step 1: move
     state, info = filter.tell(state, population, cost)      # steps 3 and 4: weight, resample
 
-with the simulation, step 2, in between. All three functions are pure and work under ``jit``,
-``vmap`` over a leading run axis of state, mask and cost, and ``lax.scan``.
+with the simulation, step 2, in between; see ``protocol``. The draws of a particle depend neither on
+the number of particles nor on the point of resumption.
 """
 
 import dataclasses
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space, reflect
+from codesign_jax.optimize.protocol import (
+    Info,
+    State,
+    check_start,
+    check_told,
+    episode_key,
+    summarize,
+)
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
 
 # Four ASCII letters each, so that they do not meet the small numbers others fold in.
@@ -24,43 +31,6 @@ STREAM_MOVE = 0x6D6F7665
 """Stream of the moves ("move")."""
 STREAM_RESAMPLE = 0x72736D70
 """Stream of the resampling ("rsmp")."""
-
-
-class State(NamedTuple):
-    """What one episode hands to the next.
-
-    Attributes:
-        particles: Particles after resampling, shape (particle, parameter).
-        episode: Number of finished episodes, int32, scalar.
-        key: Root key. It never changes: draws fold in stream, episode and particle, so they depend
-            neither on the number of particles nor on the point of resumption.
-    """
-
-    particles: jax.Array
-    episode: jax.Array
-    key: jax.Array
-
-
-class Info(NamedTuple):
-    """What one episode reports.
-
-    Attributes:
-        cost: Costs as given, shape (particle,).
-        weight: Normalised weights, shape (particle,); equal where no cost is finite.
-        ancestors: Row of the population that each new particle copies, int32, shape (particle,).
-        best_index: Row of the population with the lowest finite cost, int32, scalar.
-        best_cost: Lowest finite cost, inf if there is none, scalar.
-        mean_cost: Mean of the finite costs, inf if there are none, scalar.
-        effective_sample_size: ``1 / sum(weight**2)``, between 1 and the number of particles.
-    """
-
-    cost: jax.Array
-    weight: jax.Array
-    ancestors: jax.Array
-    best_index: jax.Array
-    best_cost: jax.Array
-    mean_cost: jax.Array
-    effective_sample_size: jax.Array
 
 
 @jax.tree_util.register_dataclass
@@ -106,13 +76,7 @@ class ParticleFilter:
             TypeError: If ``key`` is not a typed key.
             ValueError: If the shape of the seed particle or the number of particles is wrong.
         """
-        if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-            raise TypeError(f"key must be a typed key from jax.random.key, got {key.dtype}")
-        seed_particle = jnp.asarray(seed_particle, float)
-        if seed_particle.shape != jnp.shape(self.space.low):
-            raise ValueError(f"{seed_particle.shape=}, expected {jnp.shape(self.space.low)}")
-        if not 1 <= num_particles <= MAX_PARTICLES:
-            raise ValueError(f"{num_particles=}, expected 1 to {MAX_PARTICLES}")
+        seed_particle = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         particles = jnp.tile(seed_particle, (num_particles, 1))
         return State(particles, jnp.zeros((), jnp.int32), key)
 
@@ -134,13 +98,15 @@ class ParticleFilter:
         """
         low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
         n, width = state.particles.shape
-        key = _episode_key(state, STREAM_MOVE)
+        key = episode_key(state, STREAM_MOVE)
         keys = jax.vmap(lambda particle: jax.random.fold_in(key, particle))(jnp.arange(n))
         noise = jax.vmap(lambda k: jax.random.normal(k, (width,), state.particles.dtype))(keys)
         moved = reflect(state.particles + self.sigma * (high - low) * noise, low, high)
         return self.space.constrain(jnp.where(mask, moved, state.particles))
 
-    def tell(self, state: State, population: jax.Array, cost: ArrayLike) -> tuple[State, Info]:
+    def tell(
+        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[State, Info]:
         """Weight and resample the population: steps 3 and 4 of Fig. 5.
 
         ``weight = 1 / (alpha + cost)`` (section VI.1), then stochastic universal sampling with one
@@ -151,6 +117,7 @@ class ParticleFilter:
             state: State that ``population`` was asked from.
             population: Evaluated particles, shape (particle, parameter).
             cost: Mean cost over the trials of each particle, shape (particle,); lower is better.
+            mask: Not used: resampling copies whole particles.
 
         Returns:
             The state of the next episode and what happened in this one.
@@ -158,34 +125,10 @@ class ParticleFilter:
         Raises:
             ValueError: If shapes do not match.
         """
-        cost = jnp.asarray(cost, population.dtype)
-        if population.shape != state.particles.shape or cost.shape != population.shape[:1]:
-            raise ValueError(
-                f"{population.shape=}, {cost.shape=} do not match {state.particles.shape=}"
-            )
+        cost = check_told(state, population, cost)
         finite = jnp.isfinite(cost)
         weight = finite / (self.alpha + jnp.where(finite, jnp.maximum(cost, 0), 0))
-        u = jax.random.uniform(_episode_key(state, STREAM_RESAMPLE))
+        u = jax.random.uniform(episode_key(state, STREAM_RESAMPLE))
         ancestors = stochastic_universal(u, weight)
         next_state = State(population[ancestors], state.episode + 1, state.key)
-        return next_state, _info(cost, finite, jnp.where(finite.any(), weight, 1), ancestors)
-
-
-def _episode_key(state: State, stream: int) -> jax.Array:
-    return jax.random.fold_in(jax.random.fold_in(state.key, stream), state.episode)
-
-
-def _info(cost: jax.Array, finite: jax.Array, weight: jax.Array, ancestors: jax.Array) -> Info:
-    ranked = jnp.where(finite, cost, jnp.inf)
-    best = jnp.argmin(ranked).astype(jnp.int32)
-    mean = jnp.where(finite, cost, 0).sum() / jnp.maximum(finite.sum(), 1)
-    weight = weight / weight.sum()
-    return Info(
-        cost=cost,
-        weight=weight,
-        ancestors=ancestors,
-        best_index=best,
-        best_cost=ranked[best],
-        mean_cost=jnp.where(finite.any(), mean, jnp.inf),
-        effective_sample_size=1 / (weight**2).sum(),
-    )
+        return next_state, summarize(cost, jnp.where(finite.any(), weight, 1), ancestors)

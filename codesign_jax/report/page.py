@@ -147,6 +147,7 @@ def _summary(run: Run) -> str:
         ("objects", objects),
         ("design space", f"{s.preset}: {run.space.num_parameters} free parameters"),
         ("strategy", s.schedule),
+        ("optimizer", s.optimizer),
         ("engine", f"{s.engine}, time step {1000 * scene.discretization.timestep:g} ms"),
         ("grasps", f"{record.done * s.particles * s.trials:,} ({sizes})"),
         ("seed", s.seed),

@@ -37,11 +37,12 @@ class Chosen(NamedTuple):
 
     Attributes:
       design: The design [SI units], shape (parameter,).
-      particle: Its index among the final particles, or in the last episode without a test.
+      particle: Its index among the final particles, or in its episode without a test.
       cost: Its mean cost by the scene's rule for failed trials.
       trials: Outcomes of its trials, every array of shape (trial,).
-      tested: Whether they are those of the final test, or the last episode's.
-      row: Its index in the last episode's population.
+      tested: Whether they are those of the final test, or its episode's.
+      row: Its index in its episode's population.
+      episode: Index of an episode that simulated it: the last, where that did.
     """
 
     design: np.ndarray
@@ -50,6 +51,7 @@ class Chosen(NamedTuple):
     trials: Outcome
     tested: bool
     row: int
+    episode: int
 
 
 def read_record(folder: Path) -> Record:
@@ -65,29 +67,41 @@ def read_record(folder: Path) -> Record:
 
 
 def choose(scene: Scene, record: Record) -> Chosen:
-    """The final particle that tested best, or the last episode's best without a test.
+    """The final particle that tested best.
+
+    Without a test the last episode's best, or the run's where the optimiser keeps the best so far.
 
     Args:
       scene: The run's scene, with its rule for failed trials.
       record: The run, with a finished episode at least.
     """
-    history, last = record.history, record.done - 1
+    history = record.history
     if record.test is None:
-        best = int(history.cost[last].argmin())
-        trials = jax.tree.map(lambda v: v[last, best], history.trials)
-        return Chosen(
-            history.population[last, best],
-            best,
-            float(history.cost[last, best]),
-            trials,
-            False,
-            best,
-        )
+        episode, row = record.done - 1, int(history.cost[record.done - 1].argmin())
+        if (history.ancestors[: record.done] < 0).any():
+            episode, row = _place(record, 0)
+        trials = jax.tree.map(lambda v: v[episode, row], history.trials)
+        cost = float(history.cost[episode, row])
+        return Chosen(history.population[episode, row], row, cost, trials, False, row, episode)
     cost = np.asarray(particle_cost(scene, record.test))
     best = int(cost.argmin())
     trials = jax.tree.map(lambda v: np.asarray(v)[best], record.test)
     design = np.asarray(record.state.particles)[best]
-    return Chosen(design, best, float(cost[best]), trials, True, int(history.ancestors[last, best]))
+    episode, row = _place(record, best)
+    return Chosen(design, best, float(cost[best]), trials, True, row, episode)
+
+
+def _place(record: Record, particle: int) -> tuple[int, int]:
+    """Index of an episode that simulated a final particle, and its row in the population."""
+    last = record.done - 1
+    row = int(record.history.ancestors[last, particle])
+    if row >= 0:
+        return last, row
+    # One of the best so far, from an earlier episode.
+    others = record.history.population[:last]
+    apart = np.abs(others - np.asarray(record.state.particles)[particle]).sum(-1)
+    episode, row = np.unravel_index(apart.argmin(), apart.shape)
+    return int(episode), int(row)
 
 
 def find_grasp(
@@ -103,9 +117,10 @@ def find_grasp(
     Args:
       scene: The run's scene.
       record: The run, with a finished episode at least.
-      episode: Number of the episode, from 1; None for the last.
-      particle: Index of the particle; None for the chosen one in the last episode, otherwise for
-        the episode's best.
+      episode: Number of the episode, from 1; None for the chosen particle's, or the last if
+        `particle` is given.
+      particle: Index of the particle; None for the chosen one in its episode, otherwise for the
+        episode's best.
       trial: Index of the trial; None for its best one.
 
     Raises:
@@ -121,10 +136,11 @@ def find_grasp(
     found = [range_problem(n, v, "", low, high) for n, v, low, high in asked if v is not None]
     if problems := [problem for problem in found if problem]:
         raise SceneError(problems)
-    e = (episode or record.done) - 1
+    chosen = choose(scene, record)
+    last = record.done - 1 if particle is not None else chosen.episode
+    e = last if episode is None else episode - 1
     if particle is None:
-        is_last = e == record.done - 1
-        particle = choose(scene, record).row if is_last else int(history.cost[e].argmin())
+        particle = chosen.row if e == chosen.episode else int(history.cost[e].argmin())
     of_particle = jax.tree.map(lambda v: v[e, particle], history.trials)
     if trial is None:
         trial = int(np.where(failed(of_particle.status), np.inf, of_particle.cost).argmin())

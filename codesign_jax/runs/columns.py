@@ -48,7 +48,7 @@ TABLES = {
             "best_cost": "lowest of the particles' costs",
             "failed_trials": _FAILED,
             "effective_sample_size": "1 / sum of the squared weights: particles that resampling "
-            "could keep, from 1 to all",
+            "could keep, from 1 to all; all where `--optimizer` is not the particle filter",
         },
         "best_",
         "the particle of the lowest cost, as simulated",
@@ -60,9 +60,11 @@ TABLES = {
             "particle": _PARTICLE,
             "cost": "mean cost of its trials by the scene's rule for failed ones (`cost.failure`): "
             "left out, or counted with `cost.maximum`",
-            "weight": "its weight in the resampling; the weights of an episode sum to 1",
+            "weight": "its weight in the resampling; the weights of an episode sum to 1, and are "
+            "equal where `--optimizer` is not the particle filter",
             "next_copies_particle": "the particle of this episode that the next episode's particle "
-            "of this index is copied from, before it moves",
+            "of this index is copied from, before it moves; with another `--optimizer` the one "
+            "that has this index among the best of the run so far, -1: one of an earlier episode",
         },
         "",
         "the particle as simulated",
@@ -91,7 +93,8 @@ TABLES = {
         {
             "particle": _PARTICLE,
             "test_cost": "mean cost of its trials by the scene's rule for failed ones",
-            "trials": "its trials: the last episode's and the test's",
+            "trials": "its trials: the last episode's and the test's; the test's alone if final "
+            "particles are from earlier episodes, see `next_copies_particle`",
             "failed_trials": _FAILED,
             "success": f"1 if the test's cost is below {SUCCESS_COST}, else 0",
         },

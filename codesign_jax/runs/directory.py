@@ -148,7 +148,8 @@ def read_provenance(path: Path) -> dict[str, Any]:
     """
     try:
         stored = json.loads((path / PROVENANCE).read_text(encoding="utf-8"))
-        Settings(**stored["settings"])
+        # Runs from before a setting was there have its default.
+        stored["settings"] = dataclasses.asdict(Settings(**stored["settings"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SceneError([f"{path} is not a run folder: {PROVENANCE} cannot be read"]) from error
     return stored

@@ -11,7 +11,7 @@ import numpy as np
 from codesign_jax import codesign, types
 from codesign_jax.codesign import EpisodeFunction, EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import ParticleFilter
+from codesign_jax.optimize import Optimizer
 from codesign_jax.runs import failures, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints
@@ -39,7 +39,7 @@ class Plan(NamedTuple):
     settings: Settings
     engine: Engine
     space: DesignSpace
-    optimizer: ParticleFilter
+    optimizer: Optimizer
     mask: np.ndarray
     key: jax.Array
     compiled: dict[str, EpisodeFunction]
@@ -83,7 +83,10 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
       settings: Settings without `settings.problems`.
     """
     space, mask = design_space(scene.hand, settings.preset), masks_of(scene, settings)
-    engine, optimizer = make_engine(settings.engine, scene), codesign.make_filter(space)
+    engine, optimizer = (
+        make_engine(settings.engine, scene),
+        codesign.make_optimizer(settings.optimizer, space),
+    )
     key = jax.random.key(settings.seed)
     return Plan(scene, settings, engine, space, optimizer, mask, key, {})
 
@@ -178,7 +181,7 @@ class _Loop:
     def _seed(self, episode: EpisodeFunction) -> Record:
         """Finds the seed particle and saves it as step 0."""
         plan, settings = self.plan, self.plan.settings
-        evaluate = codesign.evaluate_by(episode, plan.space.num_parameters)
+        evaluate = codesign.evaluate_by(episode, plan.optimizer)
 
         def search() -> tuple[jax.Array, float, int]:
             return codesign.find_seed(
@@ -239,7 +242,7 @@ class _Loop:
         plan, settings = self.plan, self.plan.settings
         if self._tested(record):
             return
-        evaluate = codesign.evaluate_by(episode, plan.space.num_parameters)
+        evaluate = codesign.evaluate_by(episode, plan.optimizer)
         with self.progress.busy("testing the final particles") as watch:
             test = codesign.final_test(
                 plan.scene,

@@ -1,4 +1,4 @@
-"""What a run has so far: the filter's state and the reports of its episodes, and both as arrays."""
+"""What a run has so far: the optimiser's state and its episodes' reports, and both as arrays."""
 
 import dataclasses
 from typing import NamedTuple
@@ -21,7 +21,8 @@ class History(NamedTuple):
       trials: Outcomes, every array of shape (episode, particle, trial).
       cost: Mean cost of each particle, shape (episode, particle).
       weight: Normalised weights, shape (episode, particle).
-      ancestors: Row of the population that each new particle copies, shape (episode, particle).
+      ancestors: Row of the population that each new particle copies, -1 if it is from an earlier
+        episode, shape (episode, particle).
     """
 
     population: np.ndarray
@@ -67,7 +68,7 @@ class Record:
     """What a run has so far; the content of a checkpoint.
 
     Attributes:
-      state: State of the particle filter.
+      state: State of the optimiser.
       history: Reports of the episodes.
       test: Outcomes of the final test, shape (particle, trial), or None before it.
     """
@@ -81,9 +82,14 @@ class Record:
         """Number of finished episodes."""
         return int(self.state.episode)
 
-    def last_outcomes(self) -> Outcome:
-        """Outcomes in the last episode of the final particles, shape (particle, trial)."""
+    def last_outcomes(self) -> Outcome | None:
+        """Outcomes in the last episode of the final particles, shape (particle, trial).
+
+        None if some of them are from earlier episodes, chosen by their outcomes there.
+        """
         kept = self.history.ancestors[self.done - 1]
+        if (kept < 0).any():
+            return None
         return jax.tree.map(lambda v: jnp.asarray(v[self.done - 1][kept]), self.history.trials)
 
 
@@ -91,6 +97,8 @@ def to_arrays(record: Record) -> dict:
     """Returns a record as nested dictionaries of NumPy arrays."""
     s, h = record.state, record.history
     state = {"particles": s.particles, "episode": s.episode, "key": jax.random.key_data(s.key)}
+    if s.memory is not None:
+        state["memory"] = s.memory
     arrays = {"state": state, "history": h._asdict() | {"trials": h.trials._asdict()}}
     if record.test is not None:
         arrays["test"] = record.test._asdict()
@@ -101,6 +109,7 @@ def from_arrays(arrays: dict) -> Record:
     """Inverse of `to_arrays`; the history is copied, so that `report` may write to it."""
     s, h = arrays["state"], jax.tree.map(np.array, arrays["history"])
     key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
-    state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key)
+    memory = jax.tree.map(jnp.asarray, s.get("memory"))
+    state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
     test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
     return Record(state, History(**(h | {"trials": Outcome(**h["trials"])})), test)

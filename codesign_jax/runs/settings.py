@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax import engines
+from codesign_jax import engines, optimize
 from codesign_jax.optimize import MAX_PARTICLES, schedule
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.hand import Hand
@@ -26,6 +26,7 @@ class Settings:
       episodes: Episodes.
       seed: Root of all random draws.
       test_trials: Further trials in which the final particles are tested; 0 for no test.
+      optimizer: One of `optimize.NAMES`.
     """
 
     preset: str
@@ -37,6 +38,7 @@ class Settings:
     episodes: int
     seed: int
     test_trials: int
+    optimizer: str = optimize.NAMES[0]
 
     @property
     def grasps(self) -> int:
@@ -73,13 +75,14 @@ def make_settings(
     trials: int | None = None,
     episodes: int | None = None,
     test_trials: int | None = None,
+    optimizer: str = optimize.NAMES[0],
 ) -> Settings:
     """Fills sizes that are not given with the paper's: those of 2D for "2d", of 23D otherwise."""
     sizes = _SIZES.get(preset, _SIZES_OTHERWISE)
     asked = (particles, trials, episodes, test_trials)
     chosen = (s if a is None else a for a, s in zip(asked, sizes, strict=True))
     n, t, e, test = chosen
-    return Settings(preset, schedule, first, engine, n, t, e, seed, test)
+    return Settings(preset, schedule, first, engine, n, t, e, seed, test, optimizer)
 
 
 def masks_of(scene: Scene, settings: Settings) -> np.ndarray:
@@ -109,6 +112,8 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     if settings.engine not in engines.NAMES:
         hint = schema.nearest(settings.engine, engines.NAMES)
         found.append(f"--engine = {settings.engine!r} is not valid; {hint}")
+    if problem := optimize.problem(settings.optimizer, max(settings.particles, 0) or None):
+        found.append(f"--optimizer: {problem}")
     space = None
     if hand is not None:
         try:

@@ -1,0 +1,194 @@
+"""evosax's CMA-ES, particle swarm and random search as optimisers of a design space.
+
+The strategies work on unit coordinates, 0 at a parameter's lower and 1 at its upper bound. They are
+told the points that they asked for, while what is evaluated is their mirror image inside the bounds
+with the constraint applied, so that they see a periodic landscape without walls (as in Hansen's
+pycma, ``BoundTransform``).
+
+Sources: Hansen (2016), "The CMA evolution strategy: a tutorial", arXiv:1604.00772; Kennedy and
+Eberhart (1995), "Particle swarm optimization"; Lange (2022), "evosax", arXiv:2212.04180.
+"""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from codesign_jax.optimize.bounds import Space, reflect
+from codesign_jax.optimize.protocol import (
+    Info,
+    State,
+    check_start,
+    check_told,
+    episode_key,
+    summarize,
+)
+from codesign_jax.optimize.resampling import MAX_PARTICLES
+
+# Four ASCII letters each, as the particle filter's.
+STREAM_ASK = 0x61736B20
+"""Stream of the strategy's draws in ``ask`` ("ask ")."""
+STREAM_TELL = 0x74656C6C
+"""Stream of its draws in ``tell`` ("tell")."""
+STREAM_START = 0x73747274
+"""Stream of a swarm's first positions ("strt")."""
+
+LEAST = {"cma-es": 2, "pso": 1, "random": 1}
+"""The strategies, and the fewest particles that each can rank."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Evolution:
+    """A strategy of evosax behind ``init``, ``ask`` and ``tell``.
+
+    The state's particles are the best ones so far, best first; among equal costs newer ones come
+    first. Closed parameters have the values of the best one. When a schedule opens other parameters
+    the strategy starts anew around the best one: what it had learnt is about other parameters, and
+    the selection says nothing about closed ones.
+
+    Attributes:
+        space: Bounds and constraint of the parameters.
+        name: "cma-es", from the seed particle; "pso", a swarm over the whole box that the seed
+            particle attracts first; "random", uniform in the box.
+        sigma: First standard deviation of CMA-ES as a fraction of the parameter range; pycma's
+            documentation advises a quarter of the domain.
+    """
+
+    space: Space
+    name: str = dataclasses.field(metadata={"static": True})
+    sigma: float = dataclasses.field(default=0.25, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        """Check the static fields.
+
+        Raises:
+            ValueError: If there is no such strategy or ``sigma`` is not positive.
+            ModuleNotFoundError: If evosax is not installed.
+        """
+        if self.name not in LEAST or not self.sigma > 0:
+            raise ValueError(f"need a name of {', '.join(LEAST)} and sigma > 0: {self}")
+        try:
+            import evosax  # noqa: F401
+        except ModuleNotFoundError as error:
+            message = f"{self.name} needs evosax: pip install 'codesign-jax[baselines]'"
+            raise ModuleNotFoundError(message, name=error.name) from error
+
+    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
+        """The state before episode 0; see ``Optimizer.init``.
+
+        Raises:
+            TypeError: If ``key`` is not a typed key.
+            ValueError: If the shape of the seed particle or the number of particles is wrong.
+        """
+        seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
+        if num_particles < LEAST[self.name]:
+            raise ValueError(f"{num_particles=}: {self.name} needs at least {LEAST[self.name]}")
+        particles = jnp.tile(seed, (num_particles, 1))
+        state = State(particles, jnp.zeros((), jnp.int32), key)
+        memory = {
+            "mask": jnp.ones(seed.shape, bool),
+            "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
+            "strategy": _arrays(self._start(state)),
+        }
+        return state._replace(memory=memory)
+
+    def ask(self, state: State, mask: ArrayLike) -> jax.Array:
+        """Particles to evaluate; see ``Optimizer.ask``.
+
+        The constraint of the space may change a closed parameter, as with the particle filter.
+        """
+        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        unit, _ = self._asked(state, mask)
+        moved = reflect(low + unit * (high - low), low, high)
+        kept = jnp.where(jnp.any(mask), state.particles[:1], state.particles)
+        return self.space.constrain(jnp.where(mask, moved, kept).astype(state.particles.dtype))
+
+    def tell(
+        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[State, Info]:
+        """The next state and the episode's report; see ``Optimizer.tell``.
+
+        Raises:
+            ValueError: If shapes do not match.
+        """
+        assert state.memory is not None
+        cost = check_told(state, population, cost)
+        ranked = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+        # CMA-ES knows ranks only. evosax gives equal costs a common weight below their share, which
+        # shrinks the steps on a plateau such as "every grasp is lost"; rows are a fair draw.
+        told = jnp.argsort(jnp.argsort(ranked)) if self.name == "cma-es" else ranked
+        strategy, (unit, asked) = self._strategy(state), self._asked(state, mask)
+        key = episode_key(state, STREAM_TELL)
+        new, _ = strategy.algorithm.tell(key, unit, told.astype(unit.dtype), asked, strategy.params)
+        # Newer particles come first, so that they win among equal costs.
+        costs = jnp.concatenate([ranked, state.memory["cost"]])
+        best = jnp.argsort(costs)[: cost.shape[0]]
+        memory = {
+            "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
+            "cost": costs[best],
+            "strategy": _arrays(new),
+        }
+        particles = jnp.concatenate([population, state.particles])[best]
+        ancestors = jnp.where(best < cost.shape[0], best, -1).astype(jnp.int32)
+        next_state = State(particles, state.episode + 1, state.key, memory)
+        return next_state, summarize(cost, jnp.ones_like(cost), ancestors)
+
+    def _asked(self, state: State, mask: ArrayLike) -> tuple[jax.Array, Any]:
+        """Points of the strategy in unit coordinates, and the strategy's state with them."""
+        assert state.memory is not None
+        strategy, start = self._strategy(state), self._start(state)
+        same = jnp.all(mask == state.memory["mask"])
+        kept = jax.tree.map(
+            lambda old, new: jnp.where(same, old, new), state.memory["strategy"], _arrays(start)
+        )
+        key = episode_key(state, STREAM_ASK)
+        return strategy.algorithm.ask(key, start.replace(**kept), strategy.params)
+
+    def _start(self, state: State) -> Any:
+        """The strategy's state as it starts around the best particle."""
+        algorithm, params = self._strategy(state)
+        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        best = (state.particles[0] - low) / jnp.where(high > low, high - low, 1)
+        key = episode_key(state, STREAM_START)
+        if self.name != "pso":
+            return algorithm.init(key, best, params)
+        swarm = jax.random.uniform(key, state.particles.shape, best.dtype).at[0].set(best)
+        # Nothing of it is evaluated yet. Among equal fitness the first is the swarm's best.
+        return algorithm.init(key, swarm, jnp.full(len(swarm), jnp.inf, best.dtype), params)
+
+    def _strategy(self, state: State) -> "_Strategy":
+        return _build(self.name, *state.particles.shape, self.sigma, str(state.particles.dtype))
+
+
+class _Strategy(NamedTuple):
+    algorithm: Any
+    params: Any
+
+
+@functools.lru_cache(maxsize=32)
+def _build(name: str, particles: int, width: int, sigma: float, dtype: str) -> _Strategy:
+    """A strategy; one for each size, as JAX tells them apart by identity."""
+    from evosax.algorithms import CMA_ES, PSO, RandomSearch
+
+    # Its numbers must not be tracers of the program that happens to ask for it first.
+    with jax.ensure_compile_time_eval():
+        point = jnp.zeros(width, dtype)
+        if name == "random":
+            uniform = functools.partial(jax.random.uniform, shape=(width,), dtype=dtype)
+            algorithm = RandomSearch(particles, point, uniform)
+        else:
+            algorithm = (CMA_ES if name == "cma-es" else PSO)(particles, point)
+        params = algorithm.default_params
+        if name == "cma-es":
+            params = params.replace(std_init=jnp.asarray(sigma, dtype))
+        return _Strategy(algorithm, params)
+
+
+def _arrays(state: Any) -> dict[str, jax.Array]:
+    """A strategy's state as arrays by name; their types do not depend on where they come from."""
+    fields = {f.name: jnp.asarray(getattr(state, f.name)) for f in dataclasses.fields(state)}
+    return {name: jax.lax.convert_element_type(v, v.dtype) for name, v in fields.items()}

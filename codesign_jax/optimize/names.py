@@ -1,0 +1,47 @@
+"""Optimisers by name."""
+
+import difflib
+import importlib.util
+
+from codesign_jax.optimize.bounds import Space
+from codesign_jax.optimize.evolution import LEAST, Evolution
+from codesign_jax.optimize.particle_filter import ParticleFilter
+from codesign_jax.optimize.protocol import Optimizer
+
+NAMES = ("particle-filter", *LEAST)
+"""The optimisers; all but the first are evosax's."""
+
+
+def make_optimizer(name: str, space: Space) -> Optimizer:
+    """An optimiser with its default constants; those of the particle filter are the paper's.
+
+    Args:
+        name: One of ``NAMES``.
+        space: Bounds and constraint of the parameters.
+
+    Raises:
+        ValueError: If there is no such optimiser.
+        ModuleNotFoundError: If it needs evosax, which is not installed.
+    """
+    if name not in NAMES:
+        raise ValueError(problem(name))
+    return ParticleFilter(space) if name == NAMES[0] else Evolution(space, name)
+
+
+def problem(name: str, num_particles: int | None = None) -> str | None:
+    """What speaks against an optimiser, in words; None if nothing does.
+
+    Args:
+        name: Its name.
+        num_particles: Particles of a run, to be checked as well.
+    """
+    if name not in NAMES:
+        near = difflib.get_close_matches(name, NAMES, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        return f"unknown optimizer {name!r}; {hint}Valid: {', '.join(NAMES)}"
+    if name in LEAST and importlib.util.find_spec("evosax") is None:
+        return f"{name} needs evosax: pip install 'codesign-jax[baselines]'"
+    least = LEAST.get(name, 1)
+    if num_particles is not None and num_particles < least:
+        return f"{name} ranks its particles: it needs at least {least}, got {num_particles}"
+    return None

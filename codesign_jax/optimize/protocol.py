@@ -1,0 +1,172 @@
+"""What every optimiser has in common: ``init``, ``ask`` and ``tell``, a state and a report.
+
+One episode of any of them is
+
+    population = optimizer.ask(state, mask)
+    state, info = optimizer.tell(state, population, cost, mask)
+
+with the simulation in between. All three functions are pure and work under ``jit``, ``vmap`` over
+a leading run axis of state, mask and cost, and ``lax.scan``.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from codesign_jax.optimize.bounds import Space
+
+
+class State(NamedTuple):
+    """What one episode hands to the next.
+
+    Attributes:
+        particles: What the run has found so far, which the final test takes: the particles after
+            resampling of the particle filter, the best ones so far of other optimisers; shape
+            (particle, parameter).
+        episode: Number of finished episodes, int32, scalar.
+        key: Root key. It never changes: draws fold in stream and episode, so they do not depend on
+            the point of resumption.
+        memory: What else the optimiser remembers, as nested dictionaries of arrays, so that it can
+            be saved as it is; None if there is nothing.
+    """
+
+    particles: jax.Array
+    episode: jax.Array
+    key: jax.Array
+    memory: dict[str, Any] | None = None
+
+
+class Info(NamedTuple):
+    """What one episode reports.
+
+    Attributes:
+        cost: Costs as given, shape (particle,).
+        weight: Normalised weights, shape (particle,); equal where no cost is finite, and for an
+            optimiser that does not weigh.
+        ancestors: Row of the population that each new particle of the state copies, -1 if it is
+            from an earlier episode; int32, shape (particle,).
+        best_index: Row of the population with the lowest finite cost, int32, scalar.
+        best_cost: Lowest finite cost, inf if there is none, scalar.
+        mean_cost: Mean of the finite costs, inf if there are none, scalar.
+        effective_sample_size: ``1 / sum(weight**2)``, between 1 and the number of particles.
+    """
+
+    cost: jax.Array
+    weight: jax.Array
+    ancestors: jax.Array
+    best_index: jax.Array
+    best_cost: jax.Array
+    mean_cost: jax.Array
+    effective_sample_size: jax.Array
+
+
+class Optimizer(Protocol):
+    """What ``codesign.make_episode`` and ``make_run`` take; also one of your own.
+
+    It is an argument of jitted programs and so has to be a pytree, such as a dataclass registered
+    with ``jax.tree_util.register_dataclass``: arrays as leaves, everything else static.
+    """
+
+    @property
+    def space(self) -> Space:
+        """Bounds and constraint of the parameters."""
+        ...
+
+    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
+        """The state before episode 0.
+
+        Args:
+            key: Typed key from ``jax.random.key``; the root of all draws of this run.
+            seed_particle: Parameters to start from, shape (parameter,).
+            num_particles: Particles that every episode evaluates.
+        """
+        ...
+
+    def ask(self, state: State, mask: ArrayLike) -> jax.Array:
+        """Particles to evaluate, shape (particle, parameter), inside the space.
+
+        Args:
+            state: Current state.
+            mask: True where a parameter is open, bool, shape (parameter,). Closed parameters have
+                values of the state's particles. Where all are closed, the result is these
+                particles: that is how particles are tested with an episode's own program.
+        """
+        ...
+
+    def tell(
+        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[State, Info]:
+        """The state of the next episode and what happened in this one.
+
+        Args:
+            state: State that ``population`` was asked from.
+            population: Evaluated particles, shape (particle, parameter).
+            cost: Mean cost over the trials of each particle, shape (particle,); lower is better,
+                and what is not finite has failed.
+            mask: Mask that ``population`` was asked with.
+        """
+        ...
+
+
+def check_start(
+    space: Space, key: jax.Array, seed_particle: ArrayLike, num_particles: int, most: int
+) -> jax.Array:
+    """Checks the arguments of ``init``; returns the seed particle as an array of floats.
+
+    Raises:
+        TypeError: If ``key`` is not a typed key.
+        ValueError: If the shape of the seed particle or the number of particles is wrong.
+    """
+    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        raise TypeError(f"key must be a typed key from jax.random.key, got {key.dtype}")
+    seed_particle = jnp.asarray(seed_particle, float)
+    if seed_particle.shape != jnp.shape(space.low):
+        raise ValueError(f"{seed_particle.shape=}, expected {jnp.shape(space.low)}")
+    if not 1 <= num_particles <= most:
+        raise ValueError(f"{num_particles=}, expected 1 to {most}")
+    return seed_particle
+
+
+def check_told(state: State, population: jax.Array, cost: ArrayLike) -> jax.Array:
+    """Checks the arguments of ``tell``; returns the costs as an array of the population's type.
+
+    Raises:
+        ValueError: If shapes do not match.
+    """
+    cost = jnp.asarray(cost, population.dtype)
+    if population.shape != state.particles.shape or cost.shape != population.shape[:1]:
+        raise ValueError(
+            f"{population.shape=}, {cost.shape=} do not match {state.particles.shape=}"
+        )
+    return cost
+
+
+def episode_key(state: State, stream: int) -> jax.Array:
+    """Key of one stream of draws in the state's episode."""
+    return jax.random.fold_in(jax.random.fold_in(state.key, stream), state.episode)
+
+
+def summarize(cost: jax.Array, weight: jax.Array, ancestors: jax.Array) -> Info:
+    """The report of an episode.
+
+    Args:
+        cost: Costs, shape (particle,).
+        weight: Weights, not necessarily normalised, shape (particle,).
+        ancestors: See ``Info``.
+    """
+    finite = jnp.isfinite(cost)
+    ranked = jnp.where(finite, cost, jnp.inf)
+    best = jnp.argmin(ranked).astype(jnp.int32)
+    mean = jnp.where(finite, cost, 0).sum() / jnp.maximum(finite.sum(), 1)
+    weight = weight / weight.sum()
+    return Info(
+        cost=cost,
+        weight=weight,
+        ancestors=ancestors,
+        best_index=best,
+        best_cost=ranked[best],
+        mean_cost=jnp.where(finite.any(), mean, jnp.inf),
+        effective_sample_size=1 / (weight**2).sum(),
+    )

@@ -1,0 +1,247 @@
+"""Every optimiser by one protocol: what it finds, that it is evosax's, masks, resume, errors."""
+
+import sys
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import tiny
+
+from codesign_jax import codesign, optimize
+from codesign_jax.optimize import NAMES, Evolution, Space, evolution, make_optimizer, strictly_below
+from codesign_jax.runs import record as records
+from codesign_jax.runs.checkpoint import digest
+from codesign_jax.runs.record import Record
+from codesign_jax.runs.settings import make_settings
+
+EVOSAX = NAMES[1:]
+# As many parameters as in the paper, of different ranges.  Each optimiser has two programs for all
+# tests: its `ask` and `tell` at this size.
+WIDTH, PARTICLES = 23, 30
+LOW = np.linspace(-3, 1, WIDTH).astype(np.float32)
+HIGH = np.linspace(2, 100, WIDTH).astype(np.float32)
+SEED = LOW + np.float32(0.1) * (HIGH - LOW)
+TARGET = np.linspace(0.2, 0.8, WIDTH)
+OPEN = np.ones((100, WIDTH), bool)
+IS_FIRST = np.arange(WIDTH) < 9
+SWITCH = np.repeat([IS_FIRST, ~IS_FIRST], 4, axis=0)
+"""Masks of four episodes of the first nine parameters and four of the others."""
+LIMITED = 10
+
+
+def limit(particle):
+    """Keeps one of the later parameters below a limit that the first one sets."""
+    return particle.at[LIMITED].set(strictly_below(particle[LIMITED], 10 * particle[0] + 60))
+
+
+SPACE = Space(LOW, HIGH, limit)
+ask = jax.jit(lambda optimizer, *rest: optimizer.ask(*rest))
+tell = jax.jit(lambda optimizer, *rest: optimizer.tell(*rest))
+
+
+def sphere(population):
+    """Squared distance to the target in units of the range: a random design costs 3, as a grasp."""
+    unit = (population - LOW) / (HIGH - LOW)
+    return (30 * ((unit - TARGET) ** 2).mean(-1)).astype(np.float32)
+
+
+def run(optimizer, state, masks, cost=sphere):
+    """State after episodes with these masks, and the populations and reports of each."""
+    populations, infos = [], []
+    for mask in masks:
+        population = ask(optimizer, state, mask)
+        populations.append(np.asarray(population))
+        state, info = tell(optimizer, state, population, cost(populations[-1]), mask)
+        infos.append(info)
+    return state, np.array(populations), infos
+
+
+def start(optimizer, seed=0):
+    return optimizer.init(jax.random.key(seed), SEED, PARTICLES)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def optimizer(request):
+    return make_optimizer(request.param, SPACE)
+
+
+def test_each_finds_the_minimum_better_than_random_search():
+    found = {}
+    for name in NAMES:
+        made = make_optimizer(name, SPACE)
+        ends = [run(made, start(made, seed), OPEN)[0] for seed in range(3)]
+        found[name] = np.array([sphere(np.asarray(end.particles)).min() for end in ends])
+    for name in ("particle-filter", "cma-es", "pso"):
+        assert (found[name] < found["random"]).all(), found
+    # Random search is better than a random design, and CMA-ES converges linearly on a sphere.
+    assert (found["random"] < 2).all() and (found["cma-es"] < 0.02).all(), found
+
+
+@pytest.mark.parametrize("name", EVOSAX)
+def test_populations_are_those_of_evosax_called_directly(name):
+    from evosax import algorithms
+
+    made, count = make_optimizer(name, SPACE), 4
+    _, ours, infos = run(made, start(made), OPEN[:count])
+
+    def key(stream, episode):
+        return jax.random.fold_in(jax.random.fold_in(jax.random.key(0), stream), episode)
+
+    unit, zeros = (SEED - LOW) / (HIGH - LOW), jnp.zeros(WIDTH)
+    if name == "cma-es":
+        own = algorithms.CMA_ES(PARTICLES, zeros)
+        params = own.default_params.replace(std_init=jnp.float32(0.25))
+        state = own.init(key(0, 0), unit, params)
+    elif name == "pso":
+        own = algorithms.PSO(PARTICLES, zeros)
+        params = own.default_params
+        swarm = jax.random.uniform(key(evolution.STREAM_START, 0), (PARTICLES, WIDTH))
+        state = own.init(key(0, 0), swarm.at[0].set(unit), jnp.full(PARTICLES, jnp.inf), params)
+    else:
+        uniform = partial(jax.random.uniform, shape=(WIDTH,))
+        own = algorithms.RandomSearch(PARTICLES, zeros, uniform)
+        params = own.default_params
+        state = own.init(key(0, 0), unit, params)
+    free = np.arange(WIDTH) != LIMITED
+    for episode in range(count):
+        asked, state = own.ask(key(evolution.STREAM_ASK, episode), state, params)
+        folded = 1 - np.abs(1 - np.asarray(asked, np.float64) % 2)  # mirrors at 0 and 1
+        evaluated = (ours[episode] - LOW) / (HIGH - LOW)
+        # Two programs round differently, by 1e-7, which the eigenvectors of a covariance near
+        # unity magnify by the inverse gap of its eigenvalues, some hundreds.
+        np.testing.assert_allclose(evaluated[:, free], folded[:, free], rtol=0, atol=5e-4)
+        # The costs themselves, of which CMA-ES makes its ranks.
+        told = key(evolution.STREAM_TELL, episode), asked, infos[episode].cost
+        state, _ = own.tell(*told, state, params)
+
+
+def test_bounds_and_constraint_hold(optimizer):
+    _, populations, _ = run(optimizer, start(optimizer), OPEN[:8])
+    assert (populations >= LOW).all() and (populations <= HIGH).all()
+    limits = 10 * populations[..., 0].astype(np.float64) + 60
+    # The limit is a sum of rounded float32.
+    assert (populations[..., LIMITED] < limits + 1e-5).all()
+    assert populations[..., LIMITED].std() > 1
+
+
+def test_closed_parameters_keep_their_bits(optimizer):
+    """One domain and then the other: what closes keeps a value that was found before."""
+    _, populations, _ = run(optimizer, start(optimizer), SWITCH)
+    free = np.arange(WIDTH) != LIMITED  # which may sink with its limit
+    kept = populations[:4, :, ~IS_FIRST & free]
+    np.testing.assert_array_equal(kept, np.broadcast_to(SEED[~IS_FIRST & free], kept.shape))
+    first, second = populations[:4][..., IS_FIRST], populations[4:][..., IS_FIRST]
+    rows = {row.tobytes() for row in first.reshape(-1, 9)}
+    assert len(rows) > 4 and {row.tobytes() for row in second.reshape(-1, 9)} <= rows
+    assert len(np.unique(populations[4:, :, -1])) > 4
+    if isinstance(optimizer, Evolution):  # the closed values are the best design's
+        best = sphere(populations[:4].reshape(-1, WIDTH)).argmin()
+        np.testing.assert_array_equal(second - first.reshape(-1, 9)[best], 0)
+
+
+def test_with_all_closed_the_particles_come_back(optimizer):
+    """How `codesign.evaluate_by` tests particles; every row is its own."""
+    rows = np.linspace(LOW, SEED, PARTICLES).astype(np.float32)
+    rows[:, LIMITED] = LOW[LIMITED]
+    state = start(optimizer)._replace(particles=jnp.asarray(rows))
+    np.testing.assert_array_equal(ask(optimizer, state, np.zeros(WIDTH, bool)), rows)
+
+
+def test_a_resumed_run_equals_the_uninterrupted_one_bitwise(optimizer):
+    """Through the arrays of a checkpoint, within a block of the schedule and at its switch."""
+    sizes = {"particles": PARTICLES, "trials": 1, "episodes": 8}
+    history = records.empty_history(
+        make_settings("2d", "concurrent", "control", "mujoco", 0, **sizes), WIDTH
+    )
+
+    def stored(state):
+        return records.to_arrays(Record(state, history))
+
+    whole = stored(run(optimizer, start(optimizer), SWITCH)[0])
+    for cut in (2, 4):
+        part = stored(run(optimizer, start(optimizer), SWITCH[:cut])[0])
+        again = records.from_arrays(jax.tree.map(np.array, part)).state
+        assert digest(stored(run(optimizer, again, SWITCH[cut:])[0])) == digest(whole)
+
+
+@pytest.mark.parametrize("name", EVOSAX)
+def test_the_particles_are_the_best_so_far_and_failed_ones_never(name):
+    made, good = make_optimizer(name, SPACE), np.arange(PARTICLES) % 2 == 1
+
+    def half_fail(population):
+        return np.where(good, sphere(population), np.float32("nan"))
+
+    state, populations, infos = run(made, start(made), OPEN[:5], half_fail)
+    tried, particles = populations[:, good].reshape(-1, WIDTH), np.asarray(state.particles)
+    np.testing.assert_array_equal(particles, tried[np.argsort(sphere(tried))[:PARTICLES]])
+    assert np.isfinite([info.mean_cost for info in infos]).all()
+    # What is from this episode names its row.
+    ancestors = np.asarray(infos[-1].ancestors)
+    new = ancestors >= 0
+    assert new.any() and not new.all()
+    np.testing.assert_array_equal(particles[new], populations[-1][ancestors[new]])
+    assert not np.isin(particles[~new][:, 0], populations[-1][:, 0]).any()
+
+
+def test_steps_of_cma_es_do_not_shrink_on_a_plateau():
+    """Where every grasp is lost, all costs are equal: selection is a fair draw of the rows."""
+    made = make_optimizer("cma-es", SPACE)
+    lost = np.full(PARTICLES, 3.0, np.float32)
+    state, *_ = run(made, start(made), OPEN[:40], lambda population: lost)
+    # The logarithm of the step is a random walk; told equal costs, evosax has 2e-4 here.
+    assert 0.2 < float(state.memory["strategy"]["std"]) / 0.25 < 5
+
+
+@pytest.mark.parametrize(
+    "name", ["cma-es", *(pytest.param(name, marks=pytest.mark.slow) for name in EVOSAX[1:])]
+)
+def test_a_whole_run_is_its_episodes_with_one_compile(name):
+    """Toy engine, a cost of one's own: a loop, `make_run`, and a batch of seeds."""
+    the_scene, space, engine = tiny()
+
+    def seconds_held(scene, trace, ctrl):
+        return 2.0 - (trace.distance < 0.5).sum() * scene.discretization.timestep
+
+    made = codesign.make_optimizer(name, space)
+    how = (the_scene, engine, space, made, 3)
+    episode = codesign.make_episode(*how, cost=seconds_held)
+    masks = optimize.schedule("switch-1", np.array(space.is_morphology), 4)
+    states = [made.init(jax.random.key(s), np.array([0.05, 0.0]), 8) for s in range(2)]
+    costs, state, traced = [], states[0], []
+    for mask in masks:
+        state, info = episode(state, mask)
+        costs.append(info.selection.cost)
+        traced.append(engine.traced)
+    assert len(set(traced)) == 1
+    by_episode = codesign.evaluate_by(episode, made)(state.particles, jax.random.key(5))
+    assert engine.traced == traced[0] and np.asarray(by_episode.cost).shape == (8, 3)
+    run = codesign.make_run(*how, cost=seconds_held)
+    batch = jax.tree.map(lambda *v: jnp.stack(v), *states)
+    _, infos = jax.vmap(run, (0, None))(batch, masks)
+    # A cost is a number of time steps, and two programs may round a loss to the next one.
+    step = the_scene.discretization.timestep
+    np.testing.assert_allclose(infos.selection.cost[0], costs, atol=1.01 * step)
+    assert (np.asarray(costs) != infos.selection.cost[1]).any(), "another seed is another run"
+    assert np.ptp(costs) > 0.1
+
+
+def test_unknown_names_and_wrong_numbers_are_answered_in_words():
+    with pytest.raises(ValueError, match=r"'cma_es'; did you mean 'cma-es'\? Valid: particle-fil"):
+        make_optimizer("cma_es", SPACE)
+    with pytest.raises(ValueError, match="at least 2"):
+        make_optimizer("cma-es", SPACE).init(jax.random.key(0), SEED, 1)
+    with pytest.raises(ValueError, match="sigma > 0"):
+        Evolution(SPACE, "cma-es", sigma=0.0)
+    with pytest.raises(ValueError, match="do not match"):
+        made = make_optimizer("pso", SPACE)
+        made.tell(start(made), jnp.zeros((PARTICLES, WIDTH)), np.zeros(3))
+
+
+def test_a_missing_extra_is_one_line_with_the_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "evosax", None)  # as if it were not installed
+    with pytest.raises(ModuleNotFoundError) as error:
+        make_optimizer("pso", SPACE)
+    assert str(error.value) == "pso needs evosax: pip install 'codesign-jax[baselines]'"
+    assert make_optimizer("particle-filter", SPACE).space is SPACE

@@ -28,12 +28,12 @@ PAGES |= {
 }
 # Grasps that move, for the front page, with what each shows.
 MOVING = {
-    "figures/grasp_type_1.gif": "A top grasp: short fingers close on the object's sides.",
-    "figures/grasp_type_2.gif": "A wrap: long fingers splay on the table and snap together.",
+    "figures/grasp_type_1.gif": "Top grasp: short fingers close on the object's sides.",
+    "figures/grasp_type_2.gif": "Wrap: long fingers reach past the object and curl around it.",
 }
 
 _LINK = re.compile(r"(\]\(|^\[[^\]]+\]: )([^)\s#]+)", re.M)
-_FILE_NAME = re.compile(r"\[`(?:docs/)?([\w-]+)(?:/README)?\.md`\](?=[(\[])")
+_FILE_NAME = re.compile(r"\[`?(?:docs/)?([\w-]+)(?:/README)?\.md`?\](?=[(\[])")
 _CODE = re.compile(r"(^```.*?^```)", re.S | re.M)
 _DIAGRAM = re.compile(r"^```mermaid\n.*?^```", re.S | re.M)
 

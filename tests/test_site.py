@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -114,11 +115,33 @@ def test_links_of_the_repository_become_links_of_the_site(link, page, expected):
     assert site_pages._relinked(link, source, page) == expected
 
 
+def build(root, place):
+    """Runs the recipe of `make docs` on a checkout."""
+    flags = re.search(r"\$\(BIN\)/mkdocs (.*)", (ROOT / "Makefile").read_text())[1].split()
+    command = [sys.executable, "-m", "mkdocs", *flags, "--site-dir", place]
+    return subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=300)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["nowhere.md", "physics.md#nowhere", "../scripts/nowhere.py"])
+def test_a_broken_link_fails_the_build(link, tmp_path):
+    root = tmp_path / "checkout"
+    for name in ("docs", "scripts", "notebooks", "hands", "objects"):
+        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("data"))
+    for path in (*ROOT.glob("*.md"), ROOT / "mkdocs.yml"):
+        shutil.copy(path, root)
+    with (root / "docs" / "meshes.md").open("a") as page:
+        page.write(f"\n[a link]({link})\n")
+    done = build(root, tmp_path / "site")
+    warnings = [line for line in done.stderr.splitlines() if line.startswith("WARNING")]
+    assert done.returncode and len(warnings) == 1 and link.split("#")[0] in warnings[0]
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     place = tmp_path_factory.mktemp("site")
-    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", place]
-    subprocess.run(build, cwd=ROOT, check=True, timeout=300)
+    done = build(ROOT, place)
+    assert not done.returncode, done.stderr
     return place
 
 

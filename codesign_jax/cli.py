@@ -7,7 +7,16 @@ from typing import Annotated, Literal
 
 import tyro
 
-from codesign_jax.commands.flags import Count, File, Flag, Overrides, Shown, Subject, Text
+from codesign_jax.commands.flags import (
+    Count,
+    File,
+    Flag,
+    JobParameters,
+    Overrides,
+    Shown,
+    Subject,
+    Text,
+)
 
 
 @dataclasses.dataclass
@@ -54,6 +63,10 @@ class Optimize:
     """Root of all random numbers."""
     seeds: Text = None
     """Several seeds, such as 0-9 or 1,3,5: a run of each, one after another, and a comparison."""
+    jobs: Count = None
+    """With --seeds: each run in a process of its own, so many at a time: SLURM jobs where there is
+    SLURM, else local processes."""
+    job_set: JobParameters = ()
     out: File = None
     """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED, with the optimiser before the seed if
     it is another. With --seeds a folder of run folders."""

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, engines, optimize, runs
 from codesign_jax import scene as scenes
-from codesign_jax.commands import common, reference, seeds
+from codesign_jax.commands import common, jobs, reference, seeds
 from codesign_jax.runs import AllFailed, Plan, RunResult, Settings, rates
 from codesign_jax.runs.progress import duration
 from codesign_jax.runs.scene_files import scene_texts
@@ -49,6 +49,8 @@ def main(options: "Optimize") -> int:
     if options.dry_run:
         _dry_run(scene, settings, len(chosen))
         return 0
+    if options.jobs is not None:
+        return _jobs(options, scene, folders)
     results: dict[int, RunResult | None] = {}
     for seed, folder in folders.items():
         result = results[seed] = _run(runs.with_seed(plan, seed), folder, options.fresh)
@@ -60,6 +62,16 @@ def main(options: "Optimize") -> int:
             reference.test(folder, own, count, Console(highlight=False, soft_wrap=True))
     if options.seeds is not None:
         seeds.compare(results, Console(highlight=False, soft_wrap=True))
+        seeds.write_table(results, folders)
+    return int(any(result is None for result in results.values()))
+
+
+def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
+    """Runs all seeds as jobs and compares them; returns the exit status."""
+    console = Console(highlight=False, soft_wrap=True)
+    results = jobs.run(options, scene, folders, console)
+    seeds.compare(results, console)
+    console.print(f"table: {seeds.write_table(results, folders)}", markup=False)
     return int(any(result is None for result in results.values()))
 
 
@@ -113,6 +125,8 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     )
     if options.seeds is not None and options.seed != 0:
         problems.append("--seed and --seeds exclude each other")
+    if options.jobs is not None and (options.seeds is None or options.jobs < 1):
+        problems.append("--jobs needs --seeds and at least one run at a time")
     problems += runs.check(settings, scene.hand if scene else None)
     if problems or scene is None:
         raise SceneError(problems)

@@ -1,13 +1,15 @@
 """`codesign optimize --seeds`: several runs of one program, and how they compare."""
 
+import csv
 import re
+from pathlib import Path
 
 import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import codesign
+from codesign_jax import codesign, files
 from codesign_jax.report import statistics
 from codesign_jax.runs import RunResult
 from codesign_jax.scene.schema import SceneError
@@ -58,21 +60,62 @@ def compare(results: dict[int, RunResult | None], console: Console) -> None:
         )
 
 
-def _row(result: RunResult | None) -> tuple[str, ...]:
-    """Convergence, best particle's test cost and trials kept, and successful particles."""
+COLUMNS = (
+    "seed",
+    "finished",
+    "converged_episode",
+    "best_test_cost",
+    "trials_kept",
+    "trials",
+    "successful_particles",
+    "particles",
+    "run",
+)
+"""Columns of seeds.csv; an episode from 1, empty where a run has none."""
+
+
+def write_table(results: dict[int, RunResult | None], folders: dict[int, Path]) -> Path:
+    """Writes seeds.csv beside the run folders: a row for each run, with `COLUMNS`.
+
+    Args:
+      results: Each run by its seed; None for one that could not finish.
+      folders: Run folder of each seed.
+    """
+    path = next(iter(folders.values())).parent / "seeds.csv"
+    with files.atomically(path) as part, part.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for seed, result in results.items():
+            writer.writerow([seed, int(result is not None), *_values(result), folders[seed].name])
+    return path
+
+
+def _values(result: RunResult | None) -> list[object]:
+    """Numbers of a run in the order of `COLUMNS`, without seed, finished and run."""
     if result is None or result.record is None:
-        return ("failed", "", "", "")
+        return [""] * 6
     episode = codesign.convergence_episode(result.record.history.cost.mean(1))
-    converged = "no" if episode is None else f"episode {episode + 1}"
+    first: list[object] = ["" if episode is None else episode + 1]
     if result.test is None:
-        return (converged, "", "", "")
+        return first + [""] * 5
     cost, trials = np.asarray(result.test.cost), np.asarray(result.test.trials.cost)
     best = int(cost.argmin())
     kept = int((trials[best] < codesign.SUCCESS_COST).sum())
     good = int(np.asarray(result.test.success).sum())
+    return [*first, f"{cost[best]:.9g}", kept, trials.shape[1], good, cost.size]
+
+
+def _row(result: RunResult | None) -> tuple[str, ...]:
+    """Convergence, best particle's test cost and trials kept, and successful particles."""
+    if result is None or result.record is None:
+        return ("failed", "", "", "")
+    episode, cost, kept, trials, good, particles = _values(result)
+    converged = f"episode {episode}" if episode else "no"
+    if cost == "":
+        return (converged, "", "", "")
     return (
         converged,
-        f"{cost[best]:.4f}",
-        f"{kept} of {trials.shape[1]} trials",
-        f"{good} of {cost.size} particles",
+        f"{float(str(cost)):.4f}",
+        f"{kept} of {trials} trials",
+        f"{good} of {particles} particles",
     )

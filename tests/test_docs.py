@@ -127,9 +127,10 @@ def test_links_are_found():
     assert links(text) == ["b.png", "d.md#e", "l.md"]
 
 
-def test_the_files_that_contributing_names_are_there():
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/extending.md"])
+def test_the_files_that_contributors_are_sent_to_are_there(page):
     """As paths in the checkout, the package, its engines or the structured engine."""
-    text = (ROOT / "CONTRIBUTING.md").read_text()
+    text = (ROOT / page).read_text()
     paths = re.findall(r"`((?:[a-z_]+/)+(?:[a-z_]+\.[a-z]+)?)`", text)
     package = ROOT / "codesign_jax"
     places = [ROOT, package, package / "engines", package / "engines" / "structured"]

@@ -19,7 +19,7 @@ from toy import TINY
 from codesign_jax import cli, runs
 from codesign_jax.commands import common, preflight, reference
 from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.runs import columns
+from codesign_jax.runs import choice, columns
 from codesign_jax.runs.checkpoint import Checkpoints, digest
 from codesign_jax.runs.record import to_arrays
 from codesign_jax.types import Status
@@ -460,6 +460,13 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
     assert provenance["settings"]["episodes"] == 5
     ((step, command_line),) = [(e, e.pop("command")) for e in provenance["extended"]]
     assert (step["from"], step["to"]) == (3, 5) and command_line
+    # The design that was found, wherever in the run, and one grasp of it.
+    scene, record = runs.read_run(grown)[0], choice.read_record(grown)
+    chosen, grasp = choice.choose(scene, record), choice.find_grasp(scene, record)
+    np.testing.assert_array_equal(grasp.design, chosen.design)
+    assert grasp.place[:2] == (chosen.episode + 1, chosen.row)
+    # Four trials of the test; the last episode's two are the particle filter's only.
+    assert chosen.trials.cost.shape == ((6,) if optimizer == "particle-filter" else (4,))
     before = snapshot(grown)
     assert command(*run, "--episodes", "4", "--out", grown) == 2
     assert "a run can be extended, not shortened" in capsys.readouterr().err

@@ -51,6 +51,7 @@ def test_every_example_of_the_library(short):
         exec(block, names)
     assert names["table"].shape == (2, 3)
     assert names["infos"].selection.mean_cost.shape == (5, 4)
+    assert names["best"].shape == (2,) and np.isfinite(names["info"].selection.cost).all()
     assert names["by_design"].shape == (2,) and np.isfinite(names["by_design"]).all()
     assert names["outcome"].cost.shape == (2,)
 

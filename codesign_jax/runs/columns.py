@@ -93,8 +93,9 @@ TABLES = {
         {
             "particle": _PARTICLE,
             "test_cost": "mean cost of its trials by the scene's rule for failed ones",
-            "trials": "its trials: the last episode's and the test's; the test's alone if final "
-            "particles are from earlier episodes, see `next_copies_particle`",
+            "trials": "its trials: the last episode's and the test's; with another `--optimizer` "
+            "than the particle filter the test's alone, as a particle among the best so far was "
+            "chosen by its earlier ones",
             "failed_trials": _FAILED,
             "success": f"1 if the test's cost is below {SUCCESS_COST}, else 0",
         },

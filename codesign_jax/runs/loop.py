@@ -11,7 +11,7 @@ import numpy as np
 from codesign_jax import codesign, types
 from codesign_jax.codesign import EpisodeFunction, EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import Optimizer
+from codesign_jax.optimize import NAMES, Optimizer
 from codesign_jax.runs import failures, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints
@@ -243,6 +243,8 @@ class _Loop:
         if self._tested(record):
             return
         evaluate = codesign.evaluate_by(episode, plan.optimizer)
+        # Other optimisers keep the best particles so far, whose outcomes were chosen to be good.
+        counts = settings.optimizer == NAMES[0]
         with self.progress.busy("testing the final particles") as watch:
             test = codesign.final_test(
                 plan.scene,
@@ -250,7 +252,7 @@ class _Loop:
                 record.state.particles,
                 plan.key,
                 num_trials=settings.test_trials,
-                previous=record.last_outcomes(),
+                previous=record.last_outcomes() if counts else None,
             )
         record.test = test.trials
         self._save(settings.episodes + 1, record)

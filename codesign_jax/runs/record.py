@@ -82,14 +82,12 @@ class Record:
         """Number of finished episodes."""
         return int(self.state.episode)
 
-    def last_outcomes(self) -> Outcome | None:
-        """Outcomes in the last episode of the final particles, shape (particle, trial).
+    def last_outcomes(self) -> Outcome:
+        """Outcomes in the last episode of the particle filter's final particles.
 
-        None if some of them are from earlier episodes, chosen by their outcomes there.
+        Every array has shape (particle, trial).
         """
         kept = self.history.ancestors[self.done - 1]
-        if (kept < 0).any():
-            return None
         return jax.tree.map(lambda v: jnp.asarray(v[self.done - 1][kept]), self.history.trials)
 
 

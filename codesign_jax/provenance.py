@@ -9,6 +9,7 @@ import jax
 
 _PACKAGES = (
     "codesign-jax",
+    "evosax",
     "jax",
     "jaxlib",
     "llvmlite",

@@ -138,3 +138,19 @@ evaluate = codesign.make_evaluate(
     grasping, engine, space, num_trials=2, trajectory=True, cost=height_missing
 )
 print(evaluate(designs, jax.random.key(0)).cost)
+
+# %% [markdown]
+# ## Another optimiser
+#
+# CMA-ES, a particle swarm and random search have the particle filter's interface, and so may one of
+# your own (`optimize.Optimizer`).  Here CMA-ES minimises the cost above, with as many grasps as the
+# particle filter had; its particles are the best designs so far, the best one first.
+
+# %%
+searcher = codesign.make_optimizer("cma-es", space)  # pip install 'codesign-jax[baselines]'
+search = codesign.make_run(
+    grasping, engine, space, searcher, num_trials=2, trajectory=True, cost=height_missing
+)
+end, info = search(searcher.init(jax.random.key(0), start, particles), masks)
+print("mean cost of each episode [m]:", np.round(np.asarray(info.selection.mean_cost), 3))
+print("best design [mm]:", np.round(space.in_units(np.asarray(end.particles[0])), 1))

@@ -244,4 +244,5 @@ def test_a_missing_extra_is_one_line_with_the_command(monkeypatch):
     with pytest.raises(ModuleNotFoundError) as error:
         make_optimizer("pso", SPACE)
     assert str(error.value) == "pso needs evosax: pip install 'codesign-jax[baselines]'"
+    assert optimize.problem("pso") == str(error.value)  # what the command says
     assert make_optimizer("particle-filter", SPACE).space is SPACE

@@ -86,7 +86,7 @@ def test_resolved_scene_ignores_the_working_directory(tmp_path, monkeypatch):
 
 
 def test_resolved_scene_names_units(tmp_path):
-    write_scene(scene.load(), tmp_path)
+    write_scene(scene.load("paper_spheres"), tmp_path)
     text = (tmp_path / "scene.toml").read_text()
     assert "timestep = 0.01  # s\n" in text and 'hand = "hand.toml"\n' in text
     hand = (tmp_path / "hand.toml").read_text()

@@ -68,7 +68,7 @@ def _from_flags(options: Options) -> Case:
 
 
 def _from_run(options: Options) -> Case:
-    """The final particle of a run that tested best, or the last episode's best without a test.
+    """The design of a run that tested best, or without a test the best of its last episode.
 
     Objects, accuracy and single values may differ from the run's.
     """

@@ -41,7 +41,7 @@ FAST = bool(os.environ.get("CODESIGN_FAST"))
 # %%
 effects = ("disturb", "ungrasp", "palm_object", "palm_table", "finger_table", "twist")
 grasping = scene.load(
-    "paper",
+    "paper_spheres",  # contact between fingers on the skinned hull has no derivative
     overrides={
         "discretization": {"links": 2},
         "effects": dict.fromkeys(effects, False),

@@ -6,6 +6,7 @@ finish.
 """
 
 import dataclasses
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -40,10 +41,7 @@ def executor(options: "Optimize", folder: Path) -> Any:
     Raises:
       SceneError: If submitit is missing, or a parameter is none of its own.
     """
-    try:
-        import submitit
-    except ImportError as error:
-        raise SceneError(["--jobs needs submitit: pip install 'codesign-jax[cluster]'"]) from error
+    submitit = _submitit()
     given = parameters([*chain.from_iterable(options.job_set)])
     kind = given.pop("cluster", None)
     try:
@@ -55,6 +53,24 @@ def executor(options: "Optimize", folder: Path) -> Any:
     except (NameError, TypeError, ValueError, RuntimeError) as error:
         raise SceneError([f"--job-set: {error}"]) from error
     return made
+
+
+def _submitit() -> Any:
+    """The module, without its configuration of logging, which closes every handler there is.
+
+    Raises:
+      SceneError: If it is missing.
+    """
+    ours = "SUBMITIT_LOG_LEVEL" not in os.environ
+    os.environ.setdefault("SUBMITIT_LOG_LEVEL", "NOCONFIG")
+    try:
+        import submitit
+    except ImportError as error:
+        raise SceneError(["--jobs needs submitit: pip install 'codesign-jax[cluster]'"]) from error
+    finally:
+        if ours:  # jobs log as submitit does by default
+            del os.environ["SUBMITIT_LOG_LEVEL"]
+    return submitit
 
 
 def parameters(pairs: Sequence[str]) -> dict[str, int | str]:

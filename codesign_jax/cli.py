@@ -100,8 +100,8 @@ class Evaluate(Subject):
         return evaluate.main(self)
 
 
-@dataclasses.dataclass
-class Export:
+@dataclasses.dataclass(kw_only=True)
+class Export(Subject):
     """Export a design: MuJoCo models with a player, commands, parts to cast, a build sheet.
 
     docs/export.md has every file.
@@ -109,31 +109,6 @@ class Export:
 
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
     """Folder to write to."""
-    design: Annotated[
-        tuple[tuple[str, ...], ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint=""),
-    ] = ()
-    """The design in the hand file's units, e.g. length=148 arm_z=-59; the rest is the default."""
-    run_folder: Annotated[
-        Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
-    ] = None
-    """Take scene, design space and best particle from this run folder; --accuracy, --objects, --set
-    and --engine then replace the run's."""
-    preset: str = "2d"
-    """Design space that the names belong to."""
-    hand: Text = None
-    """Hand: a built-in name or a .toml file; default: the scene's."""
-    objects: Text = None
-    """Object set: a built-in name or a .toml file; default: the scene's."""
-    scene: str = "paper"
-    """Scene: a built-in name or a .toml file."""
-    accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, reference (their errors and
-    costs: docs/accuracy.md), or a .toml."""
-    overrides: Overrides = ()
-    engine: Text = None
-    """Engine that simulates; default: the run's, or structured."""
     trials: int = 0
     """Grasps with noise to export as models, beside one without noise for each object."""
     seed: int = 0

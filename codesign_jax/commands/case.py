@@ -7,7 +7,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from codesign_jax import engines, runs
-from codesign_jax import scene as scenes
 from codesign_jax.commands import common
 from codesign_jax.runs import choice
 from codesign_jax.scene import Scene, keypaths
@@ -55,13 +54,7 @@ def find_case(options: Options) -> Case:
 
 
 def _from_flags(options: Options) -> Case:
-    scene = scenes.load(
-        options.scene,
-        hand_name=options.hand,
-        object_set=options.objects,
-        accuracy=options.accuracy,
-        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
-    )
+    scene = common.load_scene(options)
     space = design_space(scene.hand, options.preset)
     design = common.parse_design(space, [*chain.from_iterable(options.design)])
     return Case(scene, space, design, options.engine or engines.DEFAULT)

@@ -2,11 +2,14 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import chain
+from typing import Protocol
 
 import jax
 import numpy as np
 
 from codesign_jax import codesign, engines, files, types
+from codesign_jax import scene as scenes
 from codesign_jax.commands import preflight
 from codesign_jax.report import statistics
 from codesign_jax.scene import Scene, keypaths, schema
@@ -20,6 +23,31 @@ def use_compilation_cache() -> None:
         jax.config.update("jax_compilation_cache_dir", str(files.cache_folder() / "jax"))
         # Small programs too, of which a command has dozens: JAX keeps those that take a second.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+class SceneFlags(Protocol):
+    """Flags that say which scene; `flags.Subject` has their meaning."""
+
+    scene: str
+    hand: str | None
+    objects: str | None
+    accuracy: str | None
+    overrides: tuple[tuple[str, ...], ...]
+
+
+def load_scene(options: SceneFlags) -> Scene:
+    """Reads the scene that a command's flags name.
+
+    Raises:
+      SceneError: If a file or a value is wrong.
+    """
+    return scenes.load(
+        options.scene,
+        hand_name=options.hand,
+        object_set=options.objects,
+        accuracy=options.accuracy,
+        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
+    )
 
 
 def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:

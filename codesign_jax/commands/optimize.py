@@ -11,12 +11,11 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, optimize, runs
-from codesign_jax import scene as scenes
 from codesign_jax.commands import common, jobs, reference, seeds
 from codesign_jax.runs import AllFailed, Plan, RunResult, Settings, rates
 from codesign_jax.runs.progress import duration
 from codesign_jax.runs.scene_files import scene_texts
-from codesign_jax.scene import Scene, keypaths, schema
+from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import SceneError
 
@@ -33,11 +32,6 @@ def main(options: "Optimize") -> int:
     common.use_compilation_cache()
     scene, settings = resolve(options)
     chosen = [settings.seed] if options.seeds is None else seeds.parse(options.seeds)
-    problem = schema.range_problem(
-        "--reference-trials", options.reference_trials or 0, "", 0, 100_000
-    )
-    if problem:
-        raise SceneError([problem])
     # Everything that speaks against the runs, before anything that takes time.
     plan = runs.prepare(scene, settings)
     folders = {seed: _folder(options, scene, settings, seed) for seed in chosen}
@@ -102,13 +96,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         problems += common.solver_problems(
             [*chain.from_iterable(options.overrides)], options.engine or engines.DEFAULT
         )
-        scene = scenes.load(
-            options.scene,
-            hand_name=options.hand,
-            object_set=options.objects,
-            accuracy=options.accuracy,
-            overrides=keypaths.parse(chain.from_iterable(options.overrides)),
-        )
+        scene = common.load_scene(options)
     except SceneError as error:
         problems += error.problems
     settings = runs.make_settings(
@@ -127,6 +115,9 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         problems.append("--seed and --seeds exclude each other")
     if options.jobs is not None and (options.seeds is None or options.jobs < 1):
         problems.append("--jobs needs --seeds and at least one run at a time")
+    reference_trials = options.reference_trials or 0
+    problem = schema.range_problem("--reference-trials", reference_trials, "", 0, 100_000)
+    problems += [problem] if problem else []
     problems += runs.check(settings, scene.hand if scene else None)
     if problems or scene is None:
         raise SceneError(problems)

@@ -1,11 +1,10 @@
-"""The last word on a run: its best particle on fresh trials, simulated finely.
+"""Tests the best particle of a run on fresh trials at the accuracy `reference`.
 
 An optimiser picks what the errors of its simulation favour (the winner's curse), and the best of
-several final particles was chosen by the very trials that tested it.  So it meets trials that the
-run has not met, at the accuracy `reference`; docs/results.md has how much that changes.
+several final particles was chosen by the very trials that tested it.  So it is simulated again, in
+trials that the run has not met and with finer steps; docs/results.md has how much that changes.
 """
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from rich.console import Console
 from codesign_jax import codesign, engines
 from codesign_jax.commands import common
 from codesign_jax.commands.case import find_case
+from codesign_jax.commands.flags import Subject
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Settings
@@ -27,21 +27,6 @@ TRIALS = 24
 
 STREAM_REFERENCE = 0x72656665
 """Stream of their noise ("refe")."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Best:
-    """The flags of a run's best particle at another accuracy; see `case.Options`."""
-
-    run_folder: Path | None
-    engine: str | None = None
-    accuracy: str | None = ACCURACY
-    design: tuple[tuple[str, ...], ...] = ()
-    overrides: tuple[tuple[str, ...], ...] = ()
-    preset: str = "2d"
-    hand: str | None = None
-    objects: str | None = None
-    scene: str = "paper"
 
 
 def number_of_trials(asked: int | None, settings: Settings) -> int:
@@ -68,7 +53,7 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Any
     Returns:
       Outcomes of the trials, shape (trial,).
     """
-    case = find_case(_Best(folder, settings.engine))
+    case = find_case(Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY))
     evaluate = codesign.make_evaluate(
         case.scene, make_engine(case.engine, case.scene), case.space, trials
     )

@@ -34,7 +34,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--scene",
         default="paper",
-        help="built-in scene or file; by default that of docs/data/reproduction",
+        help="built-in scene or file; docs/data/reproduction has paper_spheres",
     )
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
     parser.add_argument("--preset", dest="size", choices=list(plan.OVERRIDES), help="as --size")
@@ -60,7 +60,7 @@ def parse() -> argparse.Namespace:
         help="write every trial to this .npz",
     )
     parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
-    parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
     parser.add_argument("--touching", type=Path, help="the same with contact between fingers")
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--videos", type=Path, help="folder for a video of each grasp type")

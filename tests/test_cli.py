@@ -478,6 +478,7 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
 
 
 def test_seeds_are_runs_of_their_own_and_compared(tmp_path, capsys):
+    """One after another in one program, and as jobs: local processes with the same bits."""
     short = ["--episodes", "2"]
     base = [a for a in RUN if a not in ("--seed", "3")]
     assert command(*RUN, *short, "--out", tmp_path / "alone") == 0
@@ -493,24 +494,20 @@ def test_seeds_are_runs_of_their_own_and_compared(tmp_path, capsys):
     assert "of 2 runs have a particle below the limit of success" in table
     assert "% of such runs (95 % interval)" in table
 
-
-def test_seeds_as_jobs_are_the_same_runs(tmp_path, capsys):
-    """Two local processes; the same bits and the same table as one after another."""
-    base = [*(a for a in RUN if a not in ("--seed", "3")), "--episodes", "2", "--seeds", "2-3"]
+    seeds = [*base, *short, "--seeds", "2-3"]
     jobs = ["--jobs", "2", "--job-set", "cluster=local", "timeout_min=5"]
     out = tmp_path / "jobs"
-    assert command(*base, *jobs, "--out", out) == 0
-    assert command(*base, "--out", tmp_path / "here") == 0
+    assert command(*seeds, *jobs, "--out", out) == 0
     for seed in ("seed-2", "seed-3"):
-        assert stored(out / seed) == stored(tmp_path / "here" / seed)
-    assert (out / "seeds.csv").read_bytes() == (tmp_path / "here" / "seeds.csv").read_bytes()
+        assert stored(out / seed) == stored(tmp_path / "both" / seed)
+    assert (out / "seeds.csv").read_bytes() == (tmp_path / "both" / "seeds.csv").read_bytes()
     rows = (out / "seeds.csv").read_text().splitlines()
     assert len(rows) == 3 and rows[1].startswith("2,1,")
     capsys.readouterr()
-    assert command(*base[:-2], "--jobs", "2") == 2
+    assert command(*base, *short, "--jobs", "2") == 2
     assert "--jobs needs --seeds" in capsys.readouterr().err
     for wrong, words in (("timeout_min", "must be KEY=VALUE"), ("memory=3", "memory")):
-        assert command(*base, "--jobs", "2", "--job-set", wrong, "--out", tmp_path / "no") == 2
+        assert command(*seeds, "--jobs", "2", "--job-set", wrong, "--out", tmp_path / "no") == 2
         assert words in capsys.readouterr().err
 
 

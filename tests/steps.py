@@ -44,7 +44,7 @@ def path(engine, fields, ctrl):
     return Path(*(np.asarray(found[name]) for name in Path._fields))
 
 
-def against_mujoco(scene, fields, ctrl, found):
+def against_mujoco(scene, fields, ctrl, found, stride=1):
     """Errors of a path's steps against MuJoCo C, which converges at each of its states.
 
     Args:
@@ -52,9 +52,10 @@ def against_mujoco(scene, fields, ctrl, found):
       fields: Model fields of the worlds.
       ctrl: Controls, shape (world, time, nu).
       found: The path.
+      stride: Steps between states that are compared.
 
     Returns:
-      Relative errors of the accelerations and errors of the distance [m], shape (world, time - 2),
+      Relative errors of the accelerations and errors of the distance [m], shape (world, state),
       and numbers of contacts, alike.  The start is left out: there the object is so exactly on the
       table that rounding decides whether it touches.
     """
@@ -65,7 +66,7 @@ def against_mujoco(scene, fields, ctrl, found):
         compiled = world_model(scene, own)
         compiled.opt.tolerance, compiled.opt.iterations, compiled.opt.ls_iterations = 0.0, 200, 50
         data = mujoco.MjData(compiled)
-        for k in range(1, ctrl.shape[1] - 1):
+        for k in range(1, ctrl.shape[1] - 1, stride):
             qpos, (qvel, after) = found.qpos[world, k], found.qvel[world, k : k + 2]
             data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl[world, k]
             soften(scene, own, data)

@@ -15,7 +15,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.scene import Scene
-from tests import small
+from tests import small, steps
 
 CHUNK = 50
 """Steps that a compiled program of the structured engine takes."""
@@ -93,6 +93,8 @@ class Bench:
         """Tolerance: the structured engine's; MuJoCo's is the scene's."""
         self.tolerance = tolerance
         self.scene, self.engine, self.wide = the_scene, engine, precision == "float64"
+        # As far as rounding allows where a case asks for more than the scene's tolerance.
+        self.limits = {"iterations": 100, "evaluations": 40} if tolerance < 1e-6 else {}
         assert self.wide or engine == "structured"  # MuJoCo C is built for float64
         self.h = the_scene.discretization.timestep
 
@@ -127,8 +129,17 @@ class Bench:
         qvel = np.zeros((worlds, qpos.shape[1] - 1)) if qvel is None else np.asarray(qvel)
         if self.engine == "mujoco":
             return self._mujoco(fields, ctrl, qpos, qvel)
-        with floats(self.wide):
-            return self._structured(fields._replace(start=qpos), ctrl, qvel)
+        path, (last, speed) = self._structured(fields, ctrl, qpos, qvel)
+        return History(
+            np.concatenate([path.qpos[:, 1:], last], 1),
+            np.concatenate([path.qvel[:, 1:], speed], 1),
+        )
+
+    def path(self, fields, ctrl, qpos=None, qvel=None) -> steps.Path:
+        """As `run` in the structured engine: the states before every step."""
+        qpos = fields.start if qpos is None else np.asarray(qpos)
+        qvel = np.zeros((len(ctrl), qpos.shape[1] - 1)) if qvel is None else np.asarray(qvel)
+        return self._structured(fields, ctrl, qpos, qvel)[0]
 
     def _mujoco(self, fields, ctrl, qpos, qvel) -> History:
         out = []
@@ -138,27 +149,33 @@ class Bench:
             data.qpos[:], data.qvel[:] = qpos[w], qvel[w]
             for u in ctrl[w]:
                 data.ctrl[:] = u
+                steps.soften(self.scene, small.nth(fields, w), data)
                 mujoco.mj_step(compiled, data)
                 rows.append((data.qpos.copy(), data.qvel.copy()))
             out.append([np.stack(v) for v in zip(*rows, strict=True)])
         return History(*(np.stack(v) for v in zip(*out, strict=True)))
 
-    def _structured(self, fields, ctrl, qvel) -> History:
+    def _structured(self, fields, ctrl, qpos, qvel) -> tuple[steps.Path, tuple]:
+        """States before every step, and (qpos, qvel) after the last one, (world, 1, ...)."""
         dtype = jnp.float64 if self.wide else jnp.float32
-        fields = jax.tree.map(lambda v: jnp.asarray(v, dtype), fields)
-        steps, start, advance = ctrl.shape[1], *self._program
-        hand, state = start(fields, jnp.asarray(qvel, dtype))
-        ctrl = np.concatenate([ctrl, np.repeat(ctrl[:, -1:], -steps % CHUNK, 1)], 1)
-        rows = []
-        for first in range(0, ctrl.shape[1], CHUNK):
-            row, state = advance(hand, state, jnp.asarray(ctrl[:, first : first + CHUNK], dtype))
-            rows.append(jax.tree.map(np.asarray, row))
-        return History(*(np.concatenate(v, 1)[:, :steps] for v in zip(*rows, strict=True)))
+        with floats(self.wide):
+            fields = jax.tree.map(lambda v: jnp.asarray(v, dtype), fields._replace(start=qpos))
+            count, (start, advance) = ctrl.shape[1], self._program
+            hand, state = start(fields, jnp.asarray(qvel, dtype))
+            ctrl = np.concatenate([ctrl, np.repeat(ctrl[:, -1:], -count % CHUNK, 1)], 1)
+            rows = []
+            for first in range(0, ctrl.shape[1], CHUNK):
+                part = jnp.asarray(ctrl[:, first : first + CHUNK], dtype)
+                *row, state = advance(hand, state, part)
+                rows.append([np.asarray(v, np.float64) for v in row])
+            rows = [np.concatenate(v, 1) for v in zip(*rows, strict=True)]
+        after = tuple(v[:, count - 1 : count] for v in rows[4:])
+        return steps.Path(*(v[:, :count] for v in rows[:4])), after
 
     @functools.cached_property
     def _program(self):
         """Compiled start, and compiled chunk of steps."""
-        engine = StructuredEngine(self.scene, tolerance=self.tolerance)
+        engine = StructuredEngine(self.scene, tolerance=self.tolerance, **self.limits)
 
         def start(fields, qvel):
             return world_constants(self.scene, fields), moving(engine, fields, qvel)
@@ -166,10 +183,11 @@ class Bench:
         def advance(hand, state, ctrl):
             found, end = engine.advance(hand, state, ctrl)
             last = engine.qpos(end)[:, None], engine.qvel(end)[:, None]
-            after = (found["qpos"], found["qvel"]), last
-            return tuple(
-                jnp.concatenate([a[:, 1:], b], 1) for a, b in zip(*after, strict=True)
-            ), end
+            before = [found[name] for name in steps.Path._fields]
+            after = [
+                jnp.concatenate([a[:, 1:], b], 1) for a, b in zip(before[:2], last, strict=True)
+            ]
+            return *before, *after, end
 
         return jax.jit(start), jax.jit(advance)
 

@@ -1,0 +1,94 @@
+"""MuJoCo C as the judge of single steps, and energies that it reads off states."""
+
+import mujoco
+import numpy as np
+
+from codesign_jax import model
+from codesign_jax.engines.mujoco import world_model
+from tests import small, steps
+from tests.stability.bench import bench
+from tests.stability.table import Found
+
+TIGHT = {"float32": 1e-10, "float64": 1e-24}
+"""Newton decrement at which only a precision's rounding is left of a step's forces."""
+
+ROUNDING = {"float32": 1e-4, "float64": 1e-8}
+"""Relative error of accelerations.  Float64: a difference of velocities over a step loses two of 16
+digits, and MuJoCo's own Newton stops at rounding of its cost.  Float32: places 0.1 m from the palm
+are rounded to 1e-8 m, which a contact of 2 to 4 kN/m turns into 4e-5 N, and links weigh 5 g."""
+
+STATES = 250
+"""States of a world's path that are compared with MuJoCo C, spread evenly over it."""
+
+
+def exact(base, step, precision):
+    """The structured engine's bench that solves every step to rounding."""
+    return bench(base, "structured", step, precision, TIGHT[precision])
+
+
+def along(base, step, precision, make, least=1) -> Found:
+    """Accelerations along whole paths of the structured engine against MuJoCo C.
+
+    Args:
+      base: The scene.
+      step: Factor on its time step.
+      precision: The precision.
+      make: A bench to (fields, ctrl) or (fields, ctrl, qpos, qvel).
+      least: Contacts that must exist at once somewhere, so that a path that touches nothing fails.
+
+    Returns:
+      The largest relative error of all compared states.
+    """
+    b = exact(base, step, precision)
+    fields, ctrl, *start = make(b)
+    found = b.path(fields, ctrl, *start)
+    stride = max(1, ctrl.shape[1] // STATES)
+    errors, _, touching = steps.against_mujoco(b.scene, fields, ctrl, found, stride)
+    assert touching.max() >= least, "nothing touches: the case would be vacuous"
+    error = errors.max() if np.isfinite(found.qpos).all() else np.inf
+    return Found(error, ROUNDING[precision], f"up to {touching.max()} contacts")
+
+
+class Reader:
+    """MuJoCo C's model of a world, which reads states and never steps."""
+
+    def __init__(self, the_scene, fields, world=0):
+        self.scene, self.lay = the_scene, model.layout(the_scene)
+        self.fields = small.nth(fields, world)
+        self.model = world_model(the_scene, self.fields)
+        self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
+        self.data = mujoco.MjData(self.model)
+        self.armature = np.diag(self.model.dof_armature)
+
+    def at(self, qpos, qvel=None, ctrl=None):
+        """Sets a state and computes everything of it; returns MuJoCo's data."""
+        d = self.data
+        d.qpos[:] = qpos
+        d.qvel[:] = 0.0 if qvel is None else qvel
+        if ctrl is not None:
+            d.ctrl[:] = ctrl
+        mujoco.mj_forward(self.model, d)
+        return d
+
+    def kinetic(self, qpos, qvel, dofs=slice(None)):
+        """Kinetic energy [J] of some velocities, without what implicit springs add."""
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_crb(self.model, self.data)
+        full = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, self.data, full)
+        moving = np.zeros(self.model.nv)
+        moving[dofs] = np.asarray(qvel)[dofs]
+        return 0.5 * moving @ (full - self.armature) @ moving
+
+    def pushes(self):
+        """Contacts of the present state: names of both geoms, normal force [N] and MuJoCo's row."""
+        found, force = [], np.zeros(6)
+        for i, c in enumerate(self.data.contact):
+            mujoco.mj_contactForce(self.model, self.data, i, force)
+            names = [
+                mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_GEOM, int(g)) for g in c.geom
+            ]
+            found.append((names, force[0], c))
+        return found

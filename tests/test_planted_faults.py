@@ -1,0 +1,299 @@
+"""Faults planted in the kernel's own physics: the comparison with MuJoCo C notices each of them.
+
+One kernel simulates all faults, each in a world of its own beside a world that is sound: where the
+kernel evaluates a stage of its physics, the worlds of a fault get that stage's wrong result.  So
+the proof costs one compile and not one a fault.  `test_kernel.py` and `test_structured.py` make
+the same comparison of sound kernels, with the same bounds.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from codesign_jax import model
+from codesign_jax.compiler import cache
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import Limits, Program, contacts, newton, step
+from codesign_jax.engines.structured.lanewise import lanes, lanewise
+from tests import small, steps
+
+FAR = 1e30
+DEEP = 1e6
+"""Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
+STEPS = 8
+
+
+class Fault(NamedTuple):
+    """What is wrong in a world.
+
+    Attributes:
+      stages: Wrong result by the qualified name of the stage, a function of the right stage and of
+        its arguments.
+      check: The comparison that must notice: "acceleration", "position" or "distance".
+    """
+
+    stages: dict[str, Callable]
+    check: str = "acceleration"
+
+
+# Stages of the kernel: functions that it evaluates lane by lane.
+PALM, LINK = "Step._palm.<locals>.compute", "_link"
+JAR = "BoundContacts.begin.<locals>.jar"
+RESPONSE = "BoundContacts._push.<locals>.response"
+RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
+SOLVE, ELIMINATE = "Newton.at_palm.<locals>.solve", "Newton.backward.<locals>.eliminate"
+CENTRE = "Step._forward.<locals>.link.<locals>.<lambda>"
+
+
+def link(**wrong: Callable):
+    """A wrong `_link`: functions of some of its constants, joint states and forces, by name."""
+    places = {"stiffness": (0, 4), "damping": (0, 5), "mass": (0, 1), "angle": (1, 0)}
+    places |= {"pressure": (2, 1), "gravity": (2, 3)}
+
+    def stage(right, names, parent, *groups):
+        new = [list(g) for g in groups]
+        for name, change in wrong.items():
+            group, k = places[name]
+            new[group][k] = change(groups[group][k])
+        return right(names, parent, *new)
+
+    return {LINK: stage}
+
+
+def without_gyroscopic(right, names, parent, constants, joint, forces):
+    """Of the links' forces those that velocities cause."""
+    origin, frame, vel, bias, motion = parent
+    q, rate, acc = joint
+    still = (origin, frame, 0 * vel, 0 * bias, motion), constants, (q, 0 * rate, acc), forces
+    carry, stored = right(names, parent, constants, joint, forces)
+    return carry, stored | {"smooth": right(names, *still)[1]["smooth"]}
+
+
+def cones(change: Callable):
+    """Every stage that reads the friction cone reads another one."""
+
+    def stage(right, place, cone, *rest):
+        return right(place, change(cone), *rest)
+
+    return dict.fromkeys((JAR, RESPONSE, RAY, SLOPES), stage)
+
+
+def without_moment(right, *args):
+    matrix, wrench = right(*args)
+    return matrix, jnp.concatenate([0 * wrench[:3], wrench[3:]])
+
+
+def without_reaction(right, node, *rest):
+    """The fingers' contacts push the fingers, and the object does not feel it."""
+    found, kept, work = right(node, *rest)
+    return found._replace(r_object=node.r_object), kept, work
+
+
+def at_palm(**change: Callable):
+    """A wrong stage of palm, wrist and object: functions of the wrist's stiffness or gravity."""
+    places = {"stiffness": -2, "gravity": -1}
+
+    def stage(right, *args):
+        new = list(args)
+        for name, f in change.items():
+            new[places[name]] = f(args[places[name]])
+        return right(*new)
+
+    return {PALM: stage}
+
+
+def without_table(right, now, palm, node, pushes):
+    kept = {k: jax.tree.map(jnp.zeros_like, v) for k, v in pushes.items()}
+    return right(now, palm, node, kept)
+
+
+def explicit(right, h, q, rate, acc):
+    new, _, top = right(h, q, rate, acc)
+    return new, q + h * rate, top
+
+
+def spin_in_world_axes(right, h, state, columns, *acc):
+    identity = [[jnp.full_like(columns[0, 0], i == k) for i in range(3)] for k in range(3)]
+    return right(h, state, jnp.stack([jnp.stack(c) for c in identity]), *acc)
+
+
+H = 0.01  # the scene's time step
+FAULTS = {
+    # wrong sign
+    "springs push away": Fault(link(stiffness=jnp.negative)),
+    "chambers bend outwards": Fault(link(pressure=jnp.negative)),
+    "the wrist pushes away": Fault(at_palm(stiffness=jnp.negative)),
+    # dropped terms
+    "joints without damping": Fault(link(damping=jnp.zeros_like)),
+    "links without weight": Fault(link(gravity=jnp.zeros_like)),
+    "object and palm without weight": Fault(at_palm(gravity=jnp.zeros_like)),
+    "no gyroscopic forces": Fault({LINK: without_gyroscopic}),
+    "no implicit inertia": Fault(
+        {ELIMINATE: lambda f, *a: f(*a[:6], jnp.zeros_like(a[6]), *a[7:])}
+    ),
+    "no moment of contact forces": Fault({RESPONSE: without_moment}),
+    "no reaction on the object": Fault({ELIMINATE: without_reaction}),
+    "no table under the object": Fault({SOLVE: without_table}),
+    # stale state
+    "angles of the step before": Fault(
+        {
+            LINK: lambda f, names, parent, constants, joint, forces: f(
+                names, parent, constants, (joint[0] - H * joint[1], *joint[1:]), forces
+            )
+        }
+    ),
+    "contacts without velocity": Fault(
+        {JAR: lambda f, place, cone, motion, velocity: f(place, cone, motion, 0 * velocity)}
+    ),
+    "contacts of the iteration before": Fault(
+        {"tree_add_scaled": lambda f, alpha, value, change: value}
+    ),
+    "angles after explicit Euler": Fault({"_turned": explicit}, "position"),
+    "spin in the wrong frame": Fault({"_moved": spin_in_world_axes}),
+    # wrong weight
+    "links a tenth too heavy": Fault(link(mass=lambda m: 1.1 * m)),
+    "a whole weight for half segments": Fault(
+        {CENTRE: lambda f, middle, centre, share: f(middle, centre, jnp.ones_like(share))},
+        "distance",
+    ),
+    # wrong cone
+    "twice the friction": Fault(
+        cones(lambda c: c._replace(friction=2 * c.friction, ratio=2 * c.ratio))
+    ),
+    "friction as soft as normal contact": Fault(
+        cones(lambda c: c._replace(tangent=c.normal, ratio=c.friction))
+    ),
+    "a softer contact": Fault(cones(lambda c: c._replace(spring=0.9 * c.spring))),
+}
+BOUNDS = {"acceleration": 1e-8, "position": 1e-12, "distance": 1e-12}
+"""As in test_kernel.py and test_structured.py."""
+
+
+def name_of(function: Callable) -> str:
+    return getattr(getattr(function, "func", function), "__qualname__", "")
+
+
+class Planted:
+    """Evaluates stages of the kernel, wrong in the worlds of the faults."""
+
+    def __init__(self):
+        self.world, self.used = None, set()
+
+    def __call__(self, function, *args):
+        result = lanewise(function, *args)
+        stage = name_of(function)
+        for number, (name, fault) in enumerate(FAULTS.items()):
+            if stage in fault.stages:
+                self.used.add((name, stage))
+                mine = lanes([self.world == number], (), wide=False)
+                wrong = lanewise(partial(self.wrong, fault.stages[stage], function), *args)
+                result = lanewise(self.choose, mine, wrong, result)
+        return result
+
+    @staticmethod
+    def wrong(change, function, *args):
+        given = getattr(function, "args", ())
+        return change(getattr(function, "func", function), *given, *args)
+
+    @staticmethod
+    def choose(mine, wrong, right):
+        return jax.tree.map(partial(jnp.where, mine), wrong, right)
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Path of every fault's world, and of a sound one at the end, with what MuJoCo C needs."""
+    with pytest.MonkeyPatch.context() as patch, jax.enable_x64(True):
+        scene = small.pinch("box", links=2, effects__palm_object=False, effects__palm_table=False)
+        fault = Planted()
+        for module in (contacts, newton, step):
+            patch.setattr(module, "lanewise", fault)
+        start_step = step.Step.__init__
+
+        def prepare(self, *args):
+            start_step(self, *args)
+            fault.world = self.constant("penetration").lane - DEEP
+
+        patch.setattr(step.Step, "__init__", prepare)
+        # Sound kernels must neither be found in the place of this one nor find it.
+        patch.setattr(cache, "sources", lambda *_: "planted faults")
+        patch.setattr(cache, "kept", lambda name, build: build())
+        fields, state, ctrl = touching(scene)
+        run = jax.jit(partial(simulate, scene))
+        found = run(fields, state, ctrl)
+    path = steps.Path(*(np.asarray(found[n]) for n in steps.Path._fields))
+    wanted = {(name, stage) for name, f in FAULTS.items() for stage in f.stages}
+    assert fault.used == wanted, f"stages that the kernel has no more: {wanted - fault.used}"
+    return scene, fields, np.asarray(ctrl), path
+
+
+def touching(scene):
+    """Fields, states and controls of a world for each fault and a sound one, all alike.
+
+    Both fingers press on the box and on the table and slide at decimetres a second.
+    """
+    count, random = len(FAULTS) + 1, np.random.default_rng(4)
+    hand, trial = small.hand_world(scene, length=0.1)
+    trial = trial._replace(mass=np.array(10.0))  # so that the fingers do not fling it away
+    fields, ctrl = small.world_inputs(scene, hand, trial)
+    qpos = np.array(fields.start)
+    qpos[2], qpos[3:6] = 0.1, 0.1 * random.normal(size=3)
+    bend = np.zeros(model.layout(scene).dofs.shape)
+    bend[..., 0], qpos[-5] = 0.35, qpos[-5] - 5e-4
+    qpos[6:-7] = (bend + 0.05 * random.normal(size=bend.shape)).ravel()
+    qvel = 0.3 * random.normal(size=len(qpos) - 1)
+    qvel[-4] = -0.2  # onto the table
+    ctrl = np.repeat(np.asarray(ctrl[:1]), STEPS, 0)
+    ctrl[:, :6], ctrl[:, 6:] = qpos[:6] + 0.01, 90e3
+    many = jax.tree.map(lambda v: jnp.repeat(jnp.asarray(v)[None], count, 0), (fields, ctrl))
+    return many[0], (np.repeat(qpos[None], count, 0), np.repeat(qvel[None], count, 0)), many[1]
+
+
+def simulate(scene, fields, state, ctrl):
+    """The kernel's states of a few steps; solved to rounding, so that only faults are left."""
+    hand, engine = world_constants(scene, fields), StructuredEngine(scene)
+    number = jnp.arange(len(ctrl), dtype=ctrl.dtype)[None]
+    far = FAR + 0 * number
+    hand = hand._replace(bounds=hand.bounds._replace(speed=far, penetration=DEEP + number))
+    start = engine.place(engine.reset(fields), *state)
+    program = Program.here(scene, Limits(30, 40, 1e-24), np.float64)
+    return program.simulate(hand, start, ctrl, trajectory=True, states=True)[0]
+
+
+def errors(planted, world):
+    """Errors of a world's steps by what is compared with MuJoCo C."""
+    scene, fields, ctrl, path = planted
+    one = slice(world, world + 1)
+    own = steps.Path(*(v[one] for v in path))
+    batch = jax.tree.map(lambda v: v[one], fields)
+    acceleration, far, touching = steps.against_mujoco(scene, batch, ctrl[one], own)
+    compiled, moved = world_model(scene, small.nth(fields, world)), []
+    for qpos, qvel, after in zip(own.qpos[0], own.qvel[0, 1:], own.qpos[0, 1:], strict=False):
+        expected = qpos.copy()
+        mujoco.mj_integratePos(compiled, expected, qvel, scene.discretization.timestep)
+        moved.append(np.abs(expected - after).max())
+    found = {"acceleration": acceleration.max(), "position": np.max(moved), "distance": far.max()}
+    return found, touching
+
+
+def test_the_sound_world_equals_mujoco(planted):
+    """All checks pass without a fault, and everything touches that a fault could hide in."""
+    found, touching = errors(planted, len(FAULTS))
+    assert all(found[name] < bound for name, bound in BOUNDS.items()), found
+    assert touching.max() >= 4 and touching.min() > 0
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_planted_fault_is_noticed(planted, name):
+    """By a hundred times its bound, or because nothing is left but NaN."""
+    check = FAULTS[name].check
+    found, _ = errors(planted, list(FAULTS).index(name))
+    assert not found[check] < 100 * BOUNDS[check], found

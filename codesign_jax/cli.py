@@ -62,11 +62,15 @@ class Optimize:
     seed: int = 0
     """Root of all random numbers."""
     seeds: Text = None
-    """Several seeds, such as 0-9 or 1,3,5: a run of each, one after another, and a comparison."""
+    """Several seeds, such as 0-9 or 1,3,5: a run of each, simulated in one batch, and a
+    comparison. Each is the run that it would be alone."""
     jobs: Count = None
     """With --seeds: each run in a process of its own, so many at a time: SLURM jobs where there is
     SLURM, else local processes."""
     job_set: JobParameters = ()
+    devices: Count = None
+    """Devices that share the batch; default: every GPU of this host. Results do not depend on
+    it."""
     out: File = None
     """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED, with the optimiser before the seed if
     it is another. With --seeds a folder of run folders."""

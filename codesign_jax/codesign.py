@@ -5,7 +5,7 @@ section VI.4.  Everything here is a pure function of arrays; files and progress 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +21,8 @@ from codesign_jax.optimize import (
     ParticleFilter,
     Space,
     State,
-    rejection_sample,
+    answer,
+    rejection,
 )
 from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene
@@ -302,13 +303,24 @@ def evaluate_by(episode: EpisodeFunction, optimizer: Optimizer) -> EvaluateFunct
       episode: See `make_episode`; works for as many particles as it was compiled for.
       optimizer: The episode's optimiser.
     """
-    closed = np.zeros(np.shape(optimizer.space.low), bool)
 
     def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
-        state = optimizer.init(key, population[0], len(population))
-        return episode(state._replace(particles=population), closed)[1].trials
+        return episode(*closed(optimizer, population, key))[1].trials
 
     return evaluate
+
+
+def closed(optimizer: Optimizer, population: jax.Array, key: jax.Array) -> tuple[State, np.ndarray]:
+    """State and mask of an episode that moves nothing: it simulates a population as it is.
+
+    Args:
+      optimizer: The episode's optimiser.
+      population: Particles [SI units], shape (particle, parameter).
+      key: Key from which the noise of the trials derives.
+    """
+    state = optimizer.init(key, population[0], len(population))
+    mask = np.zeros(np.shape(optimizer.space.low), bool)
+    return state._replace(particles=jnp.asarray(population)), mask
 
 
 def stream_key(key: jax.Array, stream: int, index: jax.typing.ArrayLike = 0) -> jax.Array:
@@ -341,15 +353,36 @@ def find_seed(
     Raises:
       RuntimeError: If no candidate is poor enough.
     """
+    search = seed_search(scene, optimizer, key, batch=batch, threshold=threshold)
+    return answer(search, lambda asked: evaluate(*asked))
+
+
+def seed_search(
+    scene: Scene,
+    optimizer: Optimizer,
+    key: jax.Array,
+    *,
+    batch: int,
+    threshold: float = SEED_COST,
+) -> Generator[tuple[jax.Array, jax.Array], Outcome, tuple[jax.Array, float, int]]:
+    """`find_seed` as a generator: yields (population, key), and is sent their outcomes.
+
+    Args:
+      scene: The scene.
+      optimizer: Optimiser whose space is sampled.
+      key: Root key of the run.
+      batch: Candidates of one request.
+      threshold: Cost above which a candidate is poor enough.
+    """
     noise = stream_key(key, STREAM_SCREEN)
-    seeds, costs, drawn = rejection_sample(
-        key,
-        optimizer.space,
-        lambda candidates: particle_cost(scene, evaluate(candidates, noise)),
-        1,
-        threshold=threshold,
-        batch=batch,
-    )
+    asked = rejection(key, optimizer.space, 1, threshold=threshold, batch=batch)
+    try:
+        candidates = next(asked)
+        while True:
+            outcomes = yield candidates, noise
+            candidates = asked.send(particle_cost(scene, outcomes))
+    except StopIteration as stop:
+        seeds, costs, drawn = stop.value
     return seeds[0], float(costs[0]), drawn
 
 
@@ -376,10 +409,31 @@ def final_test(
       num_trials: Further trials of each particle.
       previous: Outcomes that count as well, shape (particle, trial), such as the last episode's.
     """
+    asked = testing(scene, particles, key, num_trials=num_trials, previous=previous)
+    return answer(asked, lambda request: evaluate(*request))
+
+
+def testing(
+    scene: Scene,
+    particles: jax.Array,
+    key: jax.Array,
+    *,
+    num_trials: int,
+    previous: Outcome | None = None,
+) -> Generator[tuple[jax.Array, jax.Array], Outcome, FinalTest]:
+    """`final_test` as a generator: yields (population, key), and is sent their outcomes.
+
+    Args:
+      scene: See `final_test`, as the others.
+      particles: Particles [SI units], shape (particle, parameter).
+      key: Root key of the run.
+      num_trials: Further trials of each particle.
+      previous: Outcomes that count as well.
+    """
     parts = [] if previous is None else [previous]
     done, chunk = 0, 0
     while done < num_trials:
-        parts.append(evaluate(particles, stream_key(key, STREAM_TEST, chunk)))
+        parts.append((yield particles, stream_key(key, STREAM_TEST, chunk)))
         done, chunk = done + parts[-1].cost.shape[1], chunk + 1
     return summarize_test(scene, jax.tree.map(lambda *v: jnp.concatenate(v, axis=1), *parts))
 

@@ -126,29 +126,76 @@ def simulate(
     """
     constants = numbers(scene, constants)
     parameters.refuse_unit_slips(params)
-    axes = batch_axes(constants)
+    fields, ctrl, initial = prepare(scene, params, trials, constants)
+    trace = engine.rollout(fields, ctrl, trajectory=trajectory)
+    return judge(scene, trace, ctrl, initial, constants, cost=cost), trace
+
+
+def prepare(
+    scene: Scene, params: Params, trials: Trial, constants: Constants
+) -> tuple[model.ModelFields, jax.Array, jax.Array]:
+    """What a batch of worlds is, before an engine simulates it.
+
+    Args:
+      scene: The scene.
+      params: Parameters with leading axis (world,).
+      trials: Trials with leading axis (world,).
+      constants: Numbers of the worlds, leaves of shape () or (world,).
+
+    Returns:
+      Model fields, controls of shape (world, time, nu), and bits of `Status` that the worlds start
+      with, shape (world,).
+    """
 
     def world(p: Params, t: Trial, c: Constants) -> tuple[model.ModelFields, jax.Array]:
         own = scene.with_constants(c)
         return model.model_fields(own, p, t), control.commands(own, p, t)
 
-    def judge(t: Trace, u: jax.Array, i: jax.Array, c: Constants) -> Outcome:
+    axes = batch_axes(constants)
+    fields, ctrl = jax.vmap(world, in_axes=(0, 0, axes))(params, trials, constants)
+    return fields, ctrl, invalid_start(scene, fields)
+
+
+def judge(
+    scene: Scene,
+    trace: Trace,
+    ctrl: jax.Array | None,
+    initial: jax.Array,
+    constants: Constants,
+    *,
+    cost: CostFunction | None = None,
+) -> Outcome:
+    """Outcomes of a batch of worlds, with leading axis (world,).
+
+    Args:
+      scene: The scene.
+      trace: Their trace.
+      ctrl: Their controls, for a cost of one's own; None without one.
+      initial: Bits of `Status` that they started with, shape (world,).
+      constants: Their numbers, leaves of shape () or (world,).
+      cost: As in `simulate`.
+    """
+
+    def world(t: Trace, u: jax.Array | None, i: jax.Array, c: Constants) -> Outcome:
         return _outcome(scene.with_constants(c), cost, t, u, i)
 
-    fields, ctrl = jax.vmap(world, in_axes=(0, 0, axes))(params, trials, constants)
-    trace = engine.rollout(fields, ctrl, trajectory=trajectory)
-    initial = invalid_start(scene, fields)
     every = trace, ctrl, initial, constants
-    return jax.vmap(judge, in_axes=(0, 0, 0, axes))(*every), trace
+    return jax.vmap(world, in_axes=(0, 0, 0, batch_axes(constants)))(*every)
 
 
 def _outcome(
-    scene: Scene, own: CostFunction | None, trace: Trace, ctrl: jax.Array, initial: jax.Array
+    scene: Scene,
+    own: CostFunction | None,
+    trace: Trace,
+    ctrl: jax.Array | None,
+    initial: jax.Array,
 ) -> Outcome:
     """Outcome of one world, by the scene's cost or by one's own."""
     result = outcome(scene, trace, initial)
     if own is None:
         return result
+    if ctrl is None:
+        raise ValueError("a cost of one's own needs the controls")
     value = jnp.asarray(own(scene, trace, ctrl))
     if value.shape:
         raise ValueError(f"a cost is one number for each world, not an array {value.shape}")
@@ -203,11 +250,26 @@ def evaluate_to_end(
 
     They are None if the engine does not tell them.
     """
-    particles, count = params.length.shape[0], trials.yaw.shape[0]
-    worlds_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
-    worlds_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
-    tiled = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, constants)
+    shape = params.length.shape[0], trials.yaw.shape[0]
     result, trace = simulate(
-        scene, engine, worlds_p, worlds_t, trajectory=trajectory, cost=cost, constants=tiled
+        scene,
+        engine,
+        *crossed(params, trials),
+        trajectory=trajectory,
+        cost=cost,
+        constants=jax.tree.map(lambda v: jnp.tile(v, shape[0]) if jnp.ndim(v) else v, constants),
     )
-    return jax.tree.map(lambda v: v.reshape(particles, count, *v.shape[1:]), (result, trace.last))
+    return grid((result, trace.last), shape)
+
+
+def crossed(params: Params, trials: Trial) -> tuple[Params, Trial]:
+    """Every particle in all trials: both with leading axis (particle * trial,), particles slow."""
+    particles, count = params.length.shape[0], trials.yaw.shape[0]
+    every_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
+    every_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
+    return every_p, every_t
+
+
+def grid(tree: Any, shape: tuple[int, int]) -> Any:
+    """Arrays whose leading axis (particle * trial,) becomes two, (particle, trial)."""
+    return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), tree)

@@ -478,14 +478,14 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
 
 
 def test_seeds_are_runs_of_their_own_and_compared(tmp_path, capsys):
-    """One after another in one program, and as jobs: local processes with the same bits."""
+    """In one batch, and as jobs: local processes with the same bits."""
     short = ["--episodes", "2"]
     base = [a for a in RUN if a not in ("--seed", "3")]
     assert command(*RUN, *short, "--out", tmp_path / "alone") == 0
     capsys.readouterr()
     assert command(*base, *short, "--seeds", "2-3", "--out", tmp_path / "both") == 0
     output = capsys.readouterr().out
-    assert output.count("compiled in") == 1
+    assert output.count("compiled in") == 1 and "  2 runs  mean" in output
     assert_same_run(tmp_path / "both" / "seed-3", tmp_path / "alone")
     assert stored(tmp_path / "both" / "seed-2") != stored(tmp_path / "alone")
     table = output.split("best test cost")[1]
@@ -509,6 +509,42 @@ def test_seeds_are_runs_of_their_own_and_compared(tmp_path, capsys):
     for wrong, words in (("timeout_min", "must be KEY=VALUE"), ("memory=3", "memory")):
         assert command(*seeds, "--jobs", "2", "--job-set", wrong, "--out", tmp_path / "no") == 2
         assert words in capsys.readouterr().err
+
+
+def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch, capsys):
+    """A signal, a disk that is full for one of them, and runs that are at other episodes."""
+    base = [a for a in RUN if a not in ("--seed", "3")]
+    run = [*base, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]
+    assert command(*RUN, "--episodes", "1", "--out", tmp_path / "runs" / "seed-3") == 0
+    save = Checkpoints.save
+
+    def interrupted(store, step, arrays):
+        if step == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        save(store, step, arrays)
+
+    def full(store, step, arrays):
+        if store.folder.parent.name == "seed-5" and step == 2:
+            raise OSError("no space left")
+        save(store, step, arrays)
+
+    monkeypatch.setattr(Checkpoints, "save", interrupted)
+    assert command(*run) == 128 + signal.SIGTERM
+    assert "seed 3: extended from 1 to 3 episodes" in capsys.readouterr().out
+    first = runs.load_record(tmp_path / "runs" / "seed-3")
+    assert first is not None and first.done == 2
+    monkeypatch.setattr(Checkpoints, "save", full)
+    assert command(*run) == 1
+    output = capsys.readouterr()
+    assert "error: seed 5: no space left" in output.err
+    assert "resuming episode 3/3" in output.out and "of 2 runs have a particle" in output.out
+    monkeypatch.setattr(Checkpoints, "save", save)
+    assert command(*run) == 0
+    assert "of 3 runs have a particle" in capsys.readouterr().out
+    for seed in ("3", "5"):
+        alone = [*base, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
+        assert command(*alone) == 0
+        assert_same_run(tmp_path / "runs" / f"seed-{seed}", tmp_path / f"alone-{seed}")
 
 
 def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsys):

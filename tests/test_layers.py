@@ -18,6 +18,7 @@ start
 rollout
 programs
 codesign fit
+batch
 runs
 report
 export

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, engines, optimize, runs
 from codesign_jax.commands import common, jobs, reference, seeds
-from codesign_jax.runs import AllFailed, Plan, RunResult, Settings, rates
+from codesign_jax.runs import Plan, RunResult, Settings, rates
 from codesign_jax.runs.progress import duration
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene, schema
@@ -41,23 +41,53 @@ def main(options: "Optimize") -> int:
     notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
-        _dry_run(scene, settings, len(chosen))
+        _dry_run(scene, settings, len(chosen), options)
         return 0
     if options.jobs is not None:
         return _jobs(options, scene, folders)
+    found = runs.optimize(plan, folders, sys.argv, fresh=options.fresh, devices=options.devices)
+    _record_rate(plan, found, options.devices)
     results: dict[int, RunResult | None] = {}
-    for seed, folder in folders.items():
-        result = results[seed] = _run(runs.with_seed(plan, seed), folder, options.fresh)
-        if result is not None and result.signum:
-            return 128 + result.signum
-        count = reference.number_of_trials(options.reference_trials, settings)
-        if count and result is not None and result.test is not None:
-            own = dataclasses.replace(settings, seed=seed)
-            reference.test(folder, own, count, Console(highlight=False, soft_wrap=True))
-    if options.seeds is not None:
-        seeds.compare(results, Console(highlight=False, soft_wrap=True))
-        seeds.write_table(results, folders)
+    for seed, result in found.runs.items():
+        results[seed] = result if isinstance(result, RunResult) else None
+        if isinstance(result, Exception):
+            name = "" if options.seeds is None else f"seed {seed}: "
+            print(f"error: {name}{result}", file=sys.stderr)
+    if found.signum:
+        return 128 + found.signum
+    _tell(options, plan, results, folders)
     return int(any(result is None for result in results.values()))
+
+
+def _tell(
+    options: "Optimize",
+    plan: Plan,
+    results: dict[int, RunResult | None],
+    folders: dict[int, Path],
+) -> None:
+    """Says how each run ended, tests its design at reference, and compares several."""
+    console = Console(highlight=False, soft_wrap=True)
+    trials = reference.number_of_trials(options.reference_trials, plan.settings)
+    for seed, result in results.items():
+        if result is None:
+            continue
+        if options.seeds is not None:
+            console.print(f"seed {seed}:")
+        own = runs.with_seed(plan, seed)
+        _summarize(own, result, folders[seed])
+        if trials and result.test is not None:
+            reference.test(folders[seed], own.settings, trials, console)
+    if options.seeds is not None:
+        seeds.compare(results, console)
+        seeds.write_table(results, folders)
+
+
+def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
+    """Keeps what was measured, for estimates."""
+    timing = found.timing
+    if timing.grasps and timing.compile_seconds:
+        work = rates.work(plan.scene, plan.settings, runs=timing.runs, devices=devices)
+        rates.record(work, timing.grasps / timing.seconds, timing.compile_seconds)
 
 
 def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
@@ -67,22 +97,6 @@ def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
     seeds.compare(results, console)
     console.print(f"table: {seeds.write_table(results, folders)}", markup=False)
     return int(any(result is None for result in results.values()))
-
-
-def _run(plan: Plan, folder: Path, fresh: bool) -> RunResult | None:
-    """Runs one optimisation and says how it ended; None if it failed."""
-    try:
-        result = runs.optimize(plan, folder, sys.argv, fresh=fresh)
-    except (AllFailed, OSError, RuntimeError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return None
-    timing = result.timing
-    if timing.grasps and timing.compile_seconds:  # not a program that an earlier seed compiled
-        rate = timing.grasps / timing.seconds
-        rates.record(rates.work(plan.scene, plan.settings), rate, timing.compile_seconds)
-    if not result.signum:
-        _summarize(plan, result, folder)
-    return result
 
 
 def resolve(options: "Optimize") -> tuple[Scene, Settings]:
@@ -115,6 +129,9 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         problems.append("--seed and --seeds exclude each other")
     if options.jobs is not None and (options.seeds is None or options.jobs < 1):
         problems.append("--jobs needs --seeds and at least one run at a time")
+    available = jax.local_device_count()
+    if options.devices is not None and not 1 <= options.devices <= available:
+        problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
     reference_trials = options.reference_trials or 0
     problem = schema.range_problem("--reference-trials", reference_trials, "", 0, 100_000)
     problems += [problem] if problem else []
@@ -150,7 +167,7 @@ def _preflight(scene: Scene, settings: Settings) -> list[str]:
     return common.preflight_notes(scene, space, dict(zip(names, projected, strict=True)))
 
 
-def _dry_run(scene: Scene, settings: Settings, count: int) -> None:
+def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") -> None:
     """Prints scene, settings, grasps and what this many runs will take; see `runs.rates`."""
     for name, text in scene_texts(scene).items():
         print(f"# ---- {name}\n{text}")
@@ -159,11 +176,12 @@ def _dry_run(scene: Scene, settings: Settings, count: int) -> None:
     batch = settings.particles * settings.trials
     print(f"grasps: {settings.grasps} and at least {batch} to find the seed")
     if count > 1:
-        print(f"runs: {count}, one after another; grasps and disk are those of each")
+        print(f"runs: {count}, in one batch; grasps and disk are those of each")
     row = 40 + 12 * space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
-    found = rates.estimate(rates.work(scene, settings))
+    together = 1 if options.jobs else count
+    found = rates.estimate(rates.work(scene, settings, runs=together, devices=options.devices))
     if found is None:
         print("time: unknown; a short run with these effects and this engine measures the rate")
         return

@@ -7,7 +7,7 @@ from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Info, Optimizer, State
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
 from codesign_jax.optimize.schedule import schedule
-from codesign_jax.optimize.seeding import candidates, rejection_sample
+from codesign_jax.optimize.seeding import answer, candidates, rejection, rejection_sample
 
 __all__ = [
     "MAX_PARTICLES",
@@ -18,10 +18,12 @@ __all__ = [
     "ParticleFilter",
     "Space",
     "State",
+    "answer",
     "candidates",
     "make_optimizer",
     "problem",
     "reflect",
+    "rejection",
     "rejection_sample",
     "schedule",
     "stochastic_universal",

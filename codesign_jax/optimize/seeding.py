@@ -1,6 +1,7 @@
 """Seed particles by rejection sampling."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space
+
+T = TypeVar("T")
 
 STREAM_SEED = 0x73656564
 """Stream of the candidates ("seed")."""
@@ -68,13 +71,48 @@ def rejection_sample(
         ValueError: If a count is below 1 or ``evaluate`` returns another shape.
         RuntimeError: If ``max_batches`` did not hold enough seeds.
     """
+    asked = rejection(
+        key, space, num_seeds, threshold=threshold, batch=batch, max_batches=max_batches
+    )
+    return answer(asked, evaluate)
+
+
+def rejection(
+    key: jax.Array,
+    space: Space,
+    num_seeds: int,
+    *,
+    threshold: float = 2.0,
+    batch: int = 64,
+    max_batches: int = 100,
+) -> Generator[jax.Array, ArrayLike, tuple[jax.Array, jax.Array, int]]:
+    """``rejection_sample`` as a generator, for whoever evaluates several searches at once.
+
+    Args:
+        key: See ``rejection_sample``, as the others.
+        space: Box of the candidates.
+        num_seeds: Number of seed particles to find.
+        threshold: Cost above which a candidate is accepted.
+        batch: Candidates of one request.
+        max_batches: Requests after which to give up.
+
+    Yields:
+        Candidates, shape (particle, parameter); it is sent their costs, shape (particle,).
+
+    Returns:
+        See ``rejection_sample``.
+
+    Raises:
+        ValueError: See ``rejection_sample``.
+        RuntimeError: See ``rejection_sample``.
+    """
     if min(num_seeds, batch, max_batches) < 1:
         raise ValueError(f"counts must be at least 1: {num_seeds=}, {batch=}, {max_batches=}")
     drawn, costs = [], np.empty(0)
     accepted = np.empty(0, int)
     for start in range(0, batch * max_batches, batch):
         drawn.append(candidates(key, space, np.arange(start, start + batch)))
-        cost = np.asarray(evaluate(drawn[-1]))
+        cost = np.asarray((yield drawn[-1]))
         if cost.shape != (batch,):
             raise ValueError(f"evaluate returned shape {cost.shape} for {batch} particles")
         costs = np.concatenate([costs, cost])
@@ -87,3 +125,13 @@ def rejection_sample(
         f"{costs.size} candidates; the highest finite cost was "
         f"{np.max(costs, initial=-np.inf, where=np.isfinite(costs)):g}"
     )
+
+
+def answer(asking: Generator[Any, Any, T], reply: Callable[[Any], Any]) -> T:
+    """Answers everything that a generator asks for; returns what it returns."""
+    try:
+        request = next(asking)
+        while True:
+            request = asking.send(reply(request))
+    except StopIteration as stop:
+        return stop.value

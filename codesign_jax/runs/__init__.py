@@ -9,19 +9,20 @@ from codesign_jax.runs.loop import (
     Plan,
     RunResult,
     load_record,
-    optimize,
     prepare,
     with_seed,
 )
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, check, make_settings
 from codesign_jax.runs.tables import describe, status_counts, status_names
+from codesign_jax.runs.together import Results, optimize
 
 __all__ = [
     "AllFailed",
     "History",
     "Plan",
     "Record",
+    "Results",
     "RunResult",
     "Settings",
     "check",

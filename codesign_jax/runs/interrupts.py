@@ -14,7 +14,16 @@ T = TypeVar("T")
 
 
 class Stopped(Exception):
-    """The user asked to stop, and nothing is left to save."""
+    """The user asked to stop, and nothing is left to save.
+
+    Attributes:
+      signum: Number of the signal that came.
+    """
+
+    def __init__(self, signum: int):
+        """Takes the signal's number."""
+        super().__init__(f"stopped by signal {signum}")
+        self.signum = signum
 
 
 class Interrupts:
@@ -54,7 +63,7 @@ class Interrupts:
           Stopped: If a signal came before.
         """
         if self.signum:
-            raise Stopped
+            raise Stopped(self.signum)
         future = self._worker.submit(lambda: jax.block_until_ready(function(*arguments)))
         while not future.done():
             concurrent.futures.wait([future], timeout=0.2)

@@ -1,28 +1,36 @@
-"""The optimisation of one run: seed, episodes, final test; saved after every step and resumable."""
+"""The optimisation of one run: seed, episodes, final test; saved after every step and resumable.
+
+A run is a generator that yields the episodes it wants and is sent what became of them, so that
+`together` simulates those of several runs at once.
+"""
 
 import dataclasses
-import time
+from collections.abc import Generator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from codesign_jax import codesign, types
-from codesign_jax.codesign import EpisodeFunction, EpisodeInfo, FinalTest
+from codesign_jax.batch import Request
+from codesign_jax.codesign import EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import NAMES, Optimizer
+from codesign_jax.optimize import NAMES, Optimizer, State
 from codesign_jax.runs import failures, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints
-from codesign_jax.runs.directory import RunDirectory, open_run
-from codesign_jax.runs.interrupts import Interrupts, Stopped
+from codesign_jax.runs.directory import RunDirectory
+from codesign_jax.runs.interrupts import Stopped
 from codesign_jax.runs.progress import Progress
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
-from codesign_jax.types import Status
+from codesign_jax.types import Outcome, Status
+
+Asking = Generator[Request, tuple[State, EpisodeInfo], Any]
+"""What yields episodes and is sent the state after each and its report."""
 
 
 class AllFailed(RuntimeError):
@@ -30,10 +38,7 @@ class AllFailed(RuntimeError):
 
 
 class Plan(NamedTuple):
-    """A run that was checked and can start; see `prepare`.
-
-    `compiled` keeps the episode's program for runs that differ in their seed only.
-    """
+    """A run that was checked and can start; see `prepare`."""
 
     scene: Scene
     settings: Settings
@@ -42,21 +47,6 @@ class Plan(NamedTuple):
     optimizer: Optimizer
     mask: np.ndarray
     key: jax.Array
-    compiled: dict[str, EpisodeFunction]
-
-
-class Timing(NamedTuple):
-    """What one process's part of a run took.
-
-    Attributes:
-      compile_seconds: Compiling the episode.
-      seconds: Episodes with their saving.
-      grasps: Grasps of these episodes.
-    """
-
-    compile_seconds: float = 0.0
-    seconds: float = 0.0
-    grasps: int = 0
 
 
 class RunResult(NamedTuple):
@@ -66,13 +56,11 @@ class RunResult(NamedTuple):
       record: State and history, or None if the run was stopped before it had a seed.
       test: The final test, or None if there was none.
       signum: Signal that stopped the run early, or 0.
-      timing: What this process's episodes took.
     """
 
     record: Record | None
     test: FinalTest | None
     signum: int
-    timing: Timing = Timing()
 
 
 def prepare(scene: Scene, settings: Settings) -> Plan:
@@ -88,70 +76,43 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
         codesign.make_optimizer(settings.optimizer, space),
     )
     key = jax.random.key(settings.seed)
-    return Plan(scene, settings, engine, space, optimizer, mask, key, {})
+    return Plan(scene, settings, engine, space, optimizer, mask, key)
 
 
 def with_seed(plan: Plan, seed: int) -> Plan:
-    """The same run from another seed; it shares the program, which whoever runs first compiles."""
+    """The same run from another seed."""
     settings = dataclasses.replace(plan.settings, seed=seed)
     return plan._replace(settings=settings, key=jax.random.key(seed))
 
 
-def optimize(plan: Plan, folder: Path, command: list[str], *, fresh: bool = False) -> RunResult:
-    """Runs an optimisation in a folder, or goes on with it; the same call does both.
-
-    Args:
-      plan: The run; see `prepare`.
-      folder: Run folder.
-      command: Command line to note in the folder.
-      fresh: Deletes an earlier run in the folder first.
-
-    Raises:
-      SceneError: If the folder cannot be used; see `open_run`.
-      AllFailed: If every trial of an episode failed.
-      OSError: If an episode cannot be saved; earlier ones stay intact.
-    """
-    with (
-        open_run(folder, plan.scene, plan.settings, command, fresh=fresh) as (run, notes),
-        Checkpoints(run.checkpoints) as store,
-        Progress(plan.settings.episodes) as progress,
-    ):
-        for note in notes:
-            progress.message(note)
-        with Interrupts(progress.message) as interrupts:
-            return _Loop(plan, run, store, progress, interrupts).run()
-
-
-class _Loop:
+class Loop:
     """One process's part of a run."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        run: RunDirectory,
-        store: Checkpoints,
-        progress: Progress,
-        interrupts: Interrupts,
-    ):
+    def __init__(self, plan: Plan, run: RunDirectory, store: Checkpoints, progress: Progress):
+        """Takes the run, its open folder and checkpoints, and what to tell."""
         self.plan, self.run_directory, self.store = plan, run, store
-        self.progress, self.interrupts = progress, interrupts
-        self.timing = Timing()
+        self.progress = progress
 
-    def run(self) -> RunResult:
-        """Runs what is left of the run."""
-        record, settings = self._restore(), self.plan.settings
+    def run(self) -> Generator[Request, tuple[State, EpisodeInfo], RunResult]:
+        """Runs what is left of the run; to stop it, `Stopped` is thrown in.
+
+        Raises:
+          AllFailed: If every trial of an episode failed.
+          OSError: If an episode cannot be saved; earlier ones stay intact.
+        """
+        record, settings, signum = self._restore(), self.plan.settings, 0
         try:
             if record is None or record.done < settings.episodes or not self._tested(record):
-                episode = self._compile()
                 if record is None:
-                    record = self._seed(episode)
+                    record = yield from self._seed()
                 self._write_tables(record, 0)
-                self._episodes(record, episode)
-                self._test(record, episode)
-        except Stopped:
-            self._say(f"stopped by signal {self.interrupts.signum}; the same command resumes")
+                yield from self._episodes(record)
+                yield from self._test(record)
+        except Stopped as stop:
+            signum = stop.signum
+            self.run_directory.log(f"stopped by signal {signum}; the same command resumes")
         test = None if record is None else _final_test(self.plan, record)
-        return RunResult(record, test, self.interrupts.signum, self.timing)
+        return RunResult(record, test, signum)
 
     def _tested(self, record: Record) -> bool:
         return record.test is not None or self.plan.settings.test_trials == 0
@@ -178,18 +139,13 @@ class _Loop:
             self._say(f"all {total} episodes are done in {self.run_directory.path}")
         return record
 
-    def _seed(self, episode: EpisodeFunction) -> Record:
+    def _seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Record]:
         """Finds the seed particle and saves it as step 0."""
         plan, settings = self.plan, self.plan.settings
-        evaluate = codesign.evaluate_by(episode, plan.optimizer)
-
-        def search() -> tuple[jax.Array, float, int]:
-            return codesign.find_seed(
-                plan.scene, evaluate, plan.optimizer, plan.key, batch=settings.particles
-            )
-
+        batch = settings.particles
+        search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, batch=batch)
         with self.progress.busy("looking for a poor seed") as watch:
-            seed, cost, drawn = self.interrupts.call(search)
+            seed, cost, drawn = yield from self._evaluated(search)
         design = tables.describe(plan.space, np.asarray(seed))
         self._say(f"seed {design}: cost {cost:.3f}, candidate {drawn} ({watch.seconds:.1f} s)")
         state = plan.optimizer.init(plan.key, seed, settings.particles)
@@ -197,19 +153,27 @@ class _Loop:
         self._save(0, record)
         return record
 
-    def _episodes(self, record: Record, episode: EpisodeFunction) -> None:
+    def _evaluated(self, asking: Generator[tuple[jax.Array, jax.Array], Outcome, Any]) -> Asking:
+        """Answers what asks for populations by episodes in which nothing moves."""
+        try:
+            population, key = next(asking)
+            while True:
+                closed = codesign.closed(self.plan.optimizer, population, key)
+                _, info = yield Request(*closed)
+                population, key = asking.send(info.trials)
+        except StopIteration as stop:
+            return stop.value
+
+    def _episodes(self, record: Record) -> Asking:
         for e in range(record.done, self.plan.settings.episodes):
-            key, start = record.state.key, time.perf_counter()
+            key = record.state.key
             with self.progress.busy("simulating") as watch:
-                record.state, info = self.interrupts.call(episode, record.state, self.plan.mask[e])
+                record.state, info = yield Request(record.state, self.plan.mask[e])
             records.report(record.history, e, info)
             self._save_failures(key, e, info)
             self._save(e + 1, record)
             self._write_tables(record, e)
             self._report(record.history, e, watch.seconds)
-            spent = self.timing.seconds + time.perf_counter() - start
-            done = self.timing.grasps + info.trials.cost.size
-            self.timing = self.timing._replace(seconds=spent, grasps=done)
             _check_failures(record.history.trials.status[e], self.run_directory.path)
 
     def _save_failures(self, key: jax.Array, e: int, info: EpisodeInfo) -> None:
@@ -221,39 +185,22 @@ class _Loop:
         for path in failures.save(self.run_directory.path, e + 1, info, trials):
             self.run_directory.log(f"failed world: codesign replay {path}")
 
-    def _compile(self) -> EpisodeFunction:
-        """Compiles the episode apart, so that its time is not an episode's."""
-        plan, n = self.plan, self.plan.settings.particles
-        if "episode" in plan.compiled:
-            return plan.compiled["episode"]
-        episode = codesign.make_episode(
-            plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
-        )
-        state = plan.optimizer.init(plan.key, np.array(plan.space.low), n)  # for its shapes
-        with self.progress.busy("compiling") as watch:
-            compiled = self.interrupts.call(episode.compile, state, plan.mask[0])
-        self.timing = Timing(watch.seconds)
-        self._say(f"compiled in {watch.seconds:.1f} s (engine {plan.engine.name})")
-        plan.compiled["episode"] = compiled
-        return compiled
-
-    def _test(self, record: Record, episode: EpisodeFunction) -> None:
+    def _test(self, record: Record) -> Asking:
         """Tests the final particles once and saves the outcomes as one more step."""
         plan, settings = self.plan, self.plan.settings
         if self._tested(record):
             return
-        evaluate = codesign.evaluate_by(episode, plan.optimizer)
         # Other optimisers keep the best particles so far, whose outcomes were chosen to be good.
         counts = settings.optimizer == NAMES[0]
+        testing = codesign.testing(
+            plan.scene,
+            record.state.particles,
+            plan.key,
+            num_trials=settings.test_trials,
+            previous=record.last_outcomes() if counts else None,
+        )
         with self.progress.busy("testing the final particles") as watch:
-            test = codesign.final_test(
-                plan.scene,
-                lambda population, key: self.interrupts.call(evaluate, population, key),
-                record.state.particles,
-                plan.key,
-                num_trials=settings.test_trials,
-                previous=record.last_outcomes() if counts else None,
-            )
+            test = yield from self._evaluated(testing)
         record.test = test.trials
         self._save(settings.episodes + 1, record)
         self._write_tables(record, settings.episodes)

@@ -1,6 +1,7 @@
 """Progress on the terminal: a live bar where there is one, plain lines where not."""
 
 import time
+from typing import NamedTuple
 
 import rich.console
 import rich.progress
@@ -71,6 +72,22 @@ class Progress:
           seconds: Wall time of the episode.
           causes: Counts of the status bits, such as "SPEED 1, SOLVER_CAP 3".
         """
+        line, rate, left = self._line(done, mean, best, failed, grasps, seconds, causes)
+        self._bar.update(self._task, completed=done, description=f"{rate:.1f} grasps/s  ETA {left}")
+        self.message(line)
+        return line
+
+    def _line(
+        self,
+        done: int,
+        mean: float,
+        best: float,
+        failed: int,
+        grasps: int,
+        seconds: float,
+        causes: str,
+    ) -> tuple[str, float, str]:
+        """The line of an episode, the rate so far [grasps/s] and the time left."""
         self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
         rate = self._grasps / max(self._seconds, 1e-9)
         left = duration((self.total - done) * grasps / rate)
@@ -80,9 +97,87 @@ class Progress:
             f"episode {count}  mean {mean:.3f}  best {best:.3f}  failed {failed}/{grasps}"
             f"{reasons}  {rate:.1f} grasps/s  ETA {left}"
         )
-        self._bar.update(self._task, completed=done, description=f"{rate:.1f} grasps/s  ETA {left}")
-        self.message(line)
-        return line
+        return line, rate, left
+
+
+class _Entry(NamedTuple):
+    """What a run reported of an episode."""
+
+    done: int
+    mean: float
+    best: float
+    failed: int
+    grasps: int
+
+
+class GroupProgress(Progress):
+    """Progress of several runs at once: a line for all of them after each round."""
+
+    def __init__(self, total: int, *, console: rich.console.Console | None = None):
+        """Takes the number of episodes of each run."""
+        super().__init__(total, console=console)
+        self._entries: list[_Entry] = []
+
+    def one(self, name: str) -> "OneOfMany":
+        """The progress of one of the runs."""
+        return OneOfMany(self, name)
+
+    def add(self, entry: _Entry) -> None:
+        """Takes a run's report of an episode for the line of this round."""
+        self._entries.append(entry)
+
+    def round(self, seconds: float) -> None:
+        """Prints the line of a round that took so long; nothing if no episode ended in it."""
+        entries, self._entries = self._entries, []
+        if not entries:
+            return
+        grasps, failed = (sum(getattr(e, k) for e in entries) for k in ("grasps", "failed"))
+        self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
+        rate, first = self._grasps / max(self._seconds, 1e-9), min(e.done for e in entries)
+        left = duration((self.total - first) * grasps / rate)
+        means, bests = ([getattr(e, k) for e in entries] for k in ("mean", "best"))
+        last = max(e.done for e in entries)
+        count = f"{first:>{len(str(self.total))}}" + (f" to {last}" if last > first else "")
+        self._bar.update(
+            self._task, completed=first, description=f"{rate:.1f} grasps/s  ETA {left}"
+        )
+        self.message(
+            f"episode {count}/{self.total}  {len(entries)} runs  "
+            f"mean {min(means):.3f} to {max(means):.3f}  best {min(bests):.3f} to {max(bests):.3f}"
+            f"  failed {failed}/{grasps}  {rate:.1f} grasps/s  ETA {left}"
+        )
+
+
+class OneOfMany(Progress):
+    """Progress of a run among others: messages with its name; its lines are its log's alone."""
+
+    def __init__(self, group: GroupProgress, name: str):
+        """Takes the runs' common progress and what to call this one."""
+        super().__init__(group.total, console=group.console)
+        self._group, self._name = group, name
+
+    def message(self, text: str) -> None:
+        """Prints a line that begins with the run's name."""
+        self._group.message(f"{self._name}: {text}")
+
+    def busy(self, text: str) -> "Stopwatch":
+        """As of the group."""
+        return self._group.busy(text)
+
+    def episode(
+        self,
+        done: int,
+        *,
+        mean: float,
+        best: float,
+        failed: int,
+        grasps: int,
+        seconds: float,
+        causes: str = "",
+    ) -> str:
+        """As `Progress.episode`; what is printed is the group's line."""
+        self._group.add(_Entry(done, mean, best, failed, grasps))
+        return self._line(done, mean, best, failed, grasps, seconds, causes)[0]
 
 
 class Stopwatch:

@@ -96,26 +96,33 @@ _REFERENCE = (
 )
 
 
-def work(scene: Scene, settings: Settings) -> Work:
-    """What an episode of a run is, on this machine."""
+def work(scene: Scene, settings: Settings, *, runs: int = 1, devices: int | None = None) -> Work:
+    """What an episode is, on this machine.
+
+    Args:
+      scene: The scene.
+      settings: Settings of a run.
+      runs: Runs that are simulated at once.
+      devices: Devices that simulate; None for all.
+    """
     texts = "".join(scene_texts(scene).values())
     e, meshes = scene.effects, any(shape.mesh for shape in scene.objects.object)
     parts = [str(e.surface), *["fingers"] * bool(e.finger_finger), *["meshes"] * meshes]
     return Work(
         settings.engine,
-        _device(settings.engine),
+        _device(settings.engine, devices),
         "+".join(parts),
         scene.num_steps,
         scene.num_fingers * scene.discretization.links,
-        settings.particles * settings.trials,
+        settings.particles * settings.trials * runs,
         hashlib.sha256(texts.encode()).hexdigest()[:16],
     )
 
 
-def _device(engine: str) -> str:
+def _device(engine: str, devices: int | None) -> str:
     platform = "cpu" if engine == "mujoco" else jax.default_backend()
     if platform != "cpu":
-        return f"{platform} x1"
+        return f"{platform} x{devices or jax.local_device_count()}"
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return f"cpu x{cores or 1}"
 
@@ -143,7 +150,7 @@ def estimate(work: Work) -> Estimate | None:
     """Scales the most similar measurement; None if nothing like it was ever measured.
 
     Rates go with the steps and the links of a grasp (docs/performance.md has exponents near one),
-    on CPUs with the cores, and on a GPU with the grasps at once up to the measured number.
+    on CPUs with the cores, and on GPUs with the grasps at once of each up to the measured number.
     """
     same = [r for r in measured() if _alike(r.work, work) and r.work.device == work.device]
     kind = work.device.split(" ")[0]
@@ -154,8 +161,9 @@ def estimate(work: Work) -> Estimate | None:
     rate = best.grasps_per_second * (best.work.steps * best.work.links) / (work.steps * work.links)
     if kind == "cpu":
         rate *= _count(work.device) / _count(best.work.device)
-    elif work.grasps < best.work.grasps:
-        rate *= work.grasps / best.work.grasps
+    else:
+        devices = _count(work.device) / _count(best.work.device)
+        rate *= devices * min(1.0, work.grasps / devices / best.work.grasps)
     # What was compiled before is loaded; for another scene the slowest compile is the honest guess.
     exact = [r.compile_seconds for r in same if _program(r.work) == _program(work)]
     slowest = max((r.compile_seconds or 0.0 for r in same + shipped), default=0.0) or None

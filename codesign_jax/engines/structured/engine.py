@@ -1,12 +1,12 @@
 """Step and rollout of the structured engine behind the common interface."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.compiler import launch
-from codesign_jax.engines.base import Equal
+from codesign_jax.compiler.launch import KernelUnavailable, available
+from codesign_jax.engines.base import Equal, Staged
 from codesign_jax.engines.structured import coordinates, mesh, transforms
 from codesign_jax.engines.structured.constants import WorldConstants, world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
@@ -67,7 +67,7 @@ class StructuredEngine(Equal):
           SceneError: If a mesh's distance cannot be put on a grid.
         """
         effects.refuse(scene.effects, self.name)
-        if (reason := launch.available(jax.default_backend())) is not None:
+        if (reason := available(jax.default_backend())) is not None:
             raise _unavailable(reason)
         mesh.tables(scene)
         self.scene = scene
@@ -162,18 +162,45 @@ class StructuredEngine(Equal):
         hand, start = world_constants(self.scene, fields), self.reset(fields)
         record = {"trajectory": trajectory, "states": states}
         found, end = self._run(program, hand, start, ctrl, **record)
-        qpos = found["qpos"] if trajectory else jnp.zeros((*ctrl.shape[:2], 0), ctrl.dtype)
-        status, last = self._status(found), coordinates.flat(end)
-        trace = Trace(found["distance"], found["height"], found["speed"], qpos, status, last)
+        trace = self._trace(found, end, trajectory)
         if not states:
             return trace, None
         return trace, Path(found["qpos"], found["qvel"], found["acc"], found["moved"] > 0)
+
+    def staged(self) -> Staged:
+        """See `base.staged`: the kernel's blocks, which hold a few worlds each."""
+
+        def program(dtype: Any) -> Program:
+            return Program.here(self.scene, self.limits, dtype)
+
+        def pack(fields: ModelFields, ctrl: jax.Array) -> tuple[tuple, tuple]:
+            hand, here = world_constants(self.scene, fields), program(ctrl.dtype)
+            inputs = here.inputs(hand, self.reset(fields), ctrl)
+            return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
+
+        def launch(blocks: tuple, common: tuple) -> tuple:
+            try:
+                return tuple(program(blocks[0].dtype).execute((*blocks, *common)))
+            except KernelUnavailable as error:
+                raise _unavailable(str(error)) from error
+
+        def unpack(out: tuple, worlds: int) -> Trace:
+            found, end = program(out[0].dtype).outputs(out, worlds)
+            return self._trace(found, end, trajectory=False)
+
+        return Staged(pack, launch, unpack, joins=True)
+
+    def _trace(self, found: dict[str, jax.Array], end: State, trajectory: bool) -> Trace:
+        series = found["distance"], found["height"], found["speed"]
+        shape = (*series[0].shape, 0)
+        qpos = found["qpos"] if trajectory else jnp.zeros(shape, series[0].dtype)
+        return Trace(*series, qpos, self._status(found), coordinates.flat(end))
 
     @staticmethod
     def _run(program: Program, *args, **record) -> tuple[dict[str, jax.Array], State]:
         try:
             return program.simulate(*args, **record)
-        except launch.KernelUnavailable as error:
+        except KernelUnavailable as error:
             raise _unavailable(str(error)) from error
 
     def _status(self, found: dict[str, jax.Array]) -> jax.Array:
@@ -185,9 +212,9 @@ class StructuredEngine(Equal):
         return status | jnp.where(found["overflow"] > 0, int(Status.CONTACT_OVERFLOW), 0)
 
 
-def _unavailable(reason: str) -> launch.KernelUnavailable:
+def _unavailable(reason: str) -> KernelUnavailable:
     """The error of a device without kernels, with the engines that run there."""
-    return launch.KernelUnavailable(
+    return KernelUnavailable(
         f"engine structured cannot run here: {reason}; engine mjx runs on every device of JAX, "
         "engine mujoco on every CPU"
     )

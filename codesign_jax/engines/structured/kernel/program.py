@@ -302,22 +302,39 @@ class Program:
           nq or nv), of what is recorded; and the last states.
         """
         inputs = self.inputs(hand, state, ctrl)
+        out = self.execute(inputs, trajectory=trajectory, states=states)
+        return self.outputs(out, ctrl.shape[0], trajectory=trajectory, states=states)
+
+    def execute(
+        self, inputs: tuple, *, trajectory: bool = False, states: bool = False
+    ) -> list[jax.Array | None]:
+        """Runs the blocks, which do not depend on each other; None in the place of scratch memory.
+
+        Args:
+          inputs: See `inputs`.
+          trajectory: As in `simulate`.
+          states: As in `simulate`.
+        """
         call, outputs = self._call(inputs, trajectory, states)
         if self.backend == "interpreter":
-            out = call(*inputs)
-        else:
-            code = cache.sources(PACKAGE, UNRELATED)
-            origin = repr((self.scene.structure, self.limits, trajectory, states, code))
-            shared = (len(inputs) - 1,) if self.meshes else ()
-            kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
-            out = launch(call, inputs, outputs, kernel)
-        steps = ctrl.shape[1]
-        trace = jnp.moveaxis(out[3], 3, 1)  # (block, world, time, entry)
-        trace = trace.reshape(-1, steps, len(self.trace))[: ctrl.shape[0]]
+            return call(*inputs)
+        code = cache.sources(PACKAGE, UNRELATED)
+        origin = repr((self.scene.structure, self.limits, trajectory, states, code))
+        shared = (len(inputs) - 1,) if self.meshes else ()
+        kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
+        return launch(call, inputs, outputs, kernel)
+
+    def outputs(
+        self, out: Any, worlds: int, *, trajectory: bool = False, states: bool = False
+    ) -> tuple[dict[str, jax.Array], State]:
+        """What `simulate` returns, from what the blocks of so many worlds wrote."""
+        # (block, world, time, entry)
+        trace = jnp.moveaxis(out[3], 3, 1)
+        trace = trace.reshape(-1, trace.shape[2], len(self.trace))[:worlds]
         found = {name: trace[..., k] for k, name in enumerate(self.trace)}
         if trajectory or states:
-            found |= {k: v[: ctrl.shape[0]] for k, v in self._path(out[4], out[5], states).items()}
-        last = self.unpack_state(out[0], out[1], ctrl.shape[0])
+            found |= {k: v[:worlds] for k, v in self._path(out[4], out[5], states).items()}
+        last = self.unpack_state(out[0], out[1], worlds)
         if states:
             # A row holds the acceleration of the step before it, the solver's warm start.
             end = coordinates.flat_acc(last.acc)[:, None]

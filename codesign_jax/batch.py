@@ -1,0 +1,269 @@
+"""Episodes of many runs at once, on every device of the host.
+
+Each run has the bits that it has alone: what is computed for a run by itself (moves, noise, model
+fields, verdicts, resampling) is a program of one run's size, called once for each, and only the
+engine's blocks, which do not depend on each other (`engines.base.Staged`), are joined over the runs
+and dealt to the devices.  One larger program for everything would be no faster, and XLA would round
+it differently in the last bit, after which contact goes its own way.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax import rollout
+from codesign_jax.codesign import EpisodeInfo, episode_trials
+from codesign_jax.cost import particle_cost
+from codesign_jax.engines import Engine
+from codesign_jax.engines.base import staged
+from codesign_jax.optimize import Optimizer, State
+from codesign_jax.programs import Program, shared
+from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene.parameters import DesignSpace
+
+Device = Any
+"""A `jax.Device`, which type checkers do not know."""
+
+LIMIT = 16_384
+"""Most worlds of one device in one call; more runs are simulated group by group."""
+
+
+class Request(NamedTuple):
+    """An episode that a run wants.
+
+    Attributes:
+      state: The optimiser's state before it.
+      mask: Parameters that may move, bool, shape (parameter,).
+    """
+
+    state: State
+    mask: Any
+
+
+class _Packed(NamedTuple):
+    """A run's episode, ready to be simulated.
+
+    Attributes:
+      population: Particles [SI units], shape (particle, parameter).
+      initial: Bits of `Status` that the worlds start with, shape (world,).
+      blocks: See `engines.base.Staged`.
+      common: See `engines.base.Staged`.
+    """
+
+    population: jax.Array
+    initial: jax.Array
+    blocks: tuple
+    common: tuple
+
+
+class Batch:
+    """Runs episodes as `codesign.make_episode`'s function does, of many runs in one call.
+
+    The runs have scene, sizes and design space in common; their states, seeds and schedules differ.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        engine: Engine,
+        space: DesignSpace,
+        optimizer: Optimizer,
+        num_trials: int,
+        *,
+        devices: int | None = None,
+        limit: int = LIMIT,
+    ):
+        """Compiles nothing yet.
+
+        Args:
+          scene: The scene.
+          engine: Engine that simulates.
+          space: Design space of the particles.
+          optimizer: Optimiser over the same space.
+          num_trials: Trials of each particle in an episode.
+          devices: Number of devices that simulate; None for all of this process.
+          limit: Most worlds of one device in one call.
+
+        Raises:
+          ValueError: If there are fewer devices.
+        """
+        how = scene, engine, space, num_trials, None
+        self._before = Program(scene, _before(*how), optimizer)
+        self._after = Program(scene, _after(*how), optimizer)
+        self._launch = _launch(*how)
+        self._joins, self._trials, self._limit = staged(engine).joins, num_trials, limit
+        self.devices = take(devices)
+        self._programs: dict[Any, Callable] = {}
+
+    def compile(self, request: Request, runs: int) -> None:
+        """Compiles the programs that so many such episodes take."""
+        self._program("before", self._before.compile, *request)
+        packed = jax.eval_shape(self._before, *request)
+        total, count = min(runs, self._group(request)), len(self.devices)
+        shares = _shares(total * _length(packed.blocks), count) if self._joins else [0] * total
+        for device, share in zip(self.devices, shares, strict=False):
+            blocks = _resized(packed.blocks, share) if self._joins else packed.blocks
+            self._launcher(blocks, packed.common, device)
+        out = jax.eval_shape(self._launch, packed.blocks, packed.common)
+        self._program(
+            "after", self._after.compile, (request.state, _light(packed)), (request.mask, out)
+        )
+
+    def __call__(self, requests: Sequence[Request]) -> list[tuple[State, EpisodeInfo]]:
+        """Runs an episode for each request; states and reports in their order."""
+        found, size = [], self._group(requests[0]) if requests else 1
+        for start in range(0, len(requests), size):
+            found += self._episodes(requests[start : start + size])
+        return found
+
+    def _group(self, request: Request) -> int:
+        """Runs that are simulated in one call."""
+        worlds = len(request.state.particles) * self._trials
+        return max(1, self._limit * len(self.devices) // worlds)
+
+    def _episodes(self, requests: Sequence[Request]) -> list[tuple[State, EpisodeInfo]]:
+        before = self._program("before", self._before.compile, *requests[0])
+        packed = [before(*request) for request in requests]
+        found = self._joined(packed) if self._joins else self._one_by_one(packed)
+        results = []
+        for (state, mask), mine, out in zip(requests, packed, found, strict=True):
+            told = (state, _light(mine)), (mask, out)
+            results.append(self._program("after", self._after.compile, *told)(*told))
+        return results
+
+    def _joined(self, packed: Sequence[_Packed]) -> Sequence[tuple]:
+        """The blocks of all runs, an equal part of them on each device."""
+        home, runs, size = self.devices[0], len(packed), _length(packed[0].blocks)
+        shares = _shares(runs * size, len(self.devices))
+        parts = _deal(tuple(p.blocks for p in packed), tuple(shares))
+        running = [
+            self._call(blocks, packed[0].common, device)
+            for blocks, device in zip(parts, self.devices, strict=False)
+        ]
+        return _collect(tuple(jax.device_put(part, home) for part in running), runs)
+
+    def _one_by_one(self, packed: Sequence[_Packed]) -> list[tuple]:
+        """Every run by itself, in turn on each device."""
+        turns = zip(packed, itertools.cycle(self.devices), strict=False)
+        running = [self._call(p.blocks, p.common, device) for p, device in turns]
+        return [jax.device_put(out, self.devices[0]) for out in running]
+
+    def _call(self, blocks: tuple, common: tuple, device: Device) -> tuple:
+        """Begins to simulate on a device; returns at once."""
+        blocks, common = jax.device_put((blocks, common), device)
+        return self._launcher(blocks, common, device)(blocks, common)
+
+    def _launcher(self, blocks: tuple, common: tuple, device: Device) -> Callable:
+        place = jax.sharding.SingleDeviceSharding(device)
+
+        def lower(blocks: tuple, common: tuple) -> Callable:
+            like = jax.tree.map(
+                lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype, sharding=place), (blocks, common)
+            )
+            return self._launch.lower(*like).compile()
+
+        return self._program(device, lower, blocks, common)
+
+    def _program(self, name: Any, compile: Callable, first: Any, second: Any) -> Callable:
+        """A program for arguments of these shapes, compiled when it is first asked for."""
+        shapes = tuple(jnp.shape(v) for v in jax.tree.leaves((first, second)))
+        if (name, shapes) not in self._programs:
+            self._programs[name, shapes] = compile(first, second)
+        return self._programs[name, shapes]
+
+
+@shared
+def _before(scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, _: None) -> Callable:
+    """Moves a run's particles and prepares their worlds."""
+
+    def before(state: State, mask: Any, constants: Constants, optimizer: Optimizer) -> _Packed:
+        population = optimizer.ask(state, mask)
+        noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
+        worlds = rollout.crossed(jax.vmap(space.params)(population), noise)
+        fields, ctrl, initial = rollout.prepare(scene, *worlds, constants)
+        return _Packed(population, initial, *staged(engine).pack(fields, ctrl))
+
+    return before
+
+
+@shared
+def _launch(scene: Scene, engine: Engine, *_: Any) -> Callable:
+    return staged(engine).launch
+
+
+@shared
+def _after(scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, _: None) -> Callable:
+    """Judges a run's worlds and tells its optimiser."""
+
+    def after(
+        asked: tuple[State, _Packed],
+        found: tuple[Any, tuple],
+        constants: Constants,
+        optimizer: Optimizer,
+    ) -> tuple[State, EpisodeInfo]:
+        (state, packed), (mask, out) = asked, found
+        shape = packed.population.shape[0], num_trials
+        trace = staged(engine).unpack(out, shape[0] * shape[1])
+        outcome = rollout.judge(scene, trace, None, packed.initial, constants)
+        trials, last = rollout.grid((outcome, trace.last), shape)
+        costs = particle_cost(scene.with_constants(constants), trials)
+        new, selection = optimizer.tell(state, packed.population, costs, mask)
+        return new, EpisodeInfo(packed.population, trials, selection, last)
+
+    return after
+
+
+def take(count: int | None) -> list[Device]:
+    """The first devices of this process, by default all.
+
+    Raises:
+      ValueError: If there are not so many.
+    """
+    available = jax.local_devices()
+    if count is not None and not 1 <= count <= len(available):
+        raise ValueError(f"{count} devices asked for, {len(available)} available")
+    return available[:count]
+
+
+def _light(packed: _Packed) -> _Packed:
+    """Without what only the simulation reads."""
+    return packed._replace(blocks=(), common=())
+
+
+def _length(blocks: tuple) -> int:
+    return jax.tree.leaves(blocks)[0].shape[0]
+
+
+def _shares(total: int, parts: int) -> list[int]:
+    """Sizes of the parts that blocks are cut into: equal ones, the last may be smaller."""
+    size = -(-total // parts)
+    return [min(size, total - start) for start in range(0, total, size)]
+
+
+def _resized(blocks: tuple, count: int) -> tuple:
+    return jax.tree.map(lambda v: jax.ShapeDtypeStruct((count, *v.shape[1:]), v.dtype), blocks)
+
+
+def _deal(runs: tuple[tuple, ...], shares: tuple[int, ...]) -> Sequence[tuple]:
+    """Blocks of all runs, cut into parts of these sizes."""
+    return runs if len(runs) == len(shares) == 1 else _cut(runs, shares)
+
+
+def _collect(parts: tuple[tuple, ...], runs: int) -> Sequence[tuple]:
+    """What parts of the blocks have become, run by run."""
+    if len(parts) == runs == 1:
+        return parts
+    return _cut(parts, (sum(map(_length, parts)) // runs,) * runs)
+
+
+def _cut_now(arrays: tuple[tuple, ...], sizes: tuple[int, ...]) -> list[tuple]:
+    whole = jax.tree.map(lambda *v: jnp.concatenate(v), *arrays)
+    ends = list(itertools.accumulate(sizes, initial=0))
+    return [jax.tree.map(lambda v, a=a, b=b: v[a:b], whole) for a, b in itertools.pairwise(ends)]
+
+
+_cut = jax.jit(_cut_now, static_argnums=1)
+"""Arrays one behind the other, cut into parts of these sizes along their leading axis."""

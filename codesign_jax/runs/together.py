@@ -1,0 +1,210 @@
+"""Runs in their folders, one or many: the episodes that they want are simulated in one batch.
+
+The runs differ in their seed only.  Each has a folder of its own and may be at an episode of its
+own, as after a resumption; one that fails does not stop the others.
+"""
+
+import contextlib
+import time
+from collections.abc import Generator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from codesign_jax.batch import Batch, Request
+from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.runs.directory import open_run
+from codesign_jax.runs.interrupts import Interrupts, Stopped
+from codesign_jax.runs.loop import Loop, Plan, RunResult, with_seed
+from codesign_jax.runs.progress import GroupProgress, Progress
+
+MOST = 100
+"""Most runs at once: each holds open files.  More go on when these have ended."""
+
+FAILURES = (OSError, RuntimeError)
+"""How a run may fail: what it has cannot be saved, no seed is found, or every trial failed."""
+
+
+class Timing(NamedTuple):
+    """What the runs took.
+
+    Attributes:
+      compile_seconds: Compiling the episode; 0 if there was nothing to simulate.
+      seconds: Simulations with the saving in between.
+      grasps: Grasps of these.
+      runs: Runs that were simulated at once.
+    """
+
+    compile_seconds: float = 0.0
+    seconds: float = 0.0
+    grasps: int = 0
+    runs: int = 1
+
+
+class Results(NamedTuple):
+    """How runs ended.
+
+    Attributes:
+      runs: Result of each run by its seed, or why it failed.
+      timing: What they took; with more than `MOST` runs that of the first ones.
+    """
+
+    runs: dict[int, RunResult | Exception]
+    timing: Timing
+
+    @property
+    def signum(self) -> int:
+        """Signal that stopped the runs early, or 0."""
+        ended = (r.signum for r in self.runs.values() if isinstance(r, RunResult))
+        return max(ended, default=0)
+
+
+def optimize(
+    plan: Plan,
+    folders: Mapping[int, Path],
+    command: list[str],
+    *,
+    fresh: bool = False,
+    devices: int | None = None,
+) -> Results:
+    """Runs an optimisation of each seed, or goes on with it; the same call does both.
+
+    Args:
+      plan: The runs, whatever its seed; see `prepare`.
+      folders: Run folder of each seed.
+      command: Command line to note in the folders.
+      fresh: Deletes earlier runs in the folders first.
+      devices: Devices that simulate; None for all of this host.
+
+    Raises:
+      SceneError: If a folder cannot be used; see `open_run`.
+    """
+    found: dict[int, RunResult | Exception] = {}
+    timing, seeds = None, list(folders)
+    for start in range(0, len(seeds), MOST):
+        group = {seed: folders[seed] for seed in seeds[start : start + MOST]}
+        results = _group(plan, group, command, fresh, devices)
+        found |= results.runs
+        timing = timing or results.timing
+        if results.signum:
+            break
+    return Results(found, timing or Timing())
+
+
+def _group(
+    plan: Plan,
+    folders: Mapping[int, Path],
+    command: list[str],
+    fresh: bool,
+    devices: int | None,
+) -> Results:
+    """`optimize` of as many runs as fit into one process."""
+    total, many = plan.settings.episodes, len(folders) > 1
+    with contextlib.ExitStack() as stack:
+        progress = GroupProgress(total) if many else Progress(total)
+        stack.enter_context(progress)
+        loops = {}
+        for seed, folder in folders.items():
+            own = with_seed(plan, seed)
+            how = folder, own.scene, own.settings, command
+            run, notes = stack.enter_context(open_run(*how, fresh=fresh))
+            store = stack.enter_context(Checkpoints(run.checkpoints))
+            voice = (
+                progress.one(f"seed {seed}") if isinstance(progress, GroupProgress) else progress
+            )
+            for note in notes:
+                voice.message(note)
+            loops[seed] = Loop(own, run, store, voice)
+        interrupts = stack.enter_context(Interrupts(progress.message))
+        return _Together(plan, loops, progress, interrupts, devices).run()
+
+
+class _Together:
+    """The rounds of several runs."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        loops: Mapping[int, Loop],
+        progress: Progress,
+        interrupts: Interrupts,
+        devices: int | None,
+    ):
+        self.plan, self.loops, self.progress = plan, loops, progress
+        self.interrupts, self.timing = interrupts, Timing()
+        how = plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
+        self.batch = Batch(*how, devices=devices)
+        self.waiting: dict[int, tuple[Generator, Request]] = {}
+        self.found: dict[int, RunResult | Exception] = {}
+
+    def run(self) -> Results:
+        for seed, loop in self.loops.items():
+            self._go_on(seed, loop.run(), None)
+        try:
+            if self.waiting:
+                self._compile()
+            while self.waiting:
+                self._round()
+        except Stopped as stop:
+            self.progress.message(f"stopped by signal {stop.signum}; the same command resumes")
+            self._throw(stop)
+        except RuntimeError as error:  # what simulates all of them
+            self._throw(error)
+        signum = self.interrupts.signum
+        ended = {
+            seed: r._replace(signum=signum) if isinstance(r, RunResult) else r
+            for seed, r in sorted(self.found.items())
+        }
+        return Results(ended, self.timing)
+
+    def _go_on(self, seed: int, asking: Generator, reply: Any) -> None:
+        """Lets a run go on until it wants another episode or ends."""
+        try:
+            self.waiting[seed] = asking, asking.send(reply)
+        except StopIteration as stop:
+            self.found[seed] = stop.value
+        except FAILURES as error:
+            self._fail(seed, error)
+
+    def _compile(self) -> None:
+        """Compiles apart from the first round, so that its time is not an episode's."""
+        request = next(iter(self.waiting.values()))[1]
+        with self.progress.busy("compiling") as watch:
+            self.interrupts.call(self.batch.compile, request, len(self.waiting))
+        count, engine = len(self.batch.devices), self.plan.engine.name
+        where = f", {count} devices" if count > 1 else ""
+        message = f"compiled in {watch.seconds:.1f} s (engine {engine}{where})"
+        self.progress.message(message)
+        for seed in self.waiting:
+            self.loops[seed].run_directory.log(message)
+        self.timing = Timing(watch.seconds, runs=len(self.waiting))
+
+    def _round(self) -> None:
+        """One episode of every run that wants one."""
+        start = time.perf_counter()
+        asked = [request for _, request in self.waiting.values()]
+        answers = self.interrupts.call(self.batch, asked)
+        waiting, self.waiting = self.waiting, {}
+        for (seed, (asking, _)), reply in zip(waiting.items(), answers, strict=True):
+            self._go_on(seed, asking, reply)
+        seconds = time.perf_counter() - start
+        grasps = self.plan.settings.particles * self.plan.settings.trials * len(waiting)
+        if isinstance(self.progress, GroupProgress):
+            self.progress.round(seconds)
+        self.timing = self.timing._replace(
+            seconds=self.timing.seconds + seconds, grasps=self.timing.grasps + grasps
+        )
+
+    def _throw(self, error: Exception) -> None:
+        """Ends every run that still waits."""
+        for seed, (asking, _) in self.waiting.items():
+            try:
+                asking.throw(error)
+            except StopIteration as stop:
+                self.found[seed] = stop.value
+            except FAILURES as failure:
+                self._fail(seed, failure)
+        self.waiting = {}
+
+    def _fail(self, seed: int, error: Exception) -> None:
+        self.found[seed] = error
+        self.loops[seed].run_directory.log(f"failed: {error}")

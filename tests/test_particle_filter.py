@@ -349,7 +349,8 @@ def test_candidates_fill_the_box_and_satisfy_the_constraint():
     thickness, pressure = np.asarray(
         draw(jax.random.key(0), PRESSURE.space, np.arange(500)), np.float64
     ).T
-    assert np.all(pressure < thickness * 80e3 / 2e-3)
+    # XLA may compute the thickness twice, once for its limit, and round it at other places.
+    assert np.all(pressure < thickness * 80e3 / 2e-3 * (1 + np.finfo(np.float32).eps))
 
 
 def test_seeds_do_not_depend_on_the_batch_size():

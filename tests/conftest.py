@@ -1,8 +1,10 @@
-"""What all processes of a test session share: how XLA compiles, and a folder of its programs."""
+"""What all processes of a test session share: how programs compile, and a folder of them."""
 
 import os
 import shutil
 import tempfile
+
+import pytest
 
 from tests import quick_compile
 
@@ -25,3 +27,11 @@ def pytest_configure(config):
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
     # Small programs too: JAX keeps those that take a second.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+@pytest.fixture(scope="module")
+def optimized_kernels():
+    """Kernels as LLVM makes them for users, in modules that prove the compiler itself."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CODESIGN_KERNEL_OPTIMIZATION", "2")
+        yield

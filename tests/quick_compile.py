@@ -1,4 +1,4 @@
-"""How XLA compiles where programs run for milliseconds and compile for seconds."""
+"""How XLA and kernels compile where programs run for milliseconds and compile for seconds."""
 
 import os
 from importlib import metadata
@@ -25,7 +25,10 @@ KNOWN = ("0.10.",)
 def use(flags: tuple[str, ...] = FLAGS) -> None:
     """For this process, if it has not used JAX yet, and those that it starts.
 
-    Flags that the environment already has are left alone: XLA_FLAGS= compiles as for users.
+    What the environment already has is left alone: XLA_FLAGS= CODESIGN_KERNEL_OPTIMIZATION=2
+    compiles as for users.
     """
+    if flags == FLAGS:
+        os.environ.setdefault("CODESIGN_KERNEL_OPTIMIZATION", "0")
     if metadata.version("jaxlib").startswith(KNOWN):
         os.environ.setdefault("XLA_FLAGS", " ".join(flags))

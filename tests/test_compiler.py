@@ -12,6 +12,7 @@ from jax.experimental import pallas as pl
 from codesign_jax.compiler import thread, vector
 from codesign_jax.compiler.launch import Kernel, launch
 
+pytestmark = pytest.mark.usefixtures("optimized_kernels")
 BACKENDS = ["cpu", pytest.param("gpu", marks=pytest.mark.gpu)]
 BLOCKS = 26
 """Enough for all pairs of the special numbers below on eight lanes."""

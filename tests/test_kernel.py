@@ -1,4 +1,4 @@
-"""The rollout kernel: component-wise evaluation, assembly, and equality with MuJoCo C."""
+"""The rollout kernel: assembly, equality with MuJoCo C, and worlds that share a block."""
 
 import jax
 import jax.numpy as jnp
@@ -7,58 +7,13 @@ import pytest
 
 from codesign_jax.compiler import gpu, launch, vector
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.structured import StructuredEngine, elimination
+from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
-from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.start import invalid_start
 from tests import small, steps
 
-FINGERS, WORLDS = 4, 8
-LANES = 8
-
-
-def both(rng, shape, wide=True):
-    """The same numbers as an array and as lanes."""
-    array = rng.standard_normal((*shape, FINGERS if wide else 1, WORLDS)).astype(np.float32)
-    full = np.broadcast_to(array, (*shape, FINGERS, WORLDS))
-    parts = [jnp.asarray(p.ravel()) for p in full.reshape(-1, FINGERS, WORLDS)]
-    return jnp.asarray(array), lanes(parts, shape, wide=wide)
-
-
-def as_array(value):
-    """Lanes back as an array (..., finger, world)."""
-    shape = value.parts.shape[:-2]
-    parts = [np.broadcast_to(p, (FINGERS * WORLDS,)) for p in value.parts.ravel()]
-    return np.stack(parts).reshape(*shape, FINGERS, WORLDS)
-
-
-def test_components_equal_arrays():
-    """Eliminating a joint gives the same bits either way."""
-    rng = np.random.default_rng(0)
-    node = [both(rng, s) for s in ((6, 6), (6, 6), (6, 6), (6,), (6,))]
-    axes, arm, tau = both(rng, (3, 6)), both(rng, (3,)), both(rng, (3,), wide=False)
-
-    def step(node, axes, arm, tau):
-        # A positive definite matrix, so that the joint's is invertible.
-        eye = 6.0 * jnp.eye(6)[:, :, None, None]
-        p = eye + 0.1 * (node[0] + jnp.swapaxes(node[0], 0, 1))
-        quadratic = elimination.Quadratic(p, *node[1:])
-        return elimination.eliminate(lambda f, *a: f(*a), quadratic, axes, arm**2 + 1.0, tau)
-
-    want = step([n[0] for n in node], axes[0], arm[0], tau[0])
-    got = lanewise(step, [n[1] for n in node], axes[1], arm[1], tau[1])
-    got = jax.tree.leaves(got, is_leaf=lambda x: isinstance(x, Lanes))
-    for a, b in zip(jax.tree.leaves(want), got, strict=True):
-        # XLA may fuse a multiplication with an addition: a few units in the last place.
-        np.testing.assert_allclose(as_array(b), a, rtol=2e-5, atol=2e-5)
-
-
-def test_sums_over_lanes_are_refused():
-    """Lanes do not see each other."""
-    _, x = both(np.random.default_rng(0), (3,))
-    with pytest.raises(NotImplementedError, match="over the lanes"):
-        lanewise(lambda v: v.sum(1), x)
+pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,8 @@ from codesign_jax.compiler import cache, cpu, ffi, gpu, host, launch, vector
 from codesign_jax.compiler.layout import OUTPUT, SCRATCH, Array, Layout
 from tests import frames, kernels
 
+pytestmark = pytest.mark.usefixtures("optimized_kernels")
+
 LAYOUT = Layout(
     (
         Array((2, 8), "float32"),
@@ -179,6 +181,21 @@ def test_kept_code_runs_in_another_process_on_several_devices(folder):
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_code_that_is_not_optimized_is_other_code_with_the_same_result(folder, monkeypatch):
+    """For programs that run for milliseconds; a level that LLVM has not is refused."""
+    x, table = kernels.numbers(3)
+    found = []
+    for level in ("2", "0"):
+        monkeypatch.setenv(host.OPTIMIZATION, level)
+        found.append(jax.jit(partial(kernels.run, rounds=8))(x, table))
+        assert len(list(folder.rglob("*.kernel"))) == len(found)
+    # The chaotic map multiplies a difference by up to 3.9 in each of eight rounds.
+    np.testing.assert_allclose(*found, atol=3.9**8 * 6e-8)
+    monkeypatch.setenv(host.OPTIMIZATION, "3")
+    with pytest.raises(ValueError, match="CODESIGN_KERNEL_OPTIMIZATION = '3' must be 0 or 2"):
+        jax.jit(kernels.run)(x, table)
 
 
 # What a handler refuses

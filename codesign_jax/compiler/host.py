@@ -1,7 +1,12 @@
-"""Machine code of this computer's processor, made and loaded by LLVM.  Needs llvmlite."""
+"""Machine code of this computer's processor, made and loaded by LLVM.  Needs llvmlite.
+
+The environment variable CODESIGN_KERNEL_OPTIMIZATION says how much LLVM optimises: 2, the default,
+or 0, which takes half of LLVM's time, for programs that run for milliseconds.
+"""
 
 import ctypes
 import functools
+import os
 import threading
 from typing import Any
 
@@ -10,6 +15,7 @@ import llvmlite.binding as binding
 
 from codesign_jax.compiler import ffi, handler
 
+OPTIMIZATION = "CODESIGN_KERNEL_OPTIMIZATION"
 LOCK = threading.RLock()
 """Held while a kernel is compiled and registered."""
 
@@ -23,14 +29,27 @@ def vector_bytes() -> int:
     return 64 if features.get("avx512f") else 32 if features.get("avx") else 16
 
 
-def identity() -> tuple[str, ...]:
+def identity() -> tuple[object, ...]:
     """What machine code of this processor depends on besides its source."""
     return (
+        _level(),
         llvmlite.__version__,
         binding.get_default_triple(),
         binding.get_host_cpu_name(),
         binding.get_host_cpu_features().flatten(),
     )
+
+
+def _level() -> int:
+    """LLVM's level of optimisation.
+
+    Raises:
+      ValueError: If the environment states one that is neither 0 nor 2.
+    """
+    text = os.environ.get(OPTIMIZATION, "2")
+    if text not in ("0", "2"):
+        raise ValueError(f"{OPTIMIZATION} = {text!r} must be 0 or 2")
+    return int(text)
 
 
 def _machine() -> Any:
@@ -46,10 +65,13 @@ def _machine() -> Any:
 
 def compile(text: str) -> bytes:
     """Object file of a program in LLVM's language."""
+    # At level 0 the machine code is still chosen at level 2. At 0 that would take a fourth of the
+    # time, but multiplications and additions are fused here and not there, and the bits of a world
+    # then depend on its neighbours.
     machine = _machine()
     module = binding.parse_assembly(text)
     module.triple = machine.triple
-    options = binding.create_pipeline_tuning_options(speed_level=2)
+    options = binding.create_pipeline_tuning_options(speed_level=_level())
     # Everything is in vectors already, and loops over links are to stay loops.
     options.slp_vectorization = options.loop_vectorization = options.loop_unrolling = False
     builder = binding.create_pass_builder(machine, options)

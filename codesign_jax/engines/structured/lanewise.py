@@ -6,6 +6,7 @@ is evaluated with every component as a separate value over the lanes (finger, wo
 rearranging happens at trace time and only arithmetic is left.
 """
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Callable
@@ -14,6 +15,8 @@ from typing import Any
 import jax
 import numpy as np
 from jax.extend import core
+
+from codesign_jax.engines.structured import identity
 
 # Stand for the lane axes while a function is traced: sizes that no other axis has.
 FINGER, WORLD = 1009, 1013
@@ -69,6 +72,15 @@ def lanewise(function: Callable, *args: Any) -> Any:
         components, such as a sum over fingers.
     """
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: isinstance(x, Lanes))
+    try:
+        call, values = _Call.of(function, tree, leaves)
+    except identity.NoIdentity:
+        return _components(function, tree, leaves)
+    return _program(call)(values)
+
+
+def _components(function: Callable, tree: Any, leaves: list) -> Any:
+    """`lanewise`, traced anew."""
     mine = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Lanes)]
 
     def flat(*arrays: jax.Array) -> Any:
@@ -83,6 +95,94 @@ def lanewise(function: Callable, *args: Any) -> Any:
     shapes, out_tree = jax.tree.flatten(out)
     results = [Lanes(p, s.shape, s.dtype) for p, s in zip(parts, shapes, strict=True)]
     return jax.tree.unflatten(out_tree, results)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Call:
+    """A call of `lanewise`; calls of one key are one program of their values."""
+
+    key: tuple
+    function: Callable = dataclasses.field(compare=False)
+    tree: Any = dataclasses.field(compare=False)
+    leaves: list = dataclasses.field(compare=False)
+
+    @classmethod
+    def of(cls, function: Callable, tree: Any, leaves: list) -> tuple["_Call", list]:
+        """Takes the leaves apart into numbers and types, which are the key, and values.
+
+        Raises:
+          NoIdentity: If the function, or an argument that is not lanes, has none.
+        """
+        places: dict[int, int] = {}
+        values: list = []
+        shells: list = []
+        key = [identity.of(function), tree, jax.config.jax_enable_x64]
+        for leaf in leaves:
+            if isinstance(leaf, Lanes):
+                leaf = _emptied(leaf, values, places)
+                key += [leaf.shape, leaf.dtype, *map(identity.of, leaf.parts.ravel())]
+            else:
+                key.append(identity.of(leaf))
+            shells.append(leaf)
+        key += [jax.typeof(v) for v in values]
+        return cls(tuple(key), function, tree, shells), values
+
+
+class _Place(int):
+    """Stands for the value of this number in the components of `Lanes`."""
+
+
+@functools.lru_cache(maxsize=1024)
+def _program(call: _Call) -> Callable[[list], Any]:
+    """What calls of one key compute, traced once; JAX finds its operations as one of its own.
+
+    Tracing is most of the time that a kernel takes to compile, and its functions come again: for
+    each pair of bodies, and in the kernel of the next scene.
+    """
+    found: list = []  # as the function is traced: its result, with places instead of values
+
+    def run(*values: Any) -> list:
+        filled = [
+            Lanes(_fill(x.parts, values), x.shape, x.dtype) if isinstance(x, Lanes) else x
+            for x in call.leaves
+        ]
+        out = _components(call.function, call.tree, filled)
+        leaves, tree = jax.tree.flatten(out, is_leaf=lambda x: isinstance(x, Lanes))
+        arrays: list = []
+        places: dict[int, int] = {}
+        found[:] = [_emptied(leaf, arrays, places) for leaf in leaves], tree
+        return arrays
+
+    run.__name__ = getattr(call.function, "__name__", "lanewise")
+    jitted = jax.jit(run)
+
+    def use(values: list) -> Any:
+        arrays = jitted(*values)
+        shells, tree = found
+        leaves = [Lanes(_fill(x.parts, arrays), x.shape, x.dtype) for x in shells]
+        return jax.tree.unflatten(tree, leaves)
+
+    return use
+
+
+def _emptied(leaf: Lanes, values: list, places: dict[int, int]) -> Lanes:
+    """Lanes with places instead of values, which go to the end of a list; `places` by identity."""
+    parts = leaf.parts.copy()
+    for at, part in np.ndenumerate(parts):
+        if not _is_number(part):
+            if id(part) not in places:
+                places[id(part)] = len(values)
+                values.append(part)
+            parts[at] = _Place(places[id(part)])
+    return Lanes(parts, leaf.shape, leaf.dtype)
+
+
+def _fill(parts: np.ndarray, values: Any) -> np.ndarray:
+    """Components with values in their places."""
+    filled = np.empty(parts.shape, object)
+    for at, part in np.ndenumerate(parts):
+        filled[at] = values[part] if isinstance(part, _Place) else part
+    return filled
 
 
 def _small(shape: tuple[int, ...]) -> tuple[int, ...]:

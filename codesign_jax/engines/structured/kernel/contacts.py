@@ -85,12 +85,14 @@ class ContactSet:
         found: dict[str, Any] = dict.fromkeys(Cone._fields)
         return Cone(**found | {name: numbers[i] for i, name in enumerate(names)})
 
-    def contacts(self, place: tuple, cone: Cone) -> Contacts:
+    @staticmethod
+    def contacts(place: tuple, cone: Cone) -> Contacts:
         """Contacts of (point, normal, gap), and what else the set keeps of them."""
         point, normal, gap = place
         return Contacts(point, normal, gap[0], cone)
 
-    def of_line(self, gap: tuple, cone: Cone) -> Contacts:
+    @staticmethod
+    def of_line(gap: tuple, cone: Cone) -> Contacts:
         """What a line search needs of contacts: their gaps and cones."""
         (gap,) = gap
         return Contacts(gap, gap, gap[0], cone)
@@ -142,9 +144,10 @@ class BoundContacts:
 
     def begin(self, place: tuple, motion: Lanes, velocity: Lanes) -> dict[str, Lanes]:
         """What is kept of new contacts, by field, for relative motions of their bodies."""
+        contacts = self.set.contacts
 
         def jar(place, cone, motion, velocity):
-            c = self.set.contacts(place, cone)
+            c = contacts(place, cone)
             reference = c.reference(c.relative(velocity[:, None]))
             return c.relative(motion[:, None]) - reference
 
@@ -167,8 +170,10 @@ class BoundContacts:
         return full(triangle), wrench
 
     def _push(self, item: Any, alpha: Lanes) -> list[Lanes]:
+        contacts = self.set.contacts
+
         def response(place, cone, jar):
-            c = self.set.contacts(place, cone)
+            c = contacts(place, cone)
             r = contact.constraint_update(c, jar)
             matrix = contact.contact_inertia(c, r.hessian)
             return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
@@ -184,16 +189,19 @@ class BoundContacts:
         return self.if_touching(item, lambda: [self._prepare_linesearch(item, step)], [()])[0]
 
     def _prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
+        contacts = self.set.contacts
+
         def relative(place, cone, step):
-            return self.set.contacts(place, cone).relative(step[:, None])
+            return contacts(place, cone).relative(step[:, None])
 
         return self.line(item, lanewise(relative, self.place(item), self.cone, step))
 
     def line(self, item: Any, change: Lanes) -> Lanes:
         """Stores the contacts' cost along a change of jar; returns its slope at 0."""
+        contacts = self.set.contacts
 
         def ray(place, cone, jar, change):
-            c = self.set.contacts(place, cone)
+            c = contacts(place, cone)
             line = contact.line(c, jar, change)
             first, _ = contact.slopes(c, line, 0.0)
             return jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
@@ -208,8 +216,10 @@ class BoundContacts:
         return self.if_touching(item, lambda: self._slopes(item, alpha), [(), ()])
 
     def _slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
+        of_line = self.set.of_line
+
         def both(gap, cone, ray, alpha):
-            c = self.set.of_line(gap, cone)
+            c = of_line(gap, cone)
             line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             first, second = contact.slopes(c, line, alpha)
             return [sum_axis(first, 0), sum_axis(second, 0)]

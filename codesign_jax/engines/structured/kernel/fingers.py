@@ -201,10 +201,10 @@ class Search:
         moves: list[tuple[Lanes, Lanes]],
     ) -> None:
         """Gives contacts a slot; places on either side, the sides' rows, and how they move."""
-        pairs = self.pairs
+        pairs, contacts = self.pairs, self.pairs.set.contacts
 
         def jar(one, other, cone, motion, vel):
-            a, b = (pairs.set.contacts(place, cone) for place in (one, other))
+            a, b = (contacts(place, cone) for place in (one, other))
 
             def relative(m):
                 return a.relative(m[0][:, None]) - b.relative(m[1][:, None])

@@ -280,6 +280,7 @@ class Newton:
 
     def at_palm(self, now: Iterate, node: el.Quadratic, slots: dict) -> tuple[Iterate, Eliminated]:
         """Solves for wrist and object; slots: what `slot_pushes` returns."""
+        rigid = self.rigid
 
         def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> tuple:
             force = Forces(
@@ -291,7 +292,7 @@ class Newton:
             )
             matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
             node = newton.add_palm(node, matrices, force, pushes)
-            if self.rigid:
+            if rigid:
                 obj = el.solve_object(direct, node.q, node.r_object)
                 none = jnp.zeros_like(obj)
                 step = Iterate(none, object_acceleration(obj, palm.position), none, obj)

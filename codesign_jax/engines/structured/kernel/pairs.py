@@ -73,14 +73,15 @@ class PairSet(HullSet):
         rows = {f"side.{name}": (self.links + 1, (n,)) for name, n in sides.items()}
         return super().groups() | rows
 
-    def contacts(self, place: tuple, cone: contact.Cone) -> Contacts:
+    @property
+    def contacts(self) -> Callable[[tuple, contact.Cone], Contacts]:
         """See `ContactSet`; a lever is that of the lane's own side."""
-        kind = HullSet if self.skin else ContactSet
-        return kind.contacts(self, place, cone)
+        return (HullSet if self.skin else ContactSet).contacts
 
-    def of_line(self, gap: tuple, cone: contact.Cone) -> Contacts:
+    @property
+    def of_line(self) -> Callable[[tuple, contact.Cone], Contacts]:
         """See `ContactSet`."""
-        return (HullSet if self.skin else ContactSet).of_line(self, gap, cone)
+        return (HullSet if self.skin else ContactSet).of_line
 
     def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundPairs":
         """See `ContactSet`."""
@@ -225,7 +226,12 @@ class BoundPairs(BoundSlots):
         """How the links' motion moves a slot's sides to each other, on its own side's lanes."""
         names = ("motion", "turn") if self.set.skin else ("motion",)
         parts = self._on_rows(item, names)
-        own = lanewise(self._moved, self.place(item), self.cone, parts)
+        contacts = self.set.contacts
+
+        def moved(place, cone, parts):
+            return contacts(place, cone).relative(jnp.concatenate(parts)[:, None])
+
+        own = lanewise(moved, self.place(item), self.cone, parts)
         return lanewise(jnp.subtract, own, pairing.swap(own))
 
     def _on_rows(self, item: Any, names: tuple[str, ...]) -> list[Lanes]:
@@ -264,9 +270,6 @@ class BoundPairs(BoundSlots):
         first = [jnp.max(left), left, *arrays]
         return rebuild(jax.lax.while_loop(lambda c: c[0] >= 0, step, first)[2:])
 
-    def _moved(self, place, cone, parts):
-        return self.set.contacts(place, cone).relative(jnp.concatenate(parts)[:, None])
-
     def clear_wrenches(self) -> None:
         """Sets the wrenches of all sides to zero."""
         like = jnp.zeros((self.set.size,), self.ref.dtype)
@@ -279,9 +282,10 @@ class BoundPairs(BoundSlots):
 
     def load(self, item: Any, force: Lanes) -> None:
         """Adds a slot's force to its own side's wrench."""
+        contacts = self.set.contacts
 
         def wrench(place, cone, force):
-            return sum_axis(contact.contact_wrench(self.set.contacts(place, cone), force), 1)
+            return sum_axis(contact.contact_wrench(contacts(place, cone), force), 1)
 
         more = lanewise(wrench, self.place(item), self.cone, force)
         if self.set.gathers:
@@ -302,9 +306,10 @@ class BoundPairs(BoundSlots):
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and adds up wrenches."""
         self.clear_wrenches()
+        contacts = self.set.contacts
 
         def response(place, cone, jar):
-            found = contact.constraint_update(self.set.contacts(place, cone), jar)
+            found = contact.constraint_update(contacts(place, cone), jar)
             return found.hessian, found.force
 
         def store(item: Any, pairing: Pairing) -> None:

@@ -60,12 +60,14 @@ class HullSet(SlotSet):
     places = ("point", "normal", "gap", "lever", "share")
     of_lines = ("gap", "share")
 
-    def contacts(self, place: tuple, cone: Cone) -> Contacts:
+    @staticmethod
+    def contacts(place: tuple, cone: Cone) -> Contacts:
         """See `ContactSet`."""
         point, normal, gap, lever, share = place
         return Contacts(point, normal, gap[0], _soft(cone, share[0]), lever)
 
-    def of_line(self, gap: tuple, cone: Cone) -> Contacts:
+    @staticmethod
+    def of_line(gap: tuple, cone: Cone) -> Contacts:
         """See `ContactSet`."""
         distance, share = (x[0] for x in gap)
         return Contacts(gap[0], gap[0], distance, _soft(cone, share))

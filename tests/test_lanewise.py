@@ -1,0 +1,134 @@
+"""Evaluation of array functions component by component, and which of its programs are shared."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from codesign_jax.engines.structured import elimination, identity, lanewise
+from codesign_jax.engines.structured.lanewise import Lanes, lanes
+from tests import small
+
+FINGERS, WORLDS = 4, 8
+
+
+def both(rng, shape, wide=True):
+    """The same numbers as an array and as lanes."""
+    array = rng.standard_normal((*shape, FINGERS if wide else 1, WORLDS)).astype(np.float32)
+    full = np.broadcast_to(array, (*shape, FINGERS, WORLDS))
+    parts = [jnp.asarray(p.ravel()) for p in full.reshape(-1, FINGERS, WORLDS)]
+    return jnp.asarray(array), lanes(parts, shape, wide=wide)
+
+
+def as_array(value):
+    """Lanes back as an array (..., finger, world)."""
+    shape = value.parts.shape[:-2]
+    parts = [np.broadcast_to(p, (FINGERS * WORLDS,)) for p in value.parts.ravel()]
+    return np.stack(parts).reshape(*shape, FINGERS, WORLDS)
+
+
+def test_components_equal_arrays():
+    """Eliminating a joint gives the same numbers either way."""
+    rng = np.random.default_rng(0)
+    node = [both(rng, s) for s in ((6, 6), (6, 6), (6, 6), (6,), (6,))]
+    axes, arm, tau = both(rng, (3, 6)), both(rng, (3,)), both(rng, (3,), wide=False)
+
+    def step(node, axes, arm, tau):
+        # A positive definite matrix, so that the joint's is invertible.
+        eye = 6.0 * jnp.eye(6)[:, :, None, None]
+        p = eye + 0.1 * (node[0] + jnp.swapaxes(node[0], 0, 1))
+        quadratic = elimination.Quadratic(p, *node[1:])
+        return elimination.eliminate(lambda f, *a: f(*a), quadratic, axes, arm**2 + 1.0, tau)
+
+    want = jax.jit(step)([n[0] for n in node], axes[0], arm[0], tau[0])
+    got = lanewise.lanewise(step, [n[1] for n in node], axes[1], arm[1], tau[1])
+    got = jax.tree.leaves(got, is_leaf=lambda x: isinstance(x, Lanes))
+    for a, b in zip(jax.tree.leaves(want), got, strict=True):
+        # XLA may fuse a multiplication with an addition: a few units in the last place.
+        np.testing.assert_allclose(as_array(b), a, rtol=2e-5, atol=2e-5)
+
+
+def test_sums_over_lanes_are_refused():
+    """Lanes do not see each other."""
+    _, x = both(np.random.default_rng(0), (3,))
+    with pytest.raises(NotImplementedError, match="over the lanes"):
+        lanewise.lanewise(lambda v: v.sum(1), x)
+
+
+def scaled(factor, out=None):
+    """A closure, anew at each call, of which every trace is counted."""
+
+    def multiply(x, y):
+        counted.append(factor)
+        return {"product": factor * x * y, "first": x[:1], "one": jnp.ones_like(x[0])}
+
+    return multiply
+
+
+counted = []
+
+
+def test_one_program_for_closures_of_one_code_over_equal_data():
+    """Other data, numbers in place of lanes, and lanes that come twice are other programs."""
+    counted.clear()
+    rng = np.random.default_rng(0)
+    (a, x), (b, y) = both(rng, (2,)), both(rng, (2,), wide=False)
+
+    def check(factor, left, right, arrays, traces):
+        found = lanewise.lanewise(scaled(factor), left, right)
+        np.testing.assert_allclose(
+            as_array(found["product"]), np.broadcast_to(factor * arrays[0] * arrays[1], a.shape)
+        )
+        np.testing.assert_array_equal(as_array(found["first"]), arrays[0][:1] + 0 * a[:1])
+        assert found["one"].lane == 1.0 and len(counted) == traces
+
+    check(2.0, x, y, (a, b), 1)
+    check(2.0, x, y, (a, b), 1)
+    check(2.0, *[Lanes(v.parts[::-1], v.shape, v.dtype) for v in (x, y)], (a[::-1], b[::-1]), 1)
+    check(3.0, x, y, (a, b), 2)
+    check(2.0, x, x, (a, a), 3)
+    half = Lanes(np.array([0.5, 0.25]).reshape(2, 1, 1), x.shape, x.dtype)
+    check(2.0, x, half, (a, half.parts), 4)
+    assert lanewise.lanewise(jnp.multiply, half, half).parts.ravel().tolist() == [0.25, 0.0625]
+
+
+def test_a_closure_over_an_array_is_traced_each_time():
+    """Nobody knows what an array of JAX, or an object, will hold at the next call."""
+    counted.clear()
+    _, x = both(np.random.default_rng(0), (2,))
+    for k in range(2):
+        factor = jnp.full((2, 1, 1), 1.0 + k)
+        found = lanewise.lanewise(scaled(factor), x, x)
+        np.testing.assert_allclose(as_array(found["product"]), (1.0 + k) * as_array(x) ** 2)
+    assert len(counted) == 2
+
+
+def test_identities():
+    """Equal for equal values of one type; what has none says so."""
+    scene = small.pinch("box")
+    equal = [
+        (lambda: scaled(1.5)),
+        (lambda: functools.partial(scaled, 2, out=(1, None, "x"))),
+        (lambda: np.arange(3.0)),
+        (lambda: {"a": [1, (2.0, jnp.add)]}),
+        (lambda: scene),
+    ]
+    keys = [identity.of(make()) for make in equal]
+    assert keys == [identity.of(make()) for make in equal] and len({*map(hash, keys)}) == len(keys)
+    different = [0, 0.0, -0.0, False, None, "0", np.float32(0), np.float64(0), (0,), [0], jnp.add]
+    different += [scaled(1.0), scaled(2.0), scaled(1), lambda x: x, np.zeros(1), np.zeros((1, 1))]
+    assert len({identity.of(v) for v in different}) == len(different)
+
+    def endless():
+        return endless
+
+    def early():
+        return later
+
+    for value in (jnp.ones(2), object(), scaled(jnp.ones(2)), [object()], endless, early):
+        with pytest.raises(identity.NoIdentity):
+            identity.of(value)
+    later = None
+    assert later is early()

@@ -17,6 +17,12 @@ from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.scene import Scene
 from tests import small, steps
 
+FIRM = scene.load("paper").contact
+"""Contact of the standard scene: its stiffness and impratio were chosen against creep."""
+
+CREEP = 5e-5
+"""Speed [m/s] at which a held object may creep: 0.05 mm/s."""
+
 CHUNK = 50
 """Steps that a compiled program of the structured engine takes."""
 
@@ -115,7 +121,7 @@ class Bench:
         """Constant controls, a row for each world, (world, time, nu)."""
         return np.repeat(np.stack(rows)[:, None], round(seconds / self.h), 1)
 
-    def run(self, fields, ctrl, qpos=None, qvel=None) -> History:
+    def run(self, fields, ctrl, qpos=None, qvel=None, masses=None) -> History:
         """Steps worlds from a state, the fields' start at rest if none is given.
 
         Args:
@@ -123,13 +129,14 @@ class Bench:
           ctrl: Controls, (world, time, nu).
           qpos: Start positions (world, nq).
           qvel: Start velocities (world, nv).
+          masses: Factors on the object's mass, one for each chunk of `CHUNK` steps.
         """
         worlds = len(ctrl)
         qpos = fields.start if qpos is None else np.asarray(qpos)
         qvel = np.zeros((worlds, qpos.shape[1] - 1)) if qvel is None else np.asarray(qvel)
         if self.engine == "mujoco":
-            return self._mujoco(fields, ctrl, qpos, qvel)
-        path, (last, speed) = self._structured(fields, ctrl, qpos, qvel)
+            return self._mujoco(fields, ctrl, qpos, qvel, masses)
+        path, (last, speed) = self._structured(fields, ctrl, qpos, qvel, masses)
         return History(
             np.concatenate([path.qpos[:, 1:], last], 1),
             np.concatenate([path.qvel[:, 1:], speed], 1),
@@ -141,13 +148,18 @@ class Bench:
         qvel = np.zeros((len(ctrl), qpos.shape[1] - 1)) if qvel is None else np.asarray(qvel)
         return self._structured(fields, ctrl, qpos, qvel)[0]
 
-    def _mujoco(self, fields, ctrl, qpos, qvel) -> History:
+    def _mujoco(self, fields, ctrl, qpos, qvel, masses) -> History:
         out = []
         for w in range(len(ctrl)):
             compiled = world_model(self.scene, small.nth(fields, w))
             data, rows = mujoco.MjData(compiled), []
             data.qpos[:], data.qvel[:] = qpos[w], qvel[w]
-            for u in ctrl[w]:
+            thing = compiled.body_mass[-1], compiled.body_inertia[-1].copy()
+            for k, u in enumerate(ctrl[w]):
+                if masses is not None and k % CHUNK == 0:
+                    factor = masses[k // CHUNK]
+                    compiled.body_mass[-1], compiled.body_inertia[-1] = (factor * v for v in thing)
+                    compiled.dof_M0[-6:-3], compiled.dof_M0[-3:] = (factor * v for v in thing)
                 data.ctrl[:] = u
                 steps.soften(self.scene, small.nth(fields, w), data)
                 mujoco.mj_step(compiled, data)
@@ -155,7 +167,7 @@ class Bench:
             out.append([np.stack(v) for v in zip(*rows, strict=True)])
         return History(*(np.stack(v) for v in zip(*out, strict=True)))
 
-    def _structured(self, fields, ctrl, qpos, qvel) -> tuple[steps.Path, tuple]:
+    def _structured(self, fields, ctrl, qpos, qvel, masses=None) -> tuple[steps.Path, tuple]:
         """States before every step, and (qpos, qvel) after the last one, (world, 1, ...)."""
         dtype = jnp.float64 if self.wide else jnp.float32
         with floats(self.wide):
@@ -166,6 +178,9 @@ class Bench:
             rows = []
             for first in range(0, ctrl.shape[1], CHUNK):
                 part = jnp.asarray(ctrl[:, first : first + CHUNK], dtype)
+                if masses is not None:
+                    heavier = loaded(fields, masses[first // CHUNK])
+                    hand = start(heavier, jnp.asarray(qvel, dtype))[0]
                 *row, state = advance(hand, state, part)
                 rows.append([np.asarray(v, np.float64) for v in row])
             rows = [np.concatenate(v, 1) for v in zip(*rows, strict=True)]
@@ -190,6 +205,15 @@ class Bench:
             return *before, *after, end
 
         return jax.jit(start), jax.jit(advance)
+
+
+def loaded(fields, factor):
+    """Fields whose object is heavier by a factor."""
+    scaled = {n: getattr(fields, n) for n in ("body_mass", "body_inertia")}
+    return fields._replace(
+        **{n: v.at[:, -1].multiply(factor) for n, v in scaled.items()},
+        dof_M0=fields.dof_M0.at[:, -6:].multiply(factor),
+    )
 
 
 def moving(engine: StructuredEngine, fields, qvel):

@@ -2,6 +2,7 @@
 
 import json
 import platform
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -42,12 +43,30 @@ def pytest_sessionfinish(session):
 
     path = folder / "data" / "stability.json"
     old = json.loads(path.read_text())["rows"] if path.exists() else []
-    known = {c.name for c in table.CASES.values()}
-    rows = table.merge(new, [r for r in old if r["name"] in known])
+
+    def known(row):
+        case = table.CASES.get(row["name"])
+        return case is not None and (row["step"], row["precision"]) in case.variants
+
+    made = commit()
+    for row in new:
+        row["commit"] = made
+    rows = table.merge(new, [r for r in old if known(r)])
     versions = {"jax": jax.__version__, "mujoco": mujoco.__version__}
     versions["python"] = platform.python_version()
     path.write_text(table.to_json({"command": "make stability", **versions, "rows": rows}))
     write_page(folder / "stability.md", rows)
+
+
+def commit():
+    """The commit that is checked out, marked if the code differs from it."""
+    git = ["git", "-C", str(Path(__file__).parent)]
+    head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    if head.returncode:
+        return ""
+    code = [f":/{folder}" for folder in ("codesign_jax", "tests", "hands", "objects", "scripts")]
+    clean = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", *code], capture_output=True)
+    return head.stdout.strip() + ("" if clean.returncode == 0 else " with changes")
 
 
 def write_page(page, rows):

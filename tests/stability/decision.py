@@ -1,4 +1,4 @@
-"""Hard cases 24 and 25: what refinement does to a decision, and a million random particles."""
+"""Hard cases 24 and 25: what refinement does to a decision, and random particles of Table I."""
 
 import functools
 import json
@@ -18,22 +18,24 @@ from tests.stability.bench import floats, refined
 from tests.stability.table import Found, case
 
 DESIGNS, TRIALS = 40, 6
-DATA = Path(__file__).parents[2] / "docs" / "data" / "random_particles_spheres.json"
+DATA = Path(__file__).parents[2] / "docs" / "data"
+LATE = np.array([[0.050, -0.055], [0.130, 0.060]])
+"""Length and arm height [m] among which an optimisation ends: most designs there keep some of their
+objects and lose others.  Of designs of the whole space most lose all of them and tie."""
 
 
 @functools.cache
 def evaluated(engine, step, precision, links=10):
-    """Costs (design, trial) of random 2D designs, and what the particle filter makes of them."""
+    """Costs (design, trial) of late 2D designs, and what the particle filter makes of them."""
     base = refined(
         scene.load("paper_spheres", overrides={"discretization": {"links": links}}), step
     )
     space = parameters.design_space(base.hand, "2d")
-    low, high = np.array(space.low), np.array(space.high)
-    unit = np.random.default_rng(24).random((DESIGNS, len(low)))
+    unit = np.random.default_rng(24).random((DESIGNS, 2))
     wide = precision == "float64" and engine == "structured"
     with floats(wide):
         dtype = jnp.float64 if wide else jnp.float32
-        params = jax.vmap(space.params)(jnp.asarray(low + (high - low) * unit, dtype))
+        params = jax.vmap(space.params)(jnp.asarray(LATE[0] + (LATE[1] - LATE[0]) * unit, dtype))
         # Drawn in float32 in either case: the same noise.
         with jax.enable_x64(False):
             drawn = rollout.sample_trials(base, jax.random.key(24), TRIALS)
@@ -58,37 +60,77 @@ def rates(one, two):
     return abs(change.mean()) / half
 
 
-def other(engine, step, precision, links=10):
-    return evaluated(engine, 1.0, "float64" if engine == "mujoco" else "float32"), evaluated(
-        engine, step, precision, links
-    )
+def other(step, links=10):
+    """The engine that ships at the paper's setting, and at another one."""
+    coarse = evaluated("structured", 1.0, "float32")
+    return coarse, evaluated("structured", step, "float32", links)
 
 
-many = f"{DESIGNS} designs, {TRIALS} trials"
-settings = {"steps": (0.5, 0.25), "engine": "mujoco"}
+def ties(one, two) -> str:
+    costs = [len(np.unique(np.round(v[1], 3))) for v in (one, two)]
+    kept = [np.mean(v[0] == 0) for v in (one, two)]
+    return f"{costs[0]} and {costs[1]} different costs, {kept[0]:.2f} and {kept[1]:.2f} kept"
 
 
-@case(24, f"decision at a smaller step, {many}", "rank correlation", lower=True, **settings)
+def compare(measure, one, two, bound):
+    return Found(measure(one, two), bound, ties(one, two))
+
+
+optimistic = (
+    "the paper's step and links flip 9 to 13 % of the verdicts of such designs, more to success "
+    "than to failure; final tests belong to the preset reference (docs/accuracy.md)"
+)
+many = f"{DESIGNS} late designs, {TRIALS} trials"
+ours = {"precisions": ("float32",)}
+
+
+@case(
+    24,
+    f"decision at a smaller step, {many}",
+    "rank correlation",
+    lower=True,
+    steps=(0.5, 0.25),
+    failures={(0.5, "float32"): optimistic, (0.25, "float32"): optimistic},
+    **ours,
+)
 def ranks_by_step(engine, step, precision):
-    return Found(ranks(*other(engine, step, precision)), 0.9)
+    return compare(ranks, *other(step), 0.9)
 
 
-@case(24, f"decision at a smaller step, {many}", "success rate: change over interval", **settings)
+@case(
+    24,
+    f"decision at a smaller step, {many}",
+    "success rate: change over interval",
+    steps=(0.5, 0.25),
+    failures={(0.5, "float32"): optimistic, (0.25, "float32"): optimistic},
+    **ours,
+)
 def rates_by_step(engine, step, precision):
-    return Found(rates(*other(engine, step, precision)), 1.0)
+    return compare(rates, *other(step), 1.0)
 
 
-once = {"steps": (1.0,), "engine": "mujoco"}
-
-
-@case(24, f"decision at 20 links, {many}", "rank correlation", lower=True, **once)
+@case(
+    24,
+    f"decision at 20 links, {many}",
+    "rank correlation",
+    lower=True,
+    steps=(1.0,),
+    failures={(1.0, "float32"): optimistic},
+    **ours,
+)
 def ranks_by_links(engine, step, precision):
-    return Found(ranks(*other(engine, step, precision, 20)), 0.9)
+    return compare(ranks, *other(1.0, 20), 0.9)
 
 
-@case(24, f"decision at 20 links, {many}", "success rate: change over interval", **once)
+@case(
+    24, f"decision at 20 links, {many}", "success rate: change over interval", steps=(1.0,), **ours
+)
 def rates_by_links(engine, step, precision):
-    return Found(rates(*other(engine, step, precision, 20)), 1.0)
+    return compare(rates, *other(1.0, 20), 1.0)
+
+
+def in_c():
+    return evaluated("mujoco", 1.0, "float64")
 
 
 @case(
@@ -99,56 +141,76 @@ def rates_by_links(engine, step, precision):
     lower=True,
 )
 def ranks_by_engine(engine, step, precision):
-    return Found(ranks(evaluated("mujoco", 1.0, "float64"), evaluated(engine, 1.0, precision)), 0.9)
+    return compare(ranks, in_c(), evaluated(engine, 1.0, precision), 0.9)
 
 
 @case(
     24,
     f"decision of the structured engine, {many}",
-    "success rate: change over interval",
+    "success rate: change over interval with C",
     steps=(1.0,),
 )
 def rates_by_engine(engine, step, precision):
-    return Found(rates(evaluated("mujoco", 1.0, "float64"), evaluated(engine, 1.0, precision)), 1.0)
+    return compare(rates, in_c(), evaluated(engine, 1.0, precision), 1.0)
 
 
-@case(24, f"the best design stays the best, {many}", "its rank at h/4", **once)
+@case(24, f"the best design stays good, {many}", "its rank at h/4, of 40", steps=(1.0,), **ours)
 def best_stays(engine, step, precision):
-    one, two = other(engine, 0.25, precision)
+    one, two = other(0.25)
     best = one[1] == one[1].min()
-    # Several designs may share the lowest cost; the best of them by the finer step counts.
-    rank = (two[1] < two[1][best].min()).sum() + 1
-    return Found(float(rank), 1.0)
+    # Several designs may share the lowest cost; the worst of them by the finer step counts.
+    rank = (two[1] < two[1][best].max()).sum() + 1
+    return Found(float(rank), DESIGNS / 4, f"{best.sum()} share the lowest cost at h")
 
 
-def stored():
-    return json.loads(DATA.read_text())
+def failures(file, *but):
+    """Share of the trials of a stored run that failed, and a note."""
+    data = json.loads((DATA / file).read_text())
+    bad = sum(v for k, v in data["failed"].items() if k not in ("SOLVER_CAP", *but))
+    made = f", commit {data['commit']}" if data.get("commit") else ""
+    return Found(bad / data["worlds"], 1e-4, f"{bad} of {data['worlds']:,}, stored result{made}")
 
 
+stored = {"steps": (1.0,), "precisions": ("float32",)}
 stuck = (
     "171 objects were not let go of: the hand's grip, not the numbers, and each is flagged; "
     "numerical failures alone are 1e-6"
 )
-run = {"steps": (1.0,), "precisions": ("float32",), "quick": ((1.0, "float32"),)}
+wedged = "209 objects were wedged between fingers that straighten, see docs/hull.md, and "
+winding = (
+    "25 hands of long soft fingers wound about each other had more contacts between two fingers "
+    "than slots, 8 whipped too fast, one pressed its object through the table; each is flagged, "
+    "and most are gone at half the time step (docs/hull.md)"
+)
+million = "a million random particles of Table I, spheres"
+everything = "114,688 random particles of Table I, hull and contact between fingers"
 
 
-@case(25, "a million random particles of Table I", "share of numerical failures", **run)
+@case(25, million, "share of numerical failures", quick=((1.0, "float32"),), **stored)
 def random_failures(engine, step, precision):
     """From the run on one H200; see docs/stability.md for its one failure."""
-    data = stored()
-    bad = sum(v for k, v in data["failed"].items() if k not in ("STUCK", "SOLVER_CAP"))
-    return Found(bad / data["worlds"], 1e-4, f"{bad} of {data['worlds']:,}, stored result")
+    return failures("random_particles_spheres.json", "STUCK")
+
+
+@case(
+    25, million, "share of failed trials, with STUCK", failures={(1.0, "float32"): stuck}, **stored
+)
+def random_stuck(engine, step, precision):
+    return failures("random_particles_spheres.json")
+
+
+@case(25, everything, "share of failures but STUCK", failures={(1.0, "float32"): winding}, **stored)
+def random_hulls(engine, step, precision):
+    """From the run on one H200."""
+    return failures("random_particles.json", "STUCK")
 
 
 @case(
     25,
-    "a million random particles of Table I",
+    everything,
     "share of failed trials, with STUCK",
-    failures={(1.0, "float32"): stuck},
-    steps=(1.0,),
-    precisions=("float32",),
+    failures={(1.0, "float32"): wedged + winding},
+    **stored,
 )
-def random_stuck(engine, step, precision):
-    data = stored()
-    bad = sum(v for k, v in data["failed"].items() if k != "SOLVER_CAP")
-    return Found(bad / data["worlds"], 1e-4, f"{bad} of {data['worlds']:,}, stored result")
+def random_stuck_hulls(engine, step, precision):
+    return failures("random_particles.json")

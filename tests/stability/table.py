@@ -82,16 +82,21 @@ def case(
     quick: tuple[tuple[float, str], ...] = (),
     lower: bool = False,
     failures: dict[tuple[float, str], str] | None = None,
+    name: str = "",
 ):
-    """Registers a function (engine, step factor, precision) -> Found as a hard case."""
+    """Registers a function (engine, step factor, precision) -> Found as a hard case.
+
+    Its name, by default the function's, and its engine tell it from all others.
+    """
     widths = precisions or (BOTH if engine == "structured" else ("float64",))
 
     def register(measure: Callable[[str, float, str], Found]):
-        name = f"{measure.__name__}-{engine}"
+        full = f"{name or measure.__name__}-{engine}"
+        assert full not in CASES, f"two cases are called {full}"
         variants = tuple(itertools.product(steps, widths))
-        CASES[name] = Case(
+        CASES[full] = Case(
             number,
-            name,
+            full,
             title,
             invariant,
             engine,
@@ -155,8 +160,8 @@ def step_name(step: float) -> str:
 def to_markdown(rows: list[dict[str, Any]]) -> str:
     """A row for each invariant, engine and precision: measured values over the time steps."""
     lines = [
-        "| case | invariant | engine | measured (h; h/2; h/4) | bound | least margin | |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| case | invariant | engine | measured (h; h/2; h/4) | bound | least margin | commit | |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups = itertools.groupby(rows, lambda r: (r["case"], r["name"]))
     for (count, _), group in groups:
@@ -185,8 +190,9 @@ def _line(count: int, precision: str, part: list[dict[str, Any]]) -> str:
     )
     notes = "; ".join(sorted({r["note"] for r in part if r["note"]}))
     text = " ".join(filter(None, (verdict, notes)))
+    made = ", ".join(sorted({r.get("commit", "") for r in part}))
     engine = "MuJoCo C" if first["engine"] == "mujoco" else first["engine"]
     return (
         f"| {count} {first['title']} | {first['invariant']} | {engine}, {precision} | {values} "
-        f"{first['unit']} | {sign} {', '.join(bounds)} | {number(least)} | {text} |"
+        f"{first['unit']} | {sign} {', '.join(bounds)} | {number(least)} | {made} | {text} |"
     )

@@ -6,7 +6,19 @@ docs/stability.md.  A case that fails stands in the table with its cause.
 
 import pytest
 
-from tests.stability import beam, decision, grasp, table, touch  # noqa: F401  (they register their cases)
+from tests.stability import (  # noqa: F401  (they register their cases)
+    beam,
+    capstan,
+    decision,
+    grasp,
+    laws,
+    momentum,
+    moved,
+    skin,
+    symmetry,
+    table,
+    touch,
+)
 
 
 def variants():

@@ -1,0 +1,141 @@
+"""Hard case 9: momentum of a free hand and an object that collide, linear and angular."""
+
+import dataclasses
+import functools
+
+import mujoco
+import numpy as np
+
+from codesign_jax import model
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.scene import hand
+from tests import small
+from tests.stability.bench import bench, pinch
+from tests.stability.table import Found, case
+from tests.stability.touch import SPHERE, held, worlds
+
+
+@functools.cache
+def floating(**effects):
+    """The pinch hand without wrist springs or dampers, and no gravity."""
+    base = pinch(
+        effects__finger_table=False,
+        solver__tolerance=1e-16,
+        solver__iterations=100,
+        **{f"effects__{name}": value for name, value in effects.items()},
+    )
+    free = dataclasses.replace(base.hand, wrist=hand.Wrist(0.0, 0.0, 0.0, 0.0))
+    return dataclasses.replace(base, hand=free, gravity=0.0)
+
+
+def collision(base, engine, step, precision):
+    """A sphere of 0.5 m/s hits a finger of a hand at rest: model, history of 0.6 s, momentum."""
+    # Solved as far as the precision goes: what is left of a force is left of the momentum.
+    tolerance = {"float32": 1e-12, "float64": 1e-24}[precision]
+    b = bench(base, engine, step, precision, tolerance)
+    fields = worlds(b, SPHERE)
+    compiled = world_model(b.scene, small.nth(fields, 0))
+    data = mujoco.MjData(compiled)
+    qpos = fields.start.copy()
+    qpos[0, 2] = 1.0
+    data.qpos[:] = qpos[0]
+    mujoco.mj_kinematics(compiled, data)
+    qpos[0, -7:-4] = data.xpos[model.layout(b.scene).bodies[0, 1]] + [0, 0.07, 0]
+    qvel = np.zeros((1, compiled.nv))
+    qvel[0, -5] = -0.5
+    fields = fields._replace(start=qpos)
+    history = b.run(fields, held(b, fields, 0.6) * 0, qpos, qvel)
+    assert np.abs(history.object_velocity[0, -1, 1] + 0.5) > 0.01, "the sphere met nothing"
+    return compiled, history, np.array([0.0, -0.5 * compiled.body_mass[-1], 0.0])
+
+
+MOMENTUM = {"float32": 1e-4, "float64": 1e-10}
+
+
+def momentum(engine, step, precision):
+    """Momentum of the state after each step."""
+    compiled, history, first = collision(floating(), engine, step, precision)
+    data, worst = mujoco.MjData(compiled), 0.0
+    for q, v in zip(history.qpos[0], history.qvel[0], strict=True):
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_fwdPosition(compiled, data)
+        mujoco.mj_fwdVelocity(compiled, data)
+        mujoco.mj_subtreeVel(compiled, data)
+        total = data.subtree_linvel[0] * compiled.body_subtreemass[0]
+        worst = max(worst, np.abs(total - first).max())
+    return Found(worst / np.linalg.norm(first), MOMENTUM[precision])
+
+
+def impulses(base, engine, step, precision):
+    """What each step's accelerations add to linear and angular momentum, relative, (2,)."""
+    compiled, history, first = collision(base, engine, step, precision)
+    data, h, worst = mujoco.MjData(compiled), compiled.opt.timestep, np.zeros(2)
+    acc, vel, kind = np.zeros(6), np.zeros(6), mujoco.mjtObj.mjOBJ_BODY
+    for k in range(history.qpos.shape[1] - 1):
+        data.qpos[:], data.qvel[:] = history.qpos[0, k], history.qvel[0, k]
+        mujoco.mj_fwdPosition(compiled, data)
+        mujoco.mj_fwdVelocity(compiled, data)
+        data.qacc[:] = (history.qvel[0, k + 1].astype(float) - data.qvel) / h
+        mujoco.mj_rnePostConstraint(compiled, data)
+        linear, angular = np.zeros(3), np.zeros(3)
+        for body in range(1, compiled.nbody):
+            mujoco.mj_objectAcceleration(compiled, data, kind, body, acc, 0)
+            mujoco.mj_objectVelocity(compiled, data, kind, body, vel, 0)
+            frame = data.ximat[body].reshape(3, 3)
+            inertia = frame @ np.diag(compiled.body_inertia[body]) @ frame.T
+            force = compiled.body_mass[body] * acc[3:]
+            linear += force
+            # Euler's equation of the body, and its force's moment about the origin.
+            angular += inertia @ acc[:3] + np.cross(vel[:3], inertia @ vel[:3])
+            angular += np.cross(data.xipos[body], force)
+        worst = np.maximum(worst, [np.abs(linear).max() * h, np.abs(angular).max() * h])
+    # The palm, about which things turn, is 1 m above the origin.
+    return worst / np.linalg.norm(first)
+
+
+def impulse(engine, step, precision):
+    """Contact forces act in pairs."""
+    return Found(impulses(floating(), engine, step, precision)[0], MOMENTUM[precision])
+
+
+def angular_impulse(engine, step, precision):
+    """Contact forces act in pairs and on one line."""
+    return Found(impulses(floating(), engine, step, precision)[1], MOMENTUM[precision])
+
+
+def skin():
+    """The hull, whose vertices follow two links, and contact between fingers; MuJoCo C has none."""
+    return floating(surface="hull", finger_finger=True)
+
+
+def hull_impulse(engine, step, precision):
+    return Found(impulses(skin(), engine, step, precision)[0], MOMENTUM[precision])
+
+
+def hull_angular_impulse(engine, step, precision):
+    return Found(impulses(skin(), engine, step, precision)[1], MOMENTUM[precision])
+
+
+FIRST_ORDER = (
+    "semi-implicit Euler changes the fingers' inertia matrix after the step's impulse: linear "
+    "momentum is kept to first order in h only, in MuJoCo C as well; contact forces are equal and "
+    "opposite"
+)
+free = (9, "free hand and object collide", "impulse that a step adds, relative")
+case(*free)(impulse)
+case(*free, engine="mujoco", quick=((1.0, "float64"),))(impulse)
+free = (9, "free hand and object collide", "angular impulse that a step adds, relative")
+case(*free)(angular_impulse)
+case(*free, engine="mujoco", quick=((1.0, "float64"),))(angular_impulse)
+free = (9, "free hand and object collide", "drift of linear momentum, relative")
+failing = {(s, p): FIRST_ORDER for s in (1.0, 0.5, 0.25) for p in ("float32", "float64")}
+case(*free, failures=failing)(momentum)
+case(*free, engine="mujoco", failures=failing)(momentum)
+free = (9, "free hand with the hull and object collide", "impulse that a step adds, relative")
+case(*free, steps=(1.0, 0.5))(hull_impulse)
+free = (
+    9,
+    "free hand with the hull and object collide",
+    "angular impulse that a step adds, relative",
+)
+case(*free, steps=(1.0, 0.5))(hull_angular_impulse)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         types,
     )
     from codesign_jax.engines import make_engine
+    from codesign_jax.files import use_compilation_cache
     from codesign_jax.scene import SceneError, constants, hand, objects, parameters
     from codesign_jax.types import Params, Status, Trace, Trial
 
@@ -38,6 +39,7 @@ _HOME = {
     "Status": "codesign_jax.types",
     "Trace": "codesign_jax.types",
     "Trial": "codesign_jax.types",
+    "use_compilation_cache": "codesign_jax.files",
 }
 """Where the names are that are not modules of this folder."""
 
@@ -65,6 +67,7 @@ __all__ = [
     "runs",
     "scene",
     "types",
+    "use_compilation_cache",
 ]
 
 

@@ -25,7 +25,7 @@ from codesign_jax.optimize import (
     rejection,
 )
 from codesign_jax.programs import Program, shared
-from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene import Constants, Scene, SceneError
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
@@ -146,6 +146,7 @@ def make_evaluate(
     def evaluate(
         population: jax.Array, key: jax.Array, constants: Constants | None = None
     ) -> Outcome:
+        space.refuse_population(population)
         space.refuse_unit_slips(population)
         return program(population, key, constants)
 
@@ -218,6 +219,8 @@ def _episode(
         constants: Constants,
         optimizer: Optimizer,
     ) -> tuple[State, EpisodeInfo]:
+        _refuse_mask(space, mask)
+        space.refuse_population(state.particles)
         population = optimizer.ask(state, mask)
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
@@ -229,6 +232,19 @@ def _episode(
         return new, EpisodeInfo(population, trials, selection, last)
 
     return episode
+
+
+def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
+    """Refuses a mask that is not one of the space's parameters.
+
+    Raises:
+      SceneError: If its shape is another one.
+    """
+    if np.shape(mask) != (space.num_parameters,):
+        names = ", ".join(space.names)
+        raise SceneError(
+            [f"the mask has shape {np.shape(mask)}, not ({space.num_parameters},), that is {names}"]
+        )
 
 
 def make_run(

@@ -34,3 +34,17 @@ def atomically(path: Path) -> Iterator[Path]:
 def cache_folder() -> Path:
     """Folder for what can be computed again, such as compiled programs; it may not exist yet."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "codesign-jax"
+
+
+def use_compilation_cache() -> None:
+    """Keeps compiled programs between processes, in `cache_folder`, as the commands do.
+
+    For scripts and notebooks, before their first simulation. A place that was chosen already
+    (`jax_compilation_cache_dir`) stays.
+    """
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+        # Small programs too, of which a command has dozens: JAX keeps those that take a second.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

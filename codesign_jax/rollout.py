@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import control, model
+from codesign_jax import axes, control, model
 from codesign_jax.cost import outcome
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene, parameters, schema
@@ -43,7 +43,9 @@ def sample_trials(
     Returns:
       Trials with leading axis (trial,).
     """
-    index, noises = jnp.arange(num_trials), numbers(scene, constants).objects.noise
+    constants = numbers(scene, constants)
+    axes.refuse_constants(constants, num_trials, "trial")
+    index, noises = jnp.arange(num_trials), constants.objects.noise
 
     def draw(t: jax.Array, noise: Any) -> Trial:
         own = jax.random.fold_in(key, t)
@@ -120,11 +122,14 @@ def simulate(
       Outcome and trace with leading axis (world,).
 
     Raises:
-      SceneError: If the constants do not fit the scene or lie outside their ranges, or if a
+      SceneError: If an array lacks an axis, if the constants do not fit the scene or lie outside
+        their ranges, or if a
         parameter is out of its range by a factor between units, such as millimetres given for
         metres; of traced ones no values are known.
     """
+    axes.refuse(scene, params, trials, ("world", "world"))
     constants = numbers(scene, constants)
+    axes.refuse_constants(constants, len(trials.yaw), "world")
     parameters.refuse_unit_slips(params)
     fields, ctrl, initial = prepare(scene, params, trials, constants)
     trace = engine.rollout(fields, ctrl, trajectory=trajectory)
@@ -151,8 +156,8 @@ def prepare(
         own = scene.with_constants(c)
         return model.model_fields(own, p, t), control.commands(own, p, t)
 
-    axes = batch_axes(constants)
-    fields, ctrl = jax.vmap(world, in_axes=(0, 0, axes))(params, trials, constants)
+    every = (0, 0, batch_axes(constants))
+    fields, ctrl = jax.vmap(world, in_axes=every)(params, trials, constants)
     return fields, ctrl, invalid_start(scene, fields)
 
 
@@ -250,6 +255,9 @@ def evaluate_to_end(
 
     They are None if the engine does not tell them.
     """
+    axes.refuse(scene, params, trials, ("particle", "trial"))
+    if constants is not None:
+        axes.refuse_constants(constants, len(trials.yaw), "trial")
     shape = params.length.shape[0], trials.yaw.shape[0]
     result, trace = simulate(
         scene,

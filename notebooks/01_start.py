@@ -26,12 +26,13 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from codesign_jax import codesign, rollout, scene
+from codesign_jax import codesign, rollout, scene, use_compilation_cache
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import schedule
 from codesign_jax.report import animation
 from codesign_jax.scene import parameters
 
+use_compilation_cache()  # compiled programs are kept: the second start takes seconds
 FAST = bool(os.environ.get("CODESIGN_FAST"))
 
 # %% [markdown]

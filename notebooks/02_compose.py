@@ -28,11 +28,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from codesign_jax import codesign, rollout, scene
+from codesign_jax import codesign, rollout, scene, use_compilation_cache
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import schedule
 from codesign_jax.scene import parameters
 
+use_compilation_cache()  # compiled programs are kept: the second start takes seconds
 FAST = bool(os.environ.get("CODESIGN_FAST"))
 
 # %% [markdown]
@@ -75,7 +76,7 @@ print("distance [mm], a row for each design:\n", np.round(1e3 * np.asarray(table
 # %% [markdown]
 # ## grad and value_and_grad
 #
-# The first gradient compiles for about a minute; it is kept where JAX's compilation cache is on.
+# The first gradient compiles for about a minute, and is kept for the next start.
 # With `jax.vmap` around it each design gets its own.  `jax.checkpoint` forgets the stored states
 # and simulates again when the gradient needs them: less memory for twice the kernel's time.
 

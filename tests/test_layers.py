@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = """
 types files provenance compiler optimize
 scene
-model control verdict
+axes model control verdict
 engines cost
 start
 rollout

@@ -5,24 +5,28 @@ from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import Protocol
 
-import jax
 import numpy as np
 
-from codesign_jax import codesign, engines, files, types
+from codesign_jax import codesign, engines, types
 from codesign_jax import scene as scenes
 from codesign_jax.commands import preflight
+from codesign_jax.files import use_compilation_cache
 from codesign_jax.report import statistics
 from codesign_jax.scene import Scene, keypaths, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import SceneError
 
-
-def use_compilation_cache() -> None:
-    """Keeps compiled programs between processes, unless the user has chosen a place already."""
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(files.cache_folder() / "jax"))
-        # Small programs too, of which a command has dozens: JAX keeps those that take a second.
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+__all__ = [
+    "SceneFlags",
+    "check_engine",
+    "load_scene",
+    "mesh_notes",
+    "parse_design",
+    "preflight_notes",
+    "solver_problems",
+    "use_compilation_cache",
+    "verdict",
+]
 
 
 class SceneFlags(Protocol):

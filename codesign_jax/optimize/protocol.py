@@ -12,7 +12,9 @@ a leading run axis of state, mask and cost, and ``lax.scan``.
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space
@@ -117,16 +119,31 @@ def check_start(
 
     Raises:
         TypeError: If ``key`` is not a typed key.
-        ValueError: If the shape of the seed particle or the number of particles is wrong.
+        ValueError: If the shape of the seed particle or the number of particles is wrong, or the
+            seed particle lies far outside the box.
     """
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         raise TypeError(f"key must be a typed key from jax.random.key, got {key.dtype}")
     seed_particle = jnp.asarray(seed_particle, float)
     if seed_particle.shape != jnp.shape(space.low):
         raise ValueError(f"{seed_particle.shape=}, expected {jnp.shape(space.low)}")
+    _refuse_far(space, seed_particle)
     if not 1 <= num_particles <= most:
         raise ValueError(f"{num_particles=}, expected 1 to {most}")
     return seed_particle
+
+
+def _refuse_far(space: Space, particle: jax.Array) -> None:
+    """Refuses a particle as far from the box as another unit puts it, if it is not traced."""
+    values = particle, space.low, space.high
+    if any(isinstance(v, jax.core.Tracer) or np.ndim(v) != 1 for v in values):
+        return
+    x, low, high = (np.asarray(v) for v in values)
+    for i in np.flatnonzero((x < low - 50 * (high - low)) | (x > high + 50 * (high - low))):
+        raise ValueError(
+            f"seed_particle[{i}] = {x[i]:g} is far outside its bounds, {low[i]:g} to {high[i]:g}: "
+            "is it in another unit?"
+        )
 
 
 def check_told(state: State, population: jax.Array, cost: ArrayLike) -> jax.Array:

@@ -56,8 +56,9 @@ class DesignSpace:
         """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,).
 
         Raises:
-          SceneError: See `refuse_unit_slips`.
+          SceneError: If it has another shape, and see `refuse_unit_slips`.
         """
+        self._refuse_shape(design, "")
         self.refuse_unit_slips(design)
         design = jnp.asarray(design)
         source = np.asarray(self.source)
@@ -99,8 +100,10 @@ class DesignSpace:
           designs: Design vectors [SI], shape (..., parameter).
 
         Raises:
-          SceneError: With every such number and its suggested value.
+          SceneError: With every such number and its suggested value, or if the last axis is not
+            that of the parameters.
         """
+        self._refuse_shape(designs, "..., ")
         if isinstance(designs, jax.core.Tracer):
             return
         columns = np.moveaxis(np.asarray(designs, float), -1, 0)
@@ -109,6 +112,29 @@ class DesignSpace:
             found += _slips(name, name.split("[")[0], column)
         if found:
             raise schema.SceneError(found)
+
+    def refuse_population(self, population: np.typing.ArrayLike) -> None:
+        """Refuses what are not designs of this space, shape (particle, parameter).
+
+        Raises:
+          SceneError: If the shape is another one.
+        """
+        if np.ndim(population) != 2:
+            shape = np.shape(population)
+            hint = "; population[None] makes a batch of one" if len(shape) == 1 else ""
+            raise schema.SceneError(
+                [f"population has shape {shape}, not (particle, parameter){hint}"]
+            )
+        self._refuse_shape(population, "particle, ")
+
+    def _refuse_shape(self, designs: np.typing.ArrayLike, leading: str) -> None:
+        shape, count = np.shape(designs), self.num_parameters
+        if shape[-1:] != (count,) or (not leading and len(shape) > 1):
+            names = ", ".join(self.names)
+            hint = "; jax.vmap maps over designs" if not leading and len(shape) > 1 else ""
+            raise schema.SceneError(
+                [f"designs have shape {shape}, not ({leading}{count},): {names}{hint}"]
+            )
 
     def default(self) -> np.ndarray:
         """Returns the table's default design, shape (parameter,), inside the bounds [SI]."""

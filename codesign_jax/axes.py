@@ -1,0 +1,76 @@
+"""Axes of what is simulated: arrays without them are refused in words, also while JAX traces."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene.schema import SceneError
+from codesign_jax.types import Params, Trial
+
+_TRIAL = Trial((), (2,), (), (2,), (), (), (), (), ())
+"""Shapes of one trial."""
+
+
+def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -> None:
+    """Refuses hands and trials without their leading axes.
+
+    Args:
+      scene: The scene, which says how many fingers there are.
+      params: Parameters that should have the leading axis `axes[0]`.
+      trials: Trials that should have the leading axis `axes[1]`.
+      axes: Names of the axes; where they are the same the arrays have to be as long.
+
+    Raises:
+      SceneError: With every array of another shape.
+    """
+    fingers = (scene.num_fingers,)
+    one = Params(fingers, fingers, fingers, (), (6,), fingers)
+    problems = _problems("params", params, one, axes[0])
+    problems += _problems("trials", trials, _TRIAL, axes[1])
+    if not problems and axes[0] == axes[1]:
+        counts = len(params.length), len(trials.yaw)
+        if counts[0] != counts[1]:
+            problems = [f"params have {counts[0]} {axes[0]}s and trials {counts[1]}"]
+    if problems:
+        raise SceneError(problems)
+
+
+def refuse_constants(constants: Constants, count: int, axis: str) -> None:
+    """Refuses constants of another number of values than there are worlds or trials.
+
+    Args:
+      constants: The constants, leaves of shape () or (n,).
+      count: Length of the axis.
+      axis: Its name.
+
+    Raises:
+      SceneError: With the first leaf of another length.
+    """
+    for path, value in jax.tree_util.tree_leaves_with_path(constants):
+        if np.ndim(value) == 1 and np.shape(value)[0] != count:
+            key = jax.tree_util.keystr(path)
+            raise SceneError(
+                [f"constants{key} has {np.shape(value)[0]} values, one a {axis}: there are {count}"]
+            )
+
+
+def _problems(what: str, batch: Any, one: Any, axis: str) -> list[str]:
+    """What is wrong with the shapes of a batch, given those of one."""
+    given = {k: np.shape(v) for k, v in batch._asdict().items() if v is not None}
+    if all(shape == getattr(one, k) for k, shape in given.items()):
+        return [
+            f"{what} have no axis ({axis},); of one, jax.tree.map(lambda v: v[None], {what}) "
+            "makes a batch"
+        ]
+    counts = {shape[0] for shape in given.values() if shape}
+    problems = [
+        f"{what}.{k} has shape {shape}, not ({', '.join(map(str, (axis, *getattr(one, k))))})"
+        for k, shape in given.items()
+        if not shape or shape[1:] != getattr(one, k)
+    ]
+    if not problems and len(counts) > 1:
+        lengths = ", ".join(f"{k} {shape[0]}" for k, shape in given.items())
+        problems = [f"the arrays of {what} have different lengths: {lengths}"]
+    return problems

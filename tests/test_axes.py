@@ -1,0 +1,107 @@
+"""Missing axes, lengths that do not fit and numbers in other units are answered in words."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import tiny
+
+from codesign_jax import codesign, rollout
+from codesign_jax.scene import SceneError
+
+SCENE, SPACE, ENGINE = tiny()
+HAND = jax.tree.map(np.asarray, SPACE.params(SPACE.default()))
+TRIAL = jax.tree.map(np.asarray, rollout.nominal_trial(SCENE))
+OPTIMIZER = codesign.make_filter(SPACE)
+
+
+def batch(tree, count):
+    return jax.tree.map(lambda v: np.broadcast_to(v, (count, *np.shape(v))), tree)
+
+
+def simulate(params, trials, **more):
+    return rollout.simulate(SCENE, ENGINE, params, trials, **more)
+
+
+def evaluate(population, constants=None):
+    made = codesign.make_evaluate(SCENE, ENGINE, SPACE, 2)
+    return made(jnp.asarray(population), jax.random.key(0), constants)
+
+
+def episode(mask):
+    state = OPTIMIZER.init(jax.random.key(0), SPACE.default(), 3)
+    return codesign.make_episode(SCENE, ENGINE, SPACE, OPTIMIZER, 2)(state, mask)
+
+
+LONG = SCENE.constants()._replace(gravity=np.full(5, 9.81))
+CASES = {
+    "one hand": (
+        lambda: simulate(HAND, batch(TRIAL, 3)),
+        r"params have no axis \(world,\); of one, jax.tree.map\(lambda v: v\[None\], params\)",
+    ),
+    "one trial": (lambda: simulate(batch(HAND, 3), TRIAL), r"trials have no axis \(world,\)"),
+    "lengths": (
+        lambda: simulate(batch(HAND, 2), batch(TRIAL, 3)),
+        "params have 2 worlds and trials 3",
+    ),
+    "an array without": (
+        lambda: simulate(batch(HAND, 2), batch(TRIAL, 2)._replace(yaw=np.zeros(()))),
+        r"trials.yaw has shape \(\), not \(world\)",
+    ),
+    "an array of another length": (
+        lambda: simulate(batch(HAND, 2)._replace(spread=np.zeros(3)), batch(TRIAL, 2)),
+        "the arrays of params have different lengths: length 2, .*spread 3",
+    ),
+    "another hand's": (
+        lambda: simulate(batch(HAND, 2)._replace(length=np.ones((2, 3))), batch(TRIAL, 2)),
+        r"params.length has shape \(2, 3\), not \(world, 2\)",
+    ),
+    "particles": (
+        lambda: rollout.evaluate(SCENE, ENGINE, HAND, batch(TRIAL, 3)),
+        r"no axis \(particle,\)",
+    ),
+    "constants": (
+        lambda: simulate(batch(HAND, 2), batch(TRIAL, 2), constants=LONG),
+        "constants.gravity has 5 values, one a world: there are 2",
+    ),
+    "constants of trials": (
+        lambda: evaluate(SPACE.default()[None], LONG),
+        "constants.gravity has 5 values, one a trial: there are 2",
+    ),
+    "one design": (
+        lambda: evaluate(SPACE.default()),
+        r"population has shape \(2,\), not \(particle, parameter\); population\[None\] makes",
+    ),
+    "another space": (
+        lambda: evaluate(np.ones((1, 3))),
+        r"shape \(1, 3\), not \(particle, 2,\): length, arm_z",
+    ),
+    "designs as one": (
+        lambda: SPACE.params(np.ones((4, 2))),
+        r"shape \(4, 2\), not \(2,\): length, arm_z; jax.vmap maps over designs",
+    ),
+    "mask": (
+        lambda: episode(np.ones(3, bool)),
+        r"mask has shape \(3,\), not \(2,\)",
+    ),
+    "millimetres": (lambda: evaluate([[97.0, 0.02]]), "length = 97.0 .* did you mean 0.097"),
+    "millimetres at the start": (
+        lambda: OPTIMIZER.init(jax.random.key(0), np.array([97.0, 20.0]), 3),
+        r"seed_particle\[0\] = 97 is far outside its bounds, 0.01 to 0.18",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_wrong_is_said(case):
+    call, words = CASES[case]
+    with pytest.raises((SceneError, ValueError), match=words) as caught:
+        call()
+    assert isinstance(caught.value, SceneError) or case == "millimetres at the start"
+
+
+def test_it_is_said_while_tracing():
+    with pytest.raises(SceneError, match="params have no axis"):
+        jax.jit(lambda p, t: simulate(p, t))(HAND, batch(TRIAL, 3))
+    with pytest.raises(SceneError, match="designs have shape"):
+        jax.jit(SPACE.expand)(np.ones(3))

@@ -101,13 +101,25 @@ def test_rigid_rings_equal_mujoco(shape):
 
 
 def distance(scene, data, points):
-    """Distance to the object and its gradient, world frame, by closed forms: sphere and box."""
+    """Distance to the object and its gradient, world frame, by closed forms."""
     shape, centre = scene.objects.object[0], data.body("object").xpos
     half, turn = np.array(shape.half_sizes), data.body("object").xmat.reshape(3, 3)
     local = (points - centre) @ turn
     if shape.type == "sphere":
         length = np.linalg.norm(local, axis=1)
         return length - half[0], (local / length[:, None]) @ turn.T
+    if shape.type == "cylinder":
+        beside = np.hypot(local[:, 0], local[:, 1])
+        excess = np.stack([beside - half[0], np.abs(local[:, 2]) - half[1]], 1)
+        out = np.maximum(excess, 0)
+        outside = np.linalg.norm(out, axis=1)
+        face = np.eye(2)[excess.argmax(1)]
+        slope = np.where(outside[:, None] > 0, out / np.maximum(outside, 1e-300)[:, None], face)
+        axes = [local[:, 0] / beside, local[:, 1] / beside, np.sign(local[:, 2])]
+        gradient = np.stack(
+            [slope[:, 0] * axes[0], slope[:, 0] * axes[1], slope[:, 1] * axes[2]], 1
+        )
+        return np.where(outside > 0, outside, excess.max(1)), gradient @ turn.T
     excess = np.abs(local) - half
     out = np.maximum(excess, 0)
     outside = np.linalg.norm(out, axis=1)

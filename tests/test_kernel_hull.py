@@ -10,10 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program, program
+from codesign_jax.model import layout
 from codesign_jax.types import Status
+from tests import small
 from tests import test_hull_contact as oracle
 
 STEPS = 420
@@ -98,6 +101,62 @@ def neighbours_change_no_bit(runs, qpos, qvel, ctrl):
     b = runs.along(len(qpos), partial(place, runs.engine, qpos[order], qvel[order]), ctrl[order])
     for name in ("qpos", "distance", "height"):
         np.testing.assert_array_equal(a[name][order], b[name], err_msg=name)
+
+
+def wound(scene, model, qpos, turn=0.05):
+    """The finger's joints bent around a cylinder whose axis is their own, in the air.
+
+    Args:
+      scene: A scene with a cylinder.
+      model: MuJoCo's model of a world.
+      qpos: Its start, which is changed.
+      turn: Joint velocities that follow [rad/s], so that the belt slides.
+    """
+    lay, data = layout(scene), mujoco.MjData(model)
+    radius = scene.objects.object[0].half_sizes[0]
+    segment = np.abs(model.body_pos[lay.bodies[0, 1], 0])
+    qpos[2] = 0.5
+    qpos[lay.dofs[0, :, 0]] = 2 * np.arctan(segment / 2 / radius)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    first = lay.stubs[0]
+    frame = data.xmat[first].reshape(3, 3)
+    middle = data.xpos[lay.bodies[0, 0]] - segment / 2 * frame[:, 0]
+    # Links are chords that touch the cylinder in their middles, a millimetre too close.
+    qpos[-7:-4] = middle - (radius - 1e-3) * frame[:, 2]
+    qpos[-4:] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]  # its axis along y
+    qvel = np.full(model.nv, turn)
+    qvel[-6:] = 0
+    return qpos, qvel
+
+
+@oracle.SLOW
+def test_a_belt_around_a_cylinder_equals_a_dense_solve():
+    """A finger wound about a cylinder by most of a turn, rubbing on it: one step."""
+    with jax.enable_x64(True):
+        scene = oracle.hull_scene("cylinder", links=7, hull_rings=2, hull_points=8)
+        hand, trial = small.hand_world(scene, length=0.15)
+        fields, ctrl = small.world_inputs(scene, hand, trial)
+        model = world_model(scene, fields)
+        qpos, qvel = wound(scene, model, np.array(fields.start))
+        engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
+        start = engine.place(engine.reset(batch), qpos[None], qvel[None])
+        lanes = small.lanes(scene, batch)
+        new, info = jax.jit(engine.step)(lanes, start, jnp.asarray(ctrl[0])[:, None])
+        data, h = mujoco.MjData(model), scene.discretization.timestep
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl[0]
+        mujoco.mj_forward(model, data)
+        dense = oracle.Dense(scene, model, data, hand)
+        expected = dense.solve()
+        acc = (np.asarray(engine.qvel(new))[0] - qvel) / h
+    # The object's columns of a contact's first row are the normal, here across the axis y.
+    normals = np.array([jac[0, -6:-3] for jac, *_ in dense.rows if np.abs(jac[0, -6:-3]).any()])
+    around = np.sort(np.arctan2(normals[:, 2], normals[:, 0]))
+    gap = np.diff(np.r_[around, around[0] + 2 * np.pi]).max()
+    assert len(normals) > 20 and 2 * np.pi - gap > 1.3 * np.pi and not info.overflow.any()
+    error = np.linalg.norm(acc - expected) / max(np.linalg.norm(expected), 100.0)
+    assert error < 1e-8  # as against MuJoCo
 
 
 def test_too_few_slots_are_an_overflow(monkeypatch):

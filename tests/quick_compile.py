@@ -3,11 +3,18 @@
 import os
 from importlib import metadata
 
+_ONE_THREAD = ("--xla_cpu_parallel_codegen_split_count=1",)
+"""One thread compiles, as every core has a process of its own."""
+
+_NO_EMITTERS = ("--xla_cpu_use_fusion_emitters=false",)
+"""Without fusion emitters a step in plain JAX compiles in half of the time."""
+
+_KNOWN = ("0.10.",)
+"""Releases of jaxlib that know this flag: others end the process that has an unknown one."""
+
 OPTIMIZED = (
-    # One thread compiles, as every core has a process of its own.
-    "--xla_cpu_parallel_codegen_split_count=1",
-    # Without fusion emitters a step in plain JAX compiles in half of the time.
-    "--xla_cpu_use_fusion_emitters=false",
+    *_ONE_THREAD,
+    *(_NO_EMITTERS if metadata.version("jaxlib").startswith(_KNOWN) else ()),
 )
 
 FLAGS = (
@@ -18,9 +25,6 @@ FLAGS = (
     "--xla_llvm_disable_expensive_passes=true",
 )
 
-KNOWN = ("0.10.",)
-"""Releases of jaxlib that know all flags: others end the process that has an unknown one."""
-
 
 def use(flags: tuple[str, ...] = FLAGS) -> None:
     """For this process, if it has not used JAX yet, and those that it starts.
@@ -30,5 +34,4 @@ def use(flags: tuple[str, ...] = FLAGS) -> None:
     """
     if flags == FLAGS:
         os.environ.setdefault("CODESIGN_KERNEL_OPTIMIZATION", "0")
-    if metadata.version("jaxlib").startswith(KNOWN):
-        os.environ.setdefault("XLA_FLAGS", " ".join(flags))
+    os.environ.setdefault("XLA_FLAGS", " ".join(flags))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import control, model, rollout, scene
+from codesign_jax import control, cost, model, rollout, scene
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Trial
@@ -112,4 +112,21 @@ def nth(tree, index):
 
 def stack(*trees):
     """Batches single worlds."""
-    return jax.tree.map(lambda *v: jnp.stack([jnp.asarray(x) for x in v]), *trees)
+    return jax.tree.map(lambda *v: np.stack([np.asarray(x) for x in v]), *trees)
+
+
+def repeat(tree, count):
+    """A batch of one world, `count` times; by NumPy, for which nothing is compiled."""
+    return jax.tree.map(lambda v: np.repeat(np.asarray(v)[None], count, 0), tree)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def outcome(the_scene, trace, start=0):
+    """`cost.outcome` of a world, in one program."""
+    return cost.outcome(the_scene, trace, start)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def outcomes(the_scene, traces):
+    """`cost.outcome` of worlds, in one program."""
+    return jax.vmap(lambda trace: cost.outcome(the_scene, trace))(traces)

@@ -2,7 +2,8 @@
 
 import numpy as np
 import trimesh
-from small import DATA
+
+from tests.small import DATA
 
 HEAD = (DATA / "box.toml").read_text().split("[[object]]")[0]
 

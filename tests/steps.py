@@ -107,7 +107,7 @@ def unbalanced(scene, fields, ctrl, found, stride):
     states = [v[:, times] for v in (found.qpos, found.qvel, found.acc, ctrl)]
     count = states[0].shape[1]
     qpos, qvel, acc, u = (jnp.asarray(v.reshape(-1, v.shape[-1])) for v in states)
-    many = jax.tree.map(lambda v: jnp.repeat(jnp.asarray(v), count, 0), fields)
+    many = jax.tree.map(lambda v: np.repeat(np.asarray(v), count, 0), fields)
 
     @jax.jit
     def force(many, qpos, qvel, acc, u):

@@ -8,7 +8,6 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from small import pinch, still
 
 from codesign_jax import cli, model, scene
 from codesign_jax.commands import optimize
@@ -20,6 +19,7 @@ from scripts.accuracy import beam, decision, impulse, oracle, steps, study, tip,
 from scripts.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
 from scripts.accuracy.store import Case, Store
 from scripts.accuracy.timing import name
+from tests.small import pinch, still
 
 ROOT = Path(__file__).parents[1]
 

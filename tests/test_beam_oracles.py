@@ -12,10 +12,10 @@ import mujoco
 import numpy as np
 import pytest
 from scipy import linalg, special
-from small import pinch
 
 from codesign_jax.scene import hand
 from scripts.accuracy import beam
+from tests.small import pinch
 
 
 @functools.cache

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, control, cost, model, rollout
+from codesign_jax import codesign, control, model, rollout
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.unstack import unstacked
@@ -95,10 +95,7 @@ def decided():
             for name, e in engines(scene).items()
             for trajectory in (False, True)
         }
-        outcomes = {
-            k: jax.tree.map(np.asarray, jax.vmap(lambda t: cost.outcome(scene, t))(v))
-            for k, v in found.items()
-        }
+        outcomes = {k: jax.tree.map(np.asarray, small.outcomes(scene, v)) for k, v in found.items()}
     return scene, found, outcomes
 
 

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import hand_world, nth, pinch, random_constants, random_worlds
 
 from codesign_jax import model, rollout, scene
 from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.scene import schema
+from tests.small import hand_world, nth, pinch, random_constants, random_worlds
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}

@@ -1,16 +1,29 @@
 """Status bits, frozen worlds and their neighbours, saved failures and their replay."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from small import batch_inputs, hand_world, nth, pinch, random_worlds, stack, still, world_inputs
 
 from codesign_jax import cli, cost, model, rollout, runs, start
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.types import Status, Trace, failed
+from tests.small import (
+    batch_inputs,
+    hand_world,
+    nth,
+    outcome,
+    outcomes,
+    pinch,
+    random_worlds,
+    stack,
+    still,
+    world_inputs,
+)
 
 HURRIED = {
     "links": 2,
@@ -60,7 +73,7 @@ def test_a_failed_world_returns_its_last_good_state(batches, traces):
     """First bad step, frozen from then on, and the state before it, at most one step old."""
     the_scene, *_ = batches
     bad = traces[1]
-    result = jax.vmap(lambda t: cost.outcome(the_scene, t))(bad)
+    result = outcomes(the_scene, bad)
     assert not failed(np.asarray(result.status))[[GOOD, NEIGHBOUR]].any()
     assert int(result.status[SUDDEN]) & (Status.SPEED | Status.NONFINITE)
     step = int(result.bad_step[SUDDEN])
@@ -97,7 +110,7 @@ def with_status(the_scene, bits, **changes):
 
 def test_a_capped_step_warns_and_the_trial_counts():
     the_scene = pinch("box")
-    result = cost.outcome(the_scene, with_status(the_scene, {100: Status.SOLVER_CAP}))
+    result = outcome(the_scene, with_status(the_scene, {100: Status.SOLVER_CAP}))
     assert result.status == Status.SOLVER_CAP and result.cost == 0 and result.bad_step == -1
     assert not failed(int(result.status))
     batch = jax.tree.map(lambda v: v[None], result)
@@ -108,17 +121,17 @@ def test_steps_after_the_verdict_do_not_warn():
     the_scene = pinch("box")
     lost = {"distance": (400, 1.0)}
     for step, status in ((399, Status.SOLVER_CAP), (400, Status.OK), (500, Status.OK)):
-        result = cost.outcome(the_scene, with_status(the_scene, {step: Status.SOLVER_CAP}, **lost))
+        result = outcome(the_scene, with_status(the_scene, {step: Status.SOLVER_CAP}, **lost))
         assert result.status == status and result.cost > 0
     # The step taken from the last entry leads to a state that nothing reads.
     last = with_status(the_scene, {the_scene.num_steps - 1: Status.SOLVER_CAP})
-    assert cost.outcome(the_scene, last).status == Status.OK
+    assert outcome(the_scene, last).status == Status.OK
 
 
 def test_an_overflow_fails_the_trial_at_its_step():
     the_scene = pinch("box")
     trace = with_status(the_scene, {100: Status.CONTACT_OVERFLOW, 50: Status.SOLVER_CAP})
-    result = cost.outcome(the_scene, trace)
+    result = outcome(the_scene, trace)
     assert result.status == Status.CONTACT_OVERFLOW | Status.SOLVER_CAP
     assert result.bad_step == 100 and result.cost == the_scene.cost.maximum
 
@@ -126,7 +139,7 @@ def test_an_overflow_fails_the_trial_at_its_step():
 def test_an_invalid_start_fails_the_trial_at_once():
     the_scene = pinch("box")
     trace = with_status(the_scene, {}, distance=(400, 1.0))
-    result = cost.outcome(the_scene, trace, Status.INVALID_START)
+    result = outcome(the_scene, trace, Status.INVALID_START)
     assert result.status == Status.INVALID_START and result.bad_step == 0
     assert result.cost == the_scene.cost.maximum
 
@@ -166,7 +179,7 @@ def test_mujoco_tells_when_its_contacts_do_not_fit(monkeypatch, tmp_path, capfd)
     spec.memory = 20_000
     engine.template = spec.compile()
     trace = engine.rollout(*one_world(the_scene))
-    result = cost.outcome(the_scene, nth(trace, 0))
+    result = outcome(the_scene, nth(trace, 0))
     assert result.status & Status.CONTACT_OVERFLOW and 0 <= result.bad_step <= 25
     assert result.cost == the_scene.cost.maximum
     capfd.readouterr()
@@ -182,7 +195,7 @@ def starting():
 
     def invalid(*params):
         fields, _ = both(the_scene, stack(*params), stack(*[still()] * len(params)))
-        return np.asarray(start.invalid_start(the_scene, fields)) != 0
+        return np.asarray(jax.jit(partial(start.invalid_start, the_scene))(fields)) != 0
 
     return the_scene, invalid
 
@@ -210,7 +223,7 @@ def test_the_depth_is_mujocos(starting):
     the_scene, _ = starting
     params = [hand_world(the_scene, length=x)[0] for x in (0.16, 0.17, 0.18)]
     fields, _ = both(the_scene, stack(*params), stack(*[still()] * 3))
-    ours = np.asarray(start.depth(the_scene, fields))
+    ours = np.asarray(jax.jit(partial(start.depth, the_scene))(fields))
     for p, deep in zip(params, ours, strict=True):
         compiled = model.compile_model(the_scene, p, still())
         data = mujoco.MjData(compiled)

@@ -10,7 +10,6 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from small import batch_inputs, hand_world, nth, pinch, stack
 from toy import TINY
 
 from codesign_jax import cli, rollout, scene
@@ -21,6 +20,7 @@ from codesign_jax.export.play import play
 from codesign_jax.model import build_spec
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status, Trial, failed
+from tests.small import batch_inputs, hand_world, nth, pinch, stack
 
 # A grasp in 2.2 s, with all joints and contacts.
 HURRIED = {

@@ -16,6 +16,12 @@ from tests import small
 SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 2}
 
 
+@jax.jit
+def contacts(centre, radius):
+    """The engine's contacts between spheres of fingers, without a friction cone."""
+    return finger_pairs.contacts(Stages(None), None, centre, radius)
+
+
 def curled(the_scene, seed, bend, height):
     """Model, data and lanes of a hand with random joint angles about a bend, object between."""
     hand, trial = small.hand_world(the_scene, length=0.1)
@@ -55,9 +61,8 @@ def test_candidates_are_all_pairs_of_different_fingers():
 
 def test_concentric_spheres_have_a_normal():
     """Fingers that start inside one another push along MuJoCo's fallback axis, finitely."""
-    the_scene = small.pinch("sphere", **SETTINGS)
     centre = jnp.zeros((3, 1, 1, 2, 1))
-    found = finger_pairs.contacts(Stages(None), the_scene, centre, jnp.full((1, 1, 2, 1), 0.01))
+    found = contacts(centre, jnp.full((1, 1, 2, 1), 0.01))
     np.testing.assert_allclose(found.distance[0], -0.02, rtol=1e-6)
     oracle = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body><freejoint/><geom size=".01"/></body>
@@ -72,11 +77,11 @@ def test_concentric_spheres_have_a_normal():
 
 def test_slots_hold_the_pairs_that_touch():
     """Random spheres: every touching pair of different fingers has one slot, in every world."""
-    the_scene, random = small.pinch("sphere", **SETTINGS), np.random.default_rng(0)
+    random = np.random.default_rng(0)
     links, k, fingers, worlds = 4, 2, 3, 50
     centre = 0.05 * random.normal(size=(3, links, k, fingers, worlds)).astype(np.float32)
     radius = np.full((links, k, fingers, worlds), 0.01, np.float32)
-    c = finger_pairs.contacts(Stages(None), the_scene, jnp.asarray(centre), jnp.asarray(radius))
+    c = contacts(centre, radius)
     flat = centre.reshape(3, -1, worlds)
     finger = np.arange(flat.shape[1]) % fingers
     for w in range(worlds):
@@ -95,7 +100,7 @@ def test_the_derivative_has_a_slot_for_whatever_touches_in_the_kernel():
     count = finger_pairs.slots(spheres, the_scene.num_fingers)
     assert count == pairs * pair_slots(the_scene)
     centre, radius = jnp.zeros((3, spheres, 1, 4, 1)), jnp.full((spheres, 1, 4, 1), 0.01)
-    c = finger_pairs.contacts(Stages(None), the_scene, centre, radius)
+    c = contacts(centre, radius)
     assert c.ends is not None and c.ends.touching == pairs * spheres**2
     assert c.distance.shape[0] == count == c.active.sum()
 

@@ -12,7 +12,6 @@ from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import hull as skin
 from codesign_jax.engines.structured.cones import make_cone
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
@@ -90,10 +89,11 @@ def test_velocities_are_derivatives_of_positions():
         hand, trial = small.hand_world(the_scene, length=LENGTH, height=HEIGHT)
         fields, _ = small.world_inputs(the_scene, hand, trial)
         fields = jax.tree.map(lambda x: x[None], fields)
-        engine, lanes = StructuredEngine(the_scene), world_constants(the_scene, fields)
+        engine, lanes = StructuredEngine(the_scene), small.lanes(the_scene, fields)
         rate = np.random.default_rng(1).normal(size=data.qvel.shape)
         rate[-6:] = 0.0  # the object's are no differences of its coordinates
 
+        @jax.jit
         def at(h):
             qpos = data.qpos + h * np.append(rate, 0.0)
             state = lanes_state(engine, the_scene, fields, qpos, rate)
@@ -105,7 +105,7 @@ def test_velocities_are_derivatives_of_positions():
         motion = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
         rel = relative("hull_table", motion)
         contacts = Contacts(points.point, zero, zero[0], cone, points.weight * points.image)
-        moved = contacts.relative(rel)
+        moved = jax.jit(Contacts.relative)(contacts, rel)
         h = 1e-5
         ends = [v.point + palm[:, None, None, None, None] for _, v, palm in (at(h), at(-h))]
         difference = (ends[0] - ends[1]) / (2 * h)
@@ -113,7 +113,8 @@ def test_velocities_are_derivatives_of_positions():
         np.testing.assert_allclose(moved, difference, atol=1e-8)
         # One common point instead of the images would be wrong by far more than that.
         blended = points.point - jnp.concatenate([kin.origin, kin.origin[:, -1:]], 1)[:, :, None]
-        common = contacts._replace(lever=points.weight * blended).relative(rel)
+        common = contacts._replace(lever=points.weight * blended)
+        common = jax.jit(Contacts.relative)(common, rel)
         assert np.abs(common - difference).max() > 1e-3 * np.abs(difference).max()
 
 

@@ -33,7 +33,7 @@ class Runs(NamedTuple):
 
     def along(self, count, start=None, ctrl=None):
         """The trace and qpos of worlds that repeat the fields."""
-        fields = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[None], count, 0), self.fields)
+        fields = small.repeat(self.fields, count)
         start = self.engine.reset(fields) if start is None else start(fields)
         ctrl = np.repeat(self.ctrl[None], count, 0) if ctrl is None else ctrl
         return jax.tree.map(np.asarray, self.run(fields, start, jnp.asarray(ctrl)))
@@ -164,7 +164,7 @@ def test_too_few_slots_are_an_overflow(monkeypatch):
     scene = oracle.hull_scene("box", links=2, hull_rings=1, hull_points=4)
     with jax.enable_x64(True):
         _, _, fields, _, ctrl = oracle.world(scene)
-    fields = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32)[None], fields)
+    fields = jax.tree.map(lambda x: np.asarray(x, np.float32)[None], fields)
     monkeypatch.setattr(program, "hull_slots", lambda _: 1)
     # A tolerance of its own: a kernel is known by its scene and limits.
     rollout = jax.jit(StructuredEngine(scene, tolerance=1.1e-6).rollout)

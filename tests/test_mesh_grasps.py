@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from small import DATA, hand_world, nth, stack, still
 from solids import box, object_file
 
 from codesign_jax import control, model, scene
@@ -26,6 +25,7 @@ from codesign_jax.runs import scene_files
 from codesign_jax.scene import objects, parameters, schema
 from codesign_jax.scene.meshes import surface
 from tests import steps
+from tests.small import DATA, hand_world, nth, stack, still
 
 ROOT = Path(__file__).parent.parent
 HOUSEHOLD = {

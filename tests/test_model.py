@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from small import hand_world, nth, pinch, random_constants, random_worlds
 
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import spec
+from tests.small import hand_world, nth, pinch, random_constants, random_worlds
 
 # Arrays of mjModel that differ between hands although no ModelFields entry carries them, and why
 # nothing in these scenes reads them.

@@ -4,12 +4,12 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from small import hand_world, pinch, random_worlds, still
 
 from codesign_jax import model, scene
 from codesign_jax.commands import clearance, preflight
 from codesign_jax.scene import parameters
 from codesign_jax.types import Params
+from tests.small import hand_world, pinch, random_worlds, still
 
 
 def low_start():

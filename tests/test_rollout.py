@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from small import hand_world, nth, pinch, random_designs, stack
 
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
+from tests.small import hand_world, nth, pinch, random_designs, stack
 
 PAPER = scene.load("paper_spheres")
 KEY = jax.random.key(5)

@@ -7,12 +7,12 @@ import tomllib
 import jax
 import numpy as np
 import pytest
-from small import DATA, nth, stack
 
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import hand, keypaths, library, objects, parameters, schema
+from tests.small import DATA, nth, stack
 
 HANDS, OBJECTS = sorted(library.available("hands")), sorted(library.available("objects"))
 

@@ -1,5 +1,6 @@
 """`codesign replay` of a failed world: simulated again, and its last good state in MuJoCo C."""
 
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -90,8 +91,10 @@ def _again(scene: Scene, space: DesignSpace, failure: Failure, name: str) -> Non
 def _one_step(scene: Scene, space: DesignSpace, failure: Failure) -> None:
     """Takes the step after the last good state in MuJoCo C: is it the state or the engine?"""
     params, trial = _world(scene, space, failure)
-    compiled = world_model(scene, model.model_fields(scene, params, trial))
-    ctrl = np.asarray(control.commands(scene, params, trial))
+    # Operation by operation, 300 programs would be compiled.
+    fields = jax.jit(partial(model.model_fields, scene))(params, trial)
+    compiled = world_model(scene, fields)
+    ctrl = np.asarray(jax.jit(partial(control.commands, scene))(params, trial))
     data = mujoco.MjData(compiled)
     nq = compiled.nq
     data.qpos[:], data.qvel[:] = failure.state[:nq], failure.state[nq:]

@@ -105,8 +105,8 @@ def make_worlds(chosen: Scene, count: int, *, repeat: int | None = None) -> Worl
     trials = rollout.sample_trials(chosen, jax.random.key(SEED), TRIALS)
     index = np.arange(count) % distinct
     return Worlds(
-        jax.tree.map(lambda x: x[index // TRIALS], params),
-        jax.tree.map(lambda x: x[index % TRIALS], trials),
+        jax.tree.map(lambda x: np.asarray(x)[index // TRIALS], params),
+        jax.tree.map(lambda x: np.asarray(x)[index % TRIALS], trials),
     )
 
 

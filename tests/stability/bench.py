@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from codesign_jax import control, model, scene
+from codesign_jax import model, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
@@ -108,14 +108,14 @@ class Bench:
         """Model fields of worlds, float64 NumPy arrays with a leading world axis."""
         with floats(True):
             worlds = zip(*(jax.tree.map(jnp.asarray, v) for v in (params, trials)), strict=True)
-            found = [model.model_fields(self.scene, p, t) for p, t in worlds]
+            found = [small.world_inputs(self.scene, p, t)[0] for p, t in worlds]
             return jax.tree.map(lambda *v: np.stack(v), *found)
 
     def commands(self, params, trials) -> np.ndarray:
         """The grasp's controls, (world, time, nu)."""
         with floats(True):
             worlds = zip(*(jax.tree.map(jnp.asarray, v) for v in (params, trials)), strict=True)
-            return np.stack([control.commands(self.scene, p, t) for p, t in worlds])
+            return np.stack([small.world_inputs(self.scene, p, t)[1] for p, t in worlds])
 
     def hold(self, seconds: float, *rows) -> np.ndarray:
         """Constant controls, a row for each world, (world, time, nu)."""

@@ -2,6 +2,15 @@
 
 Source: Deimel, Irmisch, Wall, Brock (2017), section VI.1 and Fig. 5; the measures are those of
 section VI.4.  Everything here is a pure function of arrays; files and progress are the caller's.
+
+The front page has an optimisation in ten lines; `notebooks/` go on from there.
+
+>>> from codesign_jax import codesign, parameters, scene
+>>> space = parameters.design_space(scene.load("paper").hand, "2d")
+>>> codesign.make_filter(space).sigma  # of a move, as a share of the parameter's range
+0.05
+>>> codesign.convergence_episode([3.0, 0.5, 1.2, 0.9])  # below 1 from then on
+3
 """
 
 import dataclasses

@@ -1,4 +1,14 @@
-"""Open-loop key frames: pressures and the pose of the arm frame X_D over a grasp (paper Fig. 3)."""
+"""Open-loop key frames: pressures and the pose of the arm frame X_D over a grasp (paper Fig. 3).
+
+>>> import jax
+>>> from codesign_jax import control, parameters, rollout, scene
+>>> grasping = scene.load("paper")
+>>> space = parameters.design_space(grasping.hand, "2d")
+>>> hand, trial = space.params(space.default()), rollout.nominal_trial(grasping)
+>>> controls = jax.jit(control.commands, static_argnums=0)(grasping, hand, trial)
+>>> controls.shape, round(float(controls[400, 6]))  # after 4 s the first chamber has [Pa]
+((900, 10), 120000)
+"""
 
 from typing import Any
 

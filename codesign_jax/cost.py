@@ -1,4 +1,15 @@
-"""Trace to cost and status (paper Sec. VI.1, Fig. 3)."""
+"""Trace to cost and status (paper Sec. VI.1, Fig. 3).
+
+>>> import jax.numpy as jnp
+>>> from codesign_jax import Trace, cost, scene
+>>> grasping = scene.load("paper")
+>>> tuple(round(float(t), 3) for t in grasping.window)  # in which a lost object counts [s]
+(3.5, 8.0)
+>>> away = jnp.where(jnp.arange(900) * 0.01 < 5.0, 0.02, 0.5)  # m: lost after 5 s
+>>> trace = Trace(away, jnp.full(900, 0.2), jnp.zeros(900), jnp.zeros((900, 0)))
+>>> float(cost.outcome(grasping, trace).cost)  # 3 (8 - 5) / (8 - 3.5)
+2.0
+"""
 
 import jax
 import jax.numpy as jnp

@@ -41,6 +41,12 @@ def use_compilation_cache() -> None:
 
     For scripts and notebooks, before their first simulation. A place that was chosen already
     (`jax_compilation_cache_dir`) stays.
+
+    >>> import jax
+    >>> from codesign_jax import use_compilation_cache
+    >>> use_compilation_cache()
+    >>> jax.config.jax_compilation_cache_dir is None
+    False
     """
     import jax
 

@@ -1,4 +1,20 @@
-"""Material of the fingers from a measured tip trajectory, by gradients through the simulation."""
+"""Material of the fingers from a measured tip trajectory, by gradients through the simulation.
+
+`notebooks/06_gradients.py` fits one. All stiffnesses of a finger are proportional to its shear
+modulus:
+
+>>> import jax
+>>> from codesign_jax import fit, model, parameters, rollout, scene
+>>> bench = scene.load("paper_spheres")
+>>> space = parameters.design_space(bench.hand, "2d")
+>>> hand, trial = space.params(space.default()), rollout.nominal_trial(bench)
+>>> fields = jax.jit(model.model_fields, static_argnums=0)(bench, hand, trial)
+>>> twice = fit.Material(2 * bench.hand.material.shear_modulus, bench.hand.material.damping_time)
+>>> first = model.layout(bench).dofs[0, 0, 0]
+>>> stiffer = fit.with_material(bench, fields, twice).jnt_stiffness[first]
+>>> round(float(stiffer / fields.jnt_stiffness[first]), 4)
+2.0
+"""
 
 from typing import NamedTuple
 

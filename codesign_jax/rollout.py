@@ -1,4 +1,17 @@
-"""Particles x trials in one batch: noise, commands, model fields, engine and cost put together."""
+"""Particles x trials in one batch: noise, commands, model fields, engine and cost put together.
+
+>>> import jax
+>>> from codesign_jax import make_engine, parameters, rollout, scene
+>>> grasping = scene.load("paper")
+>>> trials = rollout.sample_trials(grasping, jax.random.key(0), 6)
+>>> trials.position.shape  # (trial, axis) [m]
+(6, 2)
+>>> space = parameters.design_space(grasping.hand, "2d")
+>>> hand, engine = space.params(space.default()), make_engine("structured", grasping)
+>>> rollout.simulate(grasping, engine, hand, trials)
+Traceback (most recent call last):
+codesign_jax.scene.schema.SceneError: params have no axis (world,); ... makes a batch
+"""
 
 from collections.abc import Callable
 from typing import Any

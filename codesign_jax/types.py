@@ -2,6 +2,11 @@
 
 Axis order of the public API is (particle, trial, time, feature).  Failure is data: nothing raises
 inside jit.
+
+>>> import numpy as np
+>>> from codesign_jax import types
+>>> types.failed(np.array([0, types.Status.SPEED, types.Status.SOLVER_CAP]))
+array([False,  True, False])
 """
 
 import enum
@@ -27,6 +32,10 @@ class Status(enum.IntFlag):
         structured engine for those between fingers.
       INVALID_START: Bad model fields, or bodies deep inside one another before the first step.
       STUCK: The released object neither left the hand nor rests on the table.
+
+    >>> from codesign_jax import Status
+    >>> Status(10)
+    <Status.SPEED|SOLVER_CAP: 10>
     """
 
     OK = 0
@@ -61,6 +70,14 @@ class Params(NamedTuple):
       spread: Spread gamma between the finger pairs [rad], shape ().
       arm: Arm pose X_D after the approach: x, y, z [m], roll, pitch, yaw [rad], shape (6,).
       pressure: Chamber gauge pressure while grasping p_i [Pa], shape (finger,).
+
+    A design space makes them of the numbers that are free, given in the units of the hand file:
+
+    >>> from codesign_jax import parameters, scene
+    >>> space = parameters.design_space(scene.load("paper").hand, "2d")
+    >>> hand = space.params(space.from_units([95.0, 30.0]))  # finger length and arm height, mm
+    >>> hand.length.shape, round(float(hand.length[0]), 6), round(float(hand.arm[2]), 6)
+    ((4,), 0.095, 0.03)
     """
 
     length: jax.Array
@@ -84,6 +101,11 @@ class Trial(NamedTuple):
       friction: Factor on the friction of all contacts, shape (); None for 1.
       stiffness: Factor on the fingers' shear modulus, shape (); None for 1.
       hand_mass: Factor on the masses of fingers and palm, shape (); None for 1.
+
+    >>> from codesign_jax import rollout, scene
+    >>> trial = rollout.nominal_trial(scene.load("paper"), "sphere")
+    >>> int(trial.shape), float(trial.mass)
+    (2, 1.0)
     """
 
     shape: jax.Array
@@ -119,6 +141,16 @@ class Trace(NamedTuple):
         CONTACT_OVERFLOW), shape (time,) int32, or None if it does not tell.
       last: Generalized positions and velocities at the end, those in which a decided world stays,
         shape (nq + nv,), or None.
+
+    An object that leaves the hand after six seconds, as its cost sees it:
+
+    >>> import jax.numpy as jnp
+    >>> from codesign_jax import Trace, cost, scene
+    >>> time = jnp.arange(900) * 0.01  # s
+    >>> away = jnp.where(time < 6.0, 0.02, 0.5)  # m
+    >>> trace = Trace(away, jnp.full(900, 0.2), jnp.zeros(900), jnp.zeros((900, 0)))
+    >>> round(float(cost.outcome(scene.load("paper"), trace).lost_time), 3)
+    6.0
     """
 
     distance: jax.Array

@@ -1,4 +1,9 @@
-"""Engines by name; each advances batches of worlds behind the interface in `base`."""
+"""Engines by name; each advances batches of worlds behind the interface in `base`.
+
+>>> from codesign_jax import engines
+>>> engines.NAMES
+('structured', 'mujoco', 'mjx')
+"""
 
 import functools
 
@@ -20,6 +25,14 @@ def make_engine(name: str, scene: Scene) -> Engine:
     Raises:
       SceneError: If there is no such engine, or it does not do what the scene asks for: effects,
         meshes, or a [solver] table that it does not read, see `solver_problems`.
+
+    >>> from codesign_jax import make_engine, scene
+    >>> grasping = scene.load("paper")
+    >>> make_engine("structured", grasping).name
+    'structured'
+    >>> make_engine("mojoco", grasping)
+    Traceback (most recent call last):
+    codesign_jax.scene.schema.SceneError: engine 'mojoco' unknown; did you mean 'mujoco'?
     """
     if name == "mjx":
         from codesign_jax.engines.mjx import MjxEngine

@@ -1,1 +1,9 @@
-"""A design that leaves the program: MuJoCo models, commands, parts to cast, a build sheet."""
+"""A design that leaves the program: MuJoCo models, commands, parts to cast, a build sheet.
+
+`codesign export` writes all of it. The wall that a mould leaves is the design's:
+
+>>> from codesign_jax import export, parameters, scene
+>>> from codesign_jax.export import grasps
+>>> [name for name, _ in grasps.phases(scene.load("paper"))]
+['approach', 'inflate', 'lift', 'disturb', 'ungrasp']
+"""

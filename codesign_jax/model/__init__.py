@@ -11,6 +11,14 @@ Springs are integrated linearly implicitly in every engine by the same substitut
 stiffness K and damping D and time step h: dof_damping = D + h K and dof_armature = h (D + h K),
 integrator Euler with eulerdamp disabled.  MuJoCo then solves (M + h D + h^2 K) a = tau - K q - (D +
 h K) v.
+
+>>> from codesign_jax import model, scene
+>>> grasping = scene.load("paper")
+>>> template = model.compile_template(grasping)  # a mujoco.MjModel
+>>> model.layout(grasping).dofs.shape  # degrees of freedom by finger, link and axis
+(4, 10, 3)
+>>> template.nv == 6 + 4 * 10 * 3 + 6  # wrist, fingers, object
+True
 """
 
 from codesign_jax.model.fields import (

@@ -1,4 +1,22 @@
-"""Optimisers behind ``init``, ``ask`` and ``tell``; they know arrays and costs, no physics."""
+"""Optimisers behind ``init``, ``ask`` and ``tell``; they know arrays and costs, no physics.
+
+>>> import jax, numpy as np
+>>> from codesign_jax import optimize
+>>> optimize.schedule("switch-1", [True, False], 4)  # length, then arm height
+array([[ True, False],
+       [ True, False],
+       [False,  True],
+       [False,  True]])
+>>> space = optimize.Space(np.array([0.0, 0.0]), np.array([1.0, 1.0]))
+>>> optimizer = optimize.ParticleFilter(space)
+>>> state = optimizer.init(jax.random.key(0), [0.5, 0.9], 3)
+>>> population = optimizer.ask(state, np.array([True, False]))
+>>> population.shape, bool((population[:, 1] == state.particles[:, 1]).all())
+((3, 2), True)
+>>> state, info = optimizer.tell(state, population, np.array([2.0, 0.1, 3.0]))
+>>> int(info.best_index), int(state.episode)
+(1, 1)
+"""
 
 from codesign_jax.optimize.bounds import Space, reflect, strictly_below
 from codesign_jax.optimize.evolution import Evolution

@@ -3,6 +3,14 @@
 `load` reads a scene file with the hand and the objects that it names, and checks all of them.
 `parameters` has the design space, `constants` the numbers that may be traced, `effects` what each
 effect means, `schema` the checks of files, `meshes` objects of any shape.
+
+>>> from codesign_jax import scene
+>>> grasping = scene.load("paper", overrides={"discretization.links": 5})
+>>> grasping.num_fingers, grasping.num_steps, grasping.discretization.timestep  # s
+(4, 900, 0.01)
+>>> scene.load("paper", overrides={"gravty": 3.7})
+Traceback (most recent call last):
+codesign_jax.scene.schema.SceneError: paper.toml.gravty is not a known key; did you mean 'gravity'?
 """
 
 from codesign_jax.scene.description import Constants, Scene, by_structure

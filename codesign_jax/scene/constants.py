@@ -1,4 +1,13 @@
-"""Constants: checks of changed ones, batches of them, and what a trial changes in them."""
+"""Constants: checks of changed ones, batches of them, and what a trial changes in them.
+
+>>> from codesign_jax import constants, scene
+>>> grasping = scene.load("paper")
+>>> mars = grasping.constants()._replace(gravity=3.7)  # m/s^2
+>>> constants.check(grasping, mars)
+>>> constants.check(grasping, mars._replace(gravity=-3.7))
+Traceback (most recent call last):
+codesign_jax.scene.schema.SceneError: constants.gravity = -3.7 is outside [0, 100] m/s^2
+"""
 
 from collections.abc import Iterator
 from typing import Any

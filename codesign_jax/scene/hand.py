@@ -1,4 +1,13 @@
-"""Hand files: read, and checked as a whole; `hand_tables` has what is in them."""
+"""Hand files: read, and checked as a whole; `hand_tables` has what is in them.
+
+>>> from codesign_jax import hand
+>>> tripod = hand.load("tripod3")
+>>> len(tripod.finger), tripod.material.shear_modulus  # Pa
+(3, 56000.0)
+>>> hand.load("tripod")
+Traceback (most recent call last):
+codesign_jax.scene.schema.SceneError: hands: 'tripod' unknown; did you mean 'tripod3'?
+"""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,4 +1,9 @@
-"""Object sets as data: shapes, masses, friction and the noise of a trial (paper Sec. VI.2)."""
+"""Object sets as data: shapes, masses, friction and the noise of a trial (paper Sec. VI.2).
+
+>>> from codesign_jax import objects
+>>> [(shape.name, shape.mass) for shape in objects.load("paper").object]  # kg
+[('cuboid', 0.05), ('cylinder', 0.05), ('sphere', 0.05)]
+"""
 
 import dataclasses
 from collections.abc import Mapping

@@ -3,6 +3,17 @@
 A *full* vector holds every parameter of the hand's table in the table's order, one entry a finger
 where the row says so, in SI units and radians.  A *design* vector holds a preset's free parameters
 only.
+
+>>> import numpy as np
+>>> from codesign_jax import parameters, scene
+>>> space = parameters.design_space(scene.load("paper").hand, "2d")
+>>> space.names, space.units, space.is_morphology
+(('length', 'arm_z'), ('mm', 'mm'), (True, False))
+>>> space.from_units([95.0, 30.0])  # mm to m
+array([0.095, 0.03 ])
+>>> space.params(np.array([95.0, 0.03]))
+Traceback (most recent call last):
+codesign_jax.scene.schema.SceneError: length = 95.0 is outside [0.001, 1] m; did you mean 0.095? ...
 """
 
 import dataclasses

@@ -32,6 +32,14 @@ class SceneError(ValueError):
 
     Attributes:
       problems: One message for each problem found.
+
+    >>> from codesign_jax import SceneError, scene
+    >>> try:
+    ...     scene.load("paper", overrides={"gravity": -1, "discretization.links": 0})
+    ... except SceneError as error:
+    ...     print(error)
+    paper.toml.discretization.links = 0 is outside [1, 200]
+    paper.toml.gravity = -1 is outside [0, 100] m/s^2
     """
 
     def __init__(self, problems: list[str]):

@@ -1,0 +1,54 @@
+"""A user's program as type checkers see it: `make types` checks it, nothing runs it.
+
+The lines with `pyright: ignore` are mistakes: where one is not found, `make types` fails.
+"""
+
+# pyright: reportUnnecessaryTypeIgnoreComment=true, reportAttributeAccessIssue=true
+# pyright: reportArgumentType=true
+
+import jax
+import numpy as np
+
+from codesign_jax import (
+    Params,
+    SceneError,
+    Status,
+    codesign,
+    make_engine,
+    parameters,
+    rollout,
+    scene,
+    use_compilation_cache,
+)
+
+
+def find_a_design(steps: int) -> np.ndarray:
+    use_compilation_cache()
+    try:
+        grasping = scene.load("paper", overrides={"discretization.links": 5})
+    except SceneError as error:
+        raise SystemExit("; ".join(error.problems)) from error
+    engine = make_engine("structured", grasping)
+    space = parameters.design_space(grasping.hand, "2d")
+    optimizer = codesign.make_filter(space)
+    episode = codesign.make_episode(grasping, engine, space, optimizer, num_trials=3)
+    state = optimizer.init(jax.random.key(0), space.default(), num_particles=10)
+    for _ in range(steps):
+        state, _info = episode(state, np.ones(2, bool))
+    hand: Params = space.params(state.particles[0])
+    trials = rollout.sample_trials(grasping, jax.random.key(1), 6)
+    batch = jax.tree.map(lambda v: v[None], hand)
+    outcome = rollout.evaluate(grasping, engine, batch, trials)
+    if Status(int(outcome.status[0, 0])) & Status.STUCK:
+        return np.zeros(0)
+    return space.in_units(np.asarray(state.particles[0]))
+
+
+def mistakes() -> None:
+    grasping = scene.load("paper")
+    scene.load("paper", hand="tripod3")  # pyright: ignore[reportCallIssue]
+    parameters.design_space(grasping)  # pyright: ignore[reportArgumentType]
+    space = parameters.design_space(grasping.hand)
+    space.from_unit(np.zeros(2))  # pyright: ignore[reportAttributeAccessIssue]
+    codesign.make_filter(space, 0.05)  # pyright: ignore[reportCallIssue]
+    scene.lod("paper")  # pyright: ignore[reportAttributeAccessIssue]

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from toy import TINY
 
-from codesign_jax import cli, runs
+from codesign_jax import cli, codesign, runs
 from codesign_jax.commands import common, preflight, reference
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import choice, columns
@@ -277,12 +277,22 @@ def test_fresh_starts_anew(finished, tmp_path, capsys):
     assert not (folder / "tests.csv").exists()
 
 
-def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, capsys):
+def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, monkeypatch, capsys):
     """Here shortened to a few coarse steps, as everything else of the run is."""
     folder = shutil.copytree(finished, tmp_path / "run")
     assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
     line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("on 2 fresh"))
     assert "accuracy reference (1 ms, 20 links): mean cost" in line and "95 % interval" in line
+
+    def never(*arguments):
+        raise AssertionError("simulated again")
+
+    with monkeypatch.context() as patch:  # kept in the run folder
+        patch.setattr(codesign, "make_evaluate", never)
+        assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
+        assert line in capsys.readouterr().out.splitlines()
+        with pytest.raises(AssertionError, match="simulated again"):
+            command(*RUN, "--reference-trials", "3", "--out", folder)
     settings = runs.read_run(folder)[1]
     assert reference.number_of_trials(None, settings) == 0  # MuJoCo C would take minutes
     quick = dataclasses.replace(settings, engine="structured")

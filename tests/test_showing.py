@@ -214,6 +214,40 @@ def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
     assert not list(workplace.iterdir()) and "stopped" in capsys.readouterr().out
 
 
+def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
+    """After the first of three calls; another seed begins anew."""
+    monkeypatch.setitem(command.WORLDS, "cpu", 3)
+    made, count = codesign.make_evaluate, []
+
+    def stopping(*arguments):
+        evaluate = made(*arguments)
+
+        def call(*rest):
+            count.append(len(rest[0]))
+            if len(count) == 2:
+                raise KeyboardInterrupt
+            return evaluate(*rest)
+
+        return call
+
+    grid = ["landscape", *DESIGN, "--points", "3", "--trials", "1", "--out"]
+    assert cli.main([*grid, "whole"]) == 0
+    monkeypatch.setattr(codesign, "make_evaluate", stopping)
+    assert cli.main([*grid, "part"]) == 130
+    assert "the same command goes on" in capsys.readouterr().out
+    assert (workplace / "part" / command.PART).exists()
+    assert cli.main([*grid, "part"]) == 0
+    assert "going on after 1 calls" in capsys.readouterr().out and count == [3, 3, 3, 3]
+    for name in (landscape.FILE, landscape.TABLE):
+        assert (workplace / "part" / name).read_bytes() == (workplace / "whole" / name).read_bytes()
+    assert not (workplace / "part" / command.PART).exists()
+    count.clear()
+    assert cli.main([*grid, "part"]) == 130
+    monkeypatch.setattr(codesign, "make_evaluate", made)
+    assert cli.main([*grid, "part", "--seed", "1"]) == 0
+    assert "going on" not in capsys.readouterr().out
+
+
 def test_missing_extra_is_one_line(monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "codesign_jax.report.animation")
     monkeypatch.delattr(importlib.import_module("codesign_jax.report"), "animation")

@@ -17,6 +17,7 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
+from codesign_jax.runs import outcomes
 from codesign_jax.runs.directory import PROVENANCE
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import schema
@@ -25,6 +26,9 @@ from codesign_jax.types import Outcome, failed
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Landscape as Options
+
+PART = "landscape.part.npz"
+"""What is done of a landscape, until it is finished."""
 
 WORLDS = {"cpu": 512}
 """Most worlds of one call by platform: few enough to see progress, enough to fill the cores."""
@@ -62,14 +66,16 @@ def main(options: "Options") -> int:
         console.print(f"around: {runs.describe(case.space, case.design)}", markup=False)
     for note in common.mesh_notes(case.scene):
         console.print(note, markup=False)
+    part = folder / PART
     try:
-        outcomes = _simulate(case, made.designs, options, console)
+        simulated = _simulate(case, made.designs, options, console, part)
     except KeyboardInterrupt:
-        console.print("stopped; nothing was written")
+        console.print("stopped; the same command goes on")
         return 130
-    found = summarize(case, made, outcomes, options.seed)
+    found = summarize(case, made, simulated, options.seed)
     _report(case, found, console)
     _write(case, found, folder, console)
+    part.unlink(missing_ok=True)
     return 0
 
 
@@ -140,41 +146,64 @@ def grid(case: Case, columns: tuple[int, int], points: int) -> Grid:
     return Grid(columns, (axes[0], axes[1]), np.asarray(projected))
 
 
-def _simulate(case: Case, designs: np.ndarray, options: "Options", console: Console) -> Outcome:
-    """Simulates all designs in the same trials, some at a time; outcomes (design, trial)."""
+def _simulate(
+    case: Case, designs: np.ndarray, options: "Options", console: Console, part: Path
+) -> Outcome:
+    """Simulates all designs in the same trials, some at a time; outcomes (design, trial).
+
+    What is done is kept in a file, from which the same command goes on.
+    """
     engine = make_engine(case.engine, case.scene)
     evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
     most = WORLDS.get(jax.default_backend(), _WORLDS)
     size = min(len(designs), max(1, most // options.trials))
     calls = -(-len(designs) // size)
     size = -(-len(designs) // calls)  # equal calls: a short last one would be filled up
-    key, parts = jax.random.key(options.seed), []
+    key, noise = _key(case, designs, options, size), jax.random.key(options.seed)
+    done = outcomes.load(part, key)
+    parts = [] if done is None else [done]
     console.print(f"grasps: {designs.shape[0] * options.trials} in {calls} calls")
+    first = 0 if done is None else len(done.cost)
+    if first:
+        console.print(f"going on after {first // size} calls, from {part}", markup=False)
     columns = (*Progress.get_default_columns()[:-1], TimeRemainingColumn())
     quiet = not console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
-        for start in progress.track(range(0, len(designs), size), description="simulating"):
+        for start in progress.track(range(first, len(designs), size), description="simulating"):
             rows = np.minimum(np.arange(start, start + size), len(designs) - 1)
-            outcome = evaluate(jnp.asarray(designs[rows]), key)
+            outcome = evaluate(jnp.asarray(designs[rows]), noise)
             parts.append(jax.tree.map(np.asarray, outcome))
-    return jax.tree.map(lambda *v: np.concatenate(v)[: len(designs)], *parts)
+            if start + size < len(designs):
+                parts = [_joined(parts)]
+                outcomes.save(part, parts[0], key)
+    return jax.tree.map(lambda v: v[: len(designs)], _joined(parts))
 
 
-def summarize(case: Case, made: Grid, outcomes: Outcome, seed: int) -> Landscape:
+def _key(case: Case, designs: np.ndarray, options: "Options", size: int) -> str:
+    """Digest of what determines the outcomes; calls of another size round differently."""
+    how = options.trials, options.seed
+    return f"{outcomes.key(case.scene, case.engine, designs, *how)} {size}"
+
+
+def _joined(parts: list[Outcome]) -> Outcome:
+    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+
+
+def summarize(case: Case, made: Grid, found: Outcome, seed: int) -> Landscape:
     """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
     space, shape = case.space, tuple(len(axis) for axis in made.axes)
-    counted = ~failed(outcomes.status)
-    kept = counted & (outcomes.cost < codesign.SUCCESS_COST)
+    counted = ~failed(found.status)
+    kept = counted & (found.cost < codesign.SUCCESS_COST)
     scale = np.asarray(space.scale)[[*made.columns]]
     return Landscape(
         names=np.array([space.names[k] for k in made.columns]),
         units=np.array([space.units[k] for k in made.columns]),
         first=made.axes[0] / scale[0],
         second=made.axes[1] / scale[1],
-        cost=np.asarray(particle_cost(case.scene, outcomes)).reshape(shape),
+        cost=np.asarray(particle_cost(case.scene, found)).reshape(shape),
         kept=kept.sum(1).reshape(shape),
         counted=counted.sum(1).reshape(shape),
-        trials=np.array(outcomes.cost.shape[1]),
+        trials=np.array(found.cost.shape[1]),
         seed=np.array(seed),
         design=np.asarray(case.design),
     )

@@ -6,7 +6,6 @@ trials that the run has not met and with finer steps; docs/results.md has how mu
 """
 
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +14,16 @@ from rich.console import Console
 
 from codesign_jax import codesign, engines
 from codesign_jax.commands import common
-from codesign_jax.commands.case import find_case
+from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.flags import Subject
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
-from codesign_jax.runs import Settings
+from codesign_jax.runs import Settings, outcomes
+from codesign_jax.types import Outcome
 
 ACCURACY = "reference"
+FILE = "reference.npz"
+"""Where the outcomes are kept in the run folder."""
 TRIALS = 24
 """Fresh trials by default: without a loss in them, 86 to 100 % of grasps hold (95 % interval)."""
 
@@ -41,8 +43,10 @@ def number_of_trials(asked: int | None, settings: Settings) -> int:
     return TRIALS if settings.engine == engines.DEFAULT and settings.test_trials else 0
 
 
-def test(folder: Path, settings: Settings, trials: int, console: Console) -> Any:
+def test(folder: Path, settings: Settings, trials: int, console: Console) -> Outcome:
     """Simulates the best particle of a run in fresh trials at `reference` and says how it did.
+
+    Its outcomes are kept in the run folder: a finished run does not simulate them again.
 
     Args:
       folder: Run folder.
@@ -54,18 +58,25 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Any
       Outcomes of the trials, shape (trial,).
     """
     case = find_case(Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY))
+    key = outcomes.key(case.scene, case.engine, case.design[None], trials, settings.seed)
+    found = outcomes.load(folder / FILE, key)
+    if found is None:
+        found = _simulate(case, settings, trials)
+        outcomes.save(folder / FILE, found, key)
+    size = case.scene.discretization
+    verdict = common.verdict(float(particle_cost(case.scene, found)), found.cost, found.status)
+    console.print(
+        f"on {trials} fresh trials at accuracy {ACCURACY} ({1e3 * size.timestep:g} ms, "
+        f"{size.links} links): {verdict}"
+    )
+    return found
+
+
+def _simulate(case: Case, settings: Settings, trials: int) -> Outcome:
+    """Outcomes of the design in fresh trials, shape (trial,)."""
     evaluate = codesign.make_evaluate(
         case.scene, make_engine(case.engine, case.scene), case.space, trials
     )
     key = codesign.stream_key(jax.random.key(settings.seed), STREAM_REFERENCE)
     found = evaluate(jnp.asarray(case.design, jnp.float32)[None], key)
-    outcomes = jax.tree.map(np.asarray, found)
-    size = case.scene.discretization
-    verdict = common.verdict(
-        float(particle_cost(case.scene, outcomes)[0]), outcomes.cost[0], outcomes.status[0]
-    )
-    console.print(
-        f"on {trials} fresh trials at accuracy {ACCURACY} ({1e3 * size.timestep:g} ms, "
-        f"{size.links} links): {verdict}"
-    )
-    return jax.tree.map(lambda v: v[0], outcomes)
+    return jax.tree.map(lambda v: np.asarray(v)[0], found)

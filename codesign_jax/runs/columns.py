@@ -119,6 +119,10 @@ FILES = {
     "arrays (`codesign_jax.report.landscape.Landscape`)",
     "landscape.csv": "the same, a row for a point: the two parameters with units, mean cost, "
     "trials that kept the object, trials that did not fail, trials",
+    "landscape.part.npz": "what is done of a landscape that was interrupted; the same command goes "
+    "on",
+    "reference.npz": "outcomes of the chosen design's fresh trials at accuracy `reference`, arrays "
+    "of shape (trial,), and the digest of what determines them",
     "replay.html": "a grasp in 3D, of `codesign replay`: opens in any browser, without a network",
     "report.html": "the report of `codesign report`: opens in any browser, without a network",
 }

@@ -9,9 +9,10 @@ from scipy import integrate
 from codesign_jax.scene import objects
 from tests import small
 from tests.stability.bench import bench, pinch
+from tests.stability.hold import lifted
 from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
-from tests.stability.touch import CUBOID, SPHERE, at_height, held, lifted, worlds
+from tests.stability.touch import CUBOID, SPHERE, at_height, held, worlds
 from tests.test_contact import GRAVITY, MU
 
 HALF = 0.030  # half a side of the cuboid, and radius of the sphere [m]

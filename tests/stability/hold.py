@@ -71,7 +71,14 @@ def pinch_drops(engine, step, precision):
     assert fast.any(), "it never slips"
     when = start + int(np.argmax(fast))
     load = mass * masses[when // CHUNK] * GRAVITY
-    reader, grips = Reader(b.scene, fields), []
+    factor = masses[when // CHUNK]
+    heavier = fields._replace(
+        **{n: getattr(fields, n).copy() for n in ("body_mass", "body_inertia", "dof_M0")}
+    )
+    heavier.body_mass[:, -1] *= factor
+    heavier.body_inertia[:, -1] *= factor
+    heavier.dof_M0[:, -6:] *= factor
+    reader, grips = Reader(b.scene, heavier), []
     # A sliding contact hops, so the grip is the mean over the last tenth of a second.
     for k in range(when - round(0.1 / b.h), when):
         reader.at(history.qpos[0, k], history.qvel[0, k], ctrl[0, k + 1])

@@ -69,7 +69,7 @@ def costs(engine, step, links, calls=2):
 # %%
 settings = [("structured", 10, 2), ("mujoco", 10, 2)]
 if not FAST:
-    steps, links = (20, 10, 5), (5, 10)
+    steps, links = (10, 5, 2.5), (5, 10)
     settings = [("structured", h, n) for h in steps for n in links] + [("mujoco", 10, 10)]
 reference, _ = costs(*(("mujoco", 5, 2) if FAST else ("structured", 1, 20)), calls=1)
 results = []

@@ -11,6 +11,7 @@ from jax.experimental import pallas as pl
 
 from codesign_jax.compiler import thread, vector
 from codesign_jax.compiler.launch import Kernel, launch
+from codesign_jax.compiler.layout import Array, Layout
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
 BACKENDS = ["cpu", pytest.param("gpu", marks=pytest.mark.gpu)]
@@ -253,8 +254,11 @@ def write(function, *kinds, lanes=8):
         )
         (equation,) = jax.make_jaxpr(call)(*inputs).eqns
         blocks = [((1, size), k) for k in (*kinds, kinds[0])]
-        extra = (size,) if writer is vector else ([False] * len(blocks), "test")
-        yield writer.write(equation.params["jaxpr"], blocks, *extra)
+        if writer is vector:
+            yield vector.write(equation.params["jaxpr"], blocks, size)
+            continue
+        arrays = tuple(Array(shape, np.dtype(k).name) for shape, k in blocks)
+        yield thread.write(equation.params["jaxpr"], Layout(arrays, size), "test")
 
 
 @pytest.mark.parametrize(
@@ -308,8 +312,8 @@ def test_lanes_meet_where_they_read_what_others_wrote():
     shape = jax.ShapeDtypeStruct((1, 2, 32), jnp.float32)
     call = pl.pallas_call(kernel, grid=(1,), in_specs=[spec], out_specs=spec, out_shape=shape)
     (equation,) = jax.make_jaxpr(call)(shape).eqns
-    blocks = [((2, 32), np.float32)] * 2
-    text = thread.write(equation.params["jaxpr"], blocks, [False] * 2, "test")
+    layout = Layout((Array((2, 32), "float32"),) * 2, 32)
+    text = thread.write(equation.params["jaxpr"], layout, "test")
     lines = [line for line in text.splitlines() if " load " in line or "bar.warp" in line]
     assert ["bar.warp" in line for line in lines if "declare" not in line] == [
         False,
@@ -335,8 +339,8 @@ def loop_text(reverse, rows=128, count=60):
     shape = jax.ShapeDtypeStruct((1, rows, 32), jnp.float32)
     call = pl.pallas_call(kernel, grid=(1,), in_specs=[spec], out_specs=spec, out_shape=shape)
     (equation,) = jax.make_jaxpr(call)(shape).eqns
-    blocks = [((rows, 32), np.float32)] * 2
-    return thread.write(equation.params["jaxpr"], blocks, [False] * 2, "test").splitlines()
+    layout = Layout((Array((rows, 32), "float32"),) * 2, 32)
+    return thread.write(equation.params["jaxpr"], layout, "test").splitlines()
 
 
 @pytest.mark.parametrize("reverse", [False, True])

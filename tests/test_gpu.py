@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from codesign_jax.compiler import launch
 from codesign_jax.engines.structured import StructuredEngine
 from tests import gpu_cases, small
 
@@ -83,15 +84,17 @@ def test_verdicts(on_cpu, name):
 
 @pytest.mark.parametrize("name", ["spheres", "hull and fingers", "mesh"])
 def test_neighbours_in_a_block_change_no_bit(name):
-    """A world's numbers are the same whatever worlds share its warp."""
-    scene = gpu_cases.short_scene(name)
+    """A world's numbers are the same whatever worlds share its block, however wide that is."""
+    scene, many = gpu_cases.short_scene(name), 5000
     fields, ctrl = gpu_cases.inputs(scene, 40)
+    widths = [launch.block_lanes("gpu", np.float32, 4 * worlds) for worlds in (40, many)]
+    assert widths[0] < widths[1] == 32
     run = jax.jit(StructuredEngine(scene).rollout)
-    order = np.random.default_rng(0).permutation(40)
-    alone = run(fields, ctrl[:, :400])
+    order = np.random.default_rng(0).integers(0, 40, many)
+    few = run(fields, ctrl[:, :400])
     mixed = run(jax.tree.map(lambda v: v[order], fields), ctrl[order, :400])
     for key in ("distance", "height", "speed", "status"):
-        want = np.asarray(getattr(alone, key))[order]
+        want = np.asarray(getattr(few, key))[order]
         np.testing.assert_array_equal(getattr(mixed, key), want, err_msg=key)
 
 

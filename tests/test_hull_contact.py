@@ -187,15 +187,16 @@ class Dense:
             total = total + w * jac
         return total
 
-    def _add(self, scene, data, jac, normal, gap, friction, share, bodies):
+    def _add(self, scene, data, jac, normal, gap, friction, share, bodies, ratio=None):
         c = scene.contact
+        ratio = c.friction_ratio if ratio is None else ratio
         frame = np.linalg.svd(normal[None])[2]
         frame[0] = normal
         jac, d = frame @ jac, c.impedance
         r = (1 - d) / d * model.contact_invweight(scene) * bodies / share
         reference = -2 / (d * c.time_constant) * (jac @ data.qvel)
         reference[0] -= gap * d / (d * c.time_constant) ** 2
-        self.rows.append((jac, reference, np.array([r, r / c.friction_ratio]), friction))
+        self.rows.append((jac, reference, np.array([r, r / ratio]), friction))
         self.num_hull += 1
 
     def solve(self):

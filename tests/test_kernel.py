@@ -59,7 +59,9 @@ def test_kernel_becomes_ptx(effects, monkeypatch):
     monkeypatch.setattr(gpu, "register", register)
     monkeypatch.setattr(launch, "available", lambda platform: None)
     scene = small.pinch("cylinder", links=2, **{f"effects__{k}": v for k, v in effects.items()})
-    program, engine = Program(scene, Limits(8, 8, 1e-6)), StructuredEngine(scene)
+    width = 16 if effects else 32  # half a warp takes part, or all of it
+    program = Program(scene, Limits(8, 8, 1e-6), width=width)
+    engine = StructuredEngine(scene)
 
     def run(params, trials):
         f, c = small.batch_inputs(scene, params, trials)
@@ -73,6 +75,7 @@ def test_kernel_becomes_ptx(effects, monkeypatch):
     (code,) = texts
     used, other = ("f64", "f32") if effects else ("f32", "f64")
     assert "@registered" in text and f".entry {gpu.ENTRY}(" in code
+    assert f".maxntid {width}" in code and (", 65535;" if effects else ", -1;") in code
     assert f"fma.rn.{used}" in code and f".{other}" not in code
 
 

@@ -47,8 +47,7 @@ def device_code(jaxpr: Any, layout: Layout) -> str:
     Raises:
       NotImplementedError: If the kernel does something that has no instruction.
     """
-    shared = [a.shared for a in layout.arrays]
-    return nvptx.assembly(thread.write(jaxpr, layout.blocks, shared, ENTRY))
+    return nvptx.assembly(thread.write(jaxpr, layout, ENTRY))
 
 
 class Driver:
@@ -204,7 +203,7 @@ def handler_code(name: str, layout: Layout) -> str:
     launched = _call(
         h,
         "cuLaunchKernel",
-        f"ptr {kernel}, i32 {grid}, i32 1, i32 1, i32 {thread.LANES}, i32 1, i32 1, i32 0, "
+        f"ptr {kernel}, i32 {grid}, i32 1, i32 1, i32 {h.layout.lanes}, i32 1, i32 1, i32 0, "
         f"ptr {stream}, ptr {params}, ptr null",
     )
     popped = _call(h, "cuCtxPopCurrent_v2", f"ptr {context}")

@@ -48,13 +48,43 @@ def available(platform: str) -> str | None:
     return _available(platform)
 
 
-def block_lanes(platform: str, dtype: Any) -> int:
-    """Lanes that fill a vector of the CPU, or a warp."""
+WARPS_EACH = 4
+"""Warps of a GPU's multiprocessor up to which narrower blocks are faster: one a scheduler."""
+FEWEST_LANES = 8
+
+
+def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
+    """Lanes that fill a vector of the CPU, or a warp.
+
+    A block takes as long as its slowest world.  Where a batch leaves a GPU's schedulers without
+    work, blocks are half or a quarter of a warp, so that fewer worlds wait for one another
+    (whole grasps of 1,728 worlds on an H200: 0.72 instead of 0.41 million world-steps/s with the
+    hull and contact between fingers, 2.9 instead of 2.2 with the hull; of 7,200 worlds 1.15 and
+    1.04, 3.9 and 4.5).
+
+    Args:
+      platform: As `jax.default_backend` names it.
+      dtype: Type of the numbers.
+      total: Lanes of all worlds of the batch, if they are known.
+    """
     if platform == "cpu":
         from codesign_jax.compiler import host
 
         return host.vector_bytes() // np.dtype(dtype).itemsize
-    return 32
+    lanes = 32
+    if total is not None:
+        while lanes > FEWEST_LANES and 2 * total <= lanes * WARPS_EACH * _multiprocessors():
+            lanes //= 2
+    return lanes
+
+
+@functools.cache
+def _multiprocessors() -> int:
+    """Multiprocessors of this computer's first GPU; those of an A100 if it does not tell."""
+    try:
+        return int(getattr(jax.local_devices(backend="gpu")[0], "core_count", 108))
+    except RuntimeError:  # the kernel is compiled for another computer
+        return 108
 
 
 def launch(

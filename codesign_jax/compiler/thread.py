@@ -7,16 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from codesign_jax.compiler.layout import Layout
 from codesign_jax.compiler.values import LLVM_TYPES, SIZES, Ref, Value, kind_of
 from codesign_jax.compiler.writer import Writer
 
 LANES = 32
-"""Threads of a warp."""
+"""Threads of a warp, of which a block may have the first few."""
 
 AHEAD = 300
 """Lines of a loop between asking for a row and reading it, about the time that memory takes."""
-
-_ALL = "i32 -1"  # the mask of a warp's threads that take part
 
 
 class Ahead(NamedTuple):
@@ -38,6 +37,8 @@ class ThreadWriter(Writer):
         """Starts empty; the lane is in `%lane`."""
         super().__init__(lanes)
         self.lane = Value("i32", True, "%lane")
+        # The mask of the warp's threads that take part: as a signed number.
+        self.all = f"i32 {-1 if lanes == LANES else (1 << lanes) - 1}"
         self.growth: dict[str, int] = {}  # of integers [1] and addresses [bytes], in each round
         self.born: dict[str, int] = {}  # line behind an address
         self.found: list[dict[tuple, Any]] = [{}]  # computed already, one scope a region
@@ -63,7 +64,7 @@ class ThreadWriter(Writer):
     def swap_lanes(self, value: Value, source: np.ndarray) -> Value:
         """See `Writer`; lanes swap in pairs."""
         mask = int(source[0])
-        if len(source) != LANES or (source != np.arange(LANES) ^ mask).any():
+        if len(source) != self.lanes or (source != np.arange(self.lanes) ^ mask).any():
             raise NotImplementedError("a kernel's lanes swap in pairs whose indices differ by bits")
         if value.kind in ("f32", "i32"):
             return self._swap(value, mask)
@@ -85,14 +86,14 @@ class ThreadWriter(Writer):
         one = LLVM_TYPES[value.kind]
         full = f"llvm.nvvm.shfl.sync.bfly.{value.kind}"
         self.declared.add(f"declare {one} @{full}(i32, {one}, i32, i32)")
-        call = f"call {one} @{full}({_ALL}, {self.typed(value)}, i32 {mask}, i32 31)"
+        call = f"call {one} @{full}({self.all}, {self.typed(value)}, i32 {mask}, i32 31)"
         return Value(value.kind, True, self.emit(call))
 
     def over_lanes(self, name: str, value: Value) -> Value:
         """See `Writer`."""
         full = f"llvm.nvvm.redux.sync.{name}"
         self.declared.add(f"declare i32 @{full}(i32, i32)")
-        return Value("i32", False, self.emit(f"call i32 @{full}({self.typed(value)}, {_ALL})"))
+        return Value("i32", False, self.emit(f"call i32 @{full}({self.typed(value)}, {self.all})"))
 
     def compute(self, operation: str, *args: Value, kind: str | None = None) -> Value:
         """See `Writer`; no integer is computed twice, so that addresses are known again."""
@@ -236,7 +237,7 @@ class ThreadWriter(Writer):
     def _meet(self) -> None:
         """Warp barrier: what threads stored before it is visible to all of them after it."""
         self.declared.add("declare void @llvm.nvvm.bar.warp.sync(i32)")
-        self.lines.append(f"call void @llvm.nvvm.bar.warp.sync({_ALL})")
+        self.lines.append(f"call void @llvm.nvvm.bar.warp.sync({self.all})")
 
     def _read_ahead(self, base: str, offset: int) -> None:
         """Notes a read for the innermost loop in which its address is computed."""
@@ -263,7 +264,7 @@ class ThreadWriter(Writer):
             return
         for address, (line, offsets) in sorted(reads.items(), key=lambda r: -r[1].line):
             behind, self.lines = self.lines[line:], self.lines[:line]
-            for offset, rows in adjacent(sorted(set(offsets)), 4 * LANES):
+            for offset, rows in adjacent(sorted(set(offsets)), 4 * self.lanes, self.lanes):
                 self._prefetch(address, offset + rounds * self.growth[address], rows)
             self.lines += behind
 
@@ -292,36 +293,36 @@ def rounds_ahead(lines: int, length: int) -> int:
     return min(-(-AHEAD // max(1, lines)), max(1, length // 5))
 
 
-def adjacent(offsets: list[int], row: int) -> list[tuple[int, int]]:
+def adjacent(offsets: list[int], row: int, lanes: int) -> list[tuple[int, int]]:
     """Runs of adjacent rows: first offset and number, at most as many as lanes."""
     found: list[tuple[int, int]] = []
     for offset in offsets:
-        if found and offset == found[-1][0] + row * found[-1][1] and found[-1][1] < LANES:
+        if found and offset == found[-1][0] + row * found[-1][1] and found[-1][1] < lanes:
             found[-1] = (found[-1][0], found[-1][1] + 1)
         else:
             found.append((offset, 1))
     return found
 
 
-def write(
-    jaxpr: Any, blocks: list[tuple[tuple[int, ...], Any]], shared: list[bool], name: str
-) -> str:
+def write(jaxpr: Any, layout: Layout, name: str) -> str:
     """A kernel of LLVM's language whose block b works on entry b of every array.
 
     Args:
       jaxpr: The kernel's jaxpr; its arguments are references to a block of each array.
-      blocks: Shape and dtype of a block of each array.
-      shared: Whether an array has one block, which all blocks read.
+      layout: The arrays, and the number of lanes: at most those of a warp.
       name: Name of the kernel.
 
     Raises:
       NotImplementedError: If the kernel does something that has no rule here.
     """
-    writer = ThreadWriter()
+    lanes, blocks = layout.lanes, layout.blocks
+    if not 1 <= lanes <= LANES:
+        raise NotImplementedError(f"a block of {lanes} lanes: a warp has {LANES}")
+    writer = ThreadWriter(lanes)
     refs, start = [], []
-    for k, ((shape, dtype), one) in enumerate(zip(blocks, shared, strict=True)):
+    for k, ((shape, dtype), array) in enumerate(zip(blocks, layout.arrays, strict=True)):
         kind = kind_of(dtype)
-        size = 0 if one else SIZES[kind] * int(np.prod(shape))
+        size = 0 if array.shared else SIZES[kind] * int(np.prod(shape))
         start += [
             f"%o{k} = mul i64 %block, {size}",
             f"%a{k} = getelementptr inbounds i8, ptr addrspace(1) %p{k}, i64 %o{k}",
@@ -331,7 +332,7 @@ def write(
     for rows in sorted(writer.spans):  # from a lane in the first row to that lane's own row
         start += [
             f"%last{rows} = call i32 @llvm.umin.i32(i32 %lane, i32 {rows - 1})",
-            f"%row{rows} = mul i32 %last{rows}, {LANES}",
+            f"%row{rows} = mul i32 %last{rows}, {lanes}",
             f"%from{rows} = sub i32 %row{rows}, %lane",
             f"%elements{rows} = sext i32 %from{rows} to i64",
             f"%span{rows} = mul i64 %elements{rows}, 4",
@@ -339,7 +340,7 @@ def write(
     params = ", ".join(f"ptr addrspace(1) noalias align 16 %p{k}" for k in range(len(blocks)))
     head = [
         "entry:",
-        f"%lane = call range(i32 0, {LANES}) i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
+        f"%lane = call range(i32 0, {lanes}) i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
         "%index = call i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
         "%block = zext i32 %index to i64",
     ]
@@ -353,6 +354,6 @@ def write(
         'target triple = "nvptx64-nvidia-cuda"\n'
         f"define ptx_kernel void @{name}({params}) #0 {{\n{body}\n}}\n"
         + "\n".join(sorted(declared))
-        + f'\nattributes #0 = {{ nounwind "nvvm.maxntid"="{LANES},1,1" }}\n'
+        + f'\nattributes #0 = {{ nounwind "nvvm.maxntid"="{lanes},1,1" }}\n'
         "attributes #1 = { nounwind memory(inaccessiblemem: readwrite) }\n"
     )

@@ -116,6 +116,8 @@ class Contact:
         `effects.friction = "full"`.
       finger_finger_friction: Coulomb coefficient of fingers on fingers, only with
         `effects.finger_finger`.
+      finger_finger_friction_ratio: `friction_ratio` of the hulls of fingers on one another; spheres
+        have that of all contacts.
     """
 
     normal_stiffness: float = quantity("N/m", 10, 1e6)
@@ -126,6 +128,7 @@ class Contact:
     torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
     rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
     finger_finger_friction: float = quantity("", 0, 5, default=0.8)
+    finger_finger_friction_ratio: float = quantity("", 0.01, 1000, default=1.0)
 
 
 @dataclasses.dataclass(frozen=True)

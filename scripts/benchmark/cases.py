@@ -248,7 +248,7 @@ def quality(case: Case) -> dict:
         fields, ctrl = work.window(scene, worlds, case.values["steps"], distinct=distinct)
     else:
         fields, ctrl = work.inputs(scene, work.make_worlds(scene, worlds))
-    program = kernel.Program.here(scene, engine.limits, ctrl.dtype)
+    program = kernel.Program.here(scene, engine.limits, ctrl.dtype, len(ctrl))
     found = jax.jit(lambda f, c: program.run(world_constants(scene, f), engine.reset(f), c))(
         fields, ctrl
     )

@@ -34,20 +34,22 @@ def which_cone(pair: str) -> str:
     return "hand_object" if pair.endswith("_object") else "hand_table"
 
 
-def make_cone(scene: Scene, friction: Any, *, bodies: int) -> Cone:
+def make_cone(scene: Scene, friction: Any, *, bodies: int, impratio: Any = None) -> Cone:
     """MuJoCo's contact parameters for constant impedance (its Computation chapter).
 
     Args:
       scene: The scene; its numbers may be arrays.
       friction: Coulomb coefficient.
       bodies: Bodies other than the world in the contact, whose declared inverse weights add.
+      impratio: MuJoCo's impratio, by default `contact.friction_ratio`.
     """
     c = scene.contact
+    impratio = c.friction_ratio if impratio is None else impratio
     regularizer = (1.0 - c.impedance) / c.impedance * contact_invweight(scene) * bodies
     if scene.effects.friction == "none":
         return Cone(1.0 / regularizer, None, None, None, *_reference(scene))
-    ratio = friction / jnp.sqrt(c.friction_ratio)
-    tangent = c.friction_ratio / regularizer
+    ratio = friction / jnp.sqrt(impratio)
+    tangent = impratio / regularizer
     cone = Cone(1.0 / regularizer, tangent, friction, ratio, *_reference(scene))
     if scene.effects.friction != "full":
         return cone
@@ -67,11 +69,13 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
         on_object = jnp.where(shape == i, other.friction, on_object)
     e, c = scene.effects, scene.contact
     two, one = partial(make_cone, scene, bodies=2), partial(make_cone, scene, bodies=1)
+    # MuJoCo has one impratio for all contacts, so that spheres, which it simulates too, do here.
+    between = c.finger_finger_friction_ratio if e.surface == "hull" else c.friction_ratio
     return Cones(
         hand_object=two(on_object) if e.finger_object or e.palm_object else None,
         hand_table=one(c.finger_table_friction) if e.finger_table or e.palm_table else None,
         object_table=one(scene.objects.table.friction) if e.object_table else None,
-        finger_finger=two(c.finger_finger_friction) if e.finger_finger else None,
+        finger_finger=two(c.finger_finger_friction, impratio=between) if e.finger_finger else None,
     )
 
 

@@ -129,7 +129,7 @@ class StructuredEngine(Equal):
         """
         far = jnp.full_like(hand.bounds.speed, FAR)
         hand = hand._replace(bounds=hand.bounds._replace(speed=far, penetration=far))
-        program = Program.here(self.scene, self.limits, ctrl.dtype)
+        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
         return self._run(program, hand, state, ctrl, trajectory=True, states=True)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
@@ -158,7 +158,7 @@ class StructuredEngine(Equal):
         Raises:
           KernelUnavailable: If the kernel cannot be compiled for this device, or called there.
         """
-        program = Program.here(self.scene, self.limits, ctrl.dtype)
+        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
         hand, start = world_constants(self.scene, fields), self.reset(fields)
         record = {"trajectory": trajectory, "states": states}
         found, end = self._run(program, hand, start, ctrl, **record)

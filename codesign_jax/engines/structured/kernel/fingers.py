@@ -14,6 +14,8 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.constants import apply_columns
 from codesign_jax.engines.structured.kernel import hull
+from codesign_jax.engines.structured.kernel.contacts import zeros
+from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs, Pairing
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanes import dot, total
@@ -138,8 +140,7 @@ class Search:
         return tuple(self.read(name, r, pairing) for name, r in places)  # type: ignore[return-value]
 
     def _rows(self, row: Any, pairing: Pairing, there: jax.Array, first: jax.Array) -> None:
-        d, links = self.p.scene.discretization, self.p.links
-        count = d.hull_rings * d.hull_points
+        links = self.p.links
         self_size = self.p.hand.read(self.step.hand, "section_box")
         size = pairing.swap(self_size)
         side = first.astype(jnp.int32)
@@ -158,33 +159,66 @@ class Search:
                     )
 
                     def vertices() -> None:
-                        moves = self._moves((j, i), pairing)
-                        each(count, lambda v: vertex(j, own, moves, kind * count + v))
+                        self._row_contact(
+                            row, pairing, there, side, (own, kind), (theirs, size, last), (j, i)
+                        )
 
                     any_of(near & (apart.lane < 0), vertices)
 
                 any_of(near, boxes)
 
-            def vertex(j: Any, own: tuple, moves: list, item: Any) -> None:
-                constants = self.p.hand.read(self.step.hand, "vertex", item)
-                end = lanes([last], (), wide=True)
-                one, other = lanewise(_inside, constants, own, theirs, size, end)
-                which = there & (one[2].lane < 0)
-
-                def enter() -> None:
-                    def way(turn: Any) -> None:
-                        owner = there & (side == turn)
-                        found = which & owner
-                        ends = (one, other), (j, i), moves
-                        any_of(found, lambda: self._enter(row, found, owner, *ends))
-
-                    each(2, way)
-
-                any_of(which, enter)
-
             each(links + 1, inner)
 
         each(links, outer)
+
+    def _row_contact(
+        self,
+        pairing_row: Any,
+        pairing: Pairing,
+        there: jax.Array,
+        side: jax.Array,
+        own: tuple,
+        other: tuple,
+        rows: tuple,
+    ) -> None:
+        """Enters the one contact of a row's vertices with another finger's row, see `_pressure`.
+
+        Args:
+          pairing_row: Number of the pairing.
+          pairing: The pairing.
+          there: Lanes whose finger and partner exist.
+          side: Lanes' side of the pairing, 0 or 1.
+          own: Links of the lanes' own row, see `_links`, and its kind.
+          other: Links of their partners' row, its size, and whether it is the last one.
+          rows: Numbers of both rows.
+        """
+        d = self.p.scene.discretization
+        count, (links, kind), (theirs, size, last) = d.hull_rings * d.hull_points, own, other
+
+        def add(k: Any, sums: Lanes) -> Lanes:
+            vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
+            end = lanes([last], (), wide=True)
+            ends = lanewise(_inside, vertex, links, theirs, size, end)
+            return lanewise(_add_vertex, sums, *ends)
+
+        sums = loop(count, add, zeros((SUMS,), self.like), self.block.size)
+        one, two = lanewise(_pressure, sums)
+        which = there & (one[2].lane < 0)
+
+        def enter() -> None:
+            moves = self._moves(rows, pairing)
+
+            def way(turn: Any) -> None:
+                owner = there & (side == turn)
+                found = which & owner
+                any_of(
+                    found,
+                    lambda: self._enter(pairing_row, found, owner, (one, two), rows, moves),
+                )
+
+            each(2, way)
+
+        any_of(which, enter)
 
     def _moves(self, rows: tuple, pairing: Pairing) -> list[tuple[Lanes, Lanes]]:
         """Accelerations and velocities of the lanes' own row and of their partners' row."""
@@ -332,6 +366,39 @@ def _inside(vertex, own: tuple, theirs: tuple, size, last) -> tuple[tuple, tuple
     at, gap, share = (point + to_contact)[:, None], gap[None, None], 0.5 * share
     mine = at, normal[:, None], gap, lever[:, None], share
     return mine, (at, -normal[:, None], gap, behind[:, None], share)
+
+
+SUMS = 14
+"""Numbers that `_add_vertex` sums: share, share x depth, and four vectors."""
+
+
+def _add_vertex(sums: jax.Array, mine: tuple, other: tuple) -> jax.Array:
+    """Adds a vertex of `_inside` to the sums of its row, each quantity weighted by its force."""
+    point, normal, gap, lever, share = mine
+    depth = jnp.maximum(-gap[0, 0], 0.0)
+    share = jnp.where(depth > 0, share[0, 0], 0.0)
+    force = share * depth
+    vectors = [force * v[:, 0] for v in (normal, point, lever, other[3])]
+    return sums + jnp.concatenate([share[None], force[None], *vectors])
+
+
+def _pressure(sums: jax.Array) -> tuple[tuple, tuple]:
+    """The contact of a row with another row, on either side: that of all its vertices inside.
+
+    It has the vertices' resultant: their common stiffness, the sum of their forces, and the centre
+    of pressure as its point, which moves as the mean of the vertices weighted by their forces.
+    """
+    share, force, normal = sums[0], sums[1], sums[2:5]
+    some = force > 0
+    whole = jnp.where(some, force, 1.0)
+    # Vertices that push in different directions cancel in part: the resultant's length.
+    size = jnp.sqrt(dot(normal, normal))
+    pushes = some & (size > 0)
+    normal = jnp.where(pushes, normal / jnp.where(pushes, size, 1.0), 0.0)
+    gap = jnp.where(pushes, -size / jnp.where(some, share, 1.0), 1.0)[None, None]
+    point, lever, behind = ((sums[k : k + 3] / whole)[:, None] for k in (5, 8, 11))
+    normal, share = normal[:, None], share[None, None]
+    return (point, normal, gap, lever, share), (point, -normal, gap, behind, share)
 
 
 def _sign(x: jax.Array) -> jax.Array:

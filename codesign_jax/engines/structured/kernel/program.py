@@ -80,10 +80,11 @@ class Program:
         self._tables()
 
     @classmethod
-    def here(cls, scene: Scene, limits: Limits, dtype: Any) -> "Program":
-        """The program for this device and type, whose blocks fill a GPU's warp or CPU's vector."""
-        backend = jax.default_backend()
-        return cls(scene, limits, backend=backend, width=block_lanes(backend, dtype))
+    def here(cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None) -> "Program":
+        """The program for this device, type and number of worlds, see `launch.block_lanes`."""
+        backend, fingers = jax.default_backend(), layout(scene).dofs.shape[0]
+        total = None if worlds is None else worlds << (fingers - 1).bit_length()
+        return cls(scene, limits, backend=backend, width=block_lanes(backend, dtype, total))
 
     def _sets(self) -> list[ContactSet]:
         e, k = self.scene.effects, self.k

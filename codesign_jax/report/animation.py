@@ -58,8 +58,7 @@ def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[
     """
     count = trials.yaw.shape[0]
     worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (count, *jnp.shape(v))), params)
-    simulate = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t, trajectory=True))
-    outcomes, trace = jax.tree.map(np.asarray, simulate(worlds, trials))
+    outcomes, trace = jax.tree.map(np.asarray, _simulate(scene, engine, worlds, trials))
 
     def one(tree, i: int):
         return jax.tree.map(lambda v: np.asarray(v)[i], tree)
@@ -68,6 +67,11 @@ def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[
         Replay(one(worlds, i), one(trials, i), one(outcomes, i), trace.qpos[i])
         for i in range(count)
     ]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _simulate(scene: Scene, engine: Engine, worlds: Params, trials: Trial) -> tuple:
+    return rollout.simulate(scene, engine, worlds, trials, trajectory=True)
 
 
 def frames(

@@ -1,5 +1,6 @@
 """Flat batches of worlds: one program, called chunk by chunk, on one or more devices."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -42,6 +43,14 @@ def chunking(worlds: int, limit: int = LIMIT, devices: int = 1) -> Chunking:
     return Chunking(-(-worlds // calls), calls)
 
 
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _simulate(
+    scene: Scene, engine: Engine, space: DesignSpace, designs: jax.Array, trials: Trial
+) -> Outcome:
+    params = jax.vmap(space.params)(designs)
+    return rollout.simulate(scene, engine, params, trials)[0]
+
+
 class Worlds:
     """Simulates worlds of one scene in chunks of one size.
 
@@ -71,14 +80,9 @@ class Worlds:
         self.scene, self.space, self.chunk = scene, space, chunk
         self.devices = available[:devices] if devices > 1 else [None]
         self.grasps = 0
-
-        def simulate(designs: jax.Array, trials: Trial) -> Outcome:
-            params = jax.vmap(space.params)(designs)
-            return rollout.simulate(scene, engine, params, trials)[0]
-
         # A program of its own on each device instead of one over all: its shapes, and with them
         # its bits, are those of a single device.
-        self._simulate = jax.jit(simulate)
+        self._simulate = partial(_simulate, scene, engine, space)
 
     def evaluate(self, designs: np.ndarray, trials: Trial) -> Outcome:
         """Simulates every particle of every run in all trials of that run.

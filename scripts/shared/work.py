@@ -1,6 +1,7 @@
 """What a benchmark simulates: designs, trials, start states in contact, and variants of a scene."""
 
 import dataclasses
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -117,15 +118,15 @@ def nudged(trials: Trial) -> Trial:
 
 def inputs(chosen: Scene, worlds: Worlds) -> tuple[ModelFields, jax.Array]:
     """Model fields and controls, shape (world, time, nu), of worlds."""
+    return _inputs(chosen, *worlds)
 
-    @jax.jit
-    def make(params: Params, trials: Trial) -> tuple[ModelFields, jax.Array]:
-        return (
-            jax.vmap(lambda p, t: model.model_fields(chosen, p, t))(params, trials),
-            jax.vmap(lambda p, t: control.commands(chosen, p, t))(params, trials),
-        )
 
-    return make(*worlds)
+@partial(jax.jit, static_argnums=0)
+def _inputs(chosen: Scene, params: Params, trials: Trial) -> tuple[ModelFields, jax.Array]:
+    return (
+        jax.vmap(partial(model.model_fields, chosen))(params, trials),
+        jax.vmap(partial(control.commands, chosen))(params, trials),
+    )
 
 
 def window(

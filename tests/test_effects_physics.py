@@ -227,3 +227,17 @@ def test_normal_motion_needs_no_friction_model():
     np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6)
     np.testing.assert_allclose(forces[2], forces[0], rtol=1e-6)
     assert np.abs(forces[0]).max() > 0
+
+
+@jax.enable_x64(True)
+def test_a_coefficient_of_zero_is_no_friction():
+    """Pressed, sliding and apart: the force of the frictionless model, which never pulls."""
+    rng, count = np.random.default_rng(5), 50
+    rough = some_contacts("coulomb", rng, count)
+    smooth = cones.make_cone(small.pinch(effects__friction="coulomb"), 0.0, bodies=2)
+    bare = some_contacts("none", rng, count).cone
+    a = jnp.asarray(30 * rng.normal(size=(3, 1, count)))
+    force = contact.constraint_update(rough._replace(cone=smooth), a).force
+    expected = contact.constraint_update(rough._replace(cone=bare), a).force
+    np.testing.assert_allclose(force, expected, atol=1e-12)
+    assert (np.abs(expected).sum((0, 1)) == 0).any() and (np.abs(expected).sum((0, 1)) > 0).any()

@@ -181,7 +181,8 @@ def _update_frictionless(contacts: Contacts, jar: jax.Array) -> Response:
 
 def _zones(contacts: Contacts, normal: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:
     cone = contacts.cone
-    bottom = contacts.active & (cone.ratio**2 * normal + cone.friction * length <= 0)
+    # With D_n / D_t = 1 / impratio; where friction is zero nothing sticks.
+    bottom = contacts.active & (cone.friction * cone.normal * normal + cone.tangent * length <= 0)
     middle = contacts.active & ~bottom & (normal < cone.friction * length)
     return bottom, middle
 

@@ -36,11 +36,9 @@ def curling(b):
 
 def crossing_fingers(engine, step, precision):
     """From the approach to the release, wherever fingers meet, slide and let go of each other."""
-    found = along(crossing(), step, precision, curling, least=4)
     # In float32 both ends of such a contact are light, and what rounding makes of it adds up.
-    bound = {"float32": 2.0, "float64": 1.0}[precision] * found.bound
-    note = f"{found.note}, {between(step, precision)} states of crossing"
-    return found._replace(bound=bound, note=note)
+    found = along(crossing(), step, precision, curling, least=4, rounding=2.0)
+    return found._replace(note=f"{found.note}, {between(step, precision)} states of crossing")
 
 
 def between(step, precision):

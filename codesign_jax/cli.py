@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from codesign_jax.commands import status
 from codesign_jax.commands.flags import (
     Count,
     File,
@@ -71,6 +72,9 @@ class Optimize:
     devices: Count = None
     """Devices that share the batch; default: every GPU of this host. Results do not depend on
     it."""
+    distributed: Text = None
+    """With --seeds, one process on each of several hosts, which share the seeds: auto under SLURM
+    or MPI, or ADDRESS:PORT,PROCESSES,INDEX. The folder must be one that all see."""
     out: File = None
     """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED, with the optimiser before the seed if
     it is another. With --seeds a folder of run folders."""
@@ -282,14 +286,7 @@ def main(arguments: list[str] | None = None) -> int:
         prog="codesign",
         description="Co-design of soft hand morphology and control.",
     )
-    from codesign_jax.scene.schema import SceneError
-
-    try:
-        return command.run()
-    except SceneError as error:
-        for problem in error.problems:
-            print(f"error: {problem}", file=sys.stderr)
-        return 2
+    return status.of(command.run)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -338,6 +339,14 @@ WRONG = {
     "seeds that are none": (["--seeds", "0-"], ["--seeds '0-' must be seeds such as 0-9 or 1,3,5"]),
     "seeds backwards": (["--seeds", "9-0"], ["must be seeds such as"]),
     "too many seeds": (["--seeds", "0-99999"], ["names more than 1000 runs"]),
+    "hosts without seeds": (
+        ["--distributed", "auto"],
+        ["--distributed needs --seeds, and neither"],
+    ),
+    "hosts that are none": (
+        ["--seeds", "0-1", "--distributed", "node0:1234,2,2"],
+        ["'node0:1234,2,2' must be auto or ADDRESS:PORT,PROCESSES,INDEX, such as"],
+    ),
     "seed and seeds": (["--seeds", "0-1", "--seed", "1"], ["--seed and --seeds exclude"]),
     "MuJoCo's solver": (
         ["--set", "solver.tolerance=1e-9", "--set", "gravity=1000"],
@@ -555,6 +564,28 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
         alone = [*base, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
         assert command(*alone) == 0
         assert_same_run(tmp_path / "runs" / f"seed-{seed}", tmp_path / f"alone-{seed}")
+
+
+@pytest.mark.slow
+def test_hosts_share_the_seeds(tmp_path, capsys):
+    """Two processes of JAX's distributed runtime on this host: the runs are those of one."""
+    base = [a for a in RUN if a not in ("--seed", "3")]
+    run = [*base, "--episodes", "2", "--seeds", "3-5"]
+    assert command(*run, "--out", tmp_path / "one") == 0
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    hosts = [
+        launch(*run, "--out", tmp_path / "two", "--distributed", f"{address},2,{k}") for k in (0, 1)
+    ]
+    outputs = [host.communicate()[0] for host in hosts]
+    assert [host.returncode for host in hosts] == [0, 0], outputs
+    for seed in ("seed-3", "seed-4", "seed-5"):
+        assert stored(tmp_path / "two" / seed) == stored(tmp_path / "one" / seed)
+    tables = [(tmp_path / name / "seeds.csv").read_bytes() for name in ("one", "two")]
+    assert tables[0] == tables[1]
+    assert "of 3 runs have a particle" in outputs[0]
+    assert "seed 4: final test" not in outputs[0] and "of 3 runs" not in outputs[1]
 
 
 def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsys):

@@ -147,7 +147,7 @@ def _collect(running, waiting, start, options, scene, folders, console):
                 running[seed] = start(seed, folder)
             for seed in [s for s, job in running.items() if job.done()]:
                 job = running.pop(seed)
-                results[seed] = _read(scene, folders[seed]) if _succeeded(job) else None
+                results[seed] = read(scene, folders[seed]) if _succeeded(job) else None
                 state = "done" if results[seed] else f"failed, see {job.paths.stderr}"
                 console.print(f"seed {seed}: {state}", markup=False)
             time.sleep(POLL_SECONDS)
@@ -162,8 +162,8 @@ def _succeeded(job: Any) -> bool:
     return job.exception() is None and job.result() == 0
 
 
-def _read(scene: Scene, folder: Path) -> RunResult | None:
-    """The run in a folder; None if it has no checkpoint."""
+def read(scene: Scene, folder: Path) -> RunResult | None:
+    """The run in a folder as it is; None if it has no checkpoint."""
     record = runs.load_record(folder)
     if record is None:
         return None

@@ -1,6 +1,7 @@
 """`codesign optimize`."""
 
 import dataclasses
+import functools
 import sys
 from itertools import chain
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, optimize, runs
-from codesign_jax.commands import common, jobs, reference, seeds
+from codesign_jax.commands import common, hosts, jobs, reference, seeds
 from codesign_jax.runs import Plan, RunResult, Settings, rates
 from codesign_jax.runs.progress import duration
 from codesign_jax.runs.scene_files import scene_texts
@@ -30,6 +31,8 @@ def main(options: "Optimize") -> int:
       SceneError: If something is wrong with the input; nothing was created then.
     """
     common.use_compilation_cache()
+    if options.distributed is not None:
+        return _distributed(options)
     scene, settings = resolve(options)
     chosen = [settings.seed] if options.seeds is None else seeds.parse(options.seeds)
     # Everything that speaks against the runs, before anything that takes time.
@@ -55,8 +58,40 @@ def main(options: "Optimize") -> int:
             print(f"error: {name}{result}", file=sys.stderr)
     if found.signum:
         return 128 + found.signum
-    _tell(options, plan, results, folders)
+    console = Console(highlight=False, soft_wrap=True)
+    _tell(options, plan, results, folders, console)
+    if options.seeds is not None:
+        _compare(results, folders, console)
     return int(any(result is None for result in results.values()))
+
+
+def _distributed(options: "Optimize") -> int:
+    """Runs this host's share of the seeds; the first host compares all of them."""
+    hosts.check(options.distributed or "")
+    if options.seeds is None or options.jobs is not None or options.dry_run:
+        raise SceneError(["--distributed needs --seeds, and neither --jobs nor --dry-run"])
+    status, here = hosts.run(options)
+    if here.index or status == 2 or status >= 128:
+        return status
+    return hosts.in_a_process(functools.partial(_compare_all, options)) or status
+
+
+def _compare_all(options: "Optimize") -> int:
+    """Compares the runs of all hosts; returns the exit status."""
+    scene, settings = resolve(options)
+    chosen = seeds.parse(options.seeds or "")
+    folders = {seed: _folder(options, scene, settings, seed) for seed in chosen}
+    results = {seed: jobs.read(scene, folder) for seed, folder in folders.items()}
+    _compare(results, folders, Console(highlight=False, soft_wrap=True))
+    return int(any(result is None for result in results.values()))
+
+
+def _compare(
+    results: dict[int, RunResult | None], folders: dict[int, Path], console: Console
+) -> None:
+    """Compares runs on the console and in seeds.csv."""
+    seeds.compare(results, console)
+    console.print(f"table: {seeds.write_table(results, folders)}", markup=False)
 
 
 def _tell(
@@ -64,9 +99,9 @@ def _tell(
     plan: Plan,
     results: dict[int, RunResult | None],
     folders: dict[int, Path],
+    console: Console,
 ) -> None:
-    """Says how each run ended, tests its design at reference, and compares several."""
-    console = Console(highlight=False, soft_wrap=True)
+    """Says how each run ended, and tests its design at reference."""
     trials = reference.number_of_trials(options.reference_trials, plan.settings)
     for seed, result in results.items():
         if result is None:
@@ -77,9 +112,6 @@ def _tell(
         _summarize(own, result, folders[seed])
         if trials and result.test is not None:
             reference.test(folders[seed], own.settings, trials, console)
-    if options.seeds is not None:
-        seeds.compare(results, console)
-        seeds.write_table(results, folders)
 
 
 def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
@@ -94,8 +126,7 @@ def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
     """Runs all seeds as jobs and compares them; returns the exit status."""
     console = Console(highlight=False, soft_wrap=True)
     results = jobs.run(options, scene, folders, console)
-    seeds.compare(results, console)
-    console.print(f"table: {seeds.write_table(results, folders)}", markup=False)
+    _compare(results, folders, console)
     return int(any(result is None for result in results.values()))
 
 

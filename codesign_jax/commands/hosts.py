@@ -1,0 +1,122 @@
+"""`codesign optimize --seeds ... --distributed`: several hosts share the seeds of one command.
+
+JAX's distributed runtime tells each process which of how many it is, and lets all wait for the last
+one.  The runs of a host's own seeds are simulated by a process of their own, on that host's devices
+alone: orbax would not save the arrays of any host but the first one.  Files are the only other
+interface, so the folder must be one that all hosts see.
+"""
+
+import dataclasses
+import multiprocessing
+import re
+import signal
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+
+from codesign_jax.commands import seeds, status
+from codesign_jax.scene.schema import SceneError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Optimize
+
+WAIT = 7 * 24 * 3600
+"""Longest time that a process waits for the others' runs [s]."""
+
+
+class Hosts(NamedTuple):
+    """Which of how many processes this one is."""
+
+    index: int = 0
+    count: int = 1
+
+
+def check(text: str) -> tuple[str, int, int] | None:
+    """Reads "ADDRESS:PORT,PROCESSES,INDEX"; None for "auto".
+
+    Raises:
+      SceneError: If the text is neither.
+    """
+    if text == "auto":
+        return None
+    match = re.fullmatch(r"([^,\s]+:[0-9]{1,5}),([0-9]{1,5}),([0-9]{1,5})", text)
+    if match is None or not int(match[3]) < int(match[2]):
+        raise SceneError(
+            [
+                f"--distributed {text!r} must be auto or ADDRESS:PORT,PROCESSES,INDEX, such as "
+                "node0:1234,2,0 on the first of two hosts"
+            ]
+        )
+    return match[1], int(match[2]), int(match[3])
+
+
+def join(text: str) -> Hosts:
+    """Meets the other processes; before anything of JAX is used.
+
+    Args:
+      text: "auto" under SLURM, MPI and other launchers that JAX knows, or where the first process
+        listens, how many there are, and which one this is; see `check`.
+
+    Raises:
+      SceneError: If the text is wrong, or the others cannot be met.
+    """
+    given = check(text)
+    address, count, index = given or (None, None, None)
+    jax.config.update("jax_platforms", "cpu")  # this process leaves the GPUs to the one that runs
+    try:
+        jax.distributed.initialize(address, count, index, shutdown_timeout_seconds=WAIT)
+    except (RuntimeError, ValueError) as error:
+        raise SceneError([f"--distributed {text}: {error}"]) from error
+    return Hosts(jax.process_index(), jax.process_count())
+
+
+def run(options: "Optimize") -> tuple[int, Hosts]:
+    """Runs this host's seeds, and waits until the runs of all hosts have ended.
+
+    Args:
+      options: The command line; this host takes each of its seeds that its turn comes to.
+
+    Returns:
+      The command's exit status for these seeds, and which host this is.
+
+    Raises:
+      SceneError: See `join`.
+    """
+    chosen = seeds.parse(options.seeds or "")
+    here = join(options.distributed or "")
+    mine = ",".join(map(str, chosen[here.index :: here.count]))
+    code = 0
+    if mine:
+        own = dataclasses.replace(options, distributed=None, seeds=mine)
+        code = in_a_process(own.run)
+    if code < 128:  # not stopped by a signal
+        jax.distributed.shutdown()
+    return code, here
+
+
+def in_a_process(function: Callable[[], int]) -> int:
+    """The exit status of a function in a process that knows nothing of other hosts.
+
+    Args:
+      function: The function, which can be pickled; wrong input ends it as it ends the command.
+    """
+    process = multiprocessing.get_context("spawn").Process(
+        target=_child, args=(function, [*sys.argv])
+    )
+    # A terminal sends Ctrl-C to both; what ends jobs may know this process only.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    process.start()
+    earlier = signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+    process.join()
+    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGTERM, earlier)
+    code = process.exitcode
+    return 1 if code is None else 128 - code if code < 0 else code
+
+
+def _child(function: Callable[[], int], arguments: list[str]) -> None:
+    sys.argv = arguments
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.exit(status.of(function))

@@ -1,0 +1,16 @@
+"""Exit statuses.  Nothing heavy is imported here: `--help` is to be quick."""
+
+import sys
+from collections.abc import Callable
+
+
+def of(run: Callable[[], int]) -> int:
+    """Runs a parsed command and returns its exit status; wrong input is said on stderr."""
+    from codesign_jax.scene.schema import SceneError
+
+    try:
+        return run()
+    except SceneError as error:
+        for problem in error.problems:
+            print(f"error: {problem}", file=sys.stderr)
+        return 2

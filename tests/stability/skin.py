@@ -37,7 +37,8 @@ def pressed_forces(b):
     reader, lay = Reader(b.scene, fields), model.layout(b.scene)
     data, link = reader.at(fields.start[0]), lay.bodies[0, 1]
     radius, frame = reader.model.geom_size[-1, 0], data.xmat[link].reshape(3, 3)
-    along, across = np.random.default_rng(33).uniform(-1, 1, (2, PLACES))
+    # Behind the second joint the sphere touches neither the palm nor the other finger.
+    along, across = np.random.default_rng(33).uniform([[0.1], [-1]], [[0.9], [1]], (2, PLACES))
     place = [0.1 / lay.links * along, 1e-3 * across, np.full(PLACES, DEEP - radius)]
     fields.start[:, -7:-4] = data.xpos[link] + np.stack(place, 1) @ frame.T
     fields.dof_armature[:, : int(lay.dofs.max()) + 1] = HEAVY

@@ -154,7 +154,14 @@ def rates_by_engine(engine, step, precision):
     return compare(rates, in_c(), evaluated(engine, 1.0, precision), 1.0)
 
 
-@case(24, f"the best design stays good, {many}", "its rank at h/4, of 40", steps=(1.0,), **ours)
+@case(
+    24,
+    f"the best design stays good, {many}",
+    "its rank at h/4, of 40",
+    steps=(1.0,),
+    failures={(1.0, "float32"): optimistic},
+    **ours,
+)
 def best_stays(engine, step, precision):
     one, two = other(0.25)
     best = one[1] == one[1].min()

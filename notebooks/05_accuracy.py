@@ -42,7 +42,7 @@ name = "quick.toml" if FAST else "paper_spheres"
 # two numbers count: how many verdicts differ, and by how much the mean cost of a design does.
 
 # %%
-count, trials = (6, 2) if FAST else (30, 4)
+count, trials = (6, 2) if FAST else (20, 3)
 space = parameters.design_space(scene.load(name).hand, "2d")
 middle = space.from_units(np.array([[70.0, 0.0]]))  # mm, mm: where some grasps hold
 width = space.from_units(np.array([[40.0, 30.0]]))
@@ -89,12 +89,13 @@ for engine, step, links, cost_ms, flips, bias in results:
     marker, color = ("s" if engine == "mujoco" else "o"), f"C{[2, 5, 10, 20].index(links)}"
     for axis, value in zip(axes, (flips, bias), strict=True):
         axis.plot(cost_ms, value, marker, color=color)
-        axis.annotate(f"{step:g} ms, {links}", (cost_ms, value), (4, 3), textcoords="offset points")
+        axis.annotate(f"{step:g} ms, {links}", (cost_ms, value), (4, 4), textcoords="offset points")
 for axis, label in zip(
     axes, ("share of verdicts that differ", "error of a mean cost"), strict=True
 ):
-    axis.set(xlabel="wall time of a grasp [ms]", ylabel=label, xscale="log", ylim=(0, None))
-    axis.margins(x=0.2)
+    axis.set(xlabel="wall time of a grasp [ms]", ylabel=label, xscale="log")
+    axis.margins(x=0.25, y=0.15)
+    axis.set_ylim(bottom=0)
 axes[0].set_title("circles: structured, squares: MuJoCo C")
 plt.show()
 

@@ -24,7 +24,7 @@ def make(data: Path, pictures: Path, page: Path | None = None, touching: Path | 
       data: Folder of the results.
       pictures: Folder of the figures.
       page: Markdown page whose text between the marks is replaced; None for none.
-      touching: Folder of the 2D experiment with contact between fingers; None for none.
+      touching: Folder of the experiments with contact between fingers; None for none.
 
     Returns:
       The table in Markdown.
@@ -32,9 +32,10 @@ def make(data: Path, pictures: Path, page: Path | None = None, touching: Path | 
     studies = {name: load_study(data, name) for name in ("2d", "23d")}
     grid = load(data, "landscape")
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
-    other = load_study(touching, "2d") if touching else None
-    if studies["2d"] and other:
-        text += f"\n\n{with_fingers(studies['2d'], other)}"
+    for name, study in studies.items():
+        other = load_study(touching, name) if touching else None
+        if study and other:
+            text += f"\n\n{with_fingers(study, other)}"
     if studies["2d"]:
         figures.evolution(studies["2d"], pictures / "fig6_cost_evolution.png")
     for number, study in zip("79", studies.values(), strict=True):

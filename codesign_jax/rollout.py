@@ -136,12 +136,11 @@ def simulate(
 
     Raises:
       SceneError: If an array lacks an axis, if the constants do not fit the scene or lie outside
-        their ranges, or if a
-        parameter is out of its range by a factor between units, such as millimetres given for
+        their ranges, or if a parameter is out of its range by a factor between units, such as millimetres given for
         metres; of traced ones no values are known.
     """
-    axes.refuse(scene, params, trials, ("world", "world"))
     constants = numbers(scene, constants)
+    axes.refuse(scene, params, trials, ("world", "world"))
     axes.refuse_constants(constants, len(trials.yaw), "world")
     parameters.refuse_unit_slips(params)
     fields, ctrl, initial = prepare(scene, params, trials, constants)

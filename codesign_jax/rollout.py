@@ -136,8 +136,8 @@ def simulate(
 
     Raises:
       SceneError: If an array lacks an axis, if the constants do not fit the scene or lie outside
-        their ranges, or if a parameter is out of its range by a factor between units, such as millimetres given for
-        metres; of traced ones no values are known.
+        their ranges, or if a parameter is out of its range by a factor between units, such as
+        millimetres given for metres; of traced ones no values are known.
     """
     constants = numbers(scene, constants)
     axes.refuse(scene, params, trials, ("world", "world"))

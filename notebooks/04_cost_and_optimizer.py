@@ -69,6 +69,8 @@ def looseness(scene, trace, ctrl):
 class CrossEntropy:
     """Rubinstein (1999), with a share of the best and a floor under the spread."""
 
+    keeps_best = False  # every episode replaces all particles
+
     space: Space
     share: float = dataclasses.field(default=0.3, metadata={"static": True})
     floor: float = dataclasses.field(default=0.01, metadata={"static": True})

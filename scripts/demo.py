@@ -1,9 +1,9 @@
 """A 2D co-design from a poor seed to a design that grasps, with figure, animation and pictures.
 
-`make demo` runs it: two minutes on two cores.  It is `codesign optimize` and `codesign
+`make demo` runs it: two to three minutes on two cores.  It is `codesign optimize` and `codesign
 evaluate` with the arguments below; further arguments go to the former, such as --fresh or --seed 1.
-The sizes are the paper's, and the scene has its skinned hull and contact between fingers.  Not
-every seed succeeds, see README.md.
+The sizes are the paper's but for a shorter final test, and the scene has its skinned hull and
+contact between fingers.  Not every seed succeeds, see README.md.
 """
 
 import csv

@@ -177,7 +177,7 @@ def _folder(options: "Optimize", scene: Scene, settings: Settings, seed: int) ->
     if options.out is not None:
         return options.out if options.seeds is None else options.out / f"seed-{seed}"
     names = [scene.hand.name, settings.preset, settings.schedule, str(seed)]
-    if settings.optimizer != optimize.NAMES[0]:
+    if settings.optimizer != optimize.DEFAULT:
         names.insert(3, settings.optimizer)
     return Path("runs") / "-".join(names)
 

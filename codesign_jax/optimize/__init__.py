@@ -19,8 +19,8 @@ array([[ True, False],
 """
 
 from codesign_jax.optimize.bounds import Space, reflect, strictly_below
-from codesign_jax.optimize.evolution import Evolution
-from codesign_jax.optimize.names import NAMES, make_optimizer, problem
+from codesign_jax.optimize.evolution import EVOSAX, Evolution
+from codesign_jax.optimize.names import DEFAULT, NAMES, make_optimizer, problem
 from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Info, Optimizer, State
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
@@ -28,6 +28,8 @@ from codesign_jax.optimize.schedule import schedule
 from codesign_jax.optimize.seeding import answer, candidates, rejection, rejection_sample
 
 __all__ = [
+    "DEFAULT",
+    "EVOSAX",
     "MAX_PARTICLES",
     "NAMES",
     "Evolution",

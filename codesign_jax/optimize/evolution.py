@@ -38,6 +38,8 @@ STREAM_START = 0x73747274
 
 LEAST = {"cma-es": 2, "pso": 1, "random": 1}
 """The strategies, and the fewest particles that each can rank."""
+EVOSAX = tuple(LEAST)
+"""Names of the optimisers that are evosax's."""
 
 
 @jax.tree_util.register_dataclass
@@ -51,12 +53,15 @@ class Evolution:
     the selection says nothing about closed ones.
 
     Attributes:
+        keeps_best: True: the state's particles are the best so far; see ``Optimizer.keeps_best``.
         space: Bounds and constraint of the parameters.
         name: "cma-es", from the seed particle; "pso", a swarm over the whole box that the seed
             particle attracts first; "random", uniform in the box.
         sigma: First standard deviation of CMA-ES as a fraction of the parameter range; pycma's
             documentation advises a quarter of the domain.
     """
+
+    keeps_best = True
 
     space: Space
     name: str = dataclasses.field(metadata={"static": True})

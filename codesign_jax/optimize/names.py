@@ -2,14 +2,21 @@
 
 import difflib
 import importlib.util
+from collections.abc import Callable, Mapping
 
 from codesign_jax.optimize.bounds import Space
-from codesign_jax.optimize.evolution import LEAST, Evolution
+from codesign_jax.optimize.evolution import EVOSAX, LEAST, Evolution
 from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Optimizer
 
-NAMES = ("particle-filter", *LEAST)
-"""The optimisers; all but the first are evosax's."""
+DEFAULT = "particle-filter"
+"""The paper's optimiser, which a run has if it names no other."""
+
+OWN: Mapping[str, Callable[[Space], Optimizer]] = {DEFAULT: ParticleFilter}
+"""The optimisers that this package implements itself, by name: what makes each over a space."""
+
+NAMES = (*OWN, *EVOSAX)
+"""All optimisers: the package's own, and evosax's strategies."""
 
 
 def make_optimizer(name: str, space: Space) -> Optimizer:
@@ -25,7 +32,7 @@ def make_optimizer(name: str, space: Space) -> Optimizer:
     """
     if name not in NAMES:
         raise ValueError(problem(name))
-    return ParticleFilter(space) if name == NAMES[0] else Evolution(space, name)
+    return Evolution(space, name) if name in EVOSAX else OWN[name](space)
 
 
 def problem(name: str, num_particles: int | None = None) -> str | None:
@@ -39,7 +46,7 @@ def problem(name: str, num_particles: int | None = None) -> str | None:
         near = difflib.get_close_matches(name, NAMES, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         return f"unknown optimizer {name!r}; {hint}Valid: {', '.join(NAMES)}"
-    if name in LEAST and importlib.util.find_spec("evosax") is None:
+    if name in EVOSAX and importlib.util.find_spec("evosax") is None:
         return f"{name} needs evosax: pip install 'codesign-jax[baselines]'"
     least = LEAST.get(name, 1)
     if num_particles is not None and num_particles < least:

@@ -41,12 +41,15 @@ class ParticleFilter:
     Can be closed over or passed through ``jit``: the bounds are leaves, the rest is static.
 
     Attributes:
+        keeps_best: False: resampling replaces all particles; see ``Optimizer.keeps_best``.
         space: Bounds and constraint of the parameters.
         sigma: Standard deviation of a move as a fraction of the parameter range. The paper writes
             "variance sigma = 0.05 x parameter range"; only the reading as a standard deviation has
             the unit of the parameter.
         alpha: Cost offset of the weight; keeps one perfect episode from taking over all particles.
     """
+
+    keeps_best = False
 
     space: Space
     sigma: float = dataclasses.field(default=0.05, metadata={"static": True})

@@ -76,6 +76,16 @@ class Optimizer(Protocol):
         """Bounds and constraint of the parameters."""
         ...
 
+    @property
+    def keeps_best(self) -> bool:
+        """Whether the state's particles are the best of all episodes, chosen by their costs.
+
+        A class attribute is enough. The outcomes that chose such particles are better than the
+        particles are, so the final test of a run (``runs.loop``) counts new trials only. Otherwise
+        it also counts the outcomes of the last episode, as in the paper.
+        """
+        ...
+
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0.
 

@@ -16,7 +16,7 @@ from codesign_jax import codesign, types
 from codesign_jax.batch import Request
 from codesign_jax.codesign import EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import NAMES, Optimizer, State
+from codesign_jax.optimize import Optimizer, State
 from codesign_jax.runs import failures, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints
@@ -190,14 +190,14 @@ class Loop:
         plan, settings = self.plan, self.plan.settings
         if self._tested(record):
             return
-        # Other optimisers keep the best particles so far, whose outcomes were chosen to be good.
-        counts = settings.optimizer == NAMES[0]
+        # Outcomes by which the best particles so far were chosen are too good to count.
+        previous = None if plan.optimizer.keeps_best else record.last_outcomes()
         testing = codesign.testing(
             plan.scene,
             record.state.particles,
             plan.key,
             num_trials=settings.test_trials,
-            previous=record.last_outcomes() if counts else None,
+            previous=previous,
         )
         with self.progress.busy("testing the final particles") as watch:
             test = yield from self._evaluated(testing)

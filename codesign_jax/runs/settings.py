@@ -38,7 +38,7 @@ class Settings:
     episodes: int
     seed: int
     test_trials: int
-    optimizer: str = optimize.NAMES[0]
+    optimizer: str = optimize.DEFAULT
 
     @property
     def grasps(self) -> int:
@@ -75,7 +75,7 @@ def make_settings(
     trials: int | None = None,
     episodes: int | None = None,
     test_trials: int | None = None,
-    optimizer: str = optimize.NAMES[0],
+    optimizer: str = optimize.DEFAULT,
 ) -> Settings:
     """Fills sizes that are not given with the paper's: those of 2D for "2d", of 23D otherwise."""
     sizes = _SIZES.get(preset, _SIZES_OTHERWISE)

@@ -32,6 +32,7 @@ from codesign_jax.optimize import (
     State,
     answer,
     rejection,
+    translated,
 )
 from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene, SceneError
@@ -400,14 +401,11 @@ def seed_search(
       threshold: Cost above which a candidate is poor enough.
     """
     noise = stream_key(key, STREAM_SCREEN)
-    asked = rejection(key, optimizer.space, 1, threshold=threshold, batch=batch)
-    try:
-        candidates = next(asked)
-        while True:
-            outcomes = yield candidates, noise
-            candidates = asked.send(particle_cost(scene, outcomes))
-    except StopIteration as stop:
-        seeds, costs, drawn = stop.value
+    seeds, costs, drawn = yield from translated(
+        rejection(key, optimizer.space, 1, threshold=threshold, batch=batch),
+        lambda population: (population, noise),
+        lambda outcomes: particle_cost(scene, outcomes),
+    )
     return seeds[0], float(costs[0]), drawn
 
 

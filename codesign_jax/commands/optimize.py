@@ -207,7 +207,8 @@ def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") 
     batch = settings.particles * settings.trials
     print(f"grasps: {settings.grasps} and at least {batch} to find the seed")
     if count > 1:
-        print(f"runs: {count}, in one batch; grasps and disk are those of each")
+        how = f"{options.jobs} at a time" if options.jobs else "in one batch"
+        print(f"runs: {count}, {how}; grasps and disk are those of each")
     row = 40 + 12 * space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")

@@ -25,7 +25,13 @@ from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Info, Optimizer, State
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
 from codesign_jax.optimize.schedule import schedule
-from codesign_jax.optimize.seeding import answer, candidates, rejection, rejection_sample
+from codesign_jax.optimize.seeding import (
+    answer,
+    candidates,
+    rejection,
+    rejection_sample,
+    translated,
+)
 
 __all__ = [
     "DEFAULT",
@@ -47,5 +53,6 @@ __all__ = [
     "rejection_sample",
     "schedule",
     "stochastic_universal",
+    "translated",
     "strictly_below",
 ]

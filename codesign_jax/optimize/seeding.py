@@ -135,3 +135,24 @@ def answer(asking: Generator[Any, Any, T], reply: Callable[[Any], Any]) -> T:
             request = asking.send(reply(request))
     except StopIteration as stop:
         return stop.value
+
+
+def translated(
+    asking: Generator[Any, Any, T], request: Callable[[Any], Any], reply: Callable[[Any], Any]
+) -> Generator[Any, Any, T]:
+    """A generator that asks for what another one asks for, in other terms.
+
+    Args:
+        asking: The other one.
+        request: What to yield for what it asks for.
+        reply: What to send it for what is sent here.
+
+    Returns:
+        What it returns.
+    """
+    try:
+        wanted = next(asking)
+        while True:
+            wanted = asking.send(reply((yield request(wanted))))
+    except StopIteration as stop:
+        return stop.value

@@ -16,7 +16,7 @@ from codesign_jax import codesign, types
 from codesign_jax.batch import Request
 from codesign_jax.codesign import EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import Optimizer, State
+from codesign_jax.optimize import Optimizer, State, translated
 from codesign_jax.runs import failures, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints
@@ -155,14 +155,11 @@ class Loop:
 
     def _evaluated(self, asking: Generator[tuple[jax.Array, jax.Array], Outcome, Any]) -> Asking:
         """Answers what asks for populations by episodes in which nothing moves."""
-        try:
-            population, key = next(asking)
-            while True:
-                closed = codesign.closed(self.plan.optimizer, population, key)
-                _, info = yield Request(*closed)
-                population, key = asking.send(info.trials)
-        except StopIteration as stop:
-            return stop.value
+        return translated(
+            asking,
+            lambda asked: Request(*codesign.closed(self.plan.optimizer, *asked)),
+            lambda told: told[1].trials,
+        )
 
     def _episodes(self, record: Record) -> Asking:
         for e in range(record.done, self.plan.settings.episodes):

@@ -72,32 +72,27 @@ class Progress:
           seconds: Wall time of the episode.
           causes: Counts of the status bits, such as "SPEED 1, SOLVER_CAP 3".
         """
-        line, rate, left = self._line(done, mean, best, failed, grasps, seconds, causes)
-        self._bar.update(self._task, completed=done, description=f"{rate:.1f} grasps/s  ETA {left}")
-        self.message(line)
-        return line
-
-    def _line(
-        self,
-        done: int,
-        mean: float,
-        best: float,
-        failed: int,
-        grasps: int,
-        seconds: float,
-        causes: str,
-    ) -> tuple[str, float, str]:
-        """The line of an episode, the rate so far [grasps/s] and the time left."""
-        self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
-        rate = self._grasps / max(self._seconds, 1e-9)
-        left = duration((self.total - done) * grasps / rate)
+        pace = self._pace(done, grasps, seconds)
         reasons = f" ({causes})" if causes else ""
         count = f"{done:>{len(str(self.total))}}/{self.total}"
         line = (
             f"episode {count}  mean {mean:.3f}  best {best:.3f}  failed {failed}/{grasps}"
-            f"{reasons}  {rate:.1f} grasps/s  ETA {left}"
+            f"{reasons}  {pace}"
         )
-        return line, rate, left
+        self._show(_Entry(done, mean, best, failed, grasps), line, pace)
+        return line
+
+    def _pace(self, done: int, grasps: int, seconds: float) -> str:
+        """Counts grasps that took so long; the rate so far and the time left, in words."""
+        self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
+        rate = self._grasps / max(self._seconds, 1e-9)
+        left = duration((self.total - done) * grasps / rate)
+        return f"{rate:.1f} grasps/s  ETA {left}"
+
+    def _show(self, entry: "_Entry", line: str, pace: str) -> None:
+        """Shows a finished episode."""
+        self._bar.update(self._task, completed=entry.done, description=pace)
+        self.message(line)
 
 
 class _Entry(NamedTuple):
@@ -132,19 +127,15 @@ class GroupProgress(Progress):
         if not entries:
             return
         grasps, failed = (sum(getattr(e, k) for e in entries) for k in ("grasps", "failed"))
-        self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
-        rate, first = self._grasps / max(self._seconds, 1e-9), min(e.done for e in entries)
-        left = duration((self.total - first) * grasps / rate)
+        first, last = min(e.done for e in entries), max(e.done for e in entries)
+        pace = self._pace(first, grasps, seconds)
         means, bests = ([getattr(e, k) for e in entries] for k in ("mean", "best"))
-        last = max(e.done for e in entries)
         count = f"{first:>{len(str(self.total))}}" + (f" to {last}" if last > first else "")
-        self._bar.update(
-            self._task, completed=first, description=f"{rate:.1f} grasps/s  ETA {left}"
-        )
+        self._bar.update(self._task, completed=first, description=pace)
         self.message(
             f"episode {count}/{self.total}  {len(entries)} runs  "
             f"mean {min(means):.3f} to {max(means):.3f}  best {min(bests):.3f} to {max(bests):.3f}"
-            f"  failed {failed}/{grasps}  {rate:.1f} grasps/s  ETA {left}"
+            f"  failed {failed}/{grasps}  {pace}"
         )
 
 
@@ -164,20 +155,9 @@ class OneOfMany(Progress):
         """As of the group."""
         return self._group.busy(text)
 
-    def episode(
-        self,
-        done: int,
-        *,
-        mean: float,
-        best: float,
-        failed: int,
-        grasps: int,
-        seconds: float,
-        causes: str = "",
-    ) -> str:
-        """As `Progress.episode`; what is printed is the group's line."""
-        self._group.add(_Entry(done, mean, best, failed, grasps))
-        return self._line(done, mean, best, failed, grasps, seconds, causes)[0]
+    def _show(self, entry: _Entry, line: str, pace: str) -> None:
+        """Leaves it to the group, which prints one line for all runs of a round."""
+        self._group.add(entry)
 
 
 class Stopwatch:

@@ -58,9 +58,9 @@ def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
 
     A block takes as long as its slowest world.  Where a batch leaves a GPU's schedulers without
     work, blocks are half or a quarter of a warp, so that fewer worlds wait for one another
-    (whole grasps of 1,728 worlds on an H200: 0.72 instead of 0.41 million world-steps/s with the
-    hull and contact between fingers, 2.9 instead of 2.2 with the hull; of 7,200 worlds 1.15 and
-    1.04, 3.9 and 4.5).
+    (whole grasps of 1,728 worlds on an H200, half a warp and a whole one: 0.72 and 0.41 million
+    world-steps/s with the hull and contact between fingers, 2.9 and 2.2 with the hull; of 7,200
+    worlds, where whole warps are kept, 1.15 and 1.04, 3.9 and 4.5; before commit 5a0020d).
 
     Args:
       platform: As `jax.default_backend` names it.

@@ -37,7 +37,7 @@ class ThreadWriter(Writer):
         """Starts empty; the lane is in `%lane`."""
         super().__init__(lanes)
         self.lane = Value("i32", True, "%lane")
-        # The mask of the warp's threads that take part: as a signed number.
+        # Mask of the warp's threads that take part, one bit each; LLVM reads i32 as signed.
         self.all = f"i32 {-1 if lanes == LANES else (1 << lanes) - 1}"
         self.growth: dict[str, int] = {}  # of integers [1] and addresses [bytes], in each round
         self.born: dict[str, int] = {}  # line behind an address

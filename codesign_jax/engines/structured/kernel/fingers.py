@@ -3,7 +3,8 @@
 A vertex of the hull touches another finger's row (the stretch between the middles of two links)
 where it stands inside the row's section, whose frame turns from one link's to the other's along
 the row: rows neither overlap nor leave gaps, however the finger bends.  Both fingers' vertices
-are tried, each with half its share of the surface.
+are tried, each with half its share of the surface.  All vertices of a row that stand in the same
+row of another finger are one contact, see `_pressure`.
 """
 
 from collections.abc import Callable

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,6 +30,43 @@ def atomically(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_folder(path: Path, keep: str) -> Iterator[Path]:
+    """Fills a folder as a whole: what is written appears there when the block ends.
+
+    Args:
+      path: The folder; new files replace those of the same names, others stay.
+      keep: Name of a file that another attempt may go on from.
+
+    Yields:
+      The folder to write to, beside the other with a name in .part. If the block raises or the
+      process is killed, the other folder stays as it was, and the next attempt finds `keep` here.
+
+    Raises:
+      OSError: If the folder cannot be written.
+    """
+    path = path.resolve()
+    part = path.with_name(f".{path.name}.part")
+    part.mkdir(parents=True, exist_ok=True)
+    for old in part.iterdir():
+        if old.is_dir():
+            shutil.rmtree(old)
+        elif old.name != keep:
+            old.unlink()
+    try:
+        yield part
+    except BaseException:
+        if not (part / keep).exists():
+            shutil.rmtree(part)
+        raise
+    (part / keep).unlink(missing_ok=True)
+    try:
+        os.replace(part, path)  # where there is no folder, or an empty one
+    except OSError:
+        shutil.copytree(part, path, dirs_exist_ok=True)
+        shutil.rmtree(part)
 
 
 def cache_folder() -> Path:

@@ -252,7 +252,10 @@ def test_estimates_scale_the_most_similar_measurement(tmp_path, monkeypatch):
     asked = rates.work(the_scene, settings())
     shipped = rates.estimate(asked)
     assert "another machine" in shipped.basis and "scaled" in shipped.basis
-    rates.record(dataclasses.replace(asked, grasps=800, scene="another"), 10.0, 60.0)
+    other = dataclasses.replace(asked, grasps=800, scene="another", structure="another")
+    rates.record(other, 10.0, 60.0)
+    busy = dataclasses.replace(other, grasps=801)
+    rates.record(busy, 10.0, 600.0)  # the computer was busy with something else
     rates.record(asked, 50.0, 3.0)
     found = rates.estimate(asked)
     assert (found.grasps_per_second, found.compile_seconds) == (50.0, 3.0)
@@ -260,7 +263,9 @@ def test_estimates_scale_the_most_similar_measurement(tmp_path, monkeypatch):
     longer = rates.work(tiny(discretization={"timestep": 0.01, "links": 6})[0], settings())
     found = rates.estimate(longer)  # twice the steps, twice the links, a program not seen before
     assert (found.grasps_per_second, found.compile_seconds) == (12.5, 60.0)
-    assert "scaled to this run's" in found.basis
+    assert "scaled to these steps" in found.basis
+    softer = tiny(hand={"material": {"shear_modulus": 60e3}})[0]  # shares the program
+    assert rates.estimate(rates.work(softer, settings())).compile_seconds == 3.0
     assert rates.estimate(dataclasses.replace(asked, engine="mjx", device="tpu x1")) is None
     hull = rates.work(tiny(effects={"surface": "hull"})[0], settings())
     assert hull.contacts == "hull" and rates.estimate(hull) is None, "not the rate of spheres"

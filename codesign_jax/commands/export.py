@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 from collections.abc import Iterator
 from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
@@ -11,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, provenance, rollout, runs
-from codesign_jax.commands import common
+from codesign_jax import engines, files, provenance, rollout, runs
+from codesign_jax.commands import common, drift
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain, process, tables
@@ -24,7 +25,6 @@ from codesign_jax.types import Params, Trial
 if TYPE_CHECKING:
     from codesign_jax.cli import Export
     from codesign_jax.export import sheet
-    from codesign_jax.report.statistics import Interval
 
 
 def main(options: "Export") -> int:
@@ -48,10 +48,14 @@ def main(options: "Export") -> int:
     for note in notes:
         console.print(note, markup=False)
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
+        with files.whole_folder(options.out, drift.PART) as folder:
+            _write(case, params, sizes, engine, folder, options, console)
     except OSError as error:
         raise SceneError([f"--out {options.out}: {error.strerror}"]) from error
-    _write(case, params, sizes, engine, options, console)
+    except KeyboardInterrupt:
+        console.print("stopped, nothing is exported; the same command goes on")
+        return 130
+    _tell(options, console)
     return 0
 
 
@@ -116,26 +120,41 @@ def _write(
     params: Params,
     sizes: list[Size],
     engine: engines.Engine | None,
+    folder: Path,
     options: "Export",
     console: Console,
 ) -> None:
     """Writes all that is asked for; tolerances if there is an engine to simulate them."""
-    _models(case, params, options, console)
+    _models(case, params, folder, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
-    schedule = grasps.schedule(case.scene, params, nominal)
-    path = tables.write_commands(options.out, case.scene, schedule)
-    console.print(f"commands of arm and valves: {path}", markup=False)
+    tables.write_commands(folder, case.scene, grasps.schedule(case.scene, params, nominal))
     if not options.no_parts:
-        _parts(sizes, options, console)
+        _parts(sizes, folder, options, console)
     if not options.no_sheet:
-        drift = _drift(case, engine, options, console) if engine else None
-        _sheet(case, params, sizes, drift, options, console)
+        found = drift.simulate(case, engine, options, folder, console) if engine else None
+        _sheet(case, params, sizes, found, folder, options)
 
 
-def _parts(sizes: list[Size], options: "Export", console: Console) -> None:
+def _tell(options: "Export", console: Console) -> None:
+    """Says where everything is."""
+    from codesign_jax.export import sheet
+
+    console.print(f"exported: {options.out}", markup=False)
+    models = sorted((options.out / tables.MODELS).glob("*.mjb"))
+    if models:
+        player = f"python {grasps.PLAYER.name} {models[0].name}"
+        console.print(f"  {tables.MODELS}/: models for plain MuJoCo; there: {player}", markup=False)
+    console.print(f"  {tables.COMMANDS}: commands of arm and valves", markup=False)
+    if not options.no_parts:
+        console.print("  parts/: fingers and moulds, in millimetres", markup=False)
+    if not options.no_sheet:
+        console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet", markup=False)
+
+
+def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console) -> None:
     from codesign_jax.export import meshes  # needs the extra
 
-    folder, how = options.out / meshes.FOLDER, _process(options)
+    folder, how = folder / meshes.FOLDER, _process(options)
     folder.mkdir(exist_ok=True)
     for part in meshes.write(folder, sizes, how):
         edges = " x ".join(f"{v:.1f}" for v in part.extents)
@@ -146,25 +165,21 @@ def _parts(sizes: list[Size], options: "Export", console: Console) -> None:
             console.print(
                 f"finger {i} has no inlet: its chamber of {low:g} mm is narrower than the tube"
             )
-    console.print(f"parts, in millimetres: {folder}", markup=False)
 
 
-def _models(case: Case, params: Params, options: "Export", console: Console) -> None:
+def _models(case: Case, params: Params, folder: Path, options: "Export", console: Console) -> None:
     if found := plain.obstacles(case.scene):
         for text in found:
             console.print(f"no model: plain MuJoCo does not simulate {text}", markup=False)
         return
     if other := plain.stand_in(case.scene):
         console.print(f"note: {other}", markup=False)
-    folder = options.out / tables.MODELS
+    folder = folder / tables.MODELS
     folder.mkdir(exist_ok=True)
     trials = _trials(case, options)
     built = _built(case, params, trials)
     for line in tables.write_grasps(folder, case.scene, trials, built):
         console.print(f"in plain MuJoCo: {line}", markup=False)
-    console.print(
-        f"models: {folder}; there: python {grasps.PLAYER.name} {trials[0][0]}.mjb", markup=False
-    )
 
 
 def _built(case: Case, params: Params, trials: list[tuple[str, Trial]]) -> Iterator[grasps.Grasp]:
@@ -189,13 +204,13 @@ def _sheet(
     case: Case,
     params: Params,
     sizes: list[Size],
-    drift: "sheet.Drift | None",
+    found: "sheet.Drift | None",
+    folder: Path,
     options: "Export",
-    console: Console,
 ) -> None:
     from codesign_jax.export import drawing, sheet  # needs the extra
 
-    content = sheet.sections(case.scene, params, sizes, drift)
+    content = sheet.sections(case.scene, params, sizes, found)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
     code = provenance.git_state()
@@ -207,46 +222,6 @@ def _sheet(
         f"{' with changes' if code.get('modified') else ''}. Predictions of a simulation, not "
         "measurements.",
     ]
-    paths = [
-        sheet.write(options.out, title, lines, content),
-        drawing.write(
-            options.out,
-            title,
-            lines,
-            content,
-            scene=case.scene,
-            params=params,
-            sizes=sizes,
-            drift=drift,
-        ),
-    ]
-    for path in paths:
-        console.print(f"build sheet: {path}", markup=False)
-
-
-def _drift(
-    case: Case, engine: engines.Engine, options: "Export", console: Console
-) -> "sheet.Drift":
-    """Tolerances of the design: its own grasps, then those of all steps in one batch."""
-    from codesign_jax.export import sheet, tolerance
-
-    steps, trials = options.tolerance_steps, options.tolerance_trials
-    planned = tolerance.study(
-        case.scene, case.space, case.design, steps, free=options.tolerance == "free"
-    )
-    evaluate = codesign.make_evaluate(case.scene, engine, planned.space, trials)
-
-    def simulate(designs: np.ndarray) -> "list[Interval]":
-        population = jnp.asarray(designs, jnp.float32)
-        return tolerance.shares(evaluate(population, jax.random.key(options.seed)))
-
-    [nominal] = simulate(planned.designs[:1])
-    if nominal.value < tolerance.WANTED:  # known before minutes are spent on it
-        return sheet.Drift(nominal, trials, steps, case.engine, [])
-    console.print(
-        f"tolerance: simulating {len(planned.designs) * trials} grasps; --tolerance free or off "
-        "takes less time",
-        markup=False,
-    )
-    rows = tolerance.tolerances(planned, simulate(planned.designs))
-    return sheet.Drift(nominal, trials, steps, case.engine, rows)
+    sheet.write(folder, title, lines, content)
+    shown = {"scene": case.scene, "params": params, "sizes": sizes, "drift": found}
+    drawing.write(folder, title, lines, content, **shown)

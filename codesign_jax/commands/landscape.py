@@ -5,19 +5,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress, TimeRemainingColumn
 
 from codesign_jax import codesign, runs
-from codesign_jax.commands import common
+from codesign_jax.commands import calls, common, estimate
+from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
-from codesign_jax.runs import outcomes
 from codesign_jax.runs.directory import PROVENANCE
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import schema
@@ -29,10 +27,6 @@ if TYPE_CHECKING:
 
 PART = "landscape.part.npz"
 """What is done of a landscape, until it is finished."""
-
-WORLDS = {"cpu": 512}
-"""Most worlds of one call by platform: few enough to see progress, enough to fill the cores."""
-_WORLDS = 16_384  # of an accelerator
 
 
 class Grid(NamedTuple):
@@ -66,6 +60,9 @@ def main(options: "Options") -> int:
         console.print(f"around: {runs.describe(case.space, case.design)}", markup=False)
     for note in common.mesh_notes(case.scene):
         console.print(note, markup=False)
+    if options.dry_run:
+        _dry_run(case, made.designs, options, console)
+        return 0
     part = folder / PART
     try:
         simulated = _simulate(case, made.designs, options, console, part)
@@ -146,6 +143,18 @@ def grid(case: Case, columns: tuple[int, int], points: int) -> Grid:
     return Grid(columns, (axes[0], axes[1]), np.asarray(projected))
 
 
+def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Console) -> None:
+    trials = _trials(case, options)
+    size = calls.equal(len(designs), calls.most_designs(trials))
+    grasps = len(designs) * trials.count
+    console.print(f"grasps: {grasps} in {-(-len(designs) // size)} calls")
+    console.print(estimate.text([estimate.Part("", calls.work(trials, size), grasps)]))
+
+
+def _trials(case: Case, options: "Options") -> Trials:
+    return Trials(case.scene, case.engine, case.space, options.trials, options.seed)
+
+
 def _simulate(
     case: Case, designs: np.ndarray, options: "Options", console: Console, part: Path
 ) -> Outcome:
@@ -153,40 +162,19 @@ def _simulate(
 
     What is done is kept in a file, from which the same command goes on.
     """
+    trials = _trials(case, options)
+    size = calls.equal(len(designs), calls.most_designs(trials))
+    grasps = len(designs) * trials.count
     engine = make_engine(case.engine, case.scene)
-    evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
-    most = WORLDS.get(jax.default_backend(), _WORLDS)
-    size = min(len(designs), max(1, most // options.trials))
-    calls = -(-len(designs) // size)
-    size = -(-len(designs) // calls)  # equal calls: a short last one would be filled up
-    key, noise = _key(case, designs, options, size), jax.random.key(options.seed)
-    done = outcomes.load(part, key)
-    parts = [] if done is None else [done]
-    console.print(f"grasps: {designs.shape[0] * options.trials} in {calls} calls")
-    first = 0 if done is None else len(done.cost)
-    if first:
-        console.print(f"going on after {first // size} calls, from {part}", markup=False)
-    columns = (*Progress.get_default_columns()[:-1], TimeRemainingColumn())
-    quiet = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
-        for start in progress.track(range(first, len(designs), size), description="simulating"):
-            rows = np.minimum(np.arange(start, start + size), len(designs) - 1)
-            outcome = evaluate(jnp.asarray(designs[rows]), noise)
-            parts.append(jax.tree.map(np.asarray, outcome))
-            if start + size < len(designs):
-                parts = [_joined(parts)]
-                outcomes.save(part, parts[0], key)
-    return jax.tree.map(lambda v: v[: len(designs)], _joined(parts))
-
-
-def _key(case: Case, designs: np.ndarray, options: "Options", size: int) -> str:
-    """Digest of what determines the outcomes; calls of another size round differently."""
-    how = options.trials, options.seed
-    return f"{outcomes.key(case.scene, case.engine, designs, *how)} {size}"
-
-
-def _joined(parts: list[Outcome]) -> Outcome:
-    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+    simulate = Calls(trials, engine, size, part, designs)
+    console.print(f"grasps: {grasps} in {-(-len(designs) // size)} calls")
+    if simulate.found:
+        done = simulate.found // size
+        console.print(f"going on after {done} calls, from {part}", markup=False)
+    with Meter("landscape", grasps, console) as meter:
+        found = simulate(designs, meter)
+    simulate.record_rate()
+    return found
 
 
 def summarize(case: Case, made: Grid, found: Outcome, seed: int) -> Landscape:

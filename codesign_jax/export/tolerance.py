@@ -1,12 +1,12 @@
 """How far each parameter of a design may drift before grasps fail, from simulated grasps.
 
 Every parameter is moved alone, down and up, by steps that grow by a constant factor to the end of
-its range, and every design so made meets the same trials, all in one batch.  On each side the
-tolerance ends between the last step of an unbroken row of steps with at least `WANTED` successes
-and the step after it.
+its range, and every design so made meets the same trials.  On each side the tolerance ends between
+the last step of an unbroken row of steps with at least `WANTED` successes and the step after it;
+steps further out are not simulated.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -74,8 +74,7 @@ class Study(NamedTuple):
 
     Attributes:
       space: Space of the designs.
-      designs: The design, then its steps [SI units], shape (1 + parameter * 2 * step, parameter);
-        steps on a side without room repeat the design.
+      designs: The design, then its steps [SI units], shape (1 + parameter * 2 * step, parameter).
       low: Ends of the ranges downwards [SI units], shape (parameter,).
       high: Ends upwards.
     """
@@ -89,6 +88,30 @@ class Study(NamedTuple):
     def steps(self) -> int:
         """Steps on each side of a parameter."""
         return (len(self.designs) - 1) // (2 * self.space.num_parameters)
+
+    @property
+    def room(self) -> np.ndarray:
+        """Whether the range goes on downwards and upwards, bool, shape (parameter, 2)."""
+        ends = np.stack([self.low, self.high], 1)
+        margin = _MARGIN * (self.high - self.low)
+        return abs(ends - self.designs[0][:, None]) > margin[:, None]
+
+    @property
+    def most(self) -> int:
+        """Designs that `search` asks for at most."""
+        return 1 + int(self.room.sum()) * self.steps
+
+
+class Round(NamedTuple):
+    """What `search` asks for.
+
+    Attributes:
+      designs: Indices of designs of the study.
+      most: Designs that it may ask for after these, at most.
+    """
+
+    designs: list[int]
+    most: int
 
 
 def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, free: bool) -> Study:
@@ -153,29 +176,61 @@ def shares(outcomes: Outcome) -> list[Interval]:
     return [statistics.wilson(int(n), kept.shape[1]) for n in kept.sum(1)]
 
 
-def tolerances(planned: Study, found: Sequence[Interval]) -> list[Tolerance]:
+def search(planned: Study, size: int) -> Generator[Round, list[Interval], dict[int, Interval]]:
+    """Asks for the successes that the tolerances need: those of each side up to its end.
+
+    Args:
+      planned: The designs.
+      size: Most designs to ask for at a time.
+
+    Yields:
+      A round; to be sent the shares of its designs.
+
+    Returns:
+      Shares of successful grasps by index of the design; of a design with too few successes, what
+      was known by then.
+    """
+    steps, found = planned.steps, {}
+    sides = [int(side) for side in np.flatnonzero(planned.room)]
+    for step in range(steps):
+        asked = [0] * (step == 0) + [1 + side * steps + step for side in sides]
+        for start in range(0, len(asked), size):
+            some = asked[start : start + size]
+            later = len(asked) - start - len(some) + len(sides) * (steps - step - 1)
+            found |= zip(some, (yield Round(some, later)), strict=True)
+            if found[0].value < WANTED:
+                return found
+        sides = [side for side in sides if found[1 + side * steps + step].value >= WANTED]
+    return found
+
+
+def tolerances(planned: Study, found: Mapping[int, Interval]) -> list[Tolerance]:
     """Reads the tolerances off the successes.
 
     Args:
       planned: The designs.
-      found: Their shares of successful grasps.
+      found: Shares of successful grasps by index of the design, see `search`.
     """
-    space, results = planned.space, []
+    space, results, room = planned.space, [], planned.room
     factor = np.array([UNITS[unit][1] for unit in space.units])
-    values = planned.designs[1:].reshape(space.num_parameters, 2, planned.steps, -1)
-    steps = np.reshape(np.arange(1, len(planned.designs)), values.shape[:3])
     for i, name in enumerate(space.names):
         sides = []
         for s, end in enumerate((planned.low[i], planned.high[i])):
-            moved = [
-                Step(float(v[i] / factor[i]), found[k])
-                for v, k in zip(values[i, s], steps[i, s], strict=True)
-            ]
-            room = abs(end - planned.designs[0, i]) > _MARGIN * (planned.high[i] - planned.low[i])
-            sides.append(_side(moved, float(end / factor[i]), bool(room)))
+            moved = _known(planned, found, i, s, factor[i])
+            sides.append(_side([*moved], float(end / factor[i]), bool(room[i, s])))
         value = float(planned.designs[0, i] / factor[i])
         results.append(Tolerance(name, space.units[i], value, *sides))
     return results
+
+
+def _known(
+    planned: Study, found: Mapping[int, Interval], parameter: int, side: int, factor: float
+) -> Iterator[Step]:
+    """The steps of a side whose successes are known, from the design outwards."""
+    first = 1 + (2 * parameter + side) * planned.steps
+    for k in range(first, first + planned.steps):
+        if k in found:
+            yield Step(float(planned.designs[k, parameter] / factor), found[k])
 
 
 def _side(moved: list[Step], limit: float, room: bool) -> Side:

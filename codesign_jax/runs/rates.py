@@ -1,7 +1,7 @@
-"""How long a run will take, from rates that earlier runs measured; nothing is simulated for it.
+"""How long grasps will take, from rates that were measured earlier; nothing is simulated for it.
 
-Every run of `codesign optimize` adds its rate and compile time to a file in the user's cache. Where
-none fits, rates measured for docs/performance.md stand in.
+The commands that simulate many grasps add their rate and compile time to a file in the user's
+cache. Where none fits, rates measured for docs/performance.md stand in.
 """
 
 import contextlib
@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import statistics
 
 import jax
 
@@ -35,6 +36,7 @@ class Work:
       links: Links of all fingers.
       grasps: Grasps simulated at once.
       scene: Digest of the scene.
+      structure: Digest of what of the scene programs are compiled for.
     """
 
     engine: str
@@ -44,6 +46,7 @@ class Work:
     links: int
     grasps: int
     scene: str = ""
+    structure: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,18 +108,36 @@ def work(scene: Scene, settings: Settings, *, runs: int = 1, devices: int | None
       runs: Runs that are simulated at once.
       devices: Devices that simulate; None for all.
     """
-    texts = "".join(scene_texts(scene).values())
+    grasps = settings.particles * settings.trials * runs
+    return batch_work(scene, settings.engine, grasps, devices=devices)
+
+
+def batch_work(scene: Scene, engine: str, grasps: int, *, devices: int | None = None) -> Work:
+    """What grasps simulated at once are, on this machine.
+
+    Args:
+      scene: The scene.
+      engine: Name of the engine.
+      grasps: How many.
+      devices: Devices that simulate; None for all.
+    """
     e, meshes = scene.effects, any(shape.mesh for shape in scene.objects.object)
     parts = [str(e.surface), *["fingers"] * bool(e.finger_finger), *["meshes"] * meshes]
     return Work(
-        settings.engine,
-        _device(settings.engine, devices),
+        engine,
+        _device(engine, devices),
         "+".join(parts),
         scene.num_steps,
         scene.num_fingers * scene.discretization.links,
-        settings.particles * settings.trials * runs,
-        hashlib.sha256(texts.encode()).hexdigest()[:16],
+        grasps,
+        _digest(scene),
+        _digest(scene.structure),
     )
+
+
+def _digest(scene: Scene) -> str:
+    texts = "".join(scene_texts(scene).values())
+    return hashlib.sha256(texts.encode()).hexdigest()[:16]
 
 
 def _device(engine: str, devices: int | None) -> str:
@@ -164,14 +185,23 @@ def estimate(work: Work) -> Estimate | None:
     else:
         devices = _count(work.device) / _count(best.work.device)
         rate *= devices * min(1.0, work.grasps / devices / best.work.grasps)
-    # What was compiled before is loaded; for another scene the slowest compile is the honest guess.
-    exact = [r.compile_seconds for r in same if _program(r.work) == _program(work)]
-    slowest = max((r.compile_seconds or 0.0 for r in same + shipped), default=0.0) or None
-    compile_seconds = exact[-1] if exact else slowest
     basis = f"{best.grasps_per_second:.3g} grasps/s {_at(best)}"
-    if dataclasses.replace(best.work, scene=work.scene) != work:
-        basis += ", scaled to this run's steps, links and batch"
-    return Estimate(rate, compile_seconds, basis)
+    if dataclasses.replace(best.work, scene=work.scene, structure=work.structure) != work:
+        basis += ", scaled to these steps, links and batch"
+    return Estimate(rate, _compile_seconds(same or shipped, work), basis)
+
+
+def _compile_seconds(alike: list[Rate], work: Work) -> float | None:
+    """Time to compile or load: the program's own last one, or the median of others'.
+
+    Single measurements are no guide: a computer that is busy with something else takes many times
+    as long.
+    """
+    times = [(r, r.compile_seconds) for r in alike if r.compile_seconds is not None]
+    own = [seconds for r, seconds in times if _program(r.work) == _program(work)]
+    if own:
+        return own[-1]
+    return statistics.median(seconds for _, seconds in times) if times else None
 
 
 def _at(rate: Rate) -> str:
@@ -185,7 +215,8 @@ def _alike(a: Work, b: Work) -> bool:
 
 
 def _program(work: Work) -> tuple:
-    return work.scene, work.grasps, work.engine, work.device
+    """What a compiled program depends on; scenes that differ in numbers alone share it."""
+    return work.structure, work.grasps, work.engine, work.device
 
 
 def _distance(a: Work, b: Work) -> float:

@@ -1,0 +1,72 @@
+"""The grasps of `codesign export` that say how far parameters of a design may drift."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from codesign_jax.commands import calls, estimate
+from codesign_jax.commands.calls import Calls, Meter, Trials
+from codesign_jax.commands.case import Case
+from codesign_jax.engines import Engine
+from codesign_jax.optimize import answer
+from codesign_jax.report.statistics import Interval
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Export
+    from codesign_jax.export import sheet
+    from codesign_jax.export.tolerance import Study
+
+PART = "tolerance.part.npz"
+"""What is simulated of a design's tolerance, until it is finished."""
+
+
+def simulate(
+    case: Case, engine: Engine, options: "Export", folder: Path, console: Console
+) -> "sheet.Drift":
+    """Tolerances of the design: says how many grasps they take and about how long, and simulates.
+
+    Args:
+      case: The design.
+      engine: Engine that simulates.
+      options: The command line.
+      folder: Where `PART` is kept: another process goes on from it.
+      console: Told what is done.
+    """
+    from codesign_jax.export import sheet, tolerance  # with the extra
+
+    steps, count = options.tolerance_steps, options.tolerance_trials
+    free = options.tolerance == "free"
+    planned = tolerance.study(case.scene, case.space, case.design, steps, free=free)
+    trials = Trials(case.scene, case.engine, planned.space, count, options.seed)
+    first = 1 + int(planned.room.sum())
+    size = calls.equal(first, calls.most_designs(trials))
+    _announce(planned, trials, size, options, console)
+    run = Calls(trials, engine, size, folder / PART, planned.designs)
+    if run.found:
+        console.print(f"going on after {run.found * count} grasps")
+    with Meter("tolerance", planned.most * count, console) as meter:
+
+        def reply(asked: tolerance.Round) -> list[Interval]:
+            meter.total = meter.done + count * (len(asked.designs) + asked.most)
+            return tolerance.shares(run(planned.designs[asked.designs], meter))
+
+        found = answer(tolerance.search(planned, size), reply)
+    run.record_rate()
+    known = found[0].value >= tolerance.WANTED
+    rows = tolerance.tolerances(planned, found) if known else []
+    return sheet.Drift(found[0], count, steps, case.engine, rows)
+
+
+def _announce(
+    planned: "Study", trials: Trials, size: int, options: "Export", console: Console
+) -> None:
+    names, most = planned.space.names, planned.most * trials.count
+    moved = ", ".join(names) if len(names) <= 4 else f"{len(names)} parameters"
+    others = {"free": "all moves the hand's whole table", "all": "free moves fewer"}
+    console.print(
+        f"tolerance of {moved}: simulating at most {most} grasps "
+        f"(--tolerance {others[options.tolerance]}, off none)",
+        markup=False,
+    )
+    console.print(estimate.text([estimate.Part("", calls.work(trials, size), most)]))

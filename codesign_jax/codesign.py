@@ -134,7 +134,7 @@ def make_evaluate(
     space: DesignSpace,
     num_trials: int,
     *,
-    trajectory: bool = False,
+    trajectory: bool | None = None,
     cost: rollout.CostFunction | None = None,
 ) -> EvaluateFunction:
     """Returns a function (population, key) -> outcomes of shape (particle, trial); one program.
@@ -169,7 +169,7 @@ def _evaluation(
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    trajectory: bool,
+    trajectory: bool | None,
     cost: rollout.CostFunction | None,
 ) -> Callable[..., Outcome]:
     def simulate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
@@ -189,7 +189,7 @@ def make_episode(
     optimizer: Optimizer,
     num_trials: int,
     *,
-    trajectory: bool = False,
+    trajectory: bool | None = None,
     cost: rollout.CostFunction | None = None,
 ) -> Program:
     """Returns the jitted function (state, mask) -> (state, info) that runs one episode.
@@ -220,7 +220,7 @@ def _episode(
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    trajectory: bool,
+    trajectory: bool | None,
     cost: rollout.CostFunction | None,
 ) -> EpisodeFunction:
     def episode(
@@ -264,7 +264,7 @@ def make_run(
     optimizer: Optimizer,
     num_trials: int,
     *,
-    trajectory: bool = False,
+    trajectory: bool | None = None,
     cost: rollout.CostFunction | None = None,
 ) -> Program:
     """Returns the jitted function (state, masks, constants) -> (state, info) of a whole run.

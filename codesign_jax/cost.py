@@ -11,6 +11,9 @@
 2.0
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,6 +71,53 @@ def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
     count = good.sum(-1)
     mean = jnp.where(good, trials.cost, 0.0).sum(-1) / jnp.maximum(count, 1)
     return jnp.where(count > 0, mean, scene.cost.maximum)
+
+
+def shown(trace: Trace, trajectory: bool | None) -> Trace:
+    """A trace for a cost of one's own: reading what was not simulated or recorded is refused.
+
+    Without a trajectory a trace repeats the step at which a world lost its object, which a cost of
+    one's own would take for what happened.
+
+    Args:
+      trace: Trace of one world.
+      trajectory: Whether it is a trajectory; None if the caller did not say what the cost needs.
+
+    Returns:
+      The trace, whose fields raise ValueError when they are read if they are not to be.
+    """
+    return trace if trajectory else (_UNASKED if trajectory is None else _TO_LOSS)(*trace)
+
+
+def _refusing(name: str, problems: dict[str, str]) -> type:
+    """A type of traces whose fields raise these errors; a tree of JAX as `Trace` is."""
+
+    def refuse(problem: str) -> Callable:
+        def read(*_: Any) -> None:
+            raise ValueError(problem)
+
+        return read
+
+    fields = {field: property(refuse(problem)) for field, problem in problems.items()}
+    # What unpacks or indexes the trace reads all of it.
+    every = refuse(next(iter(problems.values())))
+    return type(name, (Trace,), fields | {"__iter__": every, "__getitem__": every})
+
+
+_QPOS = (
+    "a cost reads trace.qpos, which is recorded with trajectory=True only: pass that beside cost="
+)
+_TO_LOSS = _refusing("TraceToTheLoss", {"qpos": _QPOS})
+_UNASKED = _refusing(
+    "TraceUnasked",
+    {
+        field: f"a cost reads trace.{field}, but without a trajectory a world stops when it loses "
+        "its object, and its last step repeats: pass trajectory=True beside cost= to have all of "
+        "the grasp, or trajectory=False if the cost is to see it up to the loss only (faster)"
+        for field in Trace._fields
+    }
+    | {"qpos": _QPOS},
+)
 
 
 def _first(condition: jax.Array) -> jax.Array:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax import axes, control, model
-from codesign_jax.cost import outcome
+from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene, parameters, schema
 from codesign_jax.scene.constants import batch_axes, check
@@ -29,11 +29,12 @@ from codesign_jax.types import Outcome, Params, Trace, Trial, failed
 
 CostFunction = Callable[[Scene, Trace, jax.Array], jax.Array]
 """A cost of one's own: from the scene, the trace of one world (arrays of shape (time,) and qpos of
-shape (time, nq), empty unless a trajectory is asked for) and its controls (time, nu) to a number.
+shape (time, nq)) and its controls (time, nu) to a number.
 
 Whether a world failed, and when it lost its object, is told by the scene's rule all the same; a
 failed trial shows the scene's `cost.maximum`, and `cost.particle_cost` leaves it out or scores it
-with that.  A cost that reads the trace behind the loss of the object needs the trajectory.
+with that.  What the cost reads of the trace needs `trajectory=True`, or `trajectory=False` if it is
+meant to see a grasp up to the loss of the object only, see `cost.shown`.
 """
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
@@ -114,7 +115,7 @@ def simulate(
     params: Params,
     trials: Trial,
     *,
-    trajectory: bool = False,
+    trajectory: bool | None = None,
     cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> tuple[Outcome, Trace]:
@@ -126,7 +127,8 @@ def simulate(
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
       trajectory: Whether the trace holds qpos of every step, and goes on to the end of the grasp
-        where the object is lost before; see `Trace`.
+        where the object is lost before; see `Trace`. A cost of one's own that reads the trace must
+        say which.
       cost: A cost of one's own in place of the scene's, see `CostFunction`.
       constants: Numbers instead of the scene's, see `Scene.constants`; leaves of shape () or
         (world,). The engine may be that of any scene of the same structure.
@@ -144,8 +146,9 @@ def simulate(
     axes.refuse_constants(constants, len(trials.yaw), "world")
     parameters.refuse_unit_slips(params)
     fields, ctrl, initial = prepare(scene, params, trials, constants)
-    trace = engine.rollout(fields, ctrl, trajectory=trajectory)
-    return judge(scene, trace, ctrl, initial, constants, cost=cost), trace
+    trace = engine.rollout(fields, ctrl, trajectory=bool(trajectory))
+    judged = judge(scene, trace, ctrl, initial, constants, trajectory=trajectory, cost=cost)
+    return judged, trace
 
 
 def prepare(
@@ -180,6 +183,7 @@ def judge(
     initial: jax.Array,
     constants: Constants,
     *,
+    trajectory: bool | None = None,
     cost: CostFunction | None = None,
 ) -> Outcome:
     """Outcomes of a batch of worlds, with leading axis (world,).
@@ -190,27 +194,23 @@ def judge(
       ctrl: Their controls, for a cost of one's own; None without one.
       initial: Bits of `Status` that they started with, shape (world,).
       constants: Their numbers, leaves of shape () or (world,).
+      trajectory: As in `simulate`, with which the trace was made.
       cost: As in `simulate`.
     """
 
     def world(t: Trace, u: jax.Array | None, i: jax.Array, c: Constants) -> Outcome:
-        return _outcome(scene.with_constants(c), cost, t, u, i)
+        own = scene.with_constants(c)
+        result = outcome(own, t, i)
+        return result if cost is None else _by_own(own, cost, shown(t, trajectory), u, result)
 
     every = trace, ctrl, initial, constants
     return jax.vmap(world, in_axes=(0, 0, 0, batch_axes(constants)))(*every)
 
 
-def _outcome(
-    scene: Scene,
-    own: CostFunction | None,
-    trace: Trace,
-    ctrl: jax.Array | None,
-    initial: jax.Array,
+def _by_own(
+    scene: Scene, own: CostFunction, trace: Trace, ctrl: jax.Array | None, result: Outcome
 ) -> Outcome:
-    """Outcome of one world, by the scene's cost or by one's own."""
-    result = outcome(scene, trace, initial)
-    if own is None:
-        return result
+    """Outcome of one world with a cost of one's own."""
     if ctrl is None:
         raise ValueError("a cost of one's own needs the controls")
     value = jnp.asarray(own(scene, trace, ctrl))
@@ -226,7 +226,7 @@ def evaluate(
     params: Params,
     trials: Trial,
     *,
-    trajectory: bool = False,
+    trajectory: bool | None = None,
     cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> Outcome:
@@ -238,7 +238,7 @@ def evaluate(
       params: Parameters with leading axis (particle,).
       trials: Trials with leading axis (trial,): common random numbers, every particle meets the
         same ones.
-      trajectory: As in `simulate`; for a cost that reads what happens after the object is lost.
+      trajectory: As in `simulate`; for a cost of one's own.
       cost: As in `simulate`.
       constants: Numbers instead of the scene's; leaves of shape () or (trial,).
 
@@ -259,7 +259,7 @@ def evaluate_to_end(
     params: Params,
     trials: Trial,
     *,
-    trajectory: bool = False,
+    trajectory: bool | None = None,
     cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> tuple[Outcome, jax.Array | None]:

@@ -42,9 +42,9 @@ space = parameters.design_space(grasping.hand, "2d")  # finger length and arm he
 #
 # The paper's cost asks when the object is lost.  This one asks how near it is to the hand's centre
 # from the end of the inflation on, in units of the distance at which it counts as lost.  It sees
-# the trace of one world, arrays with the axis time, and the controls.  A world stops when its
-# object is lost, and its last entry repeats; a cost that reads on behind the loss asks for
-# `trajectory=True`.
+# the trace of one world, arrays with the axis time, and the controls.  A cost that reads the trace
+# says how much of it there is to be: `trajectory=True` simulates a world to the end though it lost
+# its object; with `trajectory=False` it stops there, which is faster, and its last entry repeats.
 
 # %%
 closed = round(grasping.phases.inflate / grasping.discretization.timestep)
@@ -116,7 +116,8 @@ masks = schedule("concurrent", np.array(space.is_morphology), episodes)
 start = space.from_units(np.array([130.0, 90.0]))  # mm, mm
 found = {}
 for name, optimizer in optimizers.items():
-    run = codesign.make_run(grasping, engine, space, optimizer, trials, cost=looseness)
+    how = grasping, engine, space, optimizer, trials
+    run = codesign.make_run(*how, trajectory=False, cost=looseness)
     end, found[name] = run(optimizer.init(jax.random.key(1), start, particles), masks)
     best = int(jnp.argmin(found[name].selection.best_cost))
     row = int(found[name].selection.best_index[best])

@@ -231,12 +231,42 @@ def test_failed_trials_do_not_ask_ones_own_cost():
     params = jax.tree.map(lambda v: jnp.stack([v] * 3), space.params(jnp.array([0.05, 0.0])))
     trial = jax.tree.map(lambda v: v[None], rollout.nominal_trial(scene))
     evaluate = jax.jit(
-        lambda p, t, c: rollout.evaluate(scene, engine, p, t, cost=c), static_argnums=2
+        lambda p, t, c: rollout.evaluate(scene, engine, p, t, trajectory=True, cost=c),
+        static_argnums=2,
     )
     result = evaluate(params, trial, lambda s, t, u: t.height[-1])
     np.testing.assert_array_equal(result.cost[:, 0], [0.5, scene.cost.maximum, 0.5])
     with pytest.raises(ValueError, match="one number for each world"):
         evaluate(params, trial, lambda s, t, u: t.height)
+
+
+def test_a_cost_does_not_read_what_was_not_simulated():
+    """Of a lost grasp the rest is missing without a trajectory: asked for, or an error in words."""
+    scene, space, engine = toy.tiny()
+    params = jax.tree.map(lambda v: v[None], space.params(jnp.array([0.05, 0.0])))
+    trial = jax.tree.map(lambda v: v[None], rollout.nominal_trial(scene))
+
+    def evaluate(cost, **flags):
+        run = jax.jit(lambda p, t: rollout.evaluate(scene, engine, p, t, cost=cost, **flags))
+        return float(run(params, trial).cost[0, 0])
+
+    def height(scene, trace, ctrl):
+        return trace.height[-1]
+
+    jitted = jax.jit(lambda trace: trace.height[-1])  # the trace is still a tree of arrays
+    for cost in (height, lambda s, t, u: jitted(t), lambda s, t, u: t[1][-1]):
+        words = "pass trajectory=True beside cost= to have all of the grasp, or trajectory=False"
+        with pytest.raises(ValueError, match=words):
+            evaluate(cost)
+    assert evaluate(height, trajectory=True) == evaluate(height, trajectory=False) == 0.5
+    assert evaluate(lambda s, t, u: jitted(t), trajectory=False) == 0.5
+    for flags in ({}, {"trajectory": False}):
+        with pytest.raises(ValueError, match="trace.qpos, which is recorded with trajectory=True"):
+            evaluate(lambda s, t, u: t.qpos[-1, -5], **flags)
+    assert evaluate(lambda s, t, u: u[0, 0] * 0 + 1.5) == 1.5  # reads nothing of the trace
+    make = codesign.make_evaluate(scene, engine, space, 1, cost=height)
+    with pytest.raises(ValueError, match=r"reads trace\.height"):
+        make(jnp.array([[0.05, 0.0]]), jax.random.key(0))
 
 
 # --- gradients -----------------------------------------------------------------------------------

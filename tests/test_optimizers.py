@@ -226,7 +226,7 @@ def test_a_whole_run_is_its_episodes_with_one_compile(name):
 
     made = codesign.make_optimizer(name, space)
     how = (the_scene, engine, space, made, 3)
-    episode = codesign.make_episode(*how, cost=seconds_held)
+    episode = codesign.make_episode(*how, trajectory=False, cost=seconds_held)
     masks = optimize.schedule("switch-1", np.array(space.is_morphology), 4)
     states = [made.init(jax.random.key(s), np.array([0.05, 0.0]), 8) for s in range(2)]
     costs, state, traced = [], states[0], []
@@ -237,7 +237,7 @@ def test_a_whole_run_is_its_episodes_with_one_compile(name):
     assert len(set(traced)) == 1
     by_episode = codesign.evaluate_by(episode, made)(state.particles, jax.random.key(5))
     assert engine.traced == traced[0] and np.asarray(by_episode.cost).shape == (8, 3)
-    run = codesign.make_run(*how, cost=seconds_held)
+    run = codesign.make_run(*how, trajectory=False, cost=seconds_held)
     batch = jax.tree.map(lambda *v: jnp.stack(v), *states)
     _, infos = jax.vmap(run, (0, None))(batch, masks)
     # A cost is a number of time steps, and two programs may round a loss to the next one.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax.experimental import pallas as pl
 
-from codesign_jax.compiler import thread, vector
+from codesign_jax.compiler import prefetch, thread, vector
 from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.compiler.layout import Array, Layout
 
@@ -355,6 +355,6 @@ def test_a_loop_asks_for_what_it_reads_later(reverse):
     )
     reads = [k for k, line in enumerate(lines) if " load " in line and begin < k < end]
     assert len(reads) == 2 and rounds == int(rounds) >= 1 and asked < reads[0]
-    assert rounds == thread.rounds_ahead(end - begin, 60) == 12
+    assert rounds == prefetch.rounds_ahead(end - begin, 60) == 12
     # Two rows: lane 0 asks for the first one, all others for the second one.
     assert any("umin.i32(i32 %lane, i32 1)" in line for line in lines)

@@ -13,7 +13,7 @@ import pytest
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.kernel import Limits, Program, program
+from codesign_jax.engines.structured.kernel import Limits, Program, tables
 from codesign_jax.model import layout
 from codesign_jax.types import Status
 from tests import small
@@ -165,7 +165,7 @@ def test_too_few_slots_are_an_overflow(monkeypatch):
     with jax.enable_x64(True):
         _, _, fields, _, ctrl = oracle.world(scene)
     fields = jax.tree.map(lambda x: np.asarray(x, np.float32)[None], fields)
-    monkeypatch.setattr(program, "hull_slots", lambda _: 1)
+    monkeypatch.setattr(tables, "hull_slots", lambda _: 1)
     # A tolerance of its own: a kernel is known by its scene and limits.
     rollout = jax.jit(StructuredEngine(scene, tolerance=1.1e-6).rollout)
     status = np.asarray(rollout(fields, jnp.asarray(ctrl, jnp.float32)[None, :STEPS]).status)

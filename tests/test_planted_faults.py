@@ -21,7 +21,16 @@ from codesign_jax.compiler import cache
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.kernel import Limits, Program, contacts, newton, step
+from codesign_jax.engines.structured.kernel import (
+    Limits,
+    Program,
+    contacts,
+    elimination,
+    integration,
+    newton,
+    problem,
+    step,
+)
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from tests import small, steps
 
@@ -49,7 +58,7 @@ PALM, LINK = "Step._palm.<locals>.compute", "_link"
 JAR = "BoundContacts.begin.<locals>.jar"
 RESPONSE = "BoundContacts._push.<locals>.response"
 RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
-SOLVE, ELIMINATE = "Newton.at_palm.<locals>.solve", "Newton.backward.<locals>.eliminate"
+SOLVE, ELIMINATE = "Elimination.at_palm.<locals>.solve", "Elimination.backward.<locals>.eliminate"
 CENTRE = "Step._forward.<locals>.link.<locals>.<lambda>"
 
 
@@ -214,7 +223,7 @@ def planted():
     with pytest.MonkeyPatch.context() as patch, jax.enable_x64(True):
         scene = small.pinch("box", links=2, effects__palm_object=False, effects__palm_table=False)
         fault = Planted()
-        for module in (contacts, newton, step):
+        for module in (contacts, problem, elimination, newton, integration, step):
             patch.setattr(module, "lanewise", fault)
         start_step = step.Step.__init__
 

@@ -3,31 +3,17 @@
 Source of the instructions: NVIDIA, Parallel Thread Execution ISA 8; LLVM, User Guide for NVPTX.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from codesign_jax.compiler.layout import Layout
+from codesign_jax.compiler.prefetch import Ahead, adjacent, rounds_ahead
 from codesign_jax.compiler.values import LLVM_TYPES, SIZES, Ref, Value, kind_of
 from codesign_jax.compiler.writer import Writer
 
 LANES = 32
 """Threads of a warp, of which a block may have the first few."""
-
-AHEAD = 300
-"""Lines of a loop between asking for a row and reading it, about the time that memory takes."""
-
-
-class Ahead(NamedTuple):
-    """Rows that a loop reads at an address, and reads again further on in the next round.
-
-    Attributes:
-      line: Line behind which the address is known.
-      offsets: Offsets of the rows from the address [bytes].
-    """
-
-    line: int
-    offsets: list[int]
 
 
 class ThreadWriter(Writer):
@@ -278,30 +264,6 @@ class ThreadWriter(Writer):
         self.lines.append(
             f'call void asm sideeffect "prefetch.global.L1 [$0];", "l"(ptr addrspace(1) {place}) #1'
         )
-
-
-def rounds_ahead(lines: int, length: int) -> int:
-    """How many rounds ahead of its use a loop prefetches a row.
-
-    As many as memory takes, but few against the loop's length: what is asked for in the last rounds
-    lies behind the rows that the loop reads.
-
-    Args:
-      lines: Lines of the loop's body.
-      length: Its number of rounds.
-    """
-    return min(-(-AHEAD // max(1, lines)), max(1, length // 5))
-
-
-def adjacent(offsets: list[int], row: int, lanes: int) -> list[tuple[int, int]]:
-    """Runs of adjacent rows: first offset and number, at most as many as lanes."""
-    found: list[tuple[int, int]] = []
-    for offset in offsets:
-        if found and offset == found[-1][0] + row * found[-1][1] and found[-1][1] < lanes:
-            found[-1] = (found[-1][0], found[-1][1] + 1)
-        else:
-            found.append((offset, 1))
-    return found
 
 
 def write(jaxpr: Any, layout: Layout, name: str) -> str:

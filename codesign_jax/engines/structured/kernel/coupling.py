@@ -10,7 +10,7 @@ systems, J. Comput. Appl. Math. 25, 1989, with s = 1): both products of a step a
 pass through the contacts, and everything else is updated in a second one.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +19,13 @@ from codesign_jax.engines.structured import elimination as el
 from codesign_jax.engines.structured.coupling import ITERATIONS
 from codesign_jax.engines.structured.kernel.contacts import direct, zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
-from codesign_jax.engines.structured.kernel.pairs import BoundPairs, Pairing
+from codesign_jax.engines.structured.kernel.pairing import Pairing
+from codesign_jax.engines.structured.kernel.pairs import BoundPairs
+from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.newton import wrist_slides
 from codesign_jax.engines.structured.problem import object_acceleration
-
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.newton import Iterate, Newton
 
 TOLERANCE = 1e-2
 """Squared error of a step, relative to its squared size, both as measured by H.
@@ -55,12 +54,12 @@ class Eliminated(NamedTuple):
 class Coupling:
     """Corrects a Newton step for the contacts between fingers."""
 
-    def __init__(self, newton: "Newton", pairs: BoundPairs, done: Eliminated):
+    def __init__(self, problem: Problem, pairs: BoundPairs, done: Eliminated):
         """Takes an iteration's elimination."""
-        self.newton, self.pairs, self.done = newton, pairs, done
-        self.block, self.links = newton.block, newton.links
+        self.problem, self.pairs, self.done = problem, pairs, done
+        self.block, self.links = problem.block, problem.links
 
-    def correct(self, step: "Iterate", idle: jax.Array) -> "Iterate":
+    def correct(self, step: Iterate, idle: jax.Array) -> Iterate:
         """Adds the correction to the fingers' factors z and returns the step of palm and object.
 
         Args:
@@ -97,8 +96,8 @@ class Coupling:
         more = self._result(lanes([work > 0], (), wide=False))
 
         def add(i: Any, x: jax.Array) -> jax.Array:
-            z = lanewise(jnp.add, *self.newton.read("z", "z_again", item=i))
-            self.newton.write("z", z, i)
+            z = lanewise(jnp.add, *self.problem.read("z", "z_again", item=i))
+            self.problem.write("z", z, i)
             return x
 
         jax.lax.fori_loop(0, self.links, add, jnp.int32(0))
@@ -141,7 +140,7 @@ class Coupling:
             stiff = pairs.stiff(item, answer)
             return lanewise(both, sums, pairs.read("left", item), answer, stiff)
 
-        sums = pairs.each(add, [zeros((), self.newton.like)] * 2)
+        sums = pairs.each(add, [zeros((), self.problem.like)] * 2)
         size, bent = (self.block.fold(v.lane, jnp.add) for v in sums)
         return size, bent
 
@@ -175,10 +174,10 @@ class Coupling:
             first = pairs.read("first", item)
             return lanewise(lambda g, a, b: g + 0.5 * sum_axis(dot(a, b), 0), gain, along, first)
 
-        gain = pairs.each(store, zeros((), self.newton.like))
+        gain = pairs.each(store, zeros((), self.problem.like))
         return self.block.fold(gain.lane, jnp.add)
 
-    def _result(self, kept: Lanes) -> "Iterate":
+    def _result(self, kept: Lanes) -> Iterate:
         """Solves once more, with the sum of all steps; where that is no descent, without it."""
         pairs = self.pairs
         pairs.clear_wrenches()
@@ -192,25 +191,23 @@ class Coupling:
 
     # One more right side
 
-    def again(self) -> "Iterate":
-        """Eliminates the forces that lie on the sides; see `Newton.backward`."""
-        none = zeros((6,), self.newton.like)
+    def again(self) -> Iterate:
+        """Eliminates the forces that lie on the sides; see `Elimination.backward`."""
+        none = zeros((6,), self.problem.like)
 
         def step(i: Any, carry: tuple) -> tuple:
             names = ("axes", "w", "g", "inverse")
             r, ro, z = lanewise(
-                _again, carry, self.newton.read(*names, item=i), *self.newton.pair_push(i)
+                _again, carry, self.problem.read(*names, item=i), *self.problem.pair_push(i)
             )
-            self.newton.write("z_again", z, i)
+            self.problem.write("z_again", z, i)
             return r, ro
 
         r, ro = loop(self.links, step, (none, none), self.block.size, reverse=True)
-        r = self.newton.add_first(r)
+        r = self.problem.add_first(r)
         return self._palm(*self.block.sum((r, ro)))
 
-    def _palm(self, r: Lanes, ro: Lanes) -> "Iterate":
-        from codesign_jax.engines.structured.kernel.newton import Iterate
-
+    def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
         def solve(done: Eliminated, axes, position, armature, r, ro):
             if done.hinges is None or done.slides is None:
                 obj = el.solve_object(direct, done.q, ro)
@@ -225,14 +222,14 @@ class Coupling:
             at_centre = object_acceleration(obj, position)
             return Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
 
-        palm = self.newton.palm
+        palm = self.problem.palm
         return lanewise(solve, self.done, palm.axes, palm.position, palm.armature, r, ro)
 
-    def substitute(self, z: str, step: "Iterate") -> None:
-        """Leaves the links' motion with the sides, see `Newton.forward`."""
+    def substitute(self, z: str, step: Iterate) -> None:
+        """Leaves the links' motion with the sides, see `LineSearch.prepare`."""
 
         def one(i: Any, parent: Lanes) -> Lanes:
-            axes, *factors = self.newton.read("axes", "w", "g", z, item=i)
+            axes, *factors = self.problem.read("axes", "w", "g", z, item=i)
 
             def move(axes, factors, parent, obj):
                 return el.substitute(axes, el.Factors(*factors), parent, obj)[1]
@@ -241,7 +238,7 @@ class Coupling:
             self.pairs.put_link(i, parent, moved)
             return moved
 
-        parent = self.newton.widened(step.palm_motion)
+        parent = self.problem.widened(step.palm_motion)
         self.pairs.put_palm(parent)
         loop(self.links, one, parent, self.block.size)
 

@@ -19,7 +19,7 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.scene import Scene
 
 if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.newton import Memory
+    from codesign_jax.engines.structured.kernel.problem import Memory
     from codesign_jax.engines.structured.kernel.step import Step
 
 KINDS = 3

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.lanewise import Lanes, lanes, splat
+from codesign_jax.engines.structured.components import splat
+from codesign_jax.engines.structured.lanewise import Lanes, lanes
 
 
 class MemoryLayout:

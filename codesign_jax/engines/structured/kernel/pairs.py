@@ -19,6 +19,7 @@ from codesign_jax.engines.structured.contact import Contacts
 from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.hull import across
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop, solid
+from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet
 from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import dot, sum_axis
@@ -88,38 +89,6 @@ class PairSet(HullSet):
         return BoundPairs(self, table, ref, self.cone(read))
 
 
-class Pairing:
-    """Fingers in pairs: those whose numbers differ by an exclusive or with the row's number + 1.
-
-    Attributes:
-      lane: Lane of the finger that each lane's finger is paired with, shape (lane,).
-    """
-
-    def __init__(self, block: Block, row: Any):
-        """Takes the row, a scalar."""
-        self.block = block
-        self.number = (jnp.zeros_like(block.finger) + (row + 1)).astype(jnp.int32)
-        other = jax.lax.bitwise_xor(block.finger, self.number)
-        self.lane = other * block.worlds + block.world
-
-    def swap(self, tree: Any) -> Any:
-        """What the lanes that the lanes are paired with have, of a tree of lanes.
-
-        Lanes exchange registers, once for each binary digit of the pairing's number: through memory
-        a lane would have to wait until its partner has written.
-        """
-        block = self.block
-        arrays, rebuild = solid(tree, block.size)
-        for digit in range(block.fingers.bit_length() - 1):
-            distance = block.worlds << digit
-            chosen = jax.lax.bitwise_and(self.number, jnp.int32(1 << digit)) > 0
-            arrays = [
-                jnp.where(chosen, jax.lax.rev(a.reshape(-1, 2, distance), (1,)).reshape(-1), a)
-                for a in arrays
-            ]
-        return rebuild(arrays)
-
-
 class BoundPairs(BoundSlots):
     """Contacts between fingers with their memory."""
 
@@ -130,7 +99,7 @@ class BoundPairs(BoundSlots):
         super().__init__(of, table, ref, cone)
         self.block = Block(*of.block)
 
-    def pairing(self, row: Any) -> "Pairing":
+    def pairing(self, row: Any) -> Pairing:
         """A row's pairing of the fingers."""
         return Pairing(self.block, row)
 
@@ -222,7 +191,7 @@ class BoundPairs(BoundSlots):
 
     # One side's part of a contact
 
-    def relative(self, item: Any, pairing: "Pairing") -> Lanes:
+    def relative(self, item: Any, pairing: Pairing) -> Lanes:
         """How the links' motion moves a slot's sides to each other, on its own side's lanes."""
         names = ("motion", "turn") if self.set.skin else ("motion",)
         parts = self._on_rows(item, names)

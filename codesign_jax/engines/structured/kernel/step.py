@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, inertia
+from codesign_jax.engines.structured import inertia
 from codesign_jax.engines.structured import kinematics as kin
 from codesign_jax.engines.structured.constants import apply_columns
 from codesign_jax.engines.structured.inertia import Body
-from codesign_jax.engines.structured.integration import integrate, rigid_arm
-from codesign_jax.engines.structured.kernel import objects
+from codesign_jax.engines.structured.integration import rigid_arm
+from codesign_jax.engines.structured.kernel import integration, objects
 from codesign_jax.engines.structured.kernel.contacts import (
     sphere_on_object,
     sphere_on_table,
@@ -21,20 +21,21 @@ from codesign_jax.engines.structured.kernel.contacts import (
 from codesign_jax.engines.structured.kernel.fingers import Search
 from codesign_jax.engines.structured.kernel.hull import Side, Skin
 from codesign_jax.engines.structured.kernel.memory import Block, loop
-from codesign_jax.engines.structured.kernel.newton import (
-    Iterate,
-    Memory,
-    Newton,
-    Palm,
-    relative,
-    triangle,
-)
+from codesign_jax.engines.structured.kernel.newton import Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
+from codesign_jax.engines.structured.kernel.problem import (
+    Iterate,
+    Memory,
+    Palm,
+    Problem,
+    triangle,
+)
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
+from codesign_jax.engines.structured.kernel.spheres import Spheres
 from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
-from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.problem import next_motion, object_motion, palm_motion
 
 if TYPE_CHECKING:
@@ -100,15 +101,15 @@ class Step:
         )
         now, centre = self._forward(state, geometry, pressure, memory, thing)
         rigid = not scene.effects.wrist
-        newton = Newton(p.links, self.block, memory, geometry["palm"], rigid=rigid)
-        now, quality = newton.solve(now, waiting, *p.limits)
+        problem = Problem(p.links, self.block, memory, geometry["palm"], rigid=rigid)
+        now, quality = Newton(problem).solve(now, waiting, *p.limits)
         distance = lanewise(_distance, state["position"], state["wrist"], centre).lane
         height = state["position"][2].lane
         goes_on, slots = waiting & undecided(distance, height), []
         if p.slotted:
             slots = [self._overflow(bound, waiting)]
             goes_on &= slots[0] == 0
-        new_speed, good = self._integrate(state, geometry, now, goes_on, speed)
+        new_speed, good = integration.advance(self, state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
         # Residuals of decided worlds are reported as 0; no iterations are spent on them.
         residual = jnp.where(waiting, quality.residual.lane, 0.0)
@@ -185,6 +186,7 @@ class Step:
         search = Search(self, pairs) if isinstance(pairs, BoundPairs) else None
         if search:
             search.start(motion, vel, frame, origin)
+        spheres = Spheres(self, at, m, thing)
         skin = Skin(self, at, m, thing) if any(n.startswith("hull_") for n in m.contacts) else None
 
         def link(i: Any, carry: tuple) -> tuple:
@@ -213,7 +215,7 @@ class Step:
                 m.scratch.write(self.scratch, name, value, i)
             share = p.hand.read(self.hand, "share", i + 1)
             middle = lanewise(lambda m, c, s: m + s * c, middle, stored["body_centre"], share)
-            self._finger_contacts(i, carry, at, m, thing)
+            spheres.of_link(i, carry)
             if search:
                 search.link(i, carry[4], carry[2], carry[1], carry[0])
             if skin:
@@ -227,30 +229,10 @@ class Step:
             skin.row(p.links, origin, tip, tip)
         if search:
             search.find()
-        self._slot_contacts(state, at, m, thing)
+        spheres.of_palm_and_object(state)
         count = p.num_fingers * p.links
         middle = self.block.sum(middle)
         return now, lanewise(lambda c: c / count, middle)
-
-    def _finger_contacts(
-        self, i: Any, carry: tuple, at: dict, m: Memory, thing: WorldObject
-    ) -> None:
-        p, now = self.p, at["now"]
-        if not p.k:
-            return
-        origin, frame, vel, _, motion = carry
-        sphere, radius = (p.hand.read(self.hand, n, i) for n in ("sphere", "radius"))
-        centre = lanewise(
-            lambda o, f, s: o[:, None] + apply_columns(f[:, :, None], s), origin, frame, sphere
-        )
-        for name in ("finger_object", "finger_table"):
-            if name in m.contacts:
-                geometry = self.geometry(name, centre, radius, at, thing)
-                moves = (
-                    relative(name, motion, now.palm_motion, now.object_motion),
-                    relative(name, vel, at["vel"], at["object_vel"]),
-                )
-                m.contacts[name].create(i, geometry, *moves)
 
     def geometry(self, name: str, centre: Lanes, radius: Any, at: dict, thing: WorldObject):
         """Point, normal and gap of spheres of the hand against the object or the table."""
@@ -260,99 +242,6 @@ class Step:
             return sphere_on_object(scene, thing, *place, centre, radius)
         height = self.p.world_state.read(self.world_state, "wrist", 0, self.block.world)[2]
         return lanewise(sphere_on_table, height, centre, radius)
-
-    def _slot_contacts(self, state: dict, at: dict, m: Memory, thing: WorldObject) -> None:
-        p, now = self.p, at["now"]
-
-        def create(name: str, i: Any, geometry: Any) -> None:
-            moves = (
-                relative(name, None, now.palm_motion, now.object_motion),
-                relative(name, None, at["vel"], at["object_vel"]),
-            )
-            m.contacts[name].create(i, geometry, *moves)
-
-        palm = [name for name in ("palm_object", "palm_table") if name in m.contacts]
-        for i in range(p.palm_groups if palm else 0):
-            point, radius = (p.hand.read(self.hand, n, i) for n in ("palm_point", "palm_radius"))
-            centre = lanewise(lambda f, s: apply_columns(f[:, :, None], s), at["frame"], point)
-            for name in palm:
-                create(name, i, self.geometry(name, centre, radius, at, thing))
-        on_table = m.contacts.get("object_table")
-        slots = self._table_points(state, at, thing) if on_table else []
-        for i in range(on_table.set.count if on_table else 0):
-            part = [slots[k] for k in range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))]
-            create("object_table", i, self._deal(part))
-
-    def _table_points(self, state: dict, at: dict, thing: WorldObject) -> list[tuple]:
-        """Point, normal and gap of each slot of the object on the table, lanes of a world."""
-        height, position = state["wrist"][2], at["palm"].position
-        arms = objects.table_points(self.p.scene, thing, at["columns"], position, height)
-
-        def compute(position, arms, height):
-            point, normal, gap = collision.on_table(position, arms, height)
-            return [
-                (point[:, k : k + 1], normal[:, k : k + 1], gap[None, k : k + 1])
-                for k in range(gap.shape[0])
-            ]
-
-        return lanewise(compute, position, arms, height)
-
-    def _deal(self, slots: list[tuple]) -> tuple[Lanes, Lanes, Lanes]:
-        """Deals the slots (component, 1, world) out to the finger lanes."""
-        p = self.p
-        away = jnp.full((p.size,), 1e3, self.finger_state.dtype)
-        dealt = []
-        for field in range(3):
-            values = [s[field] for s in slots]
-            parts = []
-            for c in range(values[0].parts.shape[0]):
-                lane = away
-                for k, value in enumerate(values):
-                    lane = jnp.where(self.block.finger == k, value.parts[c].item(), lane)
-                parts.append(lane)
-            dealt.append(lanes(parts, (len(parts), 1), wide=True))
-        return tuple(dealt)  # type: ignore[return-value]
-
-    def _integrate(self, state: dict, at: dict, now: Iterate, goes_on: Any, speed: Any):
-        """Semi-implicit Euler; worlds that are decided or whose step fails stay as they were.
-
-        Returns:
-          Largest velocity after the step, and whether the world has moved, shapes (1, world).
-        """
-        p, h = self.p, self.p.scene.discretization.timestep
-        new = lanewise(partial(_moved, h), state, at["columns"], now.wrist, now.object)
-        size = lanewise(_largest, new)
-
-        def link(i: Any, largest: Lanes) -> Lanes:
-            q, rate, acc = (
-                p.finger_state.read(self.finger_state, n, i)
-                for n in ("finger", "finger_vel", "acc")
-            )
-            rate, q, top = lanewise(partial(_turned, h), q, rate, acc)
-            p.scratch.write(self.scratch, "new_finger", q, i)
-            p.scratch.write(self.scratch, "new_finger_vel", rate, i)
-            return lanewise(_worse, largest, top)
-
-        like = jnp.zeros((p.size,), self.finger_state.dtype)
-        fingers = loop(p.links, link, zeros((), like), p.size).lane
-        largest = _worse(size.lane, self.block.fold(fingers, _worse))
-        limit = self.constant("speed").lane
-        good = goes_on & (largest <= limit)
-        acc = {"acc_wrist": now.wrist, "acc_object": now.object}
-        for name, value in {**new, **acc}.items():
-            kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
-            p.world_state.write(self.world_state, name, kept, 0, self.block.world)
-
-        def store(i: Any, x: Any) -> Any:
-            for name in ("finger", "finger_vel"):
-                value = p.scratch.read(self.scratch, f"new_{name}", i)
-                old = p.finger_state.read(self.finger_state, name, i)
-                kept = lanewise(jnp.where, lanes([good], (), wide=False), value, old)
-                p.finger_state.write(self.finger_state, name, kept, i)
-            return x
-
-        jax.lax.fori_loop(0, p.links, store, jnp.int32(0))
-        return jnp.where(goes_on, largest, speed), good
 
 
 def _link(names: tuple[str, ...], parent, constants, joint, forces):
@@ -389,37 +278,3 @@ def _link(names: tuple[str, ...], parent, constants, joint, forces):
 def _distance(position, wrist, centre):
     away = position - wrist[:3] - centre
     return jnp.sqrt(total([away[i] ** 2 for i in range(3)]))
-
-
-def _moved(h: float, state: dict, columns, wrist, obj) -> dict:
-    """Wrist and object after the step."""
-    names = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
-    # The fingers' joints are moved link by link, see `_turned`.
-    old = State(finger=0.0, finger_vel=0.0, acc=None, **{n: state[n] for n in names})  # type: ignore[arg-type]
-    new = integrate(old, columns, kin.Acc(wrist, 0.0, obj), h)  # type: ignore[arg-type]
-    return {n: getattr(new, n) for n in names}
-
-
-def _worse(a: jax.Array, b: jax.Array) -> jax.Array:
-    """The larger one, or what is not finite."""
-    return jnp.where((b > a) | (b != b), b, a)
-
-
-def _largest(new: dict):
-    velocities = [new[n] for n in ("wrist_vel", "linear_vel", "angular_vel")]
-    top = jnp.abs(velocities[0][0])
-    for value in velocities:
-        for i in range(value.shape[0]):
-            top = _worse(top, jnp.abs(value[i]))
-    places = [new["wrist"][i] for i in range(6)] + [new["position"][i] for i in range(3)]
-    place = total(places + [new["quat"][i] for i in range(4)])
-    return jnp.where(place == place, top, place)
-
-
-def _turned(h: float, q, rate, acc):
-    rate = rate + h * acc
-    q = q + h * rate
-    top = jnp.abs(rate[0])
-    for k in range(1, rate.shape[0]):
-        top = _worse(top, jnp.abs(rate[k]))
-    return rate, q, top

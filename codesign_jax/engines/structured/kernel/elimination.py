@@ -1,0 +1,208 @@
+"""Eliminates the fingers from their tips, then wrist and object: Newton's linear system."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import elimination as el
+from codesign_jax.engines.structured import newton
+from codesign_jax.engines.structured.kernel import hull
+from codesign_jax.engines.structured.kernel.contacts import BoundContacts, direct, zeros
+from codesign_jax.engines.structured.kernel.coupling import Eliminated
+from codesign_jax.engines.structured.kernel.memory import choose, full, loop, upper
+from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
+from codesign_jax.engines.structured.kernel.slots import BoundSlots
+from codesign_jax.engines.structured.lanes import contract, dot, total
+from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.engines.structured.problem import Forces, Matrices, object_acceleration
+
+
+class Row(NamedTuple):
+    """What a row of the hull adds to the elimination.
+
+    Attributes:
+      held: Whether its contacts are with the object.
+      used: Whether there are any, a scalar.
+      terms: What they add to the row's joint.
+      matrix: Contact inertia of the link before it, upper triangle (21,).
+      force: Its wrench.
+    """
+
+    held: bool
+    used: jax.Array
+    terms: el.JointTerms
+    matrix: Lanes
+    force: Lanes
+
+
+class Elimination:
+    """The elimination of one step's problem."""
+
+    def __init__(self, problem: Problem):
+        """Takes the problem."""
+        self.problem = problem
+        self.block, self.links, self.like = problem.block, problem.links, problem.like
+
+    def backward(self, alpha: Lanes) -> tuple[el.Quadratic, Lanes]:
+        """Eliminates the fingers from their tips.
+
+        Args:
+          alpha: Length of the last step, by which accelerations, motions and jar move first: so
+            they are read once an iteration.
+
+        Returns:
+          The sum over the fingers, and the product of their forces with the step so far.
+        """
+        problem = self.problem
+        if problem.pairs:
+            problem.pairs.update_constraints(alpha)
+
+        def eliminate(node, body, motion, smooth, tau, axes, armature, acc, pushes, terms, pairs):
+            link = make_body(*body)
+            push, tau = smooth - link.times(motion), tau - armature * acc
+            if pairs is not None:
+                wrench, turned = pairs
+                push = push + wrench
+                tau = tau if turned is None else tau + contract(axes[:, :3], turned[None], 1)
+            node = newton.add_link(node, newton.link_terms(link.matrix(), push, pushes))
+            y = contract(axes, node.r[None], 1) + tau
+            node, kept = el.eliminate_and_keep(direct, node, axes, armature, tau, terms)
+            if terms is not None:
+                y = y + terms.y
+            return node, kept, dot(y, kept.factors.z)
+
+        def step(i: Any, carry: tuple) -> tuple:
+            node, work = carry
+            acc, motion = problem.move("acc", i, alpha), problem.move("motion", i, alpha)
+            pushes = {c.set.name: c.push(i, alpha) for c in problem.fingers}
+            smooth, tau, axes, armature = problem.read("smooth", "tau", "axes", "armature", item=i)
+            node = node._replace(p=full(node.p), q=full(node.q))
+            rows = [self.row(c, i, axes, alpha) for c in problem.skin]
+            terms = add_terms([r.terms for r in rows]) if rows else None
+            pairs = problem.pair_push(i) if problem.pairs else None
+            forces = (motion, smooth, tau, axes, armature, acc, pushes, terms, pairs)
+            node, kept, more = lanewise(eliminate, node, problem.body_of(i), *forces)
+            for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
+                problem.write(name, value, i)
+            if problem.pairs:
+                problem.write("inverse", kept.inverse, i)
+                work = lanewise(jnp.add, work, more)
+            node = self.add_rows(node._replace(p=upper(node.p), q=upper(node.q)), rows)
+            return node, work
+
+        empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
+        tip = [self.row(c, self.links, None, alpha) for c in problem.skin]
+        node = self.add_rows(el.Quadratic(*empty), tip)
+        start = node, zeros((), self.like)
+        node, work = loop(self.links, step, start, self.block.size, reverse=True)
+        if problem.pairs:
+            node, work = node._replace(r=problem.add_first(node.r)), self.block.sum(work)
+        node = self.block.sum(node)
+        return node._replace(p=full(node.p), q=full(node.q)), work
+
+    def row(self, slots: BoundSlots, row: Any, axes: Lanes | None, alpha: Lanes) -> "Row":
+        """What a row of the hull adds to the elimination, see `hull.row_terms`.
+
+        Args:
+          slots: The row's contacts with the object or the table.
+          row: The row.
+          axes: Motion subspace of its joint; None for the tip, which has none.
+          alpha: Length of the last step.
+        """
+        number = 1 if axes is None else axes.shape[0]
+        shapes = ((number, number), (number, 6), (number, 6), (number,), (21,), (6,))
+        empty = [zeros(s, self.like) for s in shapes]
+        used = slots.used(row) > 0
+
+        def compute() -> list[Lanes]:
+            inertia, wrench = slots.push(row, alpha)
+            if axes is None:
+                return [*empty[:4], upper(inertia[:6, :6]), wrench[:6]]
+            terms, matrix, force = lanewise(hull.row_terms, axes, inertia, wrench)
+            return [*terms, upper(matrix), force]
+
+        *terms, matrix, force = choose(used, compute, empty, self.block.size)
+        if not slots.set.on_object:
+            terms[2] = zeros(shapes[2], self.like)
+        return Row(slots.set.on_object, used, el.JointTerms(*terms), matrix, force)
+
+    def add_rows(self, node: el.Quadratic, rows: list["Row"]) -> el.Quadratic:
+        """Adds the rows' contacts to the links before them; p and q as triangles."""
+        for row in rows:
+
+            def add(row: Row = row, node: el.Quadratic = node) -> el.Quadratic:
+                return lanewise(_add_row, node, row.matrix, full(row.matrix), row.force, row.held)
+
+            node = choose(row.used, add, node, self.block.size)
+        return node
+
+    def slot_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
+        """Contact inertia and wrench of the palm's and the object's contacts; see `backward`."""
+        pushes = {}
+        for c in self.problem.slots:
+
+            def add(i: Any, carry: tuple, c: BoundContacts = c) -> tuple:
+                matrix, wrench = c.push(i, alpha)
+                return lanewise(
+                    lambda a, b: jax.tree.map(jnp.add, a, b), carry, (upper(matrix), wrench)
+                )
+
+            start = (zeros((21,), self.like), zeros((6,), self.like))
+            triangle, wrench = self.block.sum(loop(c.set.count, add, start, self.block.size))
+            pushes[c.set.name] = (full(triangle), wrench)
+        return pushes
+
+    def at_palm(self, now: Iterate, node: el.Quadratic, slots: dict) -> tuple[Iterate, Eliminated]:
+        """Solves for wrist and object; slots: what `slot_pushes` returns."""
+        rigid = self.problem.rigid
+
+        def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> tuple:
+            force = Forces(
+                palm.smooth_palm - palm.palm.times(now.palm_motion),
+                None,  # type: ignore[arg-type]
+                palm.smooth_object - palm.object.times(now.object_motion),
+                palm.smooth_wrist - palm.armature * now.wrist,
+                None,  # type: ignore[arg-type]
+            )
+            matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
+            node = newton.add_palm(node, matrices, force, pushes)
+            if rigid:
+                obj = el.solve_object(direct, node.q, node.r_object)
+                none = jnp.zeros_like(obj)
+                step = Iterate(none, object_acceleration(obj, palm.position), none, obj)
+                return step, Eliminated(None, None, node.q, dot(node.r_object, obj))
+            armature, work = palm.armature, []
+            axes = (palm.axes, newton.wrist_slides(armature))
+            kept = []
+            for subspace, inertia, twist in zip(
+                axes, (armature[3:], armature[:3]), (force.wrist[3:], force.wrist[:3]), strict=True
+            ):
+                y = contract(subspace, node.r[None], 1) + twist
+                node, new = el.eliminate_and_keep(direct, node, subspace, inertia, twist)
+                kept.append(new)
+                work.append(dot(y, new.factors.z))
+            obj = el.solve_object(direct, node.q, node.r_object)
+            first, motion = el.substitute(axes[1], kept[1].factors, jnp.zeros_like(obj), obj)
+            second, motion = el.substitute(axes[0], kept[0].factors, motion, obj)
+            at_centre = object_acceleration(obj, palm.position)
+            step = Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
+            work = total([*work, dot(node.r_object, obj)])
+            return step, Eliminated(kept[0], kept[1], node.q, work)
+
+        return lanewise(solve, now, self.problem.palm, node, slots)
+
+
+def add_terms(terms: list[el.JointTerms]) -> el.JointTerms:
+    """Sums what the rows of several pairs of bodies add to a joint."""
+    if len(terms) == 1:
+        return terms[0]
+    return lanewise(lambda *t: jax.tree.map(lambda *v: total(v), *t), *terms)
+
+
+def _add_row(node: el.Quadratic, matrix, square, force, held: bool) -> el.Quadratic:
+    p, c, q, r, ro = node
+    p, r = p + matrix, r + force
+    if held:
+        c, q, ro = c + square, q + matrix, ro - force
+    return el.Quadratic(p, c, q, r, ro)

@@ -1,0 +1,177 @@
+"""How far to go along a Newton step: the cost's slopes along it, and where it is lowest."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import elimination as el
+from codesign_jax.engines.structured.kernel import hull, solver
+from codesign_jax.engines.structured.kernel.contacts import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.memory import anywhere, loop, solid
+from codesign_jax.engines.structured.kernel.problem import (
+    Iterate,
+    Palm,
+    Problem,
+    make_body,
+    relative,
+)
+from codesign_jax.engines.structured.lanes import dot, total
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+
+LINE_TOLERANCE = 0.01
+"""Slope at which a line search ends, over the first one: MuJoCo's default `ls_tolerance`."""
+
+
+class LineSearch:
+    """The line search of one step's problem."""
+
+    def __init__(self, problem: Problem):
+        """Takes the problem."""
+        self.problem = problem
+        self.block, self.links, self.like = problem.block, problem.links, problem.like
+
+    def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
+        """Substitutes back and prepares the line search.
+
+        Returns:
+          Slope and curvature of the smooth part, and the contacts' slope, all at 0, (1, world).
+        """
+        problem = self.problem
+
+        def substitute(parent, obj, body, motion, smooth, tau, axes, armature, acc, factors):
+            a, moved = el.substitute(axes, el.Factors(*factors), parent, obj)
+            link = make_body(*body)
+            force = smooth - link.times(motion)
+            joints = [(armature[k] * acc[k] - tau[k]) * a[k] for k in range(a.shape[0])]
+            slope = total(joints) - dot(force, moved)
+            stiff = total([armature[k] * a[k] * a[k] for k in range(a.shape[0])])
+            return a, moved, slope, stiff + dot(link.times(moved), moved)
+
+        def one(i: Any, carry: tuple) -> tuple:
+            parent, slope, curvature, touch = carry
+            names = ("motion", "smooth", "tau", "axes", "armature", "acc")
+            a, moved, s, c = lanewise(
+                substitute,
+                parent,
+                step.object_motion,
+                problem.body_of(i),
+                *problem.read(*names, item=i),
+                problem.read("w", "g", "z", item=i),
+            )
+            problem.write("step_acc", a, i)
+            problem.write("step_motion", moved, i)
+            if problem.pairs:
+                problem.pairs.put_link(i, parent, moved)
+            terms = [touch]
+            for contacts in problem.fingers:
+                rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
+                terms.append(contacts.prepare_linesearch(i, rel))
+            terms += self.prepare_row(i, parent, moved, step)
+            touch = lanewise(lambda t: total(t), terms)
+            slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
+            return moved, slope, curvature, touch
+
+        none = zeros((), self.like)
+        parent = problem.widened(step.palm_motion)
+        if problem.pairs:
+            problem.pairs.put_palm(parent)
+        last, slope, curvature, touch = loop(
+            self.links, one, (parent, none, none, none), self.block.size
+        )
+        tip = self.prepare_row(self.links, last, last, step)
+        between = [problem.pairs.prepare_all()] if problem.pairs else []
+        touch = lanewise(lambda t: total(t), [touch, *tip, *between])
+        for contacts in problem.slots:
+
+            def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
+                rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)
+                return lanewise(jnp.add, sum_, contacts.prepare_linesearch(i, rel))
+
+            touch = loop(contacts.set.count, add, touch, self.block.size)
+        slope, curvature, touch = self.block.sum((slope, curvature, touch))
+        slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
+        return slope, curvature, touch
+
+    def prepare_row(self, row: Any, before: Lanes, after: Lanes, step: Iterate) -> list[Lanes]:
+        """Slopes of a row's contacts along the step of the links before and behind it."""
+        if not self.problem.skin:
+            return []
+        moved = lanewise(partial(hull.across, obj=None), before, after)
+        names = [
+            (c, relative(c.set.name, moved, step.palm_motion, step.object_motion))
+            for c in self.problem.skin
+        ]
+        return [c.prepare_linesearch(row, motion) for c, motion in names]
+
+    def find(
+        self,
+        slope: Lanes,
+        curvature: Lanes,
+        first: Lanes,
+        floor: jax.Array,
+        evaluations: int,
+    ) -> Lanes:
+        """Step length, lanes of a world.
+
+        Args:
+          slope: Slope of the smooth part at 0.
+          curvature: Its curvature.
+          first: Slope of the contacts at 0.
+          floor: Slope that is small enough, lanes of a world.
+          evaluations: Largest number of evaluations.
+        """
+
+        def evaluate(alpha: Lanes) -> tuple[Lanes, Lanes]:
+            def add(i: Any, sums: list, sets: list) -> list:
+                for contacts in sets:
+                    new = contacts.slopes(i, alpha)
+                    sums = lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
+                return sums
+
+            problem = self.problem
+            sums = [zeros((), self.like)] * 2
+            links, skin = (self.links, problem.fingers), (self.links + 1, problem.skin)
+            for count, sets in (links, skin):
+                if sets:
+                    sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
+            for c in problem.slots:
+                sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
+            if problem.pairs:
+                sums = problem.pairs.slopes_of_all(alpha, sums)
+            one, two = self.block.sum(sums)
+            return lanewise(
+                lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
+            )
+
+        def body(carry: list) -> list:
+            count, old = carry[0], rebuild(carry[1:])
+            one, two = evaluate(old[0])
+            new = (*lanewise(solver.refine, *old[:3], one, two), one)
+            # A world that has found its step length keeps it: it must not depend on other worlds.
+            searching = lanes([jnp.abs(carry[-1]) > goal], (), wide=False)
+            new = [lanewise(jnp.where, searching, a, b) for a, b in zip(new, old, strict=True)]
+            return [count + 1, *solid(tuple(new), self.block.size)[0]]
+
+        def going(carry: list) -> jax.Array:
+            return (carry[0] < evaluations) & anywhere(jnp.abs(carry[-1]) > goal)
+
+        goal = jnp.maximum(floor, LINE_TOLERANCE * jnp.abs(lanewise(jnp.add, slope, first).lane))
+        one = lanewise(jnp.ones_like, slope)
+        none = lanewise(jnp.zeros_like, slope)
+        far = lanewise(lambda x: jnp.full_like(x, solver.FAR), slope)
+        start, rebuild = solid((one, none, far, far), self.block.size)
+        return rebuild(jax.lax.while_loop(going, body, [jnp.int32(0), *start])[1:])[0]
+
+
+def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
+    """Adds wrist, palm and object to the smooth part's slope and curvature."""
+    push = palm.smooth_palm - palm.palm.times(now.palm_motion)
+    pull = palm.smooth_object - palm.object.times(now.object_motion)
+    twist = palm.smooth_wrist - palm.armature * now.wrist
+    slope = slope - dot(push, step.palm_motion) - dot(pull, step.object_motion)
+    slope = slope - dot(twist, step.wrist)
+    bent = dot(palm.palm.times(step.palm_motion), step.palm_motion)
+    bent = bent + dot(palm.object.times(step.object_motion), step.object_motion)
+    return slope, curvature + bent + dot(palm.armature * step.wrist, step.wrist)

@@ -1,0 +1,130 @@
+"""Arrays of a batch to the tables of its blocks, and back."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.engines.structured.constants import WorldConstants
+from codesign_jax.engines.structured.kernel import hull, objects
+from codesign_jax.engines.structured.kernel.tables import Tables
+from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.model.layout import palm_touches
+
+
+class Packing(Tables):
+    """Packs the constants, states and controls of worlds; unpacks states and recorded rows."""
+
+    def pack_hand(self, hand: WorldConstants) -> tuple[jax.Array, jax.Array]:
+        """The hand's tables; padded worlds are not alive, padded fingers have no mass."""
+        worlds, n = hand.object_id.shape[1], self.num_fingers
+        dtype, lane = hand.mass.dtype, (n, worlds)
+        links_first = ("centre", "inertia", "sphere")
+        arrays = {
+            k: jnp.moveaxis(v, 1, 0) if k in links_first and v.size else v
+            for k, v in hand._asdict().items()
+        }
+        arrays |= hand.bounds._asdict()
+        for name, cone in hand.cones._asdict().items():
+            if cone is None:
+                continue
+            arrays[f"cone.{name}"] = jnp.stack([v for v in cone if v is not None])
+        # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
+        share = jnp.ones((self.links + 1, *lane), dtype)
+        arrays["share"] = share.at[jnp.array([0, self.links])].set(0.5)
+        if palm_touches(self.scene):
+            arrays |= self._palm_slots(hand)
+        if hand.section is not None:
+            arrays["section"] = hand.section[None]
+        if self.scene.effects.surface == "hull":
+            arrays |= hull.pack(self.scene, hand)
+        if hand.mesh is not None:
+            arrays |= objects.rows(hand.mesh, self.fingers, dtype)
+        extra = self.fingers - n
+        if extra:
+            for name in ("share", "mass", "inertia", "gain"):
+                pad = [(0, 0)] * (arrays[name].ndim - 2) + [(0, extra), (0, 0)]
+                arrays[name] = jnp.pad(arrays[name], pad)
+            if self.k:
+                pad = [(0, 0)] * (hand.radius.ndim - 2) + [(0, extra), (0, 0)]
+                arrays["radius"] = jnp.pad(hand.radius, pad, constant_values=-1e3)
+        wide = {k: self._widen(arrays[k]) for k in self.hand.groups}
+        arrays["alive"] = jnp.ones((1, worlds), dtype)
+        arrays["object_id"] = hand.object_id.astype(dtype)
+        narrow = {k: arrays[k] for k in self.world.groups}
+        packed = self.world.pack(1, self.block, **narrow)
+        ids = jnp.arange(packed.shape[0] * self.block).reshape(-1, self.block)
+        alive = self.world.offset["alive"]
+        packed = packed.at[:, alive].multiply(ids < worlds)
+        return self.hand.pack(self.fingers, self.block, **wide), packed
+
+    def _widen(self, array: jax.Array) -> jax.Array:
+        """Fingers up to a power of two."""
+        pad = [(0, 0)] * (array.ndim - 2) + [(0, self.fingers - array.shape[-2]), (0, 0)]
+        return jnp.pad(array, pad, mode="edge")
+
+    def _palm_slots(self, hand: WorldConstants) -> dict[str, jax.Array]:
+        """The palm's contact spheres, shared out among the lanes."""
+        f, g, worlds = self.fingers, self.palm_groups, hand.palm_radius.shape[1]
+        missing = (0, g * f - len(hand.palm_radius))
+        place = jnp.pad(hand.palm_point, [(0, 0), missing, (0, 0)]).reshape(3, g, 1, f, worlds)
+        size = jnp.pad(hand.palm_radius, [missing, (0, 0)], constant_values=-1e3)
+        return {
+            "palm_point": jnp.moveaxis(place, 0, 1),
+            "palm_radius": size.reshape(g, 1, f, worlds),
+        }
+
+    def pack_state(self, state: State) -> tuple[jax.Array, jax.Array]:
+        """The state's tables."""
+        arrays = state._asdict() | {"acc_wrist": state.acc.wrist, "acc_object": state.acc.object}
+        finger_state = {
+            "finger": state.finger,
+            "finger_vel": state.finger_vel,
+            "acc": state.acc.finger,
+        }
+        wide = {k: self._widen(v) for k, v in finger_state.items()}
+        narrow = {k: arrays[k] for k in self.world_state.groups}
+        return self.finger_state.pack(self.fingers, self.block, **wide), self.world_state.pack(
+            1, self.block, **narrow
+        )
+
+    def pack_controls(self, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Commands: arm (block, time, 6, world) and pressure (block, time, lane)."""
+        worlds, steps, _ = ctrl.shape
+        ctrl = jnp.pad(ctrl, [(0, -worlds % self.block), (0, 0), (0, 0)], mode="edge")
+        blocks = jnp.moveaxis(ctrl.reshape(-1, self.block, steps, ctrl.shape[2]), 1, 3)
+        arm, pressure = blocks[:, :, :6], blocks[:, :, 6:]
+        pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]
+        return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.size)
+
+    def path_rows(self, states: bool) -> tuple[int, int]:
+        """Numbers of rows of the state's tables that are recorded: all, or the positions."""
+        if states:
+            return self.finger_state.rows, self.world_state.rows
+        return self.finger_state.offset["finger_vel"], self.world_state.offset["wrist_vel"]
+
+    def path(self, fingers: jax.Array, worlds: jax.Array, states: bool) -> dict[str, jax.Array]:
+        """Coordinates of recorded rows (block, time, row, lane or world)."""
+        steps, size = fingers.shape[1], self.links * self.axes
+        names = [("qpos", "finger", ("wrist", "position", "quat"))]
+        if states:
+            names += [("qvel", "finger_vel", ("wrist_vel", "linear_vel", "angular_vel"))]
+            names += [("acc", "acc", ("acc_wrist", "acc_object"))]
+        found = {}
+        for name, joint, others in names:
+            rows = self.finger_state.offset[joint] + np.arange(size)
+            split = (-1, steps, size, self.fingers, self.block)
+            joints = fingers[:, :, rows].reshape(split)[..., : self.num_fingers, :]
+            joints = joints.transpose(0, 4, 1, 3, 2)  # (block, world, time, finger, link and axis)
+            joints = joints.reshape(-1, steps, self.num_fingers * size)
+            where = [(self.world_state.offset[o], self.world_state.groups[o][1][0]) for o in others]
+            rows = np.concatenate([np.arange(first, first + count) for first, count in where])
+            rest = jnp.moveaxis(worlds[:, :, rows], 3, 1).reshape(-1, steps, rows.size)
+            found[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
+        return found
+
+    def unpack_state(self, finger_state: jax.Array, world_state: jax.Array, worlds: int) -> State:
+        """Inverse of `pack_state`."""
+        wide = self.finger_state.unpack(finger_state, self.fingers, self.num_fingers, worlds)
+        narrow = self.world_state.unpack(world_state, 1, 1, worlds)
+        acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
+        return State(**wide, **narrow, acc=acc)

@@ -1,0 +1,143 @@
+"""A step's problem for the solver: a kernel's memory, its contacts, and palm, wrist and object."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.kernel import solver
+from codesign_jax.engines.structured.kernel.contacts import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
+from codesign_jax.engines.structured.kernel.pairs import BoundPairs
+from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+
+
+class Palm(NamedTuple):
+    """What the solver needs of palm, wrist and object; lanes of a world."""
+
+    palm: Body
+    object: Body
+    smooth_palm: Any
+    smooth_object: Any
+    smooth_wrist: Any
+    armature: Any
+    axes: Any
+    position: Any
+
+
+class Iterate(NamedTuple):
+    """Accelerations of wrist and object, and motion of palm and object; lanes of a world."""
+
+    wrist: Any
+    object: Any
+    palm_motion: Any
+    object_motion: Any
+
+
+class Memory(NamedTuple):
+    """A kernel's memory: tables with their refs, and the bound contact sets by name."""
+
+    hand: MemoryLayout
+    hand_ref: Any
+    state: MemoryLayout
+    state_ref: Any
+    scratch: MemoryLayout
+    scratch_ref: Any
+    contacts: dict[str, BoundContacts]
+
+
+class Problem:
+    """The solver's problem of one step.
+
+    Attributes:
+      links: Moving links of a finger.
+      block: The lanes.
+      m: The memory.
+      palm: Palm, wrist and object.
+      rigid: Whether the wrist's accelerations are known, see the batch form's `Problem.palm_acc`.
+      pairs: Contacts between fingers, if there are any.
+      fingers: Contacts of the fingers' spheres.
+      skin: Contacts of the hull.
+      slots: Contacts of the palm, and of the object with the table.
+      like: Zeros of the lanes' shape and type.
+    """
+
+    def __init__(self, links: int, block: Block, m: Memory, palm: Palm, *, rigid: bool = False):
+        """Takes the step's memory, in which the forward pass has left its results."""
+        self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
+        self.pairs: BoundPairs | None = m.contacts.get("finger_finger")  # type: ignore[assignment]
+        self.fingers = [m.contacts[n] for n in ("finger_object", "finger_table") if n in m.contacts]
+        self.skin = [c for n, c in m.contacts.items() if n.startswith("hull_")]
+        self.slots = [c for n, c in m.contacts.items() if not n.startswith(("finger", "hull_"))]
+        self.like = jnp.zeros((block.size,), palm.armature.dtype)
+
+    def read(self, *names: str, item: Any = 0) -> list[Lanes]:
+        """Reads names from the table that has them."""
+        m = self.m
+        tables = ((m.hand, m.hand_ref), (m.state, m.state_ref), (m.scratch, m.scratch_ref))
+        found = []
+        for name in names:
+            table, ref = next((t, r) for t, r in tables if name in t.groups)
+            found.append(table.read(ref, name, item))
+        return found
+
+    def write(self, name: str, value: Lanes, item: Any) -> None:
+        """Writes to the table that has the name."""
+        m = self.m
+        if name in m.state.groups:
+            m.state.write(m.state_ref, name, value, item)
+        else:
+            m.scratch.write(m.scratch_ref, name, value, item)
+
+    def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
+        """Adds the last step to a link's "acc" or "motion", and returns the sum."""
+        value = lanewise(solver.tree_add_scaled, alpha, *self.read(name, f"step_{name}", item=item))
+        self.write(name, value, item)
+        return value
+
+    def body_of(self, item: Any) -> list[Lanes]:
+        """Arguments of `make_body` for a link."""
+        return self.read("mass", "body_centre", "tensor", item=item)
+
+    def pair_push(self, i: Any) -> tuple[Lanes, Lanes | None]:
+        """Forces of the contacts between fingers on a link and on the joint before it."""
+        assert self.pairs is not None
+        push = self.pairs.pushed(i + 1)[:6]
+        return push, self.pairs.pushed(i)[6:] if self.pairs.set.skin else None
+
+    def add_first(self, r: Lanes) -> Lanes:
+        """Adds the contacts between fingers that act on the palm, those of the first joints."""
+        assert self.pairs is not None
+        if not self.pairs.set.skin:
+            return r
+        return lanewise(jnp.add, r, self.pairs.pushed(0)[:6])
+
+    def widened(self, motion: Lanes) -> Lanes:
+        """What belongs to a world, on all fingers."""
+        return lanewise(jnp.add, motion, zeros(motion.shape[:-2], self.like))
+
+
+def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
+    """Relative motion of a pair of bodies."""
+    difference = jnp.subtract
+    if name == "finger_object":
+        return lanewise(difference, link, obj)
+    if name == "palm_object":
+        return lanewise(difference, palm, obj)
+    if name == "hull_object":
+        return lanewise(lambda m, o: jnp.concatenate([m[:6] - o, m[6:]]), link, obj)
+    alone = {"finger_table": link, "hull_table": link, "palm_table": palm, "object_table": obj}
+    return alone[name]
+
+
+def make_body(mass: jax.Array, centre: jax.Array, tensor: jax.Array) -> Body:
+    """Body of a mass, a centre and the upper triangle xx, xy, xz, yy, yz, zz of a tensor."""
+    xx, xy, xz, yy, yz, zz = (tensor[i] for i in range(6))
+    rows = [jnp.stack(r) for r in ([xx, xy, xz], [xy, yy, yz], [xz, yz, zz])]
+    return Body(mass, centre, jnp.stack(rows))
+
+
+def triangle(tensor: jax.Array) -> jax.Array:
+    """Upper triangle of a symmetric tensor (3, 3, ...)."""
+    return jnp.stack([tensor[i, j] for i in range(3) for j in range(i, 3)])

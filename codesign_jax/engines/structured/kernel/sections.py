@@ -1,0 +1,169 @@
+"""Where fingers meet: balls, and a vertex of one finger's hull in a section of another finger.
+
+A row's section is its box between the middles of two links, whose frame turns from one link's to
+the other's along the row.  Lane by lane, see `fingers`.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.constants import apply_columns
+from codesign_jax.engines.structured.kernel import hull
+from codesign_jax.engines.structured.lanes import dot, total
+
+ROUND = 0.5
+"""Radius of a section's edges to other fingers, over half its smaller side: vertices that stand
+less deep than that have a normal that turns with their place."""
+
+
+def apart(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Distance between two balls (centre, radius), (4, ...)."""
+    away = a[:3] - b[:3]
+    return jnp.sqrt(dot(away, away)) - (a[3] + b[3])
+
+
+def between(a: jax.Array, b: jax.Array) -> tuple[tuple, tuple]:
+    """Point, normal and gap of two balls, on either side; see `finger_pairs`."""
+    away, reach = a[:3] - b[:3], a[3] + b[3]
+    square = dot(away, away)
+    apart = square > 0
+    length = jnp.sqrt(jnp.where(apart, square, 1.0))
+    one = jnp.ones_like(square)
+    fallback = jnp.stack([-one, 0 * one, 0 * one])
+    normal = jnp.where(apart, away / length, fallback)
+    gap = jnp.where(apart, length, 0.0) - reach
+    point = (a[:3] - normal * (a[3] + 0.5 * gap))[:, None]
+    gap, normal = gap[None, None], normal[:, None]
+    return (point, normal, gap), (point, -normal, gap)
+
+
+def separated(own: tuple, own_size, theirs: tuple, size, last) -> jax.Array:
+    """More than zero if one of the other row's faces, in both of its frames, parts the two rows.
+
+    Vertices lie between their images on two links, and the other row's frame between its two.
+    """
+    (joint, *frames), (origin, *others) = own, theirs
+    away, extent = joint - origin, (own_size[2], own_size[0], own_size[1])
+    low, high = [], []
+    for other in others:
+        for axis in range(3):
+            ends = []
+            for frame in frames:
+                tilt = [dot(other[axis], frame[k]) for k in range(3)]
+                middle = tilt[2] * own_size[1]
+                reach = total([jnp.abs(t) * e for t, e in zip(tilt, extent, strict=True)])
+                ends.append((middle - reach, middle + reach))
+            place = dot(other[axis], away)
+            low.append(place + jnp.minimum(ends[0][0], ends[1][0]))
+            high.append(place + jnp.maximum(ends[0][1], ends[1][1]))
+    width, up, half = size[0], size[1], size[2]
+    # Frame before: low[0:3]; frame behind: low[3:6].
+    parted = [
+        -half - high[0],
+        jnp.where(last > 0, -half, low[3] - half),
+        jnp.minimum(low[1], low[4]) - width,
+        -width - jnp.maximum(high[1], high[4]),
+        jnp.minimum(low[2], low[5]) - 2.0 * up,
+        -jnp.maximum(high[2], high[5]),
+    ]
+    most = parted[0]
+    for value in parted[1:]:
+        most = jnp.maximum(most, value)
+    return most
+
+
+def inside(vertex, own: tuple, theirs: tuple, size, last) -> tuple[tuple, tuple]:
+    """Point, normal, gap, lever and share of a vertex in another finger's row, on either side.
+
+    Args:
+      vertex: Place, weight and share of the vertex.
+      own: Joint of its row, and frames of the links before and behind it.
+      theirs: The same of the other row.
+      size: Half the width, the height and a segment of the other finger.
+      last: Whether the other row is the last one, which ends at the tip's face.
+    """
+    point, image, weight, share = hull.placed(vertex, *own)
+    point, image = point[:, 0], image[:, 0]
+    joint, before, after = theirs
+    half_width, half_height, half = size[0], size[1], size[2]
+    away = point - joint
+    first, second = (jnp.stack([dot(f[k], away) for k in range(3)]) for f in (before, after))
+    # Between the planes across the middles of the two links.
+    start, end = first[0] + half, half - second[0]
+    whole = start + end
+    along = jnp.where(whole > 0, start / jnp.where(whole > 0, whole, 1.0), 2.0)
+    along = jnp.minimum(jnp.maximum(along, 0.0), 1.0)
+    local = first + along * (second - first)
+    turned = before + along * (after - before)
+    edge = ROUND * jnp.minimum(half_width, half_height)
+    depth = [
+        jnp.abs(local[1]) - half_width + edge,
+        jnp.abs(local[2] - half_height) - half_height + edge,
+        jnp.where(last > 0, -end, -half) + edge,
+    ]
+    signs = [_sign(local[1]), _sign(local[2] - half_height), jnp.ones_like(along)]
+    distance, slope = _rounded(depth)
+    gap = distance - edge
+    within = (start >= 0) & ((end > 0) | (last > 0)) & (whole > 0)
+    gap = jnp.where(within, gap, 1.0)
+    axes = (turned[1], turned[2], turned[0])
+    normal = total([s * g * a for s, g, a in zip(signs, slope, axes, strict=True)])
+    normal = normal / jnp.sqrt(jnp.maximum(dot(normal, normal), 1e-12))
+    to_contact = -0.5 * gap * normal  # from the point on the skin
+    lever = weight * (image + to_contact)
+    behind = along * (apply_columns(after, local) + to_contact)
+    at, gap, share = (point + to_contact)[:, None], gap[None, None], 0.5 * share
+    mine = at, normal[:, None], gap, lever[:, None], share
+    return mine, (at, -normal[:, None], gap, behind[:, None], share)
+
+
+SUMS = 14
+"""Numbers that `add_vertex` sums: share, share x depth, and four vectors."""
+
+
+def add_vertex(sums: jax.Array, mine: tuple, other: tuple) -> jax.Array:
+    """Adds a vertex of `inside` to the sums of its row, each quantity weighted by its force."""
+    point, normal, gap, lever, share = mine
+    depth = jnp.maximum(-gap[0, 0], 0.0)
+    share = jnp.where(depth > 0, share[0, 0], 0.0)
+    force = share * depth
+    vectors = [force * v[:, 0] for v in (normal, point, lever, other[3])]
+    return sums + jnp.concatenate([share[None], force[None], *vectors])
+
+
+def pressure(sums: jax.Array) -> tuple[tuple, tuple]:
+    """The contact of a row with another row, on either side: that of all its vertices inside.
+
+    It has the vertices' resultant: their common stiffness, the sum of their forces, and the centre
+    of pressure as its point, which moves as the mean of the vertices weighted by their forces.
+    """
+    share, force, normal = sums[0], sums[1], sums[2:5]
+    some = force > 0
+    whole = jnp.where(some, force, 1.0)
+    # Vertices that push in different directions cancel in part: the resultant's length.
+    size = jnp.sqrt(dot(normal, normal))
+    pushes = some & (size > 0)
+    normal = jnp.where(pushes, normal / jnp.where(pushes, size, 1.0), 0.0)
+    gap = jnp.where(pushes, -size / jnp.where(some, share, 1.0), 1.0)[None, None]
+    point, lever, behind = ((sums[k : k + 3] / whole)[:, None] for k in (5, 8, 11))
+    normal, share = normal[:, None], share[None, None]
+    return (point, normal, gap, lever, share), (point, -normal, gap, behind, share)
+
+
+def _sign(x: jax.Array) -> jax.Array:
+    return jnp.where(x < 0, -1.0, 1.0).astype(x.dtype)
+
+
+def _rounded(depth: list[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
+    """Distance to a box from the depths behind its faces, and the slope in each of them."""
+    outside = [jnp.maximum(d, 0.0) for d in depth]
+    square = total([d * d for d in outside])
+    is_out = square > 0
+    length = jnp.sqrt(jnp.where(is_out, square, 1.0))
+    deepest = jnp.maximum(jnp.maximum(depth[0], depth[1]), depth[2])
+    nearest = [depth[0] >= deepest]
+    nearest.append(~nearest[0] & (depth[1] >= deepest))
+    nearest.append(~nearest[0] & ~nearest[1])
+    faces = [n.astype(square.dtype) for n in nearest]
+    slope = [jnp.where(is_out, d / length, f) for d, f in zip(outside, faces, strict=True)]
+    return jnp.where(is_out, length, deepest), slope

@@ -1,0 +1,149 @@
+"""What the kernel of a scene keeps in memory: its contacts, and the rows of its tables."""
+
+from functools import partial
+
+from codesign_jax import verdict
+from codesign_jax.engines.structured import collision
+from codesign_jax.engines.structured.kernel import fingers, hull, objects
+from codesign_jax.engines.structured.kernel.contacts import ContactSet
+from codesign_jax.engines.structured.kernel.memory import MemoryLayout
+from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
+from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_slots
+from codesign_jax.model import layout
+from codesign_jax.model.layout import palm_touches
+from codesign_jax.scene import Scene
+
+
+class Tables:
+    """Contacts and tables of a scene's kernel for one size of block.
+
+    Attributes:
+      links: Moving links of a finger; `axes`: axes of a joint.
+      fingers: Fingers of a block, a power of two; `num_fingers`: those of the scene.
+      block: Worlds of a block; `size`: its lanes.
+      k: Contact spheres of a link; `palm_groups`: of the palm, for each finger's lanes.
+      sets: The contacts.
+      hand: Rows of the hand's table; likewise `world`, `finger_state`, `world_state`, `scratch`.
+    """
+
+    def __init__(self, scene: Scene, *, backend: str, width: int):
+        """Lays out the memory, see `Program`."""
+        self.backend = backend
+        self.scene, self.lay = scene, layout(scene)
+        n, self.links, self.axes = self.lay.dofs.shape
+        self.fingers = 1 << (n - 1).bit_length()
+        self.num_fingers, self.block = n, max(1, width // self.fingers)
+        self.size = self.fingers * self.block
+        self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
+        self.palm_groups = -(-self.lay.palm.size // self.fingers)
+        self.meshes = bool(collision.mesh_indices(scene))
+        self.sets = self._sets()
+        self.slotted = any(isinstance(s, SlotSet) for s in self.sets)
+        self._tables()
+
+    def _sets(self) -> list[ContactSet]:
+        e, k = self.scene.effects, self.k
+        make = partial(ContactSet, self.scene, size=self.size)
+        sets = []
+        if k and e.finger_object:
+            sets.append(make("finger_object", self.links, k))
+        if k and e.finger_table:
+            sets.append(make("finger_table", self.links, k))
+        on = {"hull_object": e.finger_object, "hull_table": e.finger_table}
+        if e.surface == "hull":
+            sets += [self._skin(name) for name in on if on[name]]
+        if e.finger_finger and self.num_fingers > 1:
+            block, slots = (self.fingers, self.block), pair_slots(self.scene)
+            gathers = self.backend == "gpu"
+            sets.append(PairSet(self.scene, block, self.links, slots, gathers=gathers))
+        on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
+        sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
+        on_table = [make("object_table", -(-4 // self.fingers), 1)] if e.object_table else []
+        return [*sets, *on_table]
+
+    def _skin(self, name: str) -> HullSet:
+        slots = hull_slots(self.scene)
+        return HullSet(self.scene, name, rows=self.links + 1, slots=slots, size=self.size)
+
+    def _tables(self) -> None:
+        n, a = self.links, self.axes
+        one: tuple[int, ...] = ()
+        more = {"sphere": (n, (3, self.k)), "radius": (n, (self.k,))} if self.k else {}
+        if palm_touches(self.scene):
+            more |= {
+                "palm_point": (self.palm_groups, (3, 1)),
+                "palm_radius": (self.palm_groups, (1,)),
+            }
+        if self.scene.effects.neo_hookean:
+            more |= {"section": (1, (4,))}
+        if self.scene.effects.surface == "hull":
+            more |= hull.fields(self.scene)
+        support, grid = objects.tables(self.scene, self.fingers)
+        self.hand = MemoryLayout(
+            True,
+            mount=(1, (3, 3)),
+            base=(1, (3,)),
+            stub_centre=(1, (3,)),
+            share=(n + 1, one),
+            gain=(1, one),
+            offset=(n, one),
+            mass=(n, one),
+            centre=(n, (3,)),
+            inertia=(n, (3,)),
+            stiffness=(n, (a,)),
+            damping=(n, (a,)),
+            armature=(n, (a,)),
+            **more,
+            **support,
+        )
+        some: dict[str, tuple[int, tuple[int, ...]]] = {}
+        for contacts in self.sets:
+            some |= contacts.cone_rows()
+        if self.scene.effects.gravity:
+            some |= {"gravity": (1, one)}
+        if self.scene.effects.wrist:
+            some |= {"wrist_stiffness": (1, (6,))}
+        self.world = MemoryLayout(
+            False,
+            palm_mass=(1, one),
+            palm_centre=(1, (3,)),
+            palm_inertia=(1, (3, 3)),
+            wrist_damping=(1, (6,)),
+            wrist_armature=(1, (6,)),
+            object_mass=(1, one),
+            object_inertia=(1, (3,)),
+            object_size=(1, (3,)),
+            object_id=(1, one),
+            alive=(1, one),
+            **grid,
+            **dict.fromkeys(verdict.Bounds._fields, (1, one)),
+            **some,
+        )
+        self.finger_state = MemoryLayout(
+            True, finger=(n, (a,)), finger_vel=(n, (a,)), acc=(n, (a,))
+        )
+        world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
+        world_state |= dict(acc_wrist=6, acc_object=6)
+        self.world_state = MemoryLayout(
+            False, **{name: (1, (size,)) for name, size in world_state.items()}
+        )
+        fields: dict[str, tuple[int, tuple[int, ...]]] = {
+            "axes": (n, (a, 6)),
+            "body_centre": (n, (3,)),
+            "tensor": (n, (6,)),
+            "motion": (n, (6,)),
+            "smooth": (n, (6,)),
+            "tau": (n, (a,)),
+            "w": (n, (a, 6)),
+            "g": (n, (a, 6)),
+            "z": (n, (a,)),
+            "step_acc": (n, (a,)),
+            "step_motion": (n, (6,)),
+            "new_finger": (n, (a,)),
+            "new_finger_vel": (n, (a,)),
+        }
+        for contacts in self.sets:
+            fields |= contacts.groups()
+        if any(isinstance(s, PairSet) for s in self.sets):
+            fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))} | fingers.fields(n, self.k)
+        self.scratch = MemoryLayout(True, **fields)

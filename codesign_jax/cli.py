@@ -100,6 +100,8 @@ class Evaluate(Subject):
     """Root of the trials' noise."""
     render: File = None
     """Draw the first trial of each object: an animation (.gif) or a film strip (.png)."""
+    dry_run: Flag = False
+    """Print the number of grasps and an estimate of the time; simulate nothing."""
 
     def run(self) -> int:
         """Runs the command and returns the exit status."""

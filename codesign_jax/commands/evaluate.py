@@ -10,10 +10,12 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, rollout, runs, types
-from codesign_jax.commands import common
+from codesign_jax.commands import common, estimate
 from codesign_jax.commands.case import Case, find_case
+from codesign_jax.commands.estimate import Part
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
+from codesign_jax.runs import rates
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import SceneError
 
@@ -38,6 +40,9 @@ def main(options: "Evaluate") -> int:
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
     for note in [*notes, *common.mesh_notes(case.scene)]:
         console.print(note, markup=False)
+    if options.dry_run:
+        _dry_run(case, options, console)
+        return 0
     _evaluate(case, engine, options, console)
     if options.render:
         _render(case, engine, options, console)
@@ -62,6 +67,18 @@ def _check(options: "Evaluate", engine: str) -> None:
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], engine)
     if problems:
         raise SceneError(problems)
+
+
+def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
+    def part(name: str, grasps: int) -> Part:
+        return Part(name, rates.batch_work(case.scene, case.engine, grasps, devices=1), grasps)
+
+    console.print(f"grasps: {options.trials}")
+    parts = [part("", options.trials)]
+    if options.render:
+        drawn = min(options.trials, len(case.scene.objects.object))
+        parts.append(part("the grasps of the picture, without drawing it", drawn))
+    console.print(estimate.text(parts), markup=False)
 
 
 def _evaluate(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:

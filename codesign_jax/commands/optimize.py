@@ -12,9 +12,9 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, optimize, runs
-from codesign_jax.commands import common, hosts, jobs, reference, seeds
+from codesign_jax.commands import common, estimate, hosts, jobs, reference, seeds
+from codesign_jax.commands.estimate import Part
 from codesign_jax.runs import Plan, RunResult, Settings, rates
-from codesign_jax.runs.progress import duration
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import design_space
@@ -213,18 +213,12 @@ def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") 
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     together = 1 if options.jobs else count
-    found = rates.estimate(rates.work(scene, settings, runs=together, devices=options.devices))
-    if found is None:
-        print("time: unknown; a short run with these effects and this engine measures the rate")
-        return
-    grasping = count * (settings.grasps + batch) / found.grasps_per_second
-    compiling = found.compile_seconds
-    if compiling is None:
-        print(f"time: about {duration(grasping)}, and compiling")
-    else:
-        total = duration(grasping + compiling)
-        print(f"time: about {total}, of which {compiling:.0f} s to compile or load the program")
-    print(f"based on {found.basis}")
+    work = rates.work(scene, settings, runs=together, devices=options.devices)
+    parts = [Part("", work, count * (settings.grasps + batch))]
+    if trials := reference.number_of_trials(options.reference_trials, settings):
+        print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
+        parts.append(reference.part(scene, settings, trials, count))
+    print(estimate.text(parts))
 
 
 def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:

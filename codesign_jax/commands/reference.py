@@ -15,10 +15,12 @@ from rich.console import Console
 from codesign_jax import codesign, engines
 from codesign_jax.commands import common
 from codesign_jax.commands.case import Case, find_case
+from codesign_jax.commands.estimate import Part
 from codesign_jax.commands.flags import Subject
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
-from codesign_jax.runs import Settings, outcomes
+from codesign_jax.runs import Settings, outcomes, rates
+from codesign_jax.scene import Scene, with_accuracy
 from codesign_jax.types import Outcome
 
 ACCURACY = "reference"
@@ -41,6 +43,20 @@ def number_of_trials(asked: int | None, settings: Settings) -> int:
     if asked is not None:
         return asked
     return TRIALS if settings.engine == engines.DEFAULT and settings.test_trials else 0
+
+
+def part(scene: Scene, settings: Settings, trials: int, runs: int) -> Part:
+    """What the test takes, for an estimate.
+
+    Args:
+      scene: Scene of the runs.
+      settings: Their settings.
+      trials: Fresh trials of each run.
+      runs: Runs, whose tests come one after the other.
+    """
+    finer = with_accuracy(scene, ACCURACY)
+    work = rates.batch_work(finer, settings.engine, trials, devices=1)
+    return Part(f"the test at accuracy {ACCURACY}", work, trials * runs)
 
 
 def test(folder: Path, settings: Settings, trials: int, console: Console) -> Outcome:

@@ -14,7 +14,7 @@ codesign_jax.scene.schema.SceneError: paper.toml.gravty is not a known key; did 
 """
 
 from codesign_jax.scene.description import Constants, Scene, by_structure
-from codesign_jax.scene.loading import check_together, load, load_accuracy
+from codesign_jax.scene.loading import check_together, load, load_accuracy, with_accuracy
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.scene.tables import (
     Accuracy,
@@ -49,4 +49,5 @@ __all__ = [
     "check_together",
     "load",
     "load_accuracy",
+    "with_accuracy",
 ]

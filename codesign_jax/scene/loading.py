@@ -121,6 +121,24 @@ def load_accuracy(name: str | Path) -> Accuracy:
     return preset
 
 
+def with_accuracy(scene: Scene, name: str | Path) -> Scene:
+    """A scene with the values of a preset of accuracy in place of its own.
+
+    Args:
+      scene: The scene, checked; whether its other numbers go together with these is not.
+      name: As of `load_accuracy`.
+
+    Raises:
+      SceneError: with every problem of the preset's file.
+    """
+    tables = {key: getattr(scene, key) for key in ("discretization", "solver", "newton")}
+    preset = load_accuracy(name)
+    return dataclasses.replace(
+        scene,
+        **{key: dataclasses.replace(t, **getattr(preset, key)) for key, t in tables.items()},
+    )
+
+
 def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str, Any]]:
     """Overrides of a preset of accuracy; none without a name or with problems."""
     if name is None:

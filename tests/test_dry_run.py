@@ -1,0 +1,56 @@
+"""`--dry-run`: how many grasps and how long, with nothing simulated and nothing written."""
+
+import re
+
+import pytest
+from toy import TINY
+
+from codesign_jax import cli, scene
+from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax.runs import rates
+
+SUBJECT = ("--scene", str(TINY), "--engine", "mujoco", "--dry-run")
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path, monkeypatch):
+    """An empty working directory, no measured rates, and an engine that must not simulate."""
+
+    def never(*arguments, **flags):
+        raise AssertionError("something was simulated")
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(MujocoEngine, "rollout", never)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "work"
+
+
+def dry_run(capsys, command, *arguments):
+    """What the command prints."""
+    assert cli.main([command, *SUBJECT, *map(str, arguments)]) == 0
+    return capsys.readouterr().out
+
+
+def test_optimize_counts_the_test_at_reference(workplace, capsys):
+    """Its grasps are of another program, of 20 times as many steps and more links."""
+    output = dry_run(capsys, "optimize", "--reference-trials", 70)
+    assert "reference test: 70 grasps at accuracy reference" in output
+    [(minutes, seconds)] = re.findall(r", (\d+):(\d+) for the test at accuracy ref", output)
+    finer = scene.with_accuracy(scene.load(TINY), "reference")
+    assert finer == scene.load(TINY, accuracy="reference") and finer != scene.load(TINY)
+    rate = rates.estimate(rates.batch_work(finer, "mujoco", 70)).grasps_per_second
+    assert 60 * int(minutes) + int(seconds) == round(70 / rate) > 1
+    output = dry_run(capsys, "optimize")  # this engine has no such test by default
+    assert "reference" not in output.split("---- settings")[1]
+    assert list(workplace.iterdir()) == []
+
+
+def test_evaluate_and_landscape(workplace, capsys):
+    output = dry_run(capsys, "evaluate", "--trials", 50, "--render", "grasp.png")
+    assert "grasps: 50\n" in output and "time: about 0:" in output and "picture" in output
+    output = dry_run(capsys, "landscape", "--points", 30, "--trials", 6)
+    # 85 points of 6 grasps are at most 512 worlds; 900 points are 11 calls of equal size.
+    assert "grasps: 5400 in 11 calls" in output and "based on" in output
+    assert list(workplace.iterdir()) == []
+    assert cli.main(["landscape", *SUBJECT, "--points", "1"]) == 2

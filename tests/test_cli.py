@@ -320,7 +320,7 @@ WRONG = {
     "unknown flag": (["--particle", "10"], ["--particle"]),
     "unknown key": (
         ["--set", "discretization.timestp=0.01"],
-        ["discretization.timestp is not a known key", "did you mean 'timestep'?"],
+        ["discretization.timestp is not a known key", "did you mean 'discretization.timestep'?"],
     ),
     "unit slip": (
         ["--set", "discretization.timestep=18"],
@@ -334,15 +334,23 @@ WRONG = {
     "key of a value": (["--set", "name.x=1"], ["name = 'paper' is no table: it has no key 'x'"]),
     "key of another file": (
         ["--set", "hand.section.width=18", "--set", "objects.nois.position=0.01"],
-        ["width = 18 is outside [0.005, 0.1] m", "did you mean 'noise'?"],
+        [
+            "hand.section.width = 18 is outside [0.005, 0.1] m",
+            "objects.nois is not a known key; did you mean 'objects.noise'?",
+        ],
     ),
     "seeds that are none": (["--seeds", "0-"], ["--seeds '0-' must be seeds such as 0-9 or 1,3,5"]),
     "seeds backwards": (["--seeds", "9-0"], ["must be seeds such as"]),
     "too many seeds": (["--seeds", "0-99999"], ["names more than 1000 runs"]),
     "hosts without seeds": (
         ["--distributed", "auto"],
-        ["--distributed needs --seeds, and neither"],
+        ["--distributed needs --seeds"],
     ),
+    "hosts and jobs": (
+        ["--seeds", "0-1", "--distributed", "auto", "--jobs", "2"],
+        ["error: --distributed and --jobs exclude each other"],
+    ),
+    "a preset of too many": (["--preset", "24d"], ["did you mean '23d'?"]),
     "hosts that are none": (
         ["--seeds", "0-1", "--distributed", "node0:1234,2,2"],
         ["'node0:1234,2,2' must be auto or ADDRESS:PORT,PROCESSES,INDEX, such as"],
@@ -358,7 +366,7 @@ WRONG = {
             *("--hand", "pneuflex5", "--engine", "mujco", "--seed", "-1"),
             *("--set", "gravity=1000", "cost.failur=worst"),
         ],
-        ["pneuflex4", "mujoco", "--seed = -1", "gravity = 1000", "did you mean 'failure'?"],
+        ["pneuflex4", "mujoco", "--seed = -1", "gravity = 1000", "did you mean 'cost.failure'?"],
     ),
 }
 

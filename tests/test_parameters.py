@@ -47,11 +47,15 @@ def test_params_are_named_and_in_si_units():
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("length[1]", 97.0, "length[1] = 97.0 is outside [0.001, 1] m; did you mean 0.097? (milli"),
+        (
+            "length[1]",
+            97.0,
+            "length[1] = 97.0 is outside [0.001, 1] m; did you mean 0.097? (mm giv",
+        ),
         ("wall[0]", 3.0, "did you mean 0.003?"),
         ("arm_z", -30.0, "did you mean -0.03?"),
         ("arm_pitch", 15.0, "did you mean 0.261799? (degrees given where radians are expected)"),
-        ("pressure[3]", 120e6, "did you mean 120000? (milli-unit"),
+        ("pressure[3]", 120e6, "did you mean 120000? (mPa given"),
     ],
 )
 def test_other_units_than_si_are_refused_in_words(name, value, expected):
@@ -64,6 +68,21 @@ def test_other_units_than_si_are_refused_in_words(name, value, expected):
     full = parameters.unflatten(HAND, design)
     with pytest.raises(schema.SceneError, match=r"did you mean"):
         parameters.refuse_unit_slips(full)
+
+
+def test_pressures_that_may_be_kilopascals_are_hinted_at():
+    """141 Pa is in the range, which begins at 0, and moves nothing."""
+    design = FULL.default()
+    pressures = [i for i, name in enumerate(FULL.names) if name.startswith("pressure")]
+    design[pressures] = 141.0
+    hint = r"largest pressure is 141 Pa, next to none; did you mean 141000\? \(kPa given"
+    with pytest.warns(UserWarning, match=hint):
+        FULL.params(design)
+    with pytest.warns(UserWarning, match=hint):
+        parameters.refuse_unit_slips(parameters.unflatten(HAND, design))
+    for faint in (0.0, [141.0, 0.0, 0.0, 120e3]):  # no pressure; one finger left slack
+        design[pressures] = faint
+        FULL.params(design)
 
 
 def test_what_no_unit_explains_and_what_is_traced_is_left_to_the_status():

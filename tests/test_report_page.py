@@ -124,6 +124,13 @@ def test_landscape_of_two_among_many_says_around_what_it_is(run, tmp_path, moved
 def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
     assert cli.main(["report", str(tmp_path)]) == 2
     assert "is not a run folder" in capsys.readouterr().err
+    for seed in (0, 1):
+        folder = tmp_path / "seeds" / f"seed-{seed}"
+        folder.mkdir(parents=True)
+        shutil.copy(run / "provenance.json", folder)
+    assert cli.main(["report", str(tmp_path / "seeds")]) == 2
+    hint = f"it holds 2 runs: give one, such as {tmp_path / 'seeds' / 'seed-0'}"
+    assert hint in capsys.readouterr().err
     empty = tmp_path / "empty"
     shutil.copytree(run, empty)
     shutil.rmtree(empty / "checkpoints")

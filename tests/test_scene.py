@@ -62,7 +62,7 @@ def test_unknown_key_names_the_nearest(tmp_path):
 
 def test_unknown_key_in_a_scene_override():
     (problem,) = scene_problems(solver={"iteration": 3})
-    assert "paper.toml.solver.iteration is not a known key; did you mean 'iterations'?" in problem
+    assert "solver.iteration is not a known key; did you mean 'solver.iterations'?" in problem
 
 
 BY_PATH = {
@@ -110,21 +110,32 @@ def test_key_paths_may_be_nested_or_dotted_and_the_last_of_a_key_holds():
     [
         ("name.x=1", "paper.toml.name = 'paper' is no table: it has no key 'x'"),
         ("gravity.earth.x=1", "paper.toml.gravity = 9.81 is no table: it has no key 'earth'"),
-        ("solver=3", "paper.toml.solver must be a table, not int"),
-        ("hand.materiel.density=1", "materiel is not a known key; did you mean 'material'?"),
-        ("hand.material.densty=1", "material.densty is not a known key; did you mean 'density'?"),
+        ("solver=3", "solver must be a table, not int"),
+        (
+            "objects.nois.position=0.01",
+            "objects.nois is not a known key; did you mean 'objects.noise'",
+        ),
+        ("objects.noise.size=2", "objects.noise.size = 2 is outside"),
+        ("gravty=3", "gravty is not a known key; did you mean 'gravity'?"),
+        (
+            "hand.materiel.density=1",
+            "hand.materiel is not a known key; did you mean 'hand.material'",
+        ),
+        ("hand.material.densty=1", "did you mean 'hand.material.density'?"),
         (
             "hand.section.width=18",
-            "pneuflex4.toml.section.width = 18 is outside [0.005, 0.1] m",
+            "hand.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? (mm given",
         ),
         ("hand.finger[7].tilt=1", "pneuflex4.toml.finger has no entry '7'"),
         ("objects.object.spher.mass=1", "object has no entry 'spher'; did you mean 'sphere'?"),
-        ("objects.object.sphere.mass=light", "object[2].mass = 'light' must be of type float"),
+        ("objects.object.sphere.mass=light", "objects.object.sphere.mass = 'light' must be"),
+        ("hand.parameter.pressure.default=141e3", "hand.parameter.pressure.default = 141000.0 is"),
+        ("hand.finger[1].tilt=900", "hand.finger[1].tilt = 900 is outside"),
     ],
 )
 def test_a_wrong_key_path_is_told_in_words(pair, expected):
     problems = problems_of(lambda name: scene.load(name, overrides=keypaths.parse([pair])), "paper")
-    assert any(expected in p for p in problems), problems
+    assert any(p.startswith(expected) or expected in p[10:] for p in problems), problems
 
 
 def test_missing_table(tmp_path):
@@ -158,7 +169,7 @@ def test_an_integer_is_a_number_but_a_number_is_not_an_integer():
     ("old", "new", "suggested"),
     [
         ("size = [0.030]", "size = [30]", "0.03"),  # millimetres for metres
-        ("mass = 0.05", "mass = 50", "0.05"),  # grams for kilograms
+        ("mass = 0.05\n", "mass = 50\n", "0.05"),  # grams for kilograms
         ("position = 0.005", "position = 5", "0.005"),
     ],
 )
@@ -171,8 +182,15 @@ def test_eighteen_for_a_width_of_0_018_m(tmp_path):
     (problem,) = hand_problems(tmp_path, ("width = 0.024", "width = 18"))
     assert problem == (
         "hands.toml.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? "
-        "(milli-unit given where the base unit is expected)"
+        "(mm given where m is expected)"
     )
+
+
+def test_numbers_without_a_unit_have_no_slip_of_units():
+    (problem,) = problems_of(
+        lambda name: scene.load(name, overrides={"cost.maximum": 2000}), "paper"
+    )
+    assert problem == "cost.maximum = 2000 is outside [0.1, 100]"
 
 
 @pytest.mark.parametrize("bad", ["nan", "inf", "-inf"])
@@ -188,7 +206,7 @@ def test_not_finite_values_are_refused(tmp_path, bad):
 def test_phases_out_of_order():
     problems = scene_problems(phases={"inflate": 5.0, "lift": 4.5, "disturb": 8.6})
     assert problems == [
-        "paper.toml.phases.lift = 4.5 s must come after inflate = 5 s",
+        "phases.lift = 4.5 s must come after inflate = 5 s",
         "paper.toml.phases.deflate_time = 0.5 s does not fit between disturb = 8.6 s "
         "and ungrasp = 9 s",
     ]
@@ -243,7 +261,7 @@ def test_all_problems_of_all_files_at_once(tmp_path):
 )
 def test_inconsistent_hand(tmp_path, old, new, expected):
     problems = hand_problems(tmp_path, (old, new))
-    assert any(expected in p for p in problems), problems
+    assert any(p.startswith(expected) or expected in p[10:] for p in problems), problems
 
 
 def test_object_with_the_wrong_number_of_sizes(tmp_path):

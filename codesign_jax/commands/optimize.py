@@ -68,8 +68,15 @@ def main(options: "Optimize") -> int:
 def _distributed(options: "Optimize") -> int:
     """Runs this host's share of the seeds; the first host compares all of them."""
     hosts.check(options.distributed or "")
-    if options.seeds is None or options.jobs is not None or options.dry_run:
-        raise SceneError(["--distributed needs --seeds, and neither --jobs nor --dry-run"])
+    problems = []
+    if options.seeds is None:
+        problems.append("--distributed needs --seeds: the hosts share the runs of several seeds")
+    if options.jobs is not None:
+        problems.append("--distributed and --jobs exclude each other: both share out the seeds")
+    if options.dry_run:
+        problems.append("--dry-run knows one host: leave out --distributed to have its estimate")
+    if problems:
+        raise SceneError(problems)
     status, here = hosts.run(options)
     if here.index or status == 2 or status >= 128:
         return status

@@ -151,8 +151,19 @@ def read_provenance(path: Path) -> dict[str, Any]:
         # Runs from before a setting was there have its default.
         stored["settings"] = dataclasses.asdict(Settings(**stored["settings"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SceneError([f"{path} is not a run folder: {PROVENANCE} cannot be read"]) from error
+        problem = f"{path} is not a run folder: {PROVENANCE} cannot be read"
+        raise SceneError([problem + _runs_inside(path)]) from error
     return stored
+
+
+def _runs_inside(path: Path) -> str:
+    """A hint at the runs in a folder of several, such as that of --seeds."""
+    inside = sorted(file.parent for file in path.glob(f"*/{PROVENANCE}"))
+    inside.sort(key=lambda folder: (len(folder.name), folder.name))  # seed-2 before seed-10
+    if not inside:
+        return ""
+    some = f"{inside[0]} or {inside[1]}" if len(inside) > 1 else str(inside[0])
+    return f"; it holds {len(inside)} run{'s' * (len(inside) > 1)}: give one, such as {some}"
 
 
 def _refuse_foreign(path: Path) -> None:

@@ -10,7 +10,7 @@ effect means, `schema` the checks of files, `meshes` objects of any shape.
 (4, 900, 0.01)
 >>> scene.load("paper", overrides={"gravty": 3.7})
 Traceback (most recent call last):
-codesign_jax.scene.schema.SceneError: paper.toml.gravty is not a known key; did you mean 'gravity'?
+codesign_jax.scene.schema.SceneError: gravty is not a known key; did you mean 'gravity'?
 """
 
 from codesign_jax.scene.description import Constants, Scene, by_structure

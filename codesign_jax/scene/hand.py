@@ -57,7 +57,8 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
     path = library.find("hands", name)
     problems: list[str] = []
     table = library.read(path)
-    keypaths.apply(table, keypaths.flatten(overrides or {}), path.name, problems)
+    changes = keypaths.flatten(overrides or {})
+    places = keypaths.apply(table, changes, path.name, problems, root="hand")
     hand = schema.parse(Hand, table, path.name, problems)
     if hand is not None:
         _check_mounts(hand, path.name, problems)
@@ -66,7 +67,7 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
         if not problems:
             _check_sections(hand, path.name, problems)
     if problems or hand is None:
-        raise schema.SceneError(problems)
+        raise schema.SceneError(keypaths.as_given(problems, places))
     return hand
 
 

@@ -63,7 +63,9 @@ def below(changes: Mapping[Path, Any], key: str) -> dict[Path, Any]:
     return {path[1:]: v for path, v in changes.items() if path[0] == key and len(path) > 1}
 
 
-def apply(table: dict, changes: Mapping[Path, Any], where: str, problems: list[str]) -> None:
+def apply(
+    table: dict, changes: Mapping[Path, Any], where: str, problems: list[str], *, root: str = ""
+) -> dict[str, str]:
     """Changes values of a file that was read; the file's schema checks keys and values afterwards.
 
     Args:
@@ -71,32 +73,76 @@ def apply(table: dict, changes: Mapping[Path, Any], where: str, problems: list[s
       changes: Values by path.
       where: The file's name, for messages.
       problems: List that collects the messages.
+      root: Key of the scene that leads into the file, such as "objects".
+
+    Returns:
+      Places of the changes as the schema names them, such as "paper.toml.noise", and as they were
+      given, such as "objects.noise"; for `as_given`.
     """
+    places: dict[str, str] = {}
     for path, value in changes.items():
-        _apply(table, path, value, where, problems)
+        _apply(table, path, value, ((where,), root), problems, places)
+    return places
 
 
-def _apply(place: Any, path: Path, value: Any, where: str, problems: list[str]) -> None:
-    rest = path[1:]
+def as_given(problems: list[str], places: Mapping[str, str]) -> list[str]:
+    """Messages about changed values, with the keys as they were given instead of the file's.
+
+    Args:
+      problems: Messages that begin with a key path in a file.
+      places: See `apply`.
+    """
+    longest = sorted(places, key=len, reverse=True)
+    return [_as_given(problem, longest, places) for problem in problems]
+
+
+def _as_given(problem: str, longest: list[str], places: Mapping[str, str]) -> str:
+    for place in longest:
+        rest = problem.removeprefix(place)
+        if rest != problem and not re.match(r"\w", rest):
+            key, unknown, hint = f"{places[place]}{rest}".partition(" is not a known key; ")
+            parent = key.rpartition(".")[0]
+            if parent:
+                hint = hint.replace("did you mean '", f"did you mean '{parent}.")
+            return key + unknown + hint
+    return problem
+
+
+def _apply(
+    place: Any,
+    path: Path,
+    value: Any,
+    where: tuple[tuple[str, ...], str],
+    problems: list[str],
+    places: dict[str, str],
+) -> None:
+    """Changes one value; `where` has the names of the place in messages, and as it is given."""
+    (names, given), rest = where, path[1:]
     key: Any = path[0]
     if isinstance(place, list):
         index = _index(place, key)
         if index is None:
-            problems.append(f"{where} has no entry {key!r}; {schema.nearest(key, _names(place))}")
+            problems.append(
+                f"{names[0]} has no entry {key!r}; {schema.nearest(key, _names(place))}"
+            )
             return
-        where, key = f"{where}[{key}]", index
+        # The schema names an entry by its index, other checks by its name.
+        names, key = tuple(n + form for n in names for form in (f"[{index}]", f" {key}")), index
     elif isinstance(place, dict):
-        where = f"{where}.{key}"
+        names = tuple(f"{name}.{key}" for name in names)
     else:
-        problems.append(f"{where} = {place!r} is no table: it has no key {key!r}")
+        problems.append(f"{names[0]} = {place!r} is no table: it has no key {key!r}")
         return
+    given += f"[{path[0]}]" if path[0].isdecimal() else "." * bool(given) + path[0]
+    if not rest or (isinstance(place, dict) and key not in place):
+        places |= dict.fromkeys(names, given)
     if not rest:
         place[key] = value
         return
     if isinstance(place, dict):
         # A table that the file leaves out; if there is no such table, the schema says so.
         place.setdefault(key, {})
-    _apply(place[key], rest, value, where, problems)
+    _apply(place[key], rest, value, (names, given), problems, places)
 
 
 def _names(entries: list) -> list[str]:

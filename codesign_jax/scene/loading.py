@@ -81,8 +81,11 @@ def load(
     changes = keypaths.flatten(_preset(accuracy, problems)) | keypaths.flatten(overrides or {})
     inside = {key: keypaths.below(changes, key) for key in ("hand", "objects")}
     own = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
-    keypaths.apply(table, own, path.name, problems)
+    places = keypaths.apply(table, own, path.name, problems)
     parsed = schema.parse(_SceneFile, table, path.name, problems)
+    if parsed is not None:
+        _check(parsed, path.name, problems)
+    problems = keypaths.as_given(problems, places)
     parts = {}
     for key, loader, chosen in (
         ("hand", hand.load, hand_name),
@@ -96,8 +99,6 @@ def load(
             parts[key] = loader(source, overrides=inside[key])
         except schema.SceneError as error:
             problems += error.problems
-    if parsed is not None:
-        _check(parsed, path.name, problems)
     if problems or parsed is None:
         raise schema.SceneError(problems)
     names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]

@@ -161,8 +161,10 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
     path = library.find("objects", name)
     problems: list[str] = []
     table = library.read(path)
-    keypaths.apply(table, keypaths.flatten(overrides or {}), path.name, problems)
+    changes = keypaths.flatten(overrides or {})
+    places = keypaths.apply(table, changes, path.name, problems, root="objects")
     parsed = schema.parse(_ObjectSetFile, table, path.name, problems)
+    problems = keypaths.as_given(problems, places)
     if parsed is None:
         raise schema.SceneError(problems)
     if not parsed.object:

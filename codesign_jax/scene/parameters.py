@@ -18,6 +18,8 @@ codesign_jax.scene.schema.SceneError: length = 95.0 is outside [0.001, 1] m; did
 
 import dataclasses
 import functools
+import re
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +31,8 @@ from codesign_jax.types import Params
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
 _STRICT = 1.0 - 1e-6
+_FAINT = 1000.0
+"""Pressure below which no finger moves visibly [Pa]: 1 kPa bends one of 100 mm by half a degree."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,17 +116,19 @@ class DesignSpace:
 
         Raises:
           SceneError: With every such number and its suggested value, or if the last axis is not
-            that of the parameters.
+            that of the parameters. Of pressures that are all nearly zero, a warning is given.
         """
         self._refuse_shape(designs, "..., ")
         if isinstance(designs, jax.core.Tracer):
             return
         columns = np.moveaxis(np.asarray(designs, float), -1, 0)
+        rows = [name.split("[")[0] for name in self.names]
         found = []
-        for name, column in zip(self.names, columns, strict=True):
-            found += _slips(name, name.split("[")[0], column)
+        for name, row, column in zip(self.names, rows, columns, strict=True):
+            found += _slips(name, row, column)
         if found:
             raise schema.SceneError(found)
+        _hint_at_kilopascals(columns[[row == "pressure" for row in rows]])
 
     def refuse_population(self, population: np.typing.ArrayLike) -> None:
         """Refuses what are not designs of this space, shape (particle, parameter).
@@ -204,10 +210,18 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
     else:
         known = {p.name: p for p in hand.preset}
         if preset not in known:
-            hint = schema.nearest(preset, [*known, "full", f"{total}d"])
+            hint = _hint(preset, [*known, "full", f"{total}d"])
             raise schema.SceneError([f"preset {preset!r} unknown for hand {hand.name}; {hint}"])
         chosen = known[preset]
     return _build(hand, chosen, everything=not chosen.free)
+
+
+def _hint(preset: str, names: list[str]) -> str:
+    """The preset that an unknown name comes closest to, of numbers of parameters the next one."""
+    sizes = {int(name[:-1]): name for name in names if re.fullmatch(r"\d+d", name)}
+    if sizes and re.fullmatch(r"\d+[dD]", preset):
+        return f"did you mean {sizes[min(sizes, key=lambda n: abs(n - int(preset[:-1])))]!r}?"
+    return schema.nearest(preset, names)
 
 
 def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
@@ -261,6 +275,18 @@ def refuse_unit_slips(params: Params) -> None:
     found = [slip for name, v in values.items() for slip in _slips(name, name, np.asarray(v))]
     if found:
         raise schema.SceneError(found)
+    _hint_at_kilopascals(np.asarray(params.pressure, float))
+
+
+def _hint_at_kilopascals(pressures: np.ndarray) -> None:
+    """Warns of pressures that are all nearly zero, which their range has: kPa, most likely."""
+    largest = float(np.abs(pressures).max(initial=0.0))
+    if 0 < largest < _FAINT:
+        warnings.warn(
+            f"the largest pressure is {largest:g} Pa, next to none; did you mean "
+            f"{1e3 * largest:g}? (kPa given where Pa is expected; Python takes SI units)",
+            stacklevel=3,
+        )
 
 
 def _slips(name: str, row: str, values: np.ndarray) -> list[str]:

@@ -10,21 +10,23 @@ import dataclasses
 import difflib
 import functools
 import math
+import re
 import types
 import typing
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-# Factors between units that people mix up, tried in this order when a value is out of range.
-_UNIT_SLIPS = (
-    (1e-3, "milli-unit given where the base unit is expected"),
-    (1e3, "kilo-unit given where the base unit is expected"),
-    (180.0 / math.pi, "radians given where degrees are expected"),
-    (1e-6, "mega-scale slip"),
-    (1e6, "micro-scale slip"),
-)
-_ANGLE_SLIPS = ((math.pi / 180.0, "degrees given where radians are expected"),)
+_ANGLES = {
+    "rad": (math.pi / 180.0, "degrees given where radians are expected"),
+    "deg": (180.0 / math.pi, "radians given where degrees are expected"),
+}
+_PREFIXES = {-6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+_SLIPS = (-3, 3, -6, 6)
+"""Powers of ten between units that people mix up, tried in this order."""
+_UNIT = re.compile(r"(µ|m|k|M)?(m|s|g|N|Pa|Hz)(?![A-Za-z])(.*)")
+_COMMON = {"Mg/m^3": "g/cm^3"}
+"""What a unit is usually called."""
 
 
 class SceneError(ValueError):
@@ -38,8 +40,8 @@ class SceneError(ValueError):
     ...     scene.load("paper", overrides={"gravity": -1, "discretization.links": 0})
     ... except SceneError as error:
     ...     print(error)
-    paper.toml.discretization.links = 0 is outside [1, 200]
-    paper.toml.gravity = -1 is outside [0, 100] m/s^2
+    discretization.links = 0 is outside [1, 200]
+    gravity = -1 is outside [0, 100] m/s^2
     """
 
     def __init__(self, problems: list[str]):
@@ -97,11 +99,34 @@ def nearest(name: str, names: typing.Iterable[str]) -> str:
 
 
 def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, str] | None:
-    """The factor between units, and what was mixed up, that would bring a value into its range."""
+    """The factor between units, and what was mixed up, that would bring a value into its range.
+
+    None for a value in its range, and for a number without a unit.
+
+    >>> unit_slip(18.0, "m", 0.005, 0.1)
+    (0.001, 'mm given where m is expected')
+    >>> unit_slip(141.0, "Pa", 1e3, 1e6)
+    (1000.0, 'kPa given where Pa is expected')
+    """
     if low <= value <= high or value == 0 or not math.isfinite(value):
         return None
-    slips = _ANGLE_SLIPS if unit == "rad" else _UNIT_SLIPS
-    return next(((f, why) for f, why in slips if low <= value * f <= high), None)
+    return next(((f, why) for f, why in _slips(unit) if low <= value * f <= high), None)
+
+
+def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
+    """Factors from other units to a unit, and what was mixed up; none for other than SI units."""
+    if unit in _ANGLES:
+        yield _ANGLES[unit]
+    match = _UNIT.fullmatch(unit)
+    if match is None:
+        return
+    prefix, base, rest = match.groups()
+    own = next(power for power, name in _PREFIXES.items() if name == (prefix or ""))
+    for power in _SLIPS:
+        other = _PREFIXES.get(own + power)
+        if other is not None:
+            name = f"{other}{base}{rest}"
+            yield 10.0**power, f"{_COMMON.get(name, name)} given where {unit} is expected"
 
 
 def range_problem(path: str, value: float, unit: str, low: float, high: float) -> str | None:

@@ -18,7 +18,7 @@ from codesign_jax import rollout
 from codesign_jax.codesign import EpisodeInfo, episode_trials
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
-from codesign_jax.engines.base import staged
+from codesign_jax.engines.base import block_lanes, staged
 from codesign_jax.optimize import Optimizer, State
 from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene
@@ -59,6 +59,14 @@ class _Packed(NamedTuple):
     common: tuple
 
 
+class _Stages(NamedTuple):
+    """The programs of an episode, see `engines.base.Staged`."""
+
+    before: Program
+    launch: Any
+    after: Program
+
+
 class Batch:
     """Runs episodes as `codesign.make_episode`'s function does, of many runs in one call.
 
@@ -90,26 +98,25 @@ class Batch:
         Raises:
           ValueError: If there are fewer devices.
         """
-        how = scene, engine, space, num_trials, None
-        self._before = Program(scene, _before(*how), optimizer)
-        self._after = Program(scene, _after(*how), optimizer)
-        self._launch = _launch(*how)
+        self._how = scene, engine, space, num_trials
+        self._optimizer, self._parts = optimizer, None
         self._joins, self._trials, self._limit = staged(engine).joins, num_trials, limit
         self.devices = take(devices)
         self._programs: dict[Any, Callable] = {}
 
     def compile(self, request: Request, runs: int) -> None:
         """Compiles the programs that so many such episodes take."""
-        self._program("before", self._before.compile, *request)
-        packed = jax.eval_shape(self._before, *request)
+        parts = self._stages(request, runs)
+        self._program("before", parts.before.compile, *request)
+        packed = jax.eval_shape(parts.before, *request)
         total, count = min(runs, self._group(request)), len(self.devices)
         shares = _shares(total * _length(packed.blocks), count) if self._joins else [0] * total
         for device, share in zip(self.devices, shares, strict=False):
             blocks = _resized(packed.blocks, share) if self._joins else packed.blocks
             self._launcher(blocks, packed.common, device)
-        out = jax.eval_shape(self._launch, packed.blocks, packed.common)
+        out = jax.eval_shape(parts.launch, packed.blocks, packed.common)
         self._program(
-            "after", self._after.compile, (request.state, _light(packed)), (request.mask, out)
+            "after", parts.after.compile, (request.state, _light(packed)), (request.mask, out)
         )
 
     def __call__(self, requests: Sequence[Request]) -> list[tuple[State, EpisodeInfo]]:
@@ -121,17 +128,36 @@ class Batch:
 
     def _group(self, request: Request) -> int:
         """Runs that are simulated in one call."""
-        worlds = len(request.state.particles) * self._trials
-        return max(1, self._limit * len(self.devices) // worlds)
+        return max(1, self._limit * len(self.devices) // self._worlds(request))
+
+    def _worlds(self, request: Request) -> int:
+        """Worlds of an episode."""
+        return len(request.state.particles) * self._trials
+
+    def _stages(self, request: Request, runs: int) -> "_Stages":
+        """The programs, whose blocks fit the first call's worlds.
+
+        Later calls keep them: runs that end would otherwise make the others' blocks narrower, and
+        all programs would be compiled again in the middle.
+        """
+        if self._parts is None:
+            (scene, engine, *_), joined = self._how, min(runs, self._group(request))
+            worlds = -(-joined * self._worlds(request) // len(self.devices))
+            how = *self._how, block_lanes(engine, worlds), None
+            before = Program(scene, _before(*how), self._optimizer)
+            after = Program(scene, _after(*how), self._optimizer)
+            self._parts = _Stages(before, _launch(*how), after)
+        return self._parts
 
     def _episodes(self, requests: Sequence[Request]) -> list[tuple[State, EpisodeInfo]]:
-        before = self._program("before", self._before.compile, *requests[0])
+        parts = self._stages(requests[0], len(requests))
+        before = self._program("before", parts.before.compile, *requests[0])
         packed = [before(*request) for request in requests]
         found = self._joined(packed) if self._joins else self._one_by_one(packed)
         results = []
         for (state, mask), mine, out in zip(requests, packed, found, strict=True):
             told = (state, _light(mine)), (mask, out)
-            results.append(self._program("after", self._after.compile, *told)(*told))
+            results.append(self._program("after", parts.after.compile, *told)(*told))
         return results
 
     def _joined(self, packed: Sequence[_Packed]) -> Sequence[tuple]:
@@ -157,13 +183,14 @@ class Batch:
         return self._launcher(blocks, common, device)(blocks, common)
 
     def _launcher(self, blocks: tuple, common: tuple, device: Device) -> Callable:
-        place = jax.sharding.SingleDeviceSharding(device)
+        place, parts = jax.sharding.SingleDeviceSharding(device), self._parts
+        assert parts is not None
 
         def lower(blocks: tuple, common: tuple) -> Callable:
             like = jax.tree.map(
                 lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype, sharding=place), (blocks, common)
             )
-            return self._launch.lower(*like).compile()
+            return parts.launch.lower(*like).compile()
 
         return self._program(device, lower, blocks, common)
 
@@ -176,7 +203,9 @@ class Batch:
 
 
 @shared
-def _before(scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, _: None) -> Callable:
+def _before(
+    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, lanes: int | None, _: None
+) -> Callable:
     """Moves a run's particles and prepares their worlds."""
 
     def before(state: State, mask: Any, constants: Constants, optimizer: Optimizer) -> _Packed:
@@ -184,18 +213,22 @@ def _before(scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, _
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         worlds = rollout.crossed(jax.vmap(space.params)(population), noise)
         fields, ctrl, initial = rollout.prepare(scene, *worlds, constants)
-        return _Packed(population, initial, *staged(engine).pack(fields, ctrl))
+        return _Packed(population, initial, *staged(engine, lanes).pack(fields, ctrl))
 
     return before
 
 
 @shared
-def _launch(scene: Scene, engine: Engine, *_: Any) -> Callable:
-    return staged(engine).launch
+def _launch(
+    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, lanes: int | None, _: None
+) -> Callable:
+    return staged(engine, lanes).launch
 
 
 @shared
-def _after(scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, _: None) -> Callable:
+def _after(
+    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, lanes: int | None, _: None
+) -> Callable:
     """Judges a run's worlds and tells its optimiser."""
 
     def after(
@@ -206,7 +239,7 @@ def _after(scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, _:
     ) -> tuple[State, EpisodeInfo]:
         (state, packed), (mask, out) = asked, found
         shape = packed.population.shape[0], num_trials
-        trace = staged(engine).unpack(out, shape[0] * shape[1])
+        trace = staged(engine, lanes).unpack(out, shape[0] * shape[1])
         outcome = rollout.judge(scene, trace, None, packed.initial, constants)
         trials, last = rollout.grid((outcome, trace.last), shape)
         costs = particle_cost(scene.with_constants(constants), trials)

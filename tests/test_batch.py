@@ -5,11 +5,15 @@ import sys
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
-from toy import TINY
+from toy import TINY, tiny
 
-from codesign_jax import cli, runs
-from codesign_jax.batch import take
+from codesign_jax import cli, codesign, runs
+from codesign_jax.batch import LIMIT, Batch, Request, take
+from codesign_jax.compiler import launch
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.kernel import Limits
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
 
@@ -23,21 +27,26 @@ import sys
 import jax
 jax.config.update("jax_num_cpu_devices", 2)
 from codesign_jax import batch, cli
+from codesign_jax.engines.structured import StructuredEngine
 
-seen, call = [], batch.Batch._call
+seen, call, lanes = [], batch.Batch._call, StructuredEngine.block_lanes
 
 def spy(self, blocks, common, device):
     seen.append((device.id, jax.tree.leaves(blocks)[0].shape[0]))
     return call(self, blocks, common, device)
 
 batch.Batch._call = spy
+# As on a GPU, where a smaller batch has narrower blocks.
+StructuredEngine.block_lanes = lambda self, worlds: lanes(self, worlds) // (1 if worlds > 20 else 2)
 run, folder = sys.argv[2:], sys.argv[1]
 assert cli.main([*run, "--seeds", "0-2", "--out", folder + "/many"]) == 0
 assert {device for device, _ in seen} == {0, 1}, seen
 print("shares", *[count for _, count in seen[:2]], "end")
+joined = sum(count for _, count in seen[:2])
 seen.clear()
 assert cli.main([*run, "--seed", "1", "--devices", "1", "--out", folder + "/one"]) == 0
 assert {device for device, _ in seen} == {0}, seen
+assert seen[0][1] > joined / 3, "its blocks are narrower, and there are more of them"
 """
 
 
@@ -49,7 +58,7 @@ def stored(folder):
 
 
 def test_runs_on_two_devices_are_those_of_one_run_on_one(tmp_path):
-    """By the kernel, whose blocks are cut without regard to the runs that they belong to."""
+    """By the kernel, whose blocks are cut without regard to runs, and are narrower for one run."""
     command = [sys.executable, "-c", TWO_DEVICES, str(tmp_path), *RUN]
     root = Path(__file__).parents[1]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
@@ -68,3 +77,43 @@ def test_devices_that_there_are_not(tmp_path, capsys):
     with pytest.raises(ValueError, match="99 devices asked for, "):
         take(99)
     assert take(None) == jax.local_devices()
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """As on a GPU of 132 multiprocessors; programs are laid out and nothing is compiled."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(launch, "_multiprocessors", lambda: 132)
+
+
+def packed_lanes(particles, runs, devices=1, limit=LIMIT):
+    """Lanes and number of the blocks of one of several joined runs, of six trials a particle."""
+    the_scene, space, _ = tiny()
+    filter_ = codesign.make_filter(space)
+    engine = object.__new__(StructuredEngine)  # its constructor looks for the GPU
+    engine.scene, engine.limits = the_scene, Limits(4, 2, 1e-6)
+    batch = Batch(the_scene, engine, space, filter_, 6, devices=1, limit=limit)
+    batch.devices = batch.devices * devices
+    state = filter_.init(jax.random.key(0), space.default(), particles)
+    request = Request(state, np.ones(2, bool))
+    packed = jax.eval_shape(batch._stages(request, runs).before, *request)
+    later = batch._stages(request, 1)
+    assert later is batch._stages(request, runs), "runs that end change no program"
+    count, _, lanes = packed.blocks[0].shape
+    return lanes, count
+
+
+def test_blocks_are_as_narrow_as_the_joined_batch_asks_for(gpu):
+    """Two fingers: 2 lanes a world; 132 multiprocessors have four schedulers each.
+
+    As long as there is a scheduler for every block, blocks have 8 lanes (up to 528 x 8) or 16.
+    """
+    fingers = 2
+    assert len(tiny()[0].hand.finger) == fingers
+    assert packed_lanes(10, 1) == (8, 15)  # 60 worlds, four to a block
+    assert packed_lanes(10, 35)[0] == 8  # 4,200 lanes
+    assert packed_lanes(10, 36) == (16, 8)  # 4,320 lanes; a run's last block has gaps
+    assert packed_lanes(10, 70)[0] == 16  # 8,400 lanes
+    assert packed_lanes(10, 71) == (32, 4)  # 8,520 lanes: whole warps
+    assert packed_lanes(10, 71, devices=2)[0] == 16  # on each of two
+    assert packed_lanes(10, 71, limit=600)[0] == 8  # ten runs in a call

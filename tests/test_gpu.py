@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from codesign_jax.compiler import launch
+from codesign_jax.engines.base import staged
 from codesign_jax.engines.structured import StructuredEngine
 from tests import gpu_cases, small
 
@@ -96,6 +97,24 @@ def test_neighbours_in_a_block_change_no_bit(name):
     for key in ("distance", "height", "speed", "status"):
         want = np.asarray(getattr(few, key))[order]
         np.testing.assert_array_equal(getattr(mixed, key), want, err_msg=key)
+
+
+def test_staged_blocks_are_narrow_for_few_worlds():
+    """What `codesign optimize` simulates by: widths follow the joined batch, bits do not."""
+    scene = gpu_cases.short_scene("hull and fingers")
+    fields, ctrl = gpu_cases.inputs(scene, 40)
+    engine, ctrl = StructuredEngine(scene), ctrl[:, :200]
+    widths = [engine.block_lanes(worlds) for worlds in (40, 16_384)]
+    assert widths[0] < widths[1] == 32
+
+    def run(lanes):
+        parts = staged(engine, lanes)
+        blocks, common = jax.jit(parts.pack)(fields, ctrl)
+        assert blocks[0].shape[-1] == lanes
+        out = jax.jit(parts.launch)(blocks, common)
+        return jax.jit(lambda out: parts.unpack(out, len(ctrl)))(out)
+
+    jax.tree.map(np.testing.assert_array_equal, *map(run, widths))
 
 
 def test_the_default_is_float32_and_the_kernel():

@@ -60,11 +60,27 @@ class Staged(NamedTuple):
     joins: bool
 
 
-def staged(engine: Engine) -> Staged:
-    """The engine's own parts, or the whole rollout as the middle one."""
+def block_lanes(engine: Engine, worlds: int) -> int | None:
+    """Lanes of the blocks in which an engine packs worlds; None if it has no blocks.
+
+    Args:
+      engine: The engine.
+      worlds: Worlds of all batches that one device simulates in a call.
+    """
+    own: Any = getattr(engine, "block_lanes", None)
+    return None if own is None else own(worlds)
+
+
+def staged(engine: Engine, lanes: int | None = None) -> Staged:
+    """The engine's own parts, or the whole rollout as the middle one.
+
+    Args:
+      engine: The engine.
+      lanes: Lanes of its blocks, see `block_lanes`; None for the engine's default.
+    """
     own: Any = getattr(engine, "staged", None)
     if own is not None:
-        return own()
+        return own(lanes)
     return Staged(
         pack=lambda fields, ctrl: ((fields, ctrl), ()),
         launch=lambda blocks, common: engine.rollout(*blocks),

@@ -1,6 +1,6 @@
 """Step and rollout of the structured engine behind the common interface."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from codesign_jax.compiler.launch import KernelUnavailable, available
 from codesign_jax.engines.base import Equal, Staged
 from codesign_jax.engines.structured import coordinates, mesh, transforms
 from codesign_jax.engines.structured.constants import WorldConstants, world_constants
-from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.transforms import Path
 from codesign_jax.model import ModelFields
@@ -167,25 +167,31 @@ class StructuredEngine(Equal):
             return trace, None
         return trace, Path(found["qpos"], found["qvel"], found["acc"], found["moved"] > 0)
 
-    def staged(self) -> Staged:
+    def block_lanes(self, worlds: int) -> int:
+        """See `base.block_lanes`: a GPU with few worlds is faster with narrow blocks."""
+        return lanes_here(self.scene, jnp.result_type(float), worlds)
+
+    def staged(self, lanes: int | None = None) -> Staged:
         """See `base.staged`: the kernel's blocks, which hold a few worlds each."""
 
-        def program(dtype: Any) -> Program:
-            return Program.here(self.scene, self.limits, dtype)
+        def program(width: int) -> Program:
+            return Program(self.scene, self.limits, backend=jax.default_backend(), width=width)
 
         def pack(fields: ModelFields, ctrl: jax.Array) -> tuple[tuple, tuple]:
-            hand, here = world_constants(self.scene, fields), program(ctrl.dtype)
+            here = program(lanes or lanes_here(self.scene, ctrl.dtype))
+            hand = world_constants(self.scene, fields)
             inputs = here.inputs(hand, self.reset(fields), ctrl)
             return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
 
+        # The last axis of the first table, in and out, are the lanes of a block.
         def launch(blocks: tuple, common: tuple) -> tuple:
             try:
-                return tuple(program(blocks[0].dtype).execute((*blocks, *common)))
+                return tuple(program(blocks[0].shape[-1]).execute((*blocks, *common)))
             except KernelUnavailable as error:
                 raise _unavailable(str(error)) from error
 
         def unpack(out: tuple, worlds: int) -> Trace:
-            found, end = program(out[0].dtype).outputs(out, worlds)
+            found, end = program(out[0].shape[-1]).outputs(out, worlds)
             return self._trace(found, end, trajectory=False)
 
         return Staged(pack, launch, unpack, joins=True)

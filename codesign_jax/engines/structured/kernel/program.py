@@ -66,10 +66,9 @@ class Program(Packing):
 
     @classmethod
     def here(cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None) -> "Program":
-        """The program for this device, type and number of worlds, see `launch.block_lanes`."""
-        backend, fingers = jax.default_backend(), layout(scene).dofs.shape[0]
-        total = None if worlds is None else worlds << (fingers - 1).bit_length()
-        return cls(scene, limits, backend=backend, width=block_lanes(backend, dtype, total))
+        """The program for this device, type and number of worlds, see `lanes_here`."""
+        width = lanes_here(scene, dtype, worlds)
+        return cls(scene, limits, backend=jax.default_backend(), width=width)
 
     def run(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
         """Runs a rollout; returns `trace` by name, shape (world, time)."""
@@ -245,6 +244,19 @@ class Program(Packing):
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))
+
+
+def lanes_here(scene: Scene, dtype: Any, worlds: int | None = None) -> int:
+    """Lanes of a block on this device, see `launch.block_lanes`.
+
+    Args:
+      scene: The scene.
+      dtype: Type of the numbers.
+      worlds: Worlds that the device simulates at once; None if they are not known.
+    """
+    fingers = layout(scene).dofs.shape[0]
+    total = None if worlds is None else worlds << (fingers - 1).bit_length()
+    return block_lanes(jax.default_backend(), dtype, total)
 
 
 def _copy(source: Any, target: Any, rows: int, *where: jax.Array, at: tuple = ()) -> None:

@@ -179,8 +179,10 @@ class StructuredEngine(Equal):
 
         def pack(fields: ModelFields, ctrl: jax.Array) -> tuple[tuple, tuple]:
             here = program(lanes or lanes_here(self.scene, ctrl.dtype))
-            hand = world_constants(self.scene, fields)
-            inputs = here.inputs(hand, self.reset(fields), ctrl)
+            hand, state = world_constants(self.scene, fields), self.reset(fields)
+            # What is calculated is apart from how it is laid out, so that XLA rounds alike
+            # whatever the width.
+            inputs = here.inputs(*jax.lax.optimization_barrier((hand, state, ctrl)))
             return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
 
         # The last axis of the first table, in and out, are the lanes of a block.
@@ -191,7 +193,8 @@ class StructuredEngine(Equal):
                 raise _unavailable(str(error)) from error
 
         def unpack(out: tuple, worlds: int) -> Trace:
-            found, end = program(out[0].shape[-1]).outputs(out, worlds)
+            here = program(out[0].shape[-1])
+            found, end = jax.lax.optimization_barrier(here.outputs(out, worlds))
             return self._trace(found, end, trajectory=False)
 
         return Staged(pack, launch, unpack, joins=True)

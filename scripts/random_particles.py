@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import rollout, scene, types
+from codesign_jax.batch import LIMIT
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status
@@ -32,7 +33,7 @@ def main() -> None:
     """Runs the particles chunk by chunk and writes counts and rates."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=100_000)
-    parser.add_argument("--chunk", type=int, default=16_384)
+    parser.add_argument("--chunk", type=int, default=LIMIT)
     parser.add_argument("--scene", default="paper")
     parser.add_argument("--iterations", type=int, default=24)
     parser.add_argument("--evaluations", type=int, default=14)

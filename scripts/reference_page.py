@@ -17,14 +17,14 @@ from codesign_jax import types as data
 from codesign_jax.export import tables as exported
 from codesign_jax.model.layout import AXES, WRIST, joint_axes, layout
 from codesign_jax.optimize import ParticleFilter
-from codesign_jax.scene import Accuracy, Effects, Scene, effects, hand, loading, objects
+from codesign_jax.scene import Accuracy, Effects, Scene, description, effects, hand, objects
 from codesign_jax.scene import load as load_scene
 
 PAGE = Path(__file__).parent.parent / "docs" / "reference.md"
 
 # Files of the package: heading, schema, where the built-in ones are, and what a file is for.
 FILES = (
-    ("Scene files", loading._SceneFile, "codesign_jax/scenes/", "`--scene`"),
+    ("Scene files", description.SceneFile, "codesign_jax/scenes/", "`--scene`"),
     ("Hand files", hand.Hand, "hands/", "`--hand`, or the key `hand` of a scene file"),
     (
         "Object files",

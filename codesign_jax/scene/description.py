@@ -54,13 +54,22 @@ class Constants(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
-    """A simulation's description; built by `load`, changed by `dataclasses.replace`."""
+class SceneFile:
+    """A scene file, which names its hand and objects.
+
+    Attributes:
+      name: Name of the scene, as in results.
+      description: What the scene is, in a line.
+      hand: Name of a built-in hand, or the path of a hand file, relative to the scene file.
+      objects: Name of a built-in object set, or the path of an object file, relative to the scene
+        file.
+      gravity: Acceleration of gravity, only with `effects.gravity`.
+    """
 
     name: str
     description: str
-    hand: hand.Hand
-    objects: objects.ObjectSet
+    hand: str
+    objects: str
     effects: Effects
     phases: Phases
     arm: Arm
@@ -72,6 +81,14 @@ class Scene:
     pneumatics: Pneumatics = Pneumatics()
     newton: Newton = Newton()
     gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene(SceneFile):
+    """A simulation's description; built by `load`, changed by `dataclasses.replace`."""
+
+    hand: hand.Hand
+    objects: objects.ObjectSet
 
     def constants(self) -> Constants:
         """The numbers of the scene's files that are not structure."""

@@ -6,51 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from codesign_jax.scene import hand, keypaths, library, objects, schema
-from codesign_jax.scene.description import Scene
-from codesign_jax.scene.schema import quantity
-from codesign_jax.scene.tables import (
-    Accuracy,
-    Arm,
-    Contact,
-    Cost,
-    Discretization,
-    Effects,
-    Limits,
-    Newton,
-    Phases,
-    Pneumatics,
-    Solver,
-)
-
-
-@dataclasses.dataclass(frozen=True)
-class _SceneFile:
-    """A scene file: a `Scene` with its hand and objects by name.
-
-    Attributes:
-      name: Name of the scene, as in results.
-      description: What the scene is, in a line.
-      hand: Name of a built-in hand, or the path of a hand file, relative to the scene file.
-      objects: Name of a built-in object set, or the path of an object file, relative to the scene
-        file.
-      gravity: Acceleration of gravity, only with `effects.gravity`.
-    """
-
-    name: str
-    description: str
-    hand: str
-    objects: str
-    effects: Effects
-    phases: Phases
-    arm: Arm
-    cost: Cost
-    contact: Contact
-    discretization: Discretization
-    solver: Solver
-    limits: Limits
-    pneumatics: Pneumatics = Pneumatics()
-    newton: Newton = Newton()
-    gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
+from codesign_jax.scene.description import Scene, SceneFile
+from codesign_jax.scene.tables import Accuracy
 
 
 def load(
@@ -82,7 +39,7 @@ def load(
     inside = {key: keypaths.below(changes, key) for key in ("hand", "objects")}
     own = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
     places = keypaths.apply(table, own, path.name, problems)
-    parsed = schema.parse(_SceneFile, table, path.name, problems)
+    parsed = schema.parse(SceneFile, table, path.name, problems)
     if parsed is not None:
         _check(parsed, path.name, problems)
     problems = keypaths.as_given(problems, places)
@@ -161,7 +118,7 @@ def _beside(path: Path, name: str) -> str | Path:
     return path.parent / name if name.endswith(".toml") else name
 
 
-def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
+def _check(scene: SceneFile, where: str, problems: list[str]) -> None:
     problems += check_together(scene, where)
     e = scene.effects
     if e.surface == "hull" and e.friction == "full":
@@ -176,7 +133,7 @@ def _check(scene: _SceneFile, where: str, problems: list[str]) -> None:
         )
 
 
-def check_together(scene: Scene | _SceneFile, where: str) -> list[str]:
+def check_together(scene: SceneFile, where: str) -> list[str]:
     """Returns what is wrong with numbers that are each in range, but do not go together.
 
     Args:

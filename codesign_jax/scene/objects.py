@@ -125,13 +125,9 @@ class _ObjectSetFile:
 
 
 @dataclasses.dataclass(frozen=True)
-class ObjectSet:
+class ObjectSet(_ObjectSetFile):
     """Shapes that the trials cycle through, in the file's order; see `load`."""
 
-    name: str
-    description: str
-    noise: Noise
-    table: Table
     object: tuple[Shape, ...]
 
 

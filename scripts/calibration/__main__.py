@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from codesign_jax import codesign, scene
+from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import keypaths, parameters
@@ -35,7 +36,7 @@ from scripts.shared import provenance, record
 SCENE, PRESET = "paper", "2d"
 # Sets, grid points along a side, trials, most worlds of a call, and what changes in the scene.
 SIZES = {
-    "gpu": (2048, 12, 6, 16_384, {}),
+    "gpu": (2048, 12, 6, LIMIT, {}),
     "cpu": (64, 10, 3, 600, {"discretization.links": 5}),
     "tiny": (4, 3, 3, 54, {"discretization.links": 2}),
 }

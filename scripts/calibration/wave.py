@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import rollout
+from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene
@@ -31,7 +32,7 @@ class Size:
 
     points: int = 12
     trials: int = 6
-    chunk: int = 16_384
+    chunk: int = LIMIT
 
     @property
     def worlds(self) -> int:

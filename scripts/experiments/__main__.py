@@ -15,12 +15,13 @@ from pathlib import Path
 import jax
 
 from codesign_jax import codesign, scene
+from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
 from codesign_jax.scene import keypaths, parameters
 from codesign_jax.scene.schema import SceneError
 from scripts.experiments import Batch, Grid, Stop, Worlds, drive, parquet, plan, results
-from scripts.experiments.worlds import LIMIT, chunking
+from scripts.experiments.worlds import chunking
 from scripts.shared import output, provenance, record
 
 

@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from codesign_jax.batch import LIMIT
 from scripts.experiments import plan
-from scripts.experiments.worlds import LIMIT, chunking
+from scripts.experiments.worlds import chunking
 from scripts.shared import output, provenance
 
 TIMES = ("seconds", "processes", "_settings", "_digest")

@@ -7,13 +7,11 @@ import jax
 import numpy as np
 
 from codesign_jax import rollout
+from codesign_jax.batch import LIMIT
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
-
-LIMIT = 16_384
-"""Default of the largest number of worlds in one call."""
 
 
 class Chunking(NamedTuple):

@@ -17,8 +17,8 @@ import sys
 from pathlib import Path
 
 from codesign_jax import scene
+from codesign_jax.batch import LIMIT
 from codesign_jax.scene.schema import SceneError
-from scripts.experiments.worlds import LIMIT
 from scripts.shared import provenance, record
 from scripts.winners import files as winners_files
 from scripts.winners import variants as winners

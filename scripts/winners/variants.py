@@ -11,11 +11,12 @@ import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax import scene as scenes
+from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import SUCCESS_COST, stream_key
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.types import Outcome
-from scripts.experiments.worlds import LIMIT, Worlds, chunking
+from scripts.experiments.worlds import Worlds, chunking
 from scripts.shared import record as records
 from scripts.shared.record import Arrays
 

@@ -164,7 +164,8 @@ def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
     ("number", "status"),
     [
         (signal.SIGKILL, -signal.SIGKILL),
-        (signal.SIGTERM, 143),
+        # Within this process: test_runs_of_a_batch_stop_fail_and_go_on_by_themselves.
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
         pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
     ],
 )
@@ -474,7 +475,9 @@ def test_a_verdict_comes_with_its_interval():
     assert "every trial failed" in broken and "%" not in broken
 
 
-@pytest.mark.parametrize("optimizer", ["particle-filter", "cma-es"])
+@pytest.mark.parametrize(
+    "optimizer", ["particle-filter", pytest.param("cma-es", marks=pytest.mark.slow)]
+)
 def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
     run = [*RUN, "--optimizer", optimizer]
     long, grown = tmp_path / "long", tmp_path / "grown"

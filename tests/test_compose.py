@@ -44,14 +44,12 @@ def test_vmap_is_a_larger_batch(batch):
     engine = StructuredEngine(scene)
     want = jax.jit(engine.rollout)(fields, ctrl)
     two = jax.tree.map(lambda v: v.reshape(2, 2, 1, *v.shape[1:]), (fields, ctrl))
-    nested = jax.jit(jax.vmap(jax.vmap(engine.rollout)))(*two)
     moved = jnp.moveaxis(two[1], 0, 3)
     mixed = jax.jit(jax.vmap(jax.vmap(engine.rollout), in_axes=(0, 3)))(two[0], moved)
     for name in ("distance", "height", "speed", "status", "last"):
         expected = np.asarray(getattr(want, name))
-        for got in (nested, mixed):
-            found = np.asarray(getattr(got, name)).reshape(expected.shape)
-            np.testing.assert_array_equal(found, expected, err_msg=name)
+        found = np.asarray(getattr(mixed, name)).reshape(expected.shape)
+        np.testing.assert_array_equal(found, expected, err_msg=name)
     shared = jax.jit(jax.vmap(engine.rollout, in_axes=(0, None)))(
         jax.tree.map(lambda v: v[:, None], fields), ctrl[:1]
     )
@@ -141,37 +139,28 @@ def test_a_trajectory_changes_no_outcome(decided):
 # --- a whole optimisation as one program ---------------------------------------------------------
 
 
-def test_a_run_is_the_loop_of_its_episodes_and_vmaps_over_seeds():
-    """By the kernel; each seed of a batch as alone, with its own schedule.
-
-    One episode alone maps as well.
-    """
+def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes():
+    """By the kernel: each seed of a batch with its own schedule, as a loop over single episodes."""
     scene = small.pinch("sphere", **SHORT)
     space = parameters.design_space(scene.hand, "2d")
     optimizer, engine = codesign.make_filter(space), StructuredEngine(scene)
-    episode = codesign.make_episode(scene, engine, space, optimizer, 2)
     run = codesign.make_run(scene, engine, space, optimizer, 2)
     seeds = [(0, (0.1, 0.05), "concurrent"), (7, (0.09, 0.03), "control")]
     starts = [optimizer.init(jax.random.key(k), np.array(d), 3) for k, d, _ in seeds]
     masks = np.stack([schedule(n, np.array(space.is_morphology), 2) for *_, n in seeds])
     batch = jax.tree.map(lambda *v: jnp.stack(v), *starts)
     ends, infos = jax.jit(jax.vmap(run), compiler_options=QUICK)(batch, masks)
-    _, firsts = jax.jit(jax.vmap(episode), compiler_options=QUICK)(batch, masks[:, 0])
-    run, episode = (jax.jit(f, compiler_options=QUICK) for f in (run, episode))
+    episode = codesign.make_episode(scene, engine, space, optimizer, 2)
+    episode = jax.jit(episode, compiler_options=QUICK)
     # XLA rounds the model fields of these programs differently in their last bit, which moves the
     # states at the end by 1e-5, but no loss by a step, which would be 4e-2 of cost.
     close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
     for k, state in enumerate(starts):
-        end, info = run(state, masks[k])
         for e in range(2):
             state, want = episode(state, masks[k, e])
-            for a, b in zip(jax.tree.leaves(info), jax.tree.leaves(want), strict=True):
-                close(a[e], b)
-        close(end.particles, state.particles)
-        close(ends.particles[k], end.particles)
-        for a, b in zip(jax.tree.leaves(infos), jax.tree.leaves(info), strict=True):
-            close(a[k], b)
-    close(firsts.trials.cost, infos.trials.cost[:, 0])
+            for a, b in zip(jax.tree.leaves(infos), jax.tree.leaves(want), strict=True):
+                close(a[k, e], b)
+        close(ends.particles[k], state.particles)
     assert np.ptp(infos.trials.cost) > 0.1 and (infos.trials.status & ~int(WARNINGS) == 0).any()
 
 
@@ -246,9 +235,11 @@ def test_a_cost_does_not_read_what_was_not_simulated():
     params = jax.tree.map(lambda v: v[None], space.params(jnp.array([0.05, 0.0])))
     trial = jax.tree.map(lambda v: v[None], rollout.nominal_trial(scene))
 
-    def evaluate(cost, **flags):
-        run = jax.jit(lambda p, t: rollout.evaluate(scene, engine, p, t, cost=cost, **flags))
-        return float(run(params, trial).cost[0, 0])
+    def cost_of(p, t, cost, **flags):
+        return rollout.evaluate(scene, engine, p, t, cost=cost, **flags).cost[0, 0]
+
+    def trace_it(cost, **flags):  # without a compile
+        jax.eval_shape(partial(cost_of, cost=cost, **flags), params, trial)
 
     def height(scene, trace, ctrl):
         return trace.height[-1]
@@ -257,13 +248,21 @@ def test_a_cost_does_not_read_what_was_not_simulated():
     for cost in (height, lambda s, t, u: jitted(t), lambda s, t, u: t[1][-1]):
         words = "pass trajectory=True beside cost= to have all of the grasp, or trajectory=False"
         with pytest.raises(ValueError, match=words):
-            evaluate(cost)
-    assert evaluate(height, trajectory=True) == evaluate(height, trajectory=False) == 0.5
-    assert evaluate(lambda s, t, u: jitted(t), trajectory=False) == 0.5
+            trace_it(cost)
     for flags in ({}, {"trajectory": False}):
         with pytest.raises(ValueError, match="trace.qpos, which is recorded with trajectory=True"):
-            evaluate(lambda s, t, u: t.qpos[-1, -5], **flags)
-    assert evaluate(lambda s, t, u: u[0, 0] * 0 + 1.5) == 1.5  # reads nothing of the trace
+            trace_it(lambda s, t, u: t.qpos[-1, -5], **flags)
+
+    @jax.jit
+    def allowed(p, t):
+        return [
+            cost_of(p, t, height, trajectory=True),
+            cost_of(p, t, height, trajectory=False),
+            cost_of(p, t, lambda s, t, u: jitted(t), trajectory=False),
+            cost_of(p, t, lambda s, t, u: u[0, 0] * 0 + 1.5),  # reads nothing of the trace
+        ]
+
+    assert [float(v) for v in allowed(params, trial)] == [0.5, 0.5, 0.5, 1.5]
     make = codesign.make_evaluate(scene, engine, space, 1, cost=height)
     with pytest.raises(ValueError, match=r"reads trace\.height"):
         make(jnp.array([[0.05, 0.0]]), jax.random.key(0))
@@ -283,37 +282,59 @@ FREE = SHORT | {
 
 
 def bent(scene, engine, world, x, broken):
-    """A number of a whole grasp from factors on length, pressure and Young's modulus.
+    """A number of each of some whole grasps, from factors on length, pressure and Young's modulus.
 
-    The object is lost as the window opens, and with `broken` the world fails before: what the
-    trace repeats from then on counts.
+    The object is lost as the window opens, and `broken` worlds fail before: what the trace repeats
+    from then on counts.
+
+    Args:
+      scene: The scene.
+      engine: The engine.
+      world: Params and trial that all worlds share.
+      x: The factors, shape (world, 3).
+      broken: Bool, shape (world,).
     """
     hand, trial = jax.tree.map(
         lambda v: jnp.asarray(v, x.dtype if v.dtype.kind == "f" else None), world
     )
-    hand = hand._replace(length=x[0] * hand.length, pressure=x[1] * hand.pressure)
-    fields = model.model_fields(scene, hand, trial)
-    fields = fields._replace(jnt_stiffness=x[2] * fields.jnt_stiffness)
-    ctrl = control.commands(scene, hand, trial)
-    ctrl = ctrl.at[40:, 6].set(jnp.where(broken, jnp.nan, ctrl[40:, 6]))
-    trace = engine.rollout(jax.tree.map(lambda v: v[None], fields), ctrl[None])
+
+    def inputs(x, broken):
+        new = hand._replace(length=x[0] * hand.length, pressure=x[1] * hand.pressure)
+        fields = model.model_fields(scene, new, trial)
+        fields = fields._replace(jnt_stiffness=x[2] * fields.jnt_stiffness)
+        ctrl = control.commands(scene, new, trial)
+        return fields, ctrl.at[40:, 6].set(jnp.where(broken, jnp.nan, ctrl[40:, 6]))
+
+    trace = engine.rollout(*jax.vmap(inputs)(x, broken))
     random = np.random.default_rng(0)
     weights = random.normal(size=trace.last.shape[1]), random.normal(size=trace.distance.shape[1])
-    return trace.last[0] @ weights[0] + trace.distance[0] @ weights[1]
+    return trace.last @ weights[0] + trace.distance @ weights[1]
 
 
-def test_gradients_by_the_kernel_equal_central_differences():
-    """`vmap` of `grad` in float64, of a world that is lost and of one that fails."""
+def slopes_of_a_batch(value, x, broken):
+    return jax.grad(lambda x: value(x, broken).sum())(x)
+
+
+def slopes_by_vmap(value, x, broken):
+    return jax.vmap(jax.grad(lambda x, b: value(x[None], b[None])[0]))(x, broken)
+
+
+# A mapped derivative is traced twice, before and behind the map: that costs half a test more.
+@pytest.mark.parametrize(
+    "slopes", [slopes_of_a_batch, pytest.param(slopes_by_vmap, marks=pytest.mark.slow)]
+)
+def test_gradients_by_the_kernel_equal_central_differences(slopes):
+    """In float64, of a world that is lost and of one that fails."""
     scene = small.pinch("sphere", **FREE)
     engine = StructuredEngine(scene, iterations=60, tolerance=1e-22)
     with jax.enable_x64(True):
         value = partial(bent, scene, engine, small.hand_world(scene, pressure=50e3))
         x, broken = jnp.array([[1.0, 1.0, 1.0], [0.9, 1.1, 1.2]]), jnp.array([False, True])
-        slope = jax.jit(jax.vmap(jax.grad(value)), compiler_options=QUICK)(x, broken)
+        slope = jax.jit(partial(slopes, value), compiler_options=QUICK)(x, broken)
         step = 1e-5 * jnp.eye(3)
         sides = jnp.stack([x[:, None] + step, x[:, None] - step])
         every = jnp.broadcast_to(broken[:, None], sides.shape[:-1])
-        both = jax.jit(jax.vmap(value), compiler_options=QUICK)
+        both = jax.jit(value, compiler_options=QUICK)
         high, low = np.asarray(both(sides.reshape(-1, 3), every.ravel())).reshape(every.shape)
     assert np.isfinite(slope).all() and (np.abs(slope) > 1e-3).all()
     # A step of 1e-5 loses 1e-10 to truncation and 1e-11 to rounding.
@@ -323,8 +344,11 @@ def test_gradients_by_the_kernel_equal_central_differences():
 def test_what_has_no_derivative_says_so():
     """Forward mode and second derivatives, before anything is compiled."""
     scene = small.pinch("sphere", **FREE)
-    engine, x = StructuredEngine(scene), jnp.ones(3)
-    value = partial(bent, scene, engine, small.hand_world(scene), broken=False)
+    engine, world, x = StructuredEngine(scene), small.hand_world(scene), jnp.ones(3)
+
+    def value(x):
+        return bent(scene, engine, world, x[None], jnp.zeros(1, bool))[0]
+
     with pytest.raises(TypeError, match="forward-mode"):
         jax.jit(lambda x: jax.jvp(value, (x,), (x,))).lower(x)
     with pytest.raises(NotImplementedError, match="first derivatives only"):

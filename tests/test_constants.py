@@ -1,6 +1,7 @@
 """Numbers of scene, hand and objects are data: nothing compiles, files and constants agree."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -85,10 +86,7 @@ def test_scenes_that_differ_in_numbers_share_their_structure():
 
 
 def test_changing_any_number_compiles_nothing(monkeypatch):
-    """Neither XLA's program nor the kernel, for a number of each table and for all at once.
-
-    Mapped over two sets of numbers it is the loop over them.
-    """
+    """Neither XLA's program nor the kernel, for a number of each table and for all at once."""
     the_scene, compiled = short(), []
     engine, original = make_engine("structured", the_scene), launch.launch
 
@@ -101,12 +99,10 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     params, trials = jax.tree.map(lambda v: jnp.broadcast_to(v, (2, *v.shape)), world)
     trials = trials._replace(shape=jnp.zeros(2, jnp.int32))
 
-    @jax.jit
-    def heights(constants):
+    @partial(jax.jit, compiler_options=QUICK)
+    def height(constants):
         outcome, trace = rollout.simulate(the_scene, engine, params, trials, constants=constants)
         return trace.height[:, -1], outcome.cost
-
-    height = jax.jit(heights, compiler_options=QUICK)
 
     constants = in_float32(the_scene.constants())
     first = height(constants)
@@ -117,16 +113,11 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     changed = height(other)
     assert height._cache_size() == 1 and len(compiled) == 1
     assert not np.allclose(first[0], changed[0], rtol=1e-2)
-    both = jax.tree.map(lambda *v: jnp.stack(v), constants, other)
-    every = jax.jit(jax.vmap(heights), compiler_options=QUICK)(both)
-    for mapped, *alone in zip(every, first, changed, strict=True):
-        # XLA's two programs round model fields differently by 1e-7, and a few contacts follow.
-        np.testing.assert_allclose(mapped, np.stack(alone), rtol=1e-4)
     # A scene read from other files asks for the same kernel.
     again = as_file(the_scene, other)
     other_engine = make_engine("structured", again)
     jax.eval_shape(lambda: rollout.simulate(again, other_engine, params, trials))
-    assert len(compiled) == 3 and len(set(compiled)) == 1
+    assert len(compiled) == 2 and len(set(compiled)) == 1
 
 
 SLOW = pytest.mark.slow

@@ -295,11 +295,11 @@ def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
     from toy import TINY
 
     folder = tmp_path / "run"
-    sizes = ["--particles", "2", "--trials", "2", "--episodes", "2", "--test-trials", "0"]
+    sizes = ["--particles", "3", "--trials", "2", "--episodes", "2", "--test-trials", "0"]
     arguments = ["optimize", "--scene", str(TINY), "--out", str(folder), *sizes]
     assert cli.main([*arguments, "--set", "limits.speed=1"]) == 1
     message = capsys.readouterr().err
-    assert "every one of 4 trials failed (SPEED 4)" in message
+    assert "every one of 6 trials failed (SPEED 6)" in message
     assert "discretization.timestep" in message and "codesign replay" in message
 
 

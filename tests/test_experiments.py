@@ -183,6 +183,7 @@ run(2)
 """
 
 
+@pytest.mark.slow  # the quick tests have it of `codesign optimize` (test_batch)
 def test_two_devices_give_the_bits_of_one(tmp_path):
     """Chunks of a step are dealt to the devices; 3 chunks on 2 leave one idle at the end."""
     paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]

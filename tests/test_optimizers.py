@@ -80,7 +80,7 @@ def test_each_finds_the_minimum_better_than_random_search():
     found = {}
     for name in NAMES:
         made = make_optimizer(name, SPACE)
-        ends = [run(made, start(made, seed), OPEN)[0] for seed in range(3)]
+        ends = [run(made, start(made, seed), OPEN)[0] for seed in range(2)]
         found[name] = np.array([sphere(np.asarray(end.particles)).min() for end in ends])
     for name in set(NAMES) - {"random"}:
         assert (found[name] < found["random"]).all(), found
@@ -214,9 +214,9 @@ def test_steps_of_cma_es_do_not_shrink_on_a_plateau():
     assert 0.2 < float(state.memory["strategy"]["std"]) / 0.25 < 5
 
 
-@pytest.mark.parametrize(
-    "name", ["cma-es", *(pytest.param(name, marks=pytest.mark.slow) for name in EVOSAX[1:])]
-)
+# The same of the particle filter, by the kernel, is one of the quick tests (test_compose).
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVOSAX)
 def test_a_whole_run_is_its_episodes_with_one_compile(name):
     """Toy engine, a cost of one's own: a loop, `make_run`, and a batch of seeds."""
     the_scene, space, engine = tiny()

@@ -40,7 +40,10 @@ def setting(shape, **params):
     return scene, oracle, np.asarray(fields.start), batch, np.asarray(ctrl)
 
 
-@pytest.mark.parametrize("shape", small.SHAPES)
+# A box and a cylinder are in the quick tests of effects and of blocks (test_effects, test_kernel).
+@pytest.mark.parametrize(
+    "shape", ["sphere", *(pytest.param(s, marks=pytest.mark.slow) for s in ("box", "cylinder"))]
+)
 def test_every_step_of_a_grasp_equals_mujocos(shape):
     """Converged accelerations along the kernel's own path, contacts included."""
     with jax.enable_x64(True):

@@ -1,6 +1,7 @@
 """Do winners hold?  Final particles simulated again with other engines, steps, hands, objects."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import SUCCESS_COST, stream_key
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import Scene, keypaths, parameters
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome
 from scripts.experiments.worlds import Worlds, chunking
 from scripts.shared import record as records
@@ -163,7 +165,7 @@ class Task:
         space = parameters.design_space(scene.hand, self.finals.preset)
         designs = self.finals.chosen(self.variant.best)
         chunk = chunking(int(np.prod(designs.shape[:2])) * self.trials, limit).size
-        worlds = Worlds(scene, make_engine(self.variant.engine, scene), space, chunk=chunk)
+        worlds = _worlds(scene, self.variant.engine, space, chunk)
         key = stream_key(jax.random.key(0), STREAM_WINNERS, self.block)
         trials = jax.tree.map(lambda v: v[None], rollout.sample_trials(scene, key, self.trials))
         flat = designs.reshape(1, 1, -1, designs.shape[-1])
@@ -173,6 +175,12 @@ class Task:
             f"{self.key}|cost": found.cost.reshape(shape).astype(np.float16),
             f"{self.key}|status": found.status.reshape(shape).astype(np.uint8),
         }
+
+
+@functools.lru_cache(maxsize=8)
+def _worlds(scene: Scene, engine: str, space: DesignSpace, chunk: int) -> Worlds:
+    """The simulation of a variant: its blocks and experiments share one compiled program."""
+    return Worlds(scene, make_engine(engine, scene), space, chunk=chunk)
 
 
 def tasks(

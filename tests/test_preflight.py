@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import model, scene
+from codesign_jax import model, scene, start
 from codesign_jax.commands import clearance, preflight
 from codesign_jax.scene import parameters
 from codesign_jax.types import Params
@@ -60,6 +60,23 @@ def test_starts_inside_table_or_object_are_refused_and_those_called_clear_are_cl
     assert [text.split(":")[0] for text in refusals] == [f"design {i}" for i in deep]
     for part in (f"starts {1e3 * exact[deep[0]]:.0f} mm", "'box'", "raise arm.start_height = 0.15"):
         assert part in refusals[0]
+
+
+def test_fingers_overlap_as_deep_as_engines_find():
+    """`start.depth_between`, of random hands whose mounts are close."""
+    the_scene = scene.load("paper_spheres", overrides={"effects": {"finger_finger": True}})
+    designs = hands(the_scene, 16)
+
+    @jax.jit
+    def depths(designs):
+        fields = jax.vmap(lambda p: model.model_fields(the_scene, p, still()))(designs)
+        return start.depth_between(the_scene, fields)
+
+    with jax.enable_x64(True):
+        exact = depths(designs)
+    found = clearance.between_fingers(the_scene, designs)
+    np.testing.assert_allclose(found, exact, atol=1e-12)
+    assert np.ptp(found) > 0.003
 
 
 def test_an_ordinary_start_needs_no_program(monkeypatch):

@@ -1,6 +1,7 @@
 """Which designs start deep inside the table, an object or themselves, before any simulation."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from codesign_jax import model, rollout
 from codesign_jax.model.layout import palm_points
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.objects import Shape
-from codesign_jax.start import depth, depth_between
+from codesign_jax.start import depth
 from codesign_jax.types import Params
 
 
@@ -35,13 +36,44 @@ def overlaps(scene: Scene, designs: Params) -> np.ndarray:
 def between_fingers(scene: Scene, designs: Params) -> np.ndarray:
     """Deepest overlap of two fingers at each design's start [m], shape (design,).
 
+    As `start.depth_between` has it, which engines judge a start by: spheres around the middles of
+    the links of straight fingers.  Here no program is traced for it.
+
     Args:
       scene: The scene.
       designs: Parameters with leading axis (design,), NumPy arrays.
     """
-    if not scene.effects.finger_finger:
+    if not scene.effects.finger_finger or scene.num_fingers == 1:
         return np.zeros(designs.length.shape[0])
-    return np.asarray(_between(*_arguments(scene, designs)))
+    return np.array([_between(scene, Params(*one)) for one in zip(*designs, strict=True)])
+
+
+def _between(scene: Scene, params: Params) -> float:
+    """`between_fingers` of one design."""
+    links, fingers = scene.discretization.links, scene.hand.finger
+    azimuth, tilt = _directions(scene, params)
+    cosine, sine = np.cos(azimuth), np.sin(azimuth)
+    points = [f.base_point(c, s) for f, c, s in zip(fingers, cosine, sine, strict=True)]
+    base = np.column_stack([np.array(points), np.zeros(len(points))])
+    ahead = np.stack([np.cos(tilt) * cosine, np.cos(tilt) * sine, -np.sin(tilt)], -1)
+    back = np.stack([np.sin(tilt) * cosine, np.sin(tilt) * sine, np.cos(tilt)], -1)
+    # The last link is half as long as the others.
+    place = (np.arange(1, links + 1) - 0.25 * (np.arange(links) == links - 1)) / links
+    along = np.multiply.outer(params.length, place)[..., None] * ahead[:, None]
+    middle = (base + 0.5 * params.height[:, None] * back)[:, None] + along
+    deepest = -np.inf
+    for a, b in itertools.combinations(range(len(fingers)), 2):
+        away = np.linalg.norm(middle[a][:, None] - middle[b][None], axis=-1)
+        deepest = max(deepest, 0.5 * (params.height[a] + params.height[b]) - away.min())
+    return float(deepest)
+
+
+def _directions(scene: Scene, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuths and tilts of the fingers in the palm's frame [rad], shape (finger,)."""
+    fingers = scene.hand.finger
+    azimuth = np.deg2rad([f.azimuth for f in fingers])
+    azimuth = azimuth + np.array([f.spread for f in fingers]) * float(params.spread)
+    return azimuth, np.deg2rad([f.tilt for f in fingers])
 
 
 def lowest_point(scene: Scene, params: Params) -> float:
@@ -59,9 +91,7 @@ def lowest_point(scene: Scene, params: Params) -> float:
     roll, pitch, yaw = (float(v) for v in params.arm[3:])
     # Heights only: the last row of the palm's orientation.
     up = (_about(0, roll) @ _about(2, yaw) @ _about(1, -pitch))[2]
-    azimuth = np.deg2rad([f.azimuth for f in fingers])
-    azimuth = azimuth + np.array([f.spread for f in fingers]) * float(params.spread)
-    tilt = np.deg2rad([f.tilt for f in fingers])
+    azimuth, tilt = _directions(scene, params)
     cosine, sine = np.cos(azimuth), np.sin(azimuth)
     outwards = cosine * up[0] + sine * up[1]
     across = -sine * up[0] + cosine * up[1]
@@ -96,15 +126,9 @@ def _about(axis: int, angle: float) -> np.ndarray:
 
 
 def _arguments(scene: Scene, designs: Params) -> tuple[Scene, Constants, Params]:
-    """What the programs below take: scenes of one structure share them."""
+    """What the program below takes: scenes of one structure share it."""
     numbers = jax.tree.map(np.float32, scene.constants())
     return scene.structure, numbers, Params(*(v.astype(np.float32) for v in designs))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _between(scene: Scene, numbers: Constants, designs: Params) -> jax.Array:
-    own, trial = scene.with_constants(numbers), rollout.nominal_trial(scene)
-    return depth_between(scene, jax.vmap(lambda p: model.model_fields(own, p, trial))(designs))
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -140,8 +140,7 @@ class Export(Subject):
     tolerance: Literal["free", "all", "off"] = "free"
     """How far which parameters may drift, from simulated grasps: the design space's free ones (in
     2d at most 756 grasps, about 20 s on two cores), those of the hand's whole table (at most 8,316
-    grasps, about 3 min; one H200: seconds), or none. The number and the time are told before they
-    are simulated; after Ctrl-C the same command goes on."""
+    grasps, about 3 min), or none. Number and time are told before they are simulated."""
     tolerance_steps: int = 5
     """Values of a parameter to try on each side, until one fails."""
     tolerance_trials: int = 36

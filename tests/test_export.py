@@ -14,13 +14,14 @@ from toy import TINY
 
 from codesign_jax import cli, rollout, scene
 from codesign_jax.cost import outcome
+from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.export import grasps, mjcf, plain, tables
+from codesign_jax.export import grasps, mjcf, plain, skin, tables
 from codesign_jax.export.play import play
-from codesign_jax.model import build_spec
+from codesign_jax.model import build_spec, hull
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status, Trial, failed
-from tests.small import batch_inputs, hand_world, nth, pinch, stack
+from tests.small import batch_inputs, hand_world, nth, pinch, random_designs, stack
 
 # A grasp in 2.2 s, with all joints and contacts.
 HURRIED = {
@@ -153,27 +154,83 @@ def test_what_plain_mujoco_does_not_simulate_is_named():
     household = scene.load("paper", object_set="household")
     assert any("'mug' is a mesh" in text for text in plain.obstacles(household))
     assert not plain.obstacles(pinch()) and not plain.stand_in(pinch())
-    assert 'effects.surface = "hull" is not in the model' in plain.stand_in(household)
+    assert 'effects.surface = "hull" is in the model as points' in plain.stand_in(household)
 
 
-def test_a_box_stands_in_for_the_hull_around_each_link():
-    """It has the link's ends and section, and contacts as stiff as declared."""
-    the_scene = pinch("box", links=2, effects__surface="hull", **HURRIED)
+@pytest.fixture(scope="module")
+def skinned():
+    """A scene with the hull, contact between fingers and one object, a hand, and its spec."""
+    the_scene = pinch(
+        "box", links=2, effects__surface="hull", effects__finger_finger=True, **HURRIED
+    )
     params, trial = hand_world(the_scene, length=0.08)
-    found = grasps.grasp(the_scene, params, trial)
-    assert np.isfinite(found.states).all()
-    model, data = mujoco.MjModel.from_xml_string(found.xml), None
+    alone, trial = plain.single_object(the_scene, trial)
+    spec = build_spec(alone, params, trial)
+    return alone, params, trial, spec, skin.add(alone, spec, params)
+
+
+def test_points_of_two_links_stand_in_for_a_blended_vertex(skinned):
+    """Weighted, both are where the skin's vertex is, however the finger bends."""
+    alone, params, _, spec, shares = skinned
+    model = spec.compile()
     data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    data.qpos[:] = np.random.default_rng(0).uniform(-0.4, 0.4, model.nq)
     mujoco.mj_kinematics(model, data)
-    # Half a segment stays with the palm; the links end at 60 and 80 mm along the straight finger.
-    base, tip = data.body("finger_0_link_0"), data.geom("finger_0_box_2")
-    corner = tip.xpos + tip.xmat.reshape(3, 3) @ model.geom("finger_0_box_2").size
-    expected = [0.08, the_scene.hand.section.width / 2, params.height[0]]
-    np.testing.assert_allclose(base.xmat.reshape(3, 3).T @ (corner - base.xpos), expected)
-    assert model.geom("finger_1_box_1").size[0] == pytest.approx(0.02)
-    when, _, states = play(model, found.controls)
-    # The file and the declared model part by rounding, which boxes' changing corners let grow.
+    links = range(alone.discretization.links + 1)
+    bodies = [data.body(f"finger_1_link_{i}") for i in links]
+    position = np.array([body.xpos for body in bodies])
+    rotation = np.array([body.xmat.reshape(3, 3) for body in bodies])
+    length, height = params.length[1], params.height[1]
+    vertices = hull.pose(alone, length, height, position, rotation)
+    found: dict[tuple, list] = {}
+    for name, share in shares.items():
+        _, finger, _, row, k, _ = name.split("_")
+        if finger == "1":
+            found.setdefault((int(row), int(k)), []).append((share, data.geom(name).xpos))
+    means = {key: sum(s * x for s, x in v) / sum(s for s, _ in v) for key, v in found.items()}
+    ring = alone.discretization.hull_points
+    for (row, k), mean in means.items():
+        rows = row * alone.discretization.hull_rings * ring + k
+        vertex = vertices[min(1 + ring + rows, len(vertices) - 1)]  # the tip's last ring is a point
+        np.testing.assert_allclose(mean, vertex, atol=1e-12)
+    # The skin without its base: four sides of 80 mm, and the tip's face; the half rows at the base
+    # belong to the palm.
+    width, segment = alone.hand.section.width, length / alone.discretization.links
+    sides = 2 * (width + height) * (length - segment / alone.discretization.hull_rings / 2)
+    total = sum(share for name, share in shares.items() if name.startswith("finger_1"))
+    assert total == pytest.approx((sides + width * height) / width**2)
+
+
+def test_a_point_is_as_stiff_as_its_share_of_the_surface(skinned):
+    """K I, B and R of every constraint row of the file and of the model with declared weights."""
+    alone, _, _, spec, shares = skinned
+    rows = []
+    declared = plain.engine_model(alone, spec, shares)
+    for model in (declared, mujoco.MjModel.from_xml_string(plain.text(alone, spec.copy(), shares))):
+        data = mujoco.MjData(model)
+        data.qpos[2], data.qpos[-7:-4] = 0.005, [0.03, 0, 0.02]
+        mujoco.mj_forward(model, data)
+        k, b, impedance = data.efc_KBIP[:, :3].T
+        rows.append(np.stack([k * impedance, b, data.efc_R]))
+    np.testing.assert_allclose(rows[1], rows[0], rtol=1e-10)  # rounding
+    touching = 0
+    for contact in data.contact:
+        names = [model.geom(g).name for g in contact.geom]
+        share = min(shares.get(name, 1.0) for name in names)
+        stiffness = rows[0][0] / rows[0][2]  # k_n = K I / R
+        bodies = 1 if "table" in names else 2
+        expected = share * alone.contact.normal_stiffness * 2 / bodies
+        assert stiffness[contact.efc_address] == pytest.approx(expected, rel=1e-9)
+        touching += share < 1
+    assert touching > 10
+
+
+def test_a_grasp_of_the_skin_is_its_file_s(skinned):
+    alone, params, trial, *_ = skinned
+    found = grasps.grasp(alone, params, trial)
+    assert np.isfinite(found.states).all()
+    when, _, states = play(mujoco.MjModel.from_xml_string(found.xml), found.controls)
+    # The file and the declared model part by rounding, which contacts let grow.
     assert np.isinf(when) == np.isinf(found.outcome.lost_time)
     assert np.abs(states[:70] - found.states[:70]).max() < 1e-6
 
@@ -307,6 +364,26 @@ def test_a_hundred_grasps_have_the_engine_s_verdicts():
         apart.append(errors(states, trace, i))
     # Rounding grows where fingers slide: half of the grasps stay together to the end.
     assert np.median(apart, axis=0).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_the_hull_s_stand_in_has_nearly_the_engine_s_verdicts():
+    """Forty grasps of the default scene, of designs of the 2D space.
+
+    Of a hundred such grasps 93 ended alike; with 93 % at least 32 of forty do in 99.8 % of cases.
+    The engine agrees with itself in 91 of them if every object is moved by a micrometre.
+    """
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "2d")
+    designs = np.repeat(random_designs(space, 7, 20), 2, 0)
+    params = jax.vmap(space.params)(designs)
+    trials = rollout.sample_trials(the_scene, jax.random.key(11), 40)
+    engine = make_engine("structured", the_scene)
+    judged = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t)[0])(params, trials)
+    kept = np.isinf(judged.lost_time)
+    assert 8 < kept.sum() < 32
+    outcomes = [grasps.grasp(the_scene, nth(params, i), nth(trials, i)).outcome for i in range(40)]
+    assert (np.isinf([o.lost_time for o in outcomes]) == kept).sum() >= 32
 
 
 def test_the_page_has_every_column():

@@ -11,7 +11,7 @@ import numpy as np
 
 from codesign_jax import control, model, verdict
 from codesign_jax.cost import outcome
-from codesign_jax.export import plain
+from codesign_jax.export import plain, skin
 from codesign_jax.export.play import play
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.types import Outcome, Params, Trace, Trial
@@ -47,30 +47,29 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
       params: Parameters as concrete arrays.
       trial: The trial as concrete arrays.
     """
-    skinned = scene.effects.surface == "hull"
-    scene, trial = plain.single_object(plain.rigid_links(scene) if skinned else scene, trial)
+    scene, trial = plain.single_object(scene, trial)
     wide = _wide(params), _wide(trial)
     start, controls = _float64(_start, scene, *wide), schedule(scene, params, trial)
     spec = model.build_spec(scene, *wide, visual=True)
-    if skinned:
-        plain.boxes(scene, spec, wide[0])
+    skinned = scene.effects.surface == "hull"
+    shares = skin.add(scene, spec, wide[0]) if skinned else plain.NONE
     limits = verdict.bounds(scene)
     spec.add_numeric(name="hand_centre", data=model.layout(scene).centre_weights)
     spec.add_numeric(name="lost", data=[limits.lost_distance, limits.start, limits.end])
     spec.add_key(
         name="start", time=0.0, qpos=start, qvel=np.zeros(len(start) - 1), ctrl=controls[0, 1:]
     )
-    compiled = plain.engine_model(scene, spec)
+    compiled = plain.engine_model(scene, spec, shares)
     _, distance, states = play(compiled, controls)
     _add_keys(scene, spec, controls, states)
     try:
-        xml, note = plain.text(scene, spec.copy()), ""
+        xml, note = plain.text(scene, spec.copy(), shares), ""
     except plain.Inexpressible as error:
         xml, note = None, str(error)
     return Grasp(
         xml,
         note,
-        plain.engine_model(scene, spec),
+        plain.engine_model(scene, spec, shares),
         controls,
         states,
         _judge(scene, distance, states, compiled.nq),

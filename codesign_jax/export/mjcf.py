@@ -15,7 +15,8 @@ import numpy as np
 _DIFFERENCE = 1e-12
 """Relative difference between numbers of a model and of its file: rounding of unit vectors."""
 
-_NOT_PHYSICS = ("signature", "names")  # of the spec's whole text, and its strings
+# The signature of the spec's whole text, and its strings. Skins are for looking at only.
+_NOT_PHYSICS = ("signature", "names")
 
 
 def text(spec: mujoco.MjSpec) -> str:
@@ -41,7 +42,7 @@ def text(spec: mujoco.MjSpec) -> str:
 
 def differences(first: mujoco.MjModel, second: mujoco.MjModel) -> list[str]:
     """Names of the arrays and options in which two models differ by more than rounding."""
-    names = [n for n in dir(first) if not n.startswith("_") and n not in _NOT_PHYSICS]
+    names = [n for n in dir(first) if not n.startswith(("_", "skin_")) and n not in _NOT_PHYSICS]
     options = [n for n in dir(first.opt) if not n.startswith("_")]
     pairs = [(n, getattr(first, n), getattr(second, n)) for n in names]
     pairs += [(f"opt.{n}", getattr(first.opt, n), getattr(second.opt, n)) for n in options]

@@ -15,6 +15,8 @@ follows from the normal's R and B.  Formulas of MuJoCo: documentation, Computati
 """
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -23,10 +25,13 @@ from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
 from codesign_jax.model.spec import SOLIMP
 from codesign_jax.scene import Scene
-from codesign_jax.types import Params, Trial
+from codesign_jax.types import Trial
 
 _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 """Of (1 - d) / d, as MuJoCo keeps an impedance d between 0.0001 and 0.9999."""
+
+
+NONE: Mapping[str, float] = MappingProxyType({})
 
 
 class Inexpressible(ValueError):
@@ -49,54 +54,14 @@ def obstacles(scene: Scene) -> list[str]:
 
 
 def stand_in(scene: Scene) -> str:
-    """What of a scene the model has in another form, a sentence; empty if nothing.
-
-    A vertex of the skinned hull follows two links.  MuJoCo's geoms are rigid parts of one body, so
-    that each link becomes the box that the hull is around it.
-    """
+    """What of a scene the model has in another form, a sentence; empty if nothing."""
     if scene.effects.surface != "hull":
         return ""
     return (
-        'effects.surface = "hull" is not in the model: plain MuJoCo\'s geoms are rigid parts of '
-        "single bodies, and a box for each link stands in, so that grasps may end otherwise "
+        'effects.surface = "hull" is in the model as points on the links that its vertices follow: '
+        "plain MuJoCo's geoms are rigid parts of single bodies, so that some grasps end otherwise "
         "(docs/export.md)"
     )
-
-
-def rigid_links(scene: Scene) -> Scene:
-    """The scene with a contact geom on each link, which `boxes` gives its shape."""
-    return dataclasses.replace(
-        scene,
-        effects=dataclasses.replace(scene.effects, surface="spheres"),
-        discretization=dataclasses.replace(scene.discretization, spheres_per_link=1),
-    )
-
-
-def boxes(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
-    """Turns the contact sphere of each link into the link's box.
-
-    Args:
-      scene: A scene of `rigid_links`.
-      spec: Its spec, which is changed.
-      params: Parameters of the hand as concrete arrays.
-    """
-    links, width = scene.discretization.links, scene.hand.section.width
-    for geom in spec.geoms:
-        if "_sphere_" not in geom.name:
-            continue
-        _, finger, _, link, _ = geom.name.split("_")
-        length, height = float(params.length[int(finger)]), float(params.height[int(finger)])
-        extent = length / links * (0.5 if int(link) == links else 1.0)
-        geom.type = mujoco.mjtGeom.mjGEOM_BOX
-        geom.size, geom.pos = [extent / 2, width / 2, height / 2], [extent / 2, 0, height / 2]
-        geom.name = f"finger_{finger}_box_{link}"
-    for pair in spec.pairs:
-        for key in ("geomname1", "geomname2"):
-            setattr(pair, key, _box_name(getattr(pair, key)))
-
-
-def _box_name(name: str) -> str:
-    return name.replace("_sphere_", "_box_").rpartition("_")[0] if "_sphere_" in name else name
 
 
 def single_object(scene: Scene, trial: Trial) -> tuple[Scene, Trial]:
@@ -105,33 +70,43 @@ def single_object(scene: Scene, trial: Trial) -> tuple[Scene, Trial]:
     return dataclasses.replace(scene, objects=alone), trial._replace(shape=np.int32(0))
 
 
-def engine_model(scene: Scene, spec: mujoco.MjSpec) -> mujoco.MjModel:
+def engine_model(
+    scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE
+) -> mujoco.MjModel:
     """Compiles a spec to the model of the engine `mujoco`: inverse weights are the declared ones.
 
     Args:
       scene: The scene.
       spec: A spec of `model.build_spec`; it stays as it is.
+      shares: Stiffness of geoms that are not as stiff as declared, see `skin.add`.
     """
+    if shares:
+        spec = spec.copy()
+        for pair in spec.pairs:
+            if (share := _share(pair, shares)) < 1:
+                _absorb(scene, pair, 1 / share)
     model = spec.compile()
     model.body_invweight0[1:] = contact_invweight(scene)
     return model
 
 
-def text(scene: Scene, spec: mujoco.MjSpec) -> str:
+def text(scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE) -> str:
     """MJCF which plain MuJoCo compiles to a model of the same dynamics as `engine_model`.
 
     Args:
       scene: The scene.
       spec: A spec of `model.build_spec`; its contact pairs are rewritten.
+      shares: As in `engine_model`.
 
     Raises:
       Inexpressible: If a contact would need an impedance that MuJoCo does not take.
     """
     compiled, declared = spec.compile().body_invweight0[:, 0], contact_invweight(scene)
+    body_of = {geom.name: geom.parent.id for geom in spec.geoms}
     for pair in spec.pairs:
         names = pair.geomname1, pair.geomname2
-        bodies = [spec.geom(name).parent.id for name in names]
-        wanted = declared * sum(body > 0 for body in bodies)
+        bodies = [body_of[name] for name in names]
+        wanted = declared * sum(body > 0 for body in bodies) / _share(pair, shares)
         if not _absorb(scene, pair, wanted / compiled[bodies].sum()):
             why = "" if scene.effects.wrist else ", for effects.wrist = false makes the palm heavy"
             raise Inexpressible(
@@ -139,6 +114,11 @@ def text(scene: Scene, spec: mujoco.MjSpec) -> str:
                 f"MuJoCo's 0.0001 to 0.9999{why}; the binary model (.mjb) has the contact"
             )
     return mjcf.text(spec)
+
+
+def _share(pair: mujoco.MjsPair, shares: Mapping[str, float]) -> float:
+    """Stiffness of a pair as a share of the declared one."""
+    return min(shares.get(name, 1.0) for name in (pair.geomname1, pair.geomname2))
 
 
 def _absorb(scene: Scene, pair: mujoco.MjsPair, ratio: float) -> bool:

@@ -28,6 +28,7 @@ from codesign_jax.engines.structured.coordinates import reset
 from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
+from codesign_jax.model.layout import implicit_damping
 from codesign_jax.scene import Scene
 
 
@@ -67,7 +68,7 @@ def with_material(scene: Scene, fields: ModelFields, material: Material) -> Mode
     dofs, h = layout(scene).dofs, scene.discretization.timestep
     scale = material.shear_modulus / scene.hand.material.shear_modulus
     stiffness = fields.jnt_stiffness[dofs] * scale
-    damping = (material.damping_time + h) * stiffness
+    damping = implicit_damping(scene, stiffness, material.damping_time * stiffness)
     return fields._replace(
         jnt_stiffness=fields.jnt_stiffness.at[dofs].set(stiffness),
         dof_damping=fields.dof_damping.at[dofs].set(damping),

@@ -19,11 +19,21 @@ from tests.small import pinch
 
 
 @functools.cache
-def finger_scene(links, *, bending_only=True, gravity=0.0, timestep=0.01, shear_modulus=70e3):
+def finger_scene(
+    links,
+    *,
+    bending_only=True,
+    gravity=0.0,
+    timestep=0.01,
+    shear_modulus=70e3,
+    beta=6e-3,
+    damping="added",
+):
     the_scene = pinch(
         "sphere",
         links=links,
         discretization__timestep=timestep,
+        discretization__spring_damping=damping,
         effects__lateral_bending=not bending_only,
         effects__twist=not bending_only,
         effects__finger_object=False,
@@ -35,7 +45,9 @@ def finger_scene(links, *, bending_only=True, gravity=0.0, timestep=0.01, shear_
         the_scene.hand,
         finger=(hand.Finger(azimuth=0.0, spread=0.0, radius=0.0, tilt=0.0),),
         wrist=hand.Wrist(1e5, 1e4, 1e3, 1e2),
-        material=dataclasses.replace(the_scene.hand.material, shear_modulus=shear_modulus),
+        material=dataclasses.replace(
+            the_scene.hand.material, shear_modulus=shear_modulus, damping_time=beta
+        ),
     )
     return dataclasses.replace(the_scene, hand=one, gravity=gravity)
 
@@ -189,13 +201,17 @@ def test_natural_frequencies():
     np.testing.assert_allclose(ratio, [1.0023, 1.0080, 1.0130], atol=2e-3)
 
 
-def test_ring_down():
-    """Log decrement 2 pi zeta / sqrt(1 - zeta^2) with zeta = (beta + h) omega / 2.
+@pytest.mark.parametrize(
+    "damping, beta, acts",
+    [("added", 6e-3, 7e-3), ("own", 6e-3, 6e-3), ("least", 6e-3, 6e-3), ("least", 5e-4, 1e-3)],
+)
+def test_ring_down(damping, beta, acts):
+    """Log decrement 2 pi zeta / sqrt(1 - zeta^2) with zeta = omega / 2 times a Kelvin-Voigt time.
 
-    Linearly implicit springs act as a Kelvin-Voigt time of beta + h, to first order in h omega,
+    That time is beta + h, beta or max(beta, h) by `spring_damping`, to first order in h omega,
     which is 7e-3 here.
     """
-    finger = Finger(5, timestep=1e-3, length=0.3)
+    finger = Finger(5, timestep=1e-3, length=0.3, damping=damping, beta=beta)
     omega, shape = eigenfrequencies(finger)
     m, d = finger.model, finger.data
     d.qpos[6:11] = 1e-3 * shape[:, 0] / np.abs(shape[:, 0]).max()
@@ -207,14 +223,14 @@ def test_ring_down():
         mujoco.mj_step(m, d)
     angle = np.array(angle)
     peaks = np.flatnonzero((angle[1:-1] > angle[:-2]) & (angle[1:-1] >= angle[2:])) + 1
-    beta, h = finger.scene.hand.material.damping_time, 1e-3
-    zeta = (beta + h) * omega[0] / 2
+    h, zeta = 1e-3, acts * omega[0] / 2
     period = 2 * np.pi / (omega[0] * np.sqrt(1 - zeta**2))
     assert len(peaks) >= 4
     # Four periods of 0.85 s, peaks at whole steps.
     assert (peaks[3] - peaks[0]) / 3 * h == pytest.approx(period, rel=1e-3)
     decrement = np.log(angle[peaks[0]] / angle[peaks[3]]) / 3
-    assert decrement == pytest.approx(2 * np.pi * zeta / np.sqrt(1 - zeta**2), rel=2e-3)
+    # Of a weak damping the first-order term is a larger share: of 1 ms half a per cent.
+    assert decrement == pytest.approx(2 * np.pi * zeta / np.sqrt(1 - zeta**2), rel=6e-3)
 
 
 def test_free_fall():

@@ -291,17 +291,42 @@ def test_implicit_springs_equal_mujocos_discrete_integrator():
     assert worst < 1e-11
 
 
-def test_implicit_springs_are_stable_where_explicit_ones_are_not(tmp_path, monkeypatch):
-    """The stiffest finger of Table I, 10 mm long, at the paper's 10 ms."""
-    the_scene = free_scene()
-    params, trial = hand_world(the_scene, length=0.010, height=0.025, wall=0.007, pressure=150e3)
+STIFF = {"length": 0.010, "height": 0.025, "wall": 0.007, "pressure": 150e3}
+"""The stiffest finger of Table I."""
+
+
+@pytest.mark.parametrize("damping", ["added", "least", "own"])
+def test_implicit_springs_are_stable(damping):
+    """A finger of 10 mm at the paper's 10 ms; its own damping time is 6 ms."""
+    the_scene = free_scene(spring_damping=damping)
+    params, trial = hand_world(the_scene, **STIFF)
     ours = model.compile_model(the_scene, params, trial)
     ctrl = np.array([0, 0, 0.3, 0.3, 0, 0.3, 150e3, 150e3])
-    speeds, data = wobble(ours, 900, ctrl)
+    speeds, _ = wobble(ours, 900, ctrl)
     assert np.isfinite(speeds).all()
     assert np.abs(speeds).max() < 50.0  # the first steps throw the hand towards its target
     assert np.abs(speeds[-100:, :-6]).max() < 1e-6  # and then it rests
+    with jax.enable_x64(True):
+        fields = model.model_fields(the_scene, params, trial)
+    np.testing.assert_allclose(fields.dof_damping, ours.dof_damping, rtol=1e-12)
+    np.testing.assert_allclose(fields.dof_armature, ours.dof_armature, rtol=1e-12)
 
+
+def test_too_little_damping_of_its_own_is_refused():
+    changed = {"discretization.spring_damping": "own", "hand.material.damping_time": 0.004}
+    with pytest.raises(
+        scene.SceneError, match=r"damping_time = 0.004 s must be at least 0.00556 s"
+    ):
+        scene.load("paper", overrides=changed)
+    changed["discretization.timestep"] = 0.005
+    assert scene.load("paper", overrides=changed).discretization.spring_damping == "own"
+
+
+def test_explicit_springs_are_not_stable(tmp_path, monkeypatch):
+    """What the implicit ones are for."""
+    the_scene = free_scene()
+    params, trial = hand_world(the_scene, **STIFF)
+    ctrl = np.array([0, 0, 0.3, 0.3, 0, 0.3, 150e3, 150e3])
     monkeypatch.chdir(tmp_path)  # MuJoCo logs the instability where it runs
     explicit = model.compile_model(the_scene, params, trial)
     with jax.enable_x64(True):

@@ -11,6 +11,7 @@ from codesign_jax.model.layout import (
     Layout,
     contact_invweight,
     geom_bounds,
+    implicit_damping,
     layout,
     mounts,
     object_quat,
@@ -117,7 +118,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     mass = mass.at[lay.object].set(object_mass)
     h = scene.discretization.timestep
     stiffness, damping = joint_springs(scene, params)
-    implicit = damping + h * stiffness
+    implicit = implicit_damping(scene, stiffness, damping)
     geom_size, rbound, aabb = _geom_fields(scene, params, size, base)
     bias = base("actuator_biasprm").at[:6, 1].set(-stiffness[:6])
     gain = base("actuator_gainprm").at[:6, 0].set(stiffness[:6])

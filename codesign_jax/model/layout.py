@@ -98,11 +98,38 @@ def wrist_springs(scene: Scene) -> tuple[list[Any], list[Any]]:
     Without the effect `wrist` they are the limit in which the implicit spring ends every step where
     the arm frame is: (M + h^2 K) a = K (u - q - h v) gives q + h (v + h a) = u as K grows.
     """
-    w = scene.hand.wrist
+    w, h = scene.hand.wrist, scene.discretization.timestep
     if not scene.effects.wrist:
-        return [RIGID / scene.discretization.timestep**2] * 6, [0.0] * 6
+        # What implicit_damping does not add.
+        damping = 0.0 if scene.discretization.spring_damping == "added" else RIGID / h
+        return [RIGID / h**2] * 6, [damping] * 6
     stiffness = [w.linear_stiffness] * 3 + [w.angular_stiffness] * 3
     return stiffness, [w.linear_damping] * 3 + [w.angular_damping] * 3
+
+
+def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
+    """Damping C of a joint whose spring acts implicitly, (M + h C) a = tau - K q - C v.
+
+    With the new velocity v + h a that is the spring's force at the step's start and all of the
+    damping at its end.  C = D + h K is the implicit Euler step of both.  As a joint without inertia
+    moves by -h K / C q in a step, C > h K / 2 is stable for every stiffness, and C = max(D, h K)
+    never overshoots: a material with D >= h K then keeps its own damping.
+
+    Args:
+      scene: The scene.
+      stiffness: Stiffness K [N/m, N m/rad].
+      damping: The joint's own damping D [N s/m, N m s/rad], shaped as the stiffness.
+
+    Returns:
+      C by `discretization.spring_damping`, shaped as the stiffness.
+    """
+    kind, added = scene.discretization.spring_damping, scene.discretization.timestep * stiffness
+    if kind == "own":
+        return damping
+    if kind == "added":
+        return damping + added
+    # Not jnp.maximum: NumPy's numbers, as a MuJoCo spec takes them, stay NumPy's.
+    return damping + (added - damping) * (added > damping)
 
 
 def contact_invweight(scene: Scene) -> Any:

@@ -15,6 +15,7 @@ from codesign_jax.model.layout import (
     RIGID,
     WRIST,
     contact_invweight,
+    implicit_damping,
     layout,
     mounts,
     object_quat,
@@ -165,7 +166,7 @@ def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
     for name, stiffness, damping in zip(WRIST, *wrist_springs(scene), strict=True):
         linear = len(name) == 1
         kind = mujoco.mjtJoint.mjJNT_SLIDE if linear else mujoco.mjtJoint.mjJNT_HINGE
-        implicit = damping + h * stiffness
+        implicit = implicit_damping(scene, stiffness, damping)
         _hinge(body, f"wrist_{name}", axes[name], kind, damping=implicit, armature=h * implicit)
         actuator = spec.add_actuator(
             name=f"arm_{name}", target=f"wrist_{name}", trntype=mujoco.mjtTrn.mjTRN_JOINT
@@ -223,7 +224,8 @@ def _add_finger(
             continue
         for name in lay.axes:
             stiffness = by_axis[name] / segment
-            implicit = scene.hand.material.damping_time * stiffness + h * stiffness
+            own = scene.hand.material.damping_time * stiffness
+            implicit = implicit_damping(scene, stiffness, own)
             joint = f"finger_{f}_{name}_{i}"
             _hinge(
                 body,

@@ -156,6 +156,9 @@ class Discretization:
       spheres_per_link: Contact spheres of a link, only with `effects.surface = "spheres"`.
       hull_rings: Rings of vertices of a link, only with `effects.surface = "hull"`.
       hull_points: Vertices of a ring, a multiple of four, only with `effects.surface = "hull"`.
+      spring_damping: How much of the time step h the implicit springs add to a joint's damping time
+        beta: "added" acts as beta + h, "least" as max(beta, h), "own" as beta alone, which needs
+        h <= 1.8 beta of the fingers' material and of the wrist (docs/physics.md).
     """
 
     timestep: float = quantity("s", 1e-5, 0.05, structure=True)
@@ -163,6 +166,7 @@ class Discretization:
     spheres_per_link: int = quantity("", 1, 20, structure=True)
     hull_rings: int = quantity("", 1, 20, structure=True, default=2)
     hull_points: int = quantity("", 4, 80, structure=True, default=8)
+    spring_damping: str = choice("added", "least", "own", default="added")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -90,7 +90,7 @@ def tip_positions(scene: Scene, fields: ModelFields, qpos: jax.Array) -> jax.Arr
     state = reset(scene, world._replace(start=qpos))
     kin = kinematics(Stages(None), hand, layout(scene).axes, state)
     half = jnp.zeros_like(kin.origin[:, -1]).at[0].set(0.5 * hand.offset[-1])
-    tip = kin.origin[:, -1] + apply_columns(kin.link[:, :, -1], half) + state.wrist[:3]
+    tip = kin.origin[:, -1] + apply_columns(kin.link[:, :, -1], half) + state.position
     return jnp.moveaxis(tip, 0, -1).swapaxes(0, 1)
 
 

@@ -59,7 +59,7 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     alone = dataclasses.replace(scene.effects, finger_finger=False)
     scene = dataclasses.replace(scene, effects=alone)
     state, hand = reset(scene, fields), world_constants(scene, fields)
-    every = contacts(scene, Stages(None), hand, straight(hand, state), state.wrist[2])
+    every = contacts(scene, Stages(None), hand, straight(hand, state), state.position[2])
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
     return jnp.stack(found).max(0)
 

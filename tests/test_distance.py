@@ -71,11 +71,9 @@ def engine_contacts(kind, position, quat, centre):
         frames = columns.reshape(POSES, 3, 3).transpose(2, 1, 0)[
             :, :, None
         ]  # column, row, 1, world
-        kin = SimpleNamespace(
-            object=jnp.asarray(frames), object_pos=jnp.asarray(position.T[:, None])
-        )
+        kin = SimpleNamespace(object=jnp.asarray(frames))
         return collision.spheres_on_object(
-            paper, hand, kin, Stages(None), jnp.asarray(centre.T[:, None]), RADIUS
+            paper, hand, kin, Stages(None), jnp.asarray((centre - position).T[:, None]), RADIUS
         )
 
 
@@ -97,7 +95,7 @@ def test_distances_equal_mujoco(kind):
     assert np.all(angle[near] < 1e-14 / gap[near])
     # Contact points lie half way between the surfaces.
     point = np.asarray(got.point)[:, 0].T
-    back = centre - point
+    back = centre - position - point
     np.testing.assert_allclose(np.linalg.norm(back, axis=1), np.abs(RADIUS + gap / 2), atol=1e-12)
 
 

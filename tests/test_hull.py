@@ -98,7 +98,7 @@ def test_velocities_are_derivatives_of_positions():
             qpos = data.qpos + h * np.append(rate, 0.0)
             state = lanes_state(engine, the_scene, fields, qpos, rate)
             kin = kinematics(Stages(None), lanes, model.layout(the_scene).axes, state)
-            return kin, skin.vertices(the_scene, lanes, kin), state.wrist[:3, 0, 0]
+            return kin, skin.vertices(the_scene, lanes, kin), state.position[:, 0, 0]
 
         kin, points, _ = at(0.0)
         zero, cone = jnp.zeros_like(points.point), make_cone(the_scene, 0.5, bodies=1)
@@ -107,7 +107,7 @@ def test_velocities_are_derivatives_of_positions():
         contacts = Contacts(points.point, zero, zero[0], cone, points.weight * points.image)
         moved = jax.jit(Contacts.relative)(contacts, rel)
         h = 1e-5
-        ends = [v.point + palm[:, None, None, None, None] for _, v, palm in (at(h), at(-h))]
+        ends = [v.point + origin[:, None, None, None, None] for _, v, origin in (at(h), at(-h))]
         difference = (ends[0] - ends[1]) / (2 * h)
         # Error h^2 times third derivatives of lengths of 0.3 m at rates of a few rad/s.
         np.testing.assert_allclose(moved, difference, atol=1e-8)

@@ -33,25 +33,24 @@ def spheres_on_object(
       hand: The hand.
       kin: Kinematics.
       run: Runs the stages.
-      centre: Sphere centres in the palm's frame, shape (3, ...).
+      centre: Sphere centres from the object's, shape (3, ...).
       radius: Sphere radii, broadcasting to (...).
     """
 
-    def measure(columns: jax.Array, position: jax.Array, centre: jax.Array):
-        return signed_distance(scene, hand, in_object(columns, position, centre))
+    def measure(columns: jax.Array, centre: jax.Array):
+        return signed_distance(scene, hand, in_object(columns, centre))
 
     def place(columns: jax.Array, centre: jax.Array, distance: jax.Array, gradient: jax.Array):
         return on_surface(columns, centre, radius, distance, gradient)
 
-    distance, gradient = run(measure, kin.object, kin.object_pos, centre)
+    distance, gradient = run(measure, kin.object, centre)
     point, normal, gap = run(place, kin.object, centre, distance, gradient)
     return Contacts(point, normal, gap, hand.cones.hand_object)
 
 
-def in_object(columns: jax.Array, position: jax.Array, point: jax.Array) -> jax.Array:
-    """Points (3, ...) of the palm's frame in the object's frame."""
-    away = jnp.stack([point[i] - position[i] for i in range(3)])
-    return jnp.stack([dot(columns[k], away) for k in range(3)])
+def in_object(columns: jax.Array, point: jax.Array) -> jax.Array:
+    """Points (3, ...) from the object's centre along the world's axes in the object's frame."""
+    return jnp.stack([dot(columns[k], point) for k in range(3)])
 
 
 def on_surface(
@@ -65,7 +64,7 @@ def on_surface(
 
     Args:
       columns: Columns of the object's orientation.
-      centre: Sphere centres in the palm's frame, shape (3, ...).
+      centre: Sphere centres from the object's, shape (3, ...).
       radius: Sphere radii.
       distance: Signed distance of the centres from the object, shape (...).
       gradient: Its unit gradient in the object's frame, shape (3, ...).
@@ -77,7 +76,7 @@ def on_surface(
 def spheres_on_table(
     cone: Cone, height: jax.Array, centre: jax.Array, radius: jax.Array | float
 ) -> Contacts:
-    """Contacts of spheres with the table; `height` is the palm's, the origin's, (1, world)."""
+    """Contacts of spheres with the table; `height` is the object's, the origin's, (1, world)."""
     gap = centre[2] + height - radius
     zero = jnp.zeros_like(gap)
     normal = jnp.stack([zero, zero, zero + 1.0])
@@ -86,13 +85,13 @@ def spheres_on_table(
 
 
 def finger_spheres(hand: WorldConstants, kin: Kinematics) -> jax.Array:
-    """Centres of the finger spheres in the palm's frame, shape (3, link, k, finger, world)."""
+    """Centres of the finger spheres from the object's, shape (3, link, k, finger, world)."""
     return kin.origin[:, :, None] + apply_columns(kin.link[:, :, :, None], hand.sphere)
 
 
 def palm_spheres(hand: WorldConstants, kin: Kinematics) -> jax.Array:
-    """Centres of the palm spheres in the palm's frame, shape (3, sphere, world)."""
-    return apply_columns(kin.palm, hand.palm_point)
+    """Centres of the palm spheres from the object's, shape (3, sphere, world)."""
+    return kin.place + apply_columns(kin.palm, hand.palm_point)
 
 
 def signed_distance(
@@ -195,7 +194,7 @@ def object_on_table(
     a sphere (one slot); four spread-out ones among the lowest support points of a mesh.
     """
 
-    def points(size: jax.Array, columns: jax.Array, position: jax.Array, height: jax.Array):
+    def points(size: jax.Array, columns: jax.Array, height: jax.Array):
         meshes, arms = mesh_indices(scene), None
         if len(meshes) < len(scene.objects.object):
             arms = primitive_points(scene, size, hand.object_id, columns)
@@ -203,11 +202,9 @@ def object_on_table(
             new = mesh.table_points(hand.mesh, columns)  # type: ignore[arg-type]
             mine = jnp.isin(hand.object_id, jnp.array(meshes))
             arms = new if arms is None else jnp.where(mine, new, arms)
-        return on_table(position, arms, height)
+        return on_table(arms, height)
 
-    point, normal, gap = run(
-        points, hand.object_size[:, 0], kin.object[:, :, 0], kin.object_pos, height
-    )
+    point, normal, gap = run(points, hand.object_size[:, 0], kin.object[:, :, 0], height)
     return Contacts(point, normal, gap, hand.cones.object_table)
 
 
@@ -226,21 +223,17 @@ def primitive_points(
     return _by_kind(scene, shape, {k: partial(f, size, columns) for k, f in functions.items()})
 
 
-def on_table(
-    position: jax.Array, arms: jax.Array, height: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def on_table(arms: jax.Array, height: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Contacts of an object's points with the table: point, normal (3, slot, world) and gap.
 
     Args:
-      position: Centre of the object in the palm's frame, shape (3, 1, world).
       arms: Points from the centre, shape (3, slot, world).
-      height: Height of the palm above the table, shape (1, world).
+      height: Height of the object's centre above the table, shape (1, world).
     """
-    point = position + arms
-    gap = point[2] + height
+    gap = arms[2] + height
     zero = jnp.zeros_like(gap)
     normal = jnp.stack([zero, zero, zero + 1.0])
-    return point - 0.5 * gap * normal, normal, gap
+    return arms - 0.5 * gap * normal, normal, gap
 
 
 _AWAY = 1e3  # an unused slot hangs this far above the table

@@ -57,7 +57,7 @@ def step(scene: Scene, hand: WorldConstants, state: State, ctrl: jax.Array) -> M
         acc = acc._replace(wrist=assembled.palm_acc)
     h = scene.discretization.timestep
     new = run(lambda s, o, a: integrate(s, o, a, h), state, assembled.kin.object, acc)
-    centre = _centre(hand, assembled.kin, assembled.body) + state.wrist[:3]
+    centre = _centre(hand, assembled.kin, assembled.body) + state.position
     return Moved(new, centre)
 
 
@@ -69,7 +69,7 @@ def problem(
     body = bodies(run, hand, kin)
     smooth = smooth_forces(run, hand, kin, body, state, ctrl, scene)
     matrix = Matrices(*(run(lambda b: b.matrix(), b) for b in body))
-    found = contacts(scene, run, hand, kin, state.wrist[2])
+    found = contacts(scene, run, hand, kin, state.position[2])
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
     h, palm_acc = scene.discretization.timestep, None
     if not scene.effects.wrist:
@@ -87,7 +87,7 @@ def contacts(
       run: Runs the stages.
       hand: Constants of the worlds.
       kin: Kinematics.
-      height: Height of the palm above the table, shape (1, world).
+      height: Height of the object's centre above the table, shape (1, world).
     """
     e, found = scene.effects, {}
     on_object = partial(collision.spheres_on_object, scene, hand, kin)
@@ -136,9 +136,9 @@ def refuse(scene: Scene) -> None:
 
 
 def _centre(hand: WorldConstants, kin: Kinematics, body: Bodies) -> jax.Array:
-    """Mean position of the segments in the palm's frame: half weight for the half segments."""
+    """Mean position of the segments from the object's centre: half weight for half segments."""
     n, links = hand.mount.shape[2], hand.mass.shape[0]
     weights = [1.0] * (links - 1) + [0.5]
     moving = total([w * body.link.centre[:, i] for i, w in enumerate(weights)])
-    every = moving + 0.5 * apply_columns(kin.palm, hand.stub_centre)
+    every = moving + 0.5 * (kin.place + apply_columns(kin.palm, hand.stub_centre))
     return total([every[:, f : f + 1] for f in range(n)]) / (n * links)

@@ -34,7 +34,7 @@ class Vertices(NamedTuple):
     """Contact points of the hull; rows are the joints and the tip, see `model.hull.Slots`.
 
     Attributes:
-      point: In the palm's frame, shape (3, row, k, finger, world).
+      point: From the object's centre along the world's axes, shape (3, row, k, finger, world).
       image: Images on the rows' links, from their joints, same shape.
       weight: Weights of those links, shape (row, k, 1, 1).
       share: Contact stiffness relative to the scene's, shape (row, k, finger, world).

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.kinematics import Acc
-from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, sum_items
+from codesign_jax.engines.structured.lanes import Stages, dot, sum_items
 from codesign_jax.engines.structured.newton import linear_solve
 from codesign_jax.engines.structured.problem import (
     Forces,
@@ -69,12 +69,10 @@ def adjoint(run: Stages, problem: Problem, velocity: Spatial, acc: Acc, cotangen
         n: run(lambda *v, n=n: _jar(n, *v), c, motion, velocity)
         for n, c in problem.contacts.items()
     }
-    turning, moving = cotangent.object[:3], cotangent.object[3:]
-    # The object's accelerations are at its centre, its spatial force at the origin.
     force = Forces(
         palm=jnp.zeros_like(motion.palm),
         link=jnp.zeros_like(motion.link),
-        object=spatial(turning + cross(problem.kin.object_pos, moving), moving),
+        object=cotangent.object,
         wrist=cotangent.wrist,
         finger=cotangent.finger,
     )

@@ -12,7 +12,7 @@ from codesign_jax.model.morphology import softening
 
 
 class Body(NamedTuple):
-    """Inertia of bodies in the palm's frame; the item axes (link, finger or 1) precede the world's.
+    """Inertia of bodies; the item axes (link, finger or 1) precede the world's.
 
     Attributes:
       mass: Shape (..., world).
@@ -71,12 +71,53 @@ class Body(NamedTuple):
         return spatial(moment + cross(self.centre, force), force)
 
 
+class Centred(NamedTuple):
+    """As `Body`, its centre the origin.
+
+    Attributes:
+      mass: Shape (..., world).
+      tensor: Rotational inertia, world axes, shape (3, 3, ..., world).
+    """
+
+    mass: jax.Array
+    tensor: jax.Array
+
+    def times(self, acc: jax.Array) -> jax.Array:
+        """See `Body.times`."""
+        return spatial(apply_columns(self.tensor, acc[:3]), self.mass * acc[3:])
+
+    def matrix(self) -> jax.Array:
+        """See `Body.matrix`."""
+        zero = jnp.zeros_like(self.mass + self.tensor[0, 0])
+        none = jnp.stack([zero] * 3)
+        mass = self.mass + zero
+        rows = [jnp.concatenate([self.tensor[i], none]) for i in range(3)]
+        for i in range(3):
+            moving = jnp.stack([mass if i == j else zero for j in range(3)])
+            rows.append(jnp.concatenate([none, moving]))
+        return jnp.stack(rows)
+
+    def smooth_force(self, vel: jax.Array, gravity: jax.Array | None) -> jax.Array:
+        """Gravity and gyroscopic moment, shape (6, ...); see `Body.smooth_force`.
+
+        The velocity of the centre causes no force: the body's coordinates are its own velocity.
+
+        Args:
+          vel: Spatial velocity.
+          gravity: Magnitude of gravity, along -z [m/s^2]; None without the effect.
+        """
+        omega, zero = vel[:3], jnp.zeros_like(vel[0])
+        weight = zero if gravity is None else -self.mass * gravity + zero
+        moment = -cross(omega, apply_columns(self.tensor, omega))
+        return spatial(moment, jnp.stack([zero, zero, weight]))
+
+
 class Bodies(NamedTuple):
     """The palm (1, world), the links (link, finger, world) and the object (1, world)."""
 
     palm: Body
     link: Body
-    object: Body
+    object: Centred
 
 
 class Smooth(NamedTuple):
@@ -113,14 +154,6 @@ def turned_tensor(frame: jax.Array, tensor: jax.Array) -> jax.Array:
     return jnp.stack([apply_columns(frame, half[j]) for j in range(3)])
 
 
-def object_force(body: Body, vel: jax.Array, gravity: jax.Array | None) -> jax.Array:
-    """`Body.smooth_force` of the object, from its spatial velocity, shape (6, ...)."""
-    # The object's coordinates are its own velocity components: no acceleration is left at zero.
-    spin = jnp.concatenate([jnp.zeros_like(vel[:3])] * 2)
-    turning = spatial(vel[:3], -cross(vel[:3], body.centre))
-    return body.smooth_force(turning, spin, gravity)
-
-
 def bodies(run: Stages, hand: WorldConstants, kin: Kinematics) -> Bodies:
     """Inertia of all bodies at the present positions."""
 
@@ -130,7 +163,7 @@ def bodies(run: Stages, hand: WorldConstants, kin: Kinematics) -> Bodies:
     def rest(palm: jax.Array, obj: jax.Array):
         tensor = turned_tensor(palm, hand.palm_inertia)
         return (
-            apply_columns(palm, hand.palm_centre),
+            kin.place + apply_columns(palm, hand.palm_centre),
             tensor,
             principal_tensor(obj, hand.object_inertia),
         )
@@ -139,7 +172,7 @@ def bodies(run: Stages, hand: WorldConstants, kin: Kinematics) -> Bodies:
     return Bodies(
         palm=Body(hand.palm_mass, centre, tensor),
         link=Body(hand.mass, *run(link, kin.origin, kin.link)),
-        object=Body(hand.object_mass, kin.object_pos, object_tensor),
+        object=Centred(hand.object_mass, object_tensor),
     )
 
 
@@ -186,7 +219,7 @@ def smooth_forces(
     return Smooth(
         palm=body.palm.smooth_force(kin.palm_vel, kin.palm_bias, g),
         link=links,
-        object=object_force(body.object, kin.object_vel, g),
+        object=body.object.smooth_force(kin.object_vel, g),
         wrist=wrist,
         finger=finger,
     )

@@ -1,8 +1,10 @@
 """Positions, motion subspaces, velocities and bias accelerations of all bodies of one state.
 
-All spatial quantities are in a world-aligned frame whose origin is the palm's present position
-(short lever arms, so that float32 suffices); it does not move during the step.  In such a frame
-velocities and motion subspaces of different bodies add without transforms.
+All spatial quantities are in one world-aligned frame, whose origin is the object's present centre;
+it does not move during the step.  In such a frame velocities and motion subspaces of different
+bodies add without transforms.  The object is the origin because it is hardest to solve for in
+float32: contacts hold it with up to some hundred kg, which seen from the palm, 0.1 m away, are a
+moment of inertia a million times the object's own about its centre.
 """
 
 from functools import partial
@@ -71,9 +73,10 @@ class Acc(NamedTuple):
 
 
 class Kinematics(NamedTuple):
-    """Bodies in the frame at the palm; spatial vectors are (angular, linear).
+    """Bodies in the frame at the object's centre; spatial vectors are (angular, linear).
 
     Attributes:
+      place: Palm position, shape (3, 1, world).
       palm: Columns of the palm's orientation, shape (3, 3, 1, world).
       wrist_axes: Subspace of the three wrist hinges, shape (3, 6, 1, world).
       palm_vel: Palm velocity, shape (6, 1, world).
@@ -84,10 +87,10 @@ class Kinematics(NamedTuple):
       vel: Link velocities, shape (6, link, finger, world).
       bias: Link accelerations at zero joint acceleration, same shape.
       object: Columns of the object's orientation, shape (3, 3, 1, world).
-      object_pos: Object centre, shape (3, 1, world).
       object_vel: Object velocity, shape (6, 1, world).
     """
 
+    place: jax.Array
     palm: jax.Array
     wrist_axes: jax.Array
     palm_vel: jax.Array
@@ -98,7 +101,6 @@ class Kinematics(NamedTuple):
     vel: jax.Array
     bias: jax.Array
     object: jax.Array
-    object_pos: jax.Array
     object_vel: jax.Array
 
 
@@ -106,8 +108,9 @@ def kinematics(
     run: Stages, hand: WorldConstants, axis_names: tuple[str, ...], state: State
 ) -> Kinematics:
     """Computes the kinematics of all bodies."""
-    palm, wrist_axes, palm_vel, palm_bias = run(_wrist, state.wrist, state.wrist_vel)
-    frame, origin = run(_mount, palm, hand.mount, hand.base)
+    place = _place(state)
+    palm, wrist_axes, palm_vel, palm_bias = run(_wrist, place, state.wrist, state.wrist_vel)
+    frame, origin = run(_mount, place, palm, hand.mount, hand.base)
     vel, bias = palm_vel, palm_bias
     trig = run(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
 
@@ -122,8 +125,9 @@ def kinematics(
     lanes = jnp.zeros_like(hand.offset[0])
     first = (origin, frame, vel + lanes, bias + lanes)
     _, (origins, frames, vels, biases, axes) = scan_links(next_link, first, over)
-    columns, position, object_vel = run(_object, state)
+    columns, object_vel = run(_object, state)
     return Kinematics(
+        place=place,
         palm=palm,
         wrist_axes=wrist_axes,
         palm_vel=palm_vel,
@@ -134,26 +138,30 @@ def kinematics(
         vel=jnp.moveaxis(vels, 0, 1),
         bias=jnp.moveaxis(biases, 0, 1),
         object=columns,
-        object_pos=position,
         object_vel=object_vel,
     )
 
 
 def straight(hand: WorldConstants, state: State) -> Kinematics:
     """Places of all bodies with straight fingers, nothing moving: no loop along the links."""
-    palm, wrist_axes, *_ = _wrist(state.wrist, jnp.zeros_like(state.wrist_vel))
-    frame, base = _mount(palm, hand.mount, hand.base)
+    place = _place(state)
+    palm, wrist_axes, *_ = _wrist(place, state.wrist, jnp.zeros_like(state.wrist_vel))
+    frame, base = _mount(place, palm, hand.mount, hand.base)
     along = jnp.cumsum(hand.offset, axis=0)
     origin = jnp.stack([base[i] + frame[0][i] * along for i in range(3)])
     link = jnp.broadcast_to(frame[:, :, None], (3, *origin.shape))
-    columns, position, _ = _object(state)
+    columns, _ = _object(state)
     none = jnp.zeros(())
     return Kinematics(
-        palm, wrist_axes, none, none, link, origin, none, none, none, columns, position, none
+        place, palm, wrist_axes, none, none, link, origin, none, none, none, columns, none
     )
 
 
-def _wrist(wrist: jax.Array, wrist_vel: jax.Array):
+def _place(state: State) -> jax.Array:
+    return state.wrist[:3] - state.position
+
+
+def _wrist(place: jax.Array, wrist: jax.Array, wrist_vel: jax.Array):
     one, zero = jnp.ones_like(wrist[0]), jnp.zeros_like(wrist[0])
     frame = [jnp.stack([one if i == k else zero for i in range(3)]) for k in range(3)]
     none = jnp.stack([zero] * 3)
@@ -161,7 +169,7 @@ def _wrist(wrist: jax.Array, wrist_vel: jax.Array):
     cos, sin = jnp.cos(wrist[3:]), jnp.sin(wrist[3:])
     axes = []
     for k, axis in enumerate(_WRIST):
-        s = spatial(frame[axis], none)
+        s = spatial(frame[axis], cross(place, frame[axis]))
         bias = bias + motion_cross(vel, s) * wrist_vel[3 + k]
         vel = vel + s * wrist_vel[3 + k]
         axes.append(s)
@@ -169,9 +177,9 @@ def _wrist(wrist: jax.Array, wrist_vel: jax.Array):
     return jnp.stack(frame), jnp.stack(axes), vel, bias
 
 
-def _mount(palm: jax.Array, mount: jax.Array, base: jax.Array):
+def _mount(place: jax.Array, palm: jax.Array, mount: jax.Array, base: jax.Array):
     frame = jnp.stack([apply_columns(palm, mount[k]) for k in range(3)])
-    return frame, apply_columns(palm, base)
+    return frame, place + apply_columns(palm, base)
 
 
 def _turn_link(names: tuple[str, ...], origin, frame, offset, cos, sin):
@@ -194,6 +202,4 @@ def _link_velocity(vel: jax.Array, bias: jax.Array, subspace: jax.Array, rate: j
 
 def _object(state: State):
     columns = rotation_columns(state.quat)
-    position = state.position - state.wrist[:3]
-    omega = apply_columns(columns, state.angular_vel)
-    return columns, position, spatial(omega, state.linear_vel + cross(position, omega))
+    return columns, spatial(apply_columns(columns, state.angular_vel), state.linear_vel)

@@ -248,7 +248,7 @@ def table_points(lanes: MeshLanes, columns: jax.Array) -> jax.Array:
 
 
 def turned(columns: jax.Array, point: jax.Array) -> jax.Array:
-    """Points (3, point, world) of the object's frame, from its centre in the palm's frame."""
+    """Points (3, point, world) of the object's frame along the world's axes."""
     return jnp.stack([dot(columns[:, i], point) for i in range(3)])
 
 

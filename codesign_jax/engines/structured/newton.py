@@ -21,7 +21,6 @@ from codesign_jax.engines.structured.problem import (
     Problem,
     Spatial,
     inner,
-    object_acceleration,
     on_links,
 )
 
@@ -157,7 +156,7 @@ def substitute(run: Stages, problem: Problem, done: Eliminated) -> tuple[Acc, Sp
     _, (fingers, motions) = scan_links(
         next_link, palm + jnp.zeros_like(like), (kin.axes, done.fingers.factors)
     )
-    acc = Acc(jnp.concatenate(joints), fingers, object_acceleration(obj, kin.object_pos))
+    acc = Acc(jnp.concatenate(joints), fingers, obj)
     return acc, Spatial(palm, jnp.moveaxis(motions, 0, 1), obj)
 
 

@@ -14,7 +14,6 @@ from codesign_jax.engines.structured.inertia import Bodies, Smooth
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics
 from codesign_jax.engines.structured.lanes import (
     Stages,
-    cross,
     dot,
     scan_links,
     spatial,
@@ -74,16 +73,6 @@ def next_motion(parent: jax.Array, axes: jax.Array, a: jax.Array) -> jax.Array:
     return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
 
 
-def object_motion(acc: jax.Array, position: jax.Array) -> jax.Array:
-    """The object's spatial acceleration from that at its centre."""
-    return spatial(acc[:3], acc[3:] + cross(position, acc[:3]))
-
-
-def object_acceleration(motion: jax.Array, position: jax.Array) -> jax.Array:
-    """Inverse of `object_motion`."""
-    return spatial(motion[:3], motion[3:] - cross(position, motion[:3]))
-
-
 def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
     """Spatial accelerations J a of all bodies, without velocity terms."""
     palm = run(palm_motion, acc.wrist, kin.wrist_axes)
@@ -94,8 +83,7 @@ def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
 
     first = palm + jnp.zeros_like(kin.vel[:, 0])
     _, links = scan_links(step, first, (kin.axes, acc.finger))
-    obj = object_motion(acc.object, kin.object_pos)
-    return Spatial(palm, jnp.moveaxis(links, 0, 1), obj)
+    return Spatial(palm, jnp.moveaxis(links, 0, 1), acc.object)
 
 
 def on_links(name: str) -> bool:

@@ -232,7 +232,6 @@ def sphere_on_object(
     scene: Scene,
     thing: WorldObject,
     columns: Lanes,
-    position: Lanes,
     centre: Lanes,
     radius: Lanes | float,
 ) -> tuple[Lanes, Lanes, Lanes]:
@@ -244,16 +243,15 @@ def sphere_on_object(
     Args:
       scene: The scene.
       thing: The block's objects, see `objects.read`.
-      columns: Columns of their orientation in the palm's frame, shape (3, 3).
-      position: Their centres in the palm's frame [m], shape (3,).
-      centre: Sphere centres in the palm's frame [m], shape (3, k).
+      columns: Columns of their orientation, shape (3, 3).
+      centre: Sphere centres from the objects' [m], shape (3, k).
       radius: Sphere radii [m], shape (k,).
 
     Returns:
       Contact points [m] and unit normals from object to hand, shape (3, k), and gaps [m], negative
       in contact, shape (1, k).
     """
-    local = lanewise(collision.in_object, columns, position, centre)
+    local = lanewise(collision.in_object, columns, centre)
     distance, gradient = objects.signed_distance(scene, thing, local)
 
     def place(*args):

@@ -25,7 +25,6 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.newton import wrist_slides
-from codesign_jax.engines.structured.problem import object_acceleration
 
 TOLERANCE = 1e-2
 """Squared error of a step, relative to its squared size, both as measured by H.
@@ -208,22 +207,21 @@ class Coupling:
         return self._palm(*self.block.sum((r, ro)))
 
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
-        def solve(done: Eliminated, axes, position, armature, r, ro):
+        def solve(done: Eliminated, axes, armature, r, ro):
             if done.hinges is None or done.slides is None:
                 obj = el.solve_object(direct, done.q, ro)
                 none = jnp.zeros_like(obj)
-                return Iterate(none, object_acceleration(obj, position), none, obj)
+                return Iterate(none, none, obj)
             r, ro, hinges = el.eliminate_again(direct, axes, done.hinges, r, ro)
             slide_axes = wrist_slides(armature)
             _, ro, slides = el.eliminate_again(direct, slide_axes, done.slides, r, ro)
             obj = el.solve_object(direct, done.q, ro)
             first, motion = el.substitute(slide_axes, slides, jnp.zeros_like(obj), obj)
             second, motion = el.substitute(axes, hinges, motion, obj)
-            at_centre = object_acceleration(obj, position)
-            return Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
+            return Iterate(jnp.concatenate([first, second]), motion, obj)
 
         palm = self.problem.palm
-        return lanewise(solve, self.done, palm.axes, palm.position, palm.armature, r, ro)
+        return lanewise(solve, self.done, palm.axes, palm.armature, r, ro)
 
     def substitute(self, z: str, step: Iterate) -> None:
         """Leaves the links' motion with the sides, see `LineSearch.prepare`."""

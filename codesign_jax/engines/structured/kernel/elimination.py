@@ -15,7 +15,7 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Proble
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
-from codesign_jax.engines.structured.problem import Forces, Matrices, object_acceleration
+from codesign_jax.engines.structured.problem import Forces, Matrices
 
 
 class Row(NamedTuple):
@@ -170,7 +170,7 @@ class Elimination:
             if rigid:
                 obj = el.solve_object(direct, node.q, node.r_object)
                 none = jnp.zeros_like(obj)
-                step = Iterate(none, object_acceleration(obj, palm.position), none, obj)
+                step = Iterate(none, none, obj)
                 return step, Eliminated(None, None, node.q, dot(node.r_object, obj))
             armature, work = palm.armature, []
             axes = (palm.axes, newton.wrist_slides(armature))
@@ -185,8 +185,7 @@ class Elimination:
             obj = el.solve_object(direct, node.q, node.r_object)
             first, motion = el.substitute(axes[1], kept[1].factors, jnp.zeros_like(obj), obj)
             second, motion = el.substitute(axes[0], kept[0].factors, motion, obj)
-            at_centre = object_acceleration(obj, palm.position)
-            step = Iterate(jnp.concatenate([first, second]), at_centre, motion, obj)
+            step = Iterate(jnp.concatenate([first, second]), motion, obj)
             work = total([*work, dot(node.r_object, obj)])
             return step, Eliminated(kept[0], kept[1], node.q, work)
 

@@ -26,7 +26,7 @@ def advance(step: "Step", state: dict, at: dict, now: Iterate, goes_on: Any, spe
       Largest velocity after the step, and whether the world has moved, shapes (1, world).
     """
     p, h = step.p, step.p.scene.discretization.timestep
-    new = lanewise(partial(_moved, h), state, at["columns"], now.wrist, now.object)
+    new = lanewise(partial(_moved, h), state, at["columns"], now.wrist, now.object_motion)
     size = lanewise(_largest, new)
 
     def link(i: Any, largest: Lanes) -> Lanes:
@@ -43,7 +43,7 @@ def advance(step: "Step", state: dict, at: dict, now: Iterate, goes_on: Any, spe
     largest = _worse(size.lane, step.block.fold(fingers, _worse))
     limit = step.constant("speed").lane
     good = goes_on & (largest <= limit)
-    acc = {"acc_wrist": now.wrist, "acc_object": now.object}
+    acc = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
     for name, value in {**new, **acc}.items():
         kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
         p.world_state.write(step.world_state, name, kept, 0, step.block.world)

@@ -182,17 +182,14 @@ def _gather(ref: Any, index: Lanes, dtype: Any) -> Lanes:
     return Lanes(parts, index.shape, dtype)
 
 
-def table_points(
-    scene: Scene, thing: WorldObject, columns: Lanes, position: Lanes, height: Lanes
-) -> Lanes:
+def table_points(scene: Scene, thing: WorldObject, columns: Lanes, height: Lanes) -> Lanes:
     """Four points that may touch the table, from the centre, shape (3, 4, world).
 
     Args:
       scene: The scene.
       thing: The objects.
       columns: Columns of their orientation, shape (3, 3).
-      position: Their centres in the palm's frame, shape (3,).
-      height: Height of the palm above the table.
+      height: Height of their centres above the table.
     """
 
     def primitive() -> Lanes:
@@ -213,7 +210,7 @@ def table_points(
     if thing.mesh is not None:
         # A mesh whose centre is higher than its farthest point touches nothing: the search for
         # its points is left out, and zeros, its centre, touch nothing either.
-        clear = lanewise(lambda p, h, r: p[2] + h - r, position, height, thing.mesh.reach)
+        clear = lanewise(jnp.subtract, height, thing.mesh.reach)
         near = clear.lane < 0
     none = lanewise(lambda c: jnp.zeros((3, 4, c.shape[-1]), c.dtype), columns)
     return _for_both(scene, thing, primitive, meshed, none, near)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.inertia import Body, Centred
 from codesign_jax.engines.structured.kernel import solver
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
@@ -17,20 +17,18 @@ class Palm(NamedTuple):
     """What the solver needs of palm, wrist and object; lanes of a world."""
 
     palm: Body
-    object: Body
+    object: Centred
     smooth_palm: Any
     smooth_object: Any
     smooth_wrist: Any
     armature: Any
     axes: Any
-    position: Any
 
 
 class Iterate(NamedTuple):
-    """Accelerations of wrist and object, and motion of palm and object; lanes of a world."""
+    """Accelerations of the wrist, and motion of palm and object; lanes of a world."""
 
     wrist: Any
-    object: Any
     palm_motion: Any
     object_motion: Any
 

@@ -57,7 +57,10 @@ class Spheres:
             point, radius = (
                 p.hand.read(self.step.hand, n, i) for n in ("palm_point", "palm_radius")
             )
-            centre = lanewise(lambda f, s: apply_columns(f[:, :, None], s), at["frame"], point)
+            centre = lanewise(
+                lambda x, f, s: x[:, None] + apply_columns(f[:, :, None], s),
+                at["place"], at["frame"], point,
+            )  # fmt: skip
             for name in palm:
                 create(name, i, self.step.geometry(name, centre, radius, at, self.thing))
         on_table = m.contacts.get("object_table")
@@ -69,17 +72,17 @@ class Spheres:
     def _table_points(self, state: dict) -> list[tuple]:
         """Point, normal and gap of each slot of the object on the table, lanes of a world."""
         at = self.at
-        height, position = state["wrist"][2], at["palm"].position
-        arms = objects.table_points(self.p.scene, self.thing, at["columns"], position, height)
+        height = state["position"][2]
+        arms = objects.table_points(self.p.scene, self.thing, at["columns"], height)
 
-        def compute(position, arms, height):
-            point, normal, gap = collision.on_table(position, arms, height)
+        def compute(arms, height):
+            point, normal, gap = collision.on_table(arms, height)
             return [
                 (point[:, k : k + 1], normal[:, k : k + 1], gap[None, k : k + 1])
                 for k in range(gap.shape[0])
             ]
 
-        return lanewise(compute, position, arms, height)
+        return lanewise(compute, arms, height)
 
     def _deal(self, slots: list[tuple]) -> tuple[Lanes, Lanes, Lanes]:
         """Deals the slots (component, 1, world) out to the finger lanes."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured import inertia
 from codesign_jax.engines.structured import kinematics as kin
 from codesign_jax.engines.structured.constants import apply_columns
-from codesign_jax.engines.structured.inertia import Body
+from codesign_jax.engines.structured.inertia import Body, Centred
 from codesign_jax.engines.structured.integration import rigid_arm
 from codesign_jax.engines.structured.kernel import integration, objects
 from codesign_jax.engines.structured.kernel.contacts import (
@@ -34,9 +34,9 @@ from codesign_jax.engines.structured.kernel.problem import (
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.kernel.spheres import Spheres
 from codesign_jax.engines.structured.kinematics import State
-from codesign_jax.engines.structured.lanes import total
+from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
-from codesign_jax.engines.structured.problem import next_motion, object_motion, palm_motion
+from codesign_jax.engines.structured.problem import next_motion, palm_motion
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.program import Program
@@ -103,7 +103,7 @@ class Step:
         rigid = not scene.effects.wrist
         problem = Problem(p.links, self.block, memory, geometry["palm"], rigid=rigid)
         now, quality = Newton(problem).solve(now, waiting, *p.limits)
-        distance = lanewise(_distance, state["position"], state["wrist"], centre).lane
+        distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
         goes_on, slots = waiting & undecided(distance, height), []
         if p.slotted:
@@ -130,35 +130,35 @@ class Step:
         wrist, h = self.p.scene.effects.wrist, self.p.scene.discretization.timestep
 
         def compute(state, arm, mass, centre, tensor, damping, armature, obj, principal, k, g):
-            frame, axes, vel, bias = kin._wrist(state["wrist"], state["wrist_vel"])
             s = State(**{k: state.get(k) for k in State._fields})
-            columns, position, object_vel = kin._object(s)
+            place = kin._place(s)
+            frame, axes, vel, bias = kin._wrist(place, s.wrist, s.wrist_vel)
+            columns, object_vel = kin._object(s)
             turned = inertia.turned_tensor(frame, tensor)
-            palm = Body(mass, apply_columns(frame, centre), turned)
-            thing = Body(obj, position, inertia.principal_tensor(columns, principal))
+            palm = Body(mass, place + apply_columns(frame, centre), turned)
+            thing = Centred(obj, inertia.principal_tensor(columns, principal))
             spring = -damping * state["wrist_vel"]
             if k is not None:
                 spring = k * (arm - state["wrist"]) + spring
             acc = state["acc_wrist"], state["acc_object"]
             if not wrist:
                 acc = rigid_arm(arm, state["wrist"], state["wrist_vel"], h), acc[1]
-            motions = palm_motion(acc[0], axes), object_motion(acc[1], position)
             return {
+                "place": place,
                 "frame": frame,
                 "vel": vel,
                 "bias": bias,
                 "columns": columns,
                 "object_vel": object_vel,
-                "now": Iterate(*acc, *motions),
+                "now": Iterate(acc[0], palm_motion(acc[0], axes), acc[1]),
                 "palm": Palm(
                     palm,
                     thing,
                     palm.smooth_force(vel, bias, g),
-                    inertia.object_force(thing, object_vel, g),
+                    thing.smooth_force(object_vel, g),
                     spring,
                     armature,
                     axes,
-                    position,
                 ),
             }
 
@@ -168,15 +168,18 @@ class Step:
         """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
 
         Returns:
-          The warm start and the hand's centre in the palm's frame.
+          The warm start and the hand's centre from the object's.
         """
         p, now = self.p, at["now"]
         like = jnp.zeros((p.size,), self.finger_state.dtype)
         mount, base, share, stub = (
             p.hand.read(self.hand, n) for n in ("mount", "base", "share", "stub_centre")
         )
-        frame, origin = lanewise(kin._mount, at["frame"], mount, base)
-        weight = lanewise(lambda f, s, share: share * apply_columns(f, s), at["frame"], stub, share)
+        frame, origin = lanewise(kin._mount, at["place"], at["frame"], mount, base)
+        weight = lanewise(
+            lambda x, f, s, share: share * (x + apply_columns(f, s)),
+            at["place"], at["frame"], stub, share,
+        )  # fmt: skip
         wide, gravity = zeros((6,), like), self.gravity()
         vel, bias, motion = (
             lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
@@ -238,9 +241,8 @@ class Step:
         """Point, normal and gap of spheres of the hand against the object or the table."""
         scene = self.p.scene
         if name.endswith("_object"):
-            place = at["columns"], at["palm"].position
-            return sphere_on_object(scene, thing, *place, centre, radius)
-        height = self.p.world_state.read(self.world_state, "wrist", 0, self.block.world)[2]
+            return sphere_on_object(scene, thing, at["columns"], centre, radius)
+        height = self.p.world_state.read(self.world_state, "position", 0, self.block.world)[2]
         return lanewise(sphere_on_table, height, centre, radius)
 
 
@@ -273,8 +275,3 @@ def _link(names: tuple[str, ...], parent, constants, joint, forces):
         "tau": tau,
     }
     return (origin, frame, vel, bias, motion), stored
-
-
-def _distance(position, wrist, centre):
-    away = position - wrist[:3] - centre
-    return jnp.sqrt(total([away[i] ** 2 for i in range(3)]))

@@ -207,6 +207,8 @@ def test_command_writes_the_sheet(tmp_path, capsys, by_toy):
     text = (tmp_path / "out" / "build_sheet.md").read_text()
     assert "Of 4 grasps of the design itself 100 % [51, 100] succeed." in text
     assert "| length | mm | 100 |" in text and "Design: length=100 mm arm_z=40 mm" in text
+    # The toy scene's hand has two fingers: lengths and height of the arm of 15 parameters.
+    assert "12 further parameters of the hand's table were not moved" in text
     assert (tmp_path / "out" / "build_sheet.pdf").exists()
     assert [p.name for p in tmp_path.iterdir() if p.name != "cache"] == ["out"]
     assert cli.main([*TOY, "--tolerance-steps", "0", "--out", str(tmp_path / "no")]) == 2

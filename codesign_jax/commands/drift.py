@@ -55,7 +55,8 @@ def simulate(
     run.record_rate()
     known = found[0].value >= tolerance.WANTED
     rows = tolerance.tolerances(planned, found) if known else []
-    return sheet.Drift(found[0], count, steps, case.engine, rows)
+    fixed = sum(source < 0 for source in planned.space.source)
+    return sheet.Drift(found[0], count, steps, case.engine, rows, fixed)
 
 
 def _announce(

@@ -36,6 +36,7 @@ class Drift(NamedTuple):
       steps: Steps on each side.
       engine: Engine that simulated.
       rows: Tolerances; empty if the design itself has too few successes.
+      fixed: Parameters of the hand's table that were not moved.
     """
 
     nominal: Interval
@@ -43,6 +44,7 @@ class Drift(NamedTuple):
     steps: int
     engine: str
     rows: list[Tolerance]
+    fixed: int = 0
 
 
 def sections(
@@ -182,6 +184,11 @@ def tolerance_section(drift: Drift) -> Section:
         f"limit, each {factor:.2g} times as far as the one before. The limits are Table I's, "
         "or the design space's where that is wider, and the pressure limit.",
     ]
+    if drift.fixed:
+        notes.append(
+            f"{drift.fixed} further parameters of the hand's table were not moved; codesign export "
+            "--tolerance all moves each of them."
+        )
     head = ("parameter", "unit", "value", "down to", "fails at", "up to", "fails at")
     return Section(f"Tolerance: drift until fewer than {limit} succeed", head, rows, notes)
 

@@ -79,7 +79,7 @@ format: $(STAMP)
 	$(BIN)/ruff format $(CHECKED)
 
 types: $(STAMP)
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright --threads 2 --pythonpath $(BIN)/python
 
 # Installed again only when the dependencies change.
 $(STAMP): pyproject.toml

@@ -35,3 +35,5 @@ def use(flags: tuple[str, ...] = FLAGS) -> None:
     if flags == FLAGS:
         os.environ.setdefault("CODESIGN_KERNEL_OPTIMIZATION", "0")
     os.environ.setdefault("XLA_FLAGS", " ".join(flags))
+    # Every operation of a program would carry the lines of code from which it was called.
+    os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")

@@ -136,7 +136,7 @@ def test_the_presets_files_and_the_front_page_state_what_was_measured(tmp_path, 
 
 
 @pytest.mark.parametrize(
-    "parts", ["tip,impulse,time", pytest.param(",".join(study.PARTS), marks=pytest.mark.slow)]
+    "parts", ["impulse,time", pytest.param(",".join(study.PARTS), marks=pytest.mark.slow)]
 )
 def test_a_tiny_study_runs_resumes_and_is_drawn(parts, tmp_path, monkeypatch, capsys):
     """The script with MuJoCo C alone: parts, a refused setting, the budget, page and CSV."""
@@ -157,7 +157,9 @@ def test_a_tiny_study_runs_resumes_and_is_drawn(parts, tmp_path, monkeypatch, ca
     assert run("--commit", "abc") == 0
     records = json.loads((data / "accuracy_cpu.json").read_text())["records"]
     # 20 ms with the scene's own contact constant, in the parts tip and impulse.
-    assert sum("refused" in r for r in records.values()) == 2
+    assert sum("refused" in r for r in records.values()) == len(
+        {"tip", "impulse"} & set(parts.split(","))
+    )
     assert not [k for k, r in records.items() if "failed" in r]
     capsys.readouterr()
     assert run() == 0

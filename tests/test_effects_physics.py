@@ -184,7 +184,9 @@ def some_contacts(friction, rng, count):
     )
 
 
-@pytest.mark.parametrize("friction", ["none", "coulomb", "full"])
+@pytest.mark.parametrize(
+    "friction", ["full", *(pytest.param(f, marks=pytest.mark.slow) for f in ("none", "coulomb"))]
+)
 def test_force_and_inertia_are_derivatives_of_the_cost(friction):
     """In spatial accelerations, by automatic differentiation of the cost, in every zone."""
     rng, count = np.random.default_rng(3), 60

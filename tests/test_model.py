@@ -58,7 +58,13 @@ SCENES = {
 }
 
 
-@pytest.fixture(params=SCENES, scope="module")
+QUICK = ("pneuflex4", "tripod3, two spheres", "one link")
+
+
+@pytest.fixture(
+    params=[n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in SCENES],
+    scope="module",
+)
 def worlds(request):
     """A scene with fields of six random worlds in float64 and their fresh compiles.
 

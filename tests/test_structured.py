@@ -99,6 +99,7 @@ def test_float32_is_close_to_float64():
     assert error < 1e-4
 
 
+@pytest.mark.slow  # quick: test_a_decided_world_stays, test_a_trajectory_changes_no_outcome
 def test_worlds_that_end_early():
     """They change no verdict, and the block's other worlds no bit."""
     with jax.enable_x64(True):

@@ -462,7 +462,7 @@ def test_evaluate_judges_a_run_on_other_objects_and_settings(finished, tmp_path,
     wrong = ["--accuracy", "fats", "--set", "hand.sectoin.width=1"]
     assert command("evaluate", "--run", finished, *wrong) == 2
     error = capsys.readouterr().err
-    assert "did you mean 'fast'?" in error and "did you mean 'section'?" in error
+    assert "did you mean 'fast'?" in error and "did you mean 'hand.section'?" in error
 
 
 def test_a_verdict_comes_with_its_interval():

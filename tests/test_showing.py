@@ -14,6 +14,7 @@ from tiny_run import small_run  # noqa: F401
 from toy import TINY
 
 from codesign_jax import cli, codesign, runs, scene
+from codesign_jax.commands import calls
 from codesign_jax.commands import landscape as command
 from codesign_jax.commands.case import Case
 from codesign_jax.engines import make_engine
@@ -126,7 +127,7 @@ def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
 
 def test_landscape_has_every_point(run, monkeypatch, capsys):
     """Cut into calls, it is what one evaluation of all designs says; files and report agree."""
-    monkeypatch.setitem(command.WORLDS, "cpu", 10)  # five designs; the last call is filled up
+    monkeypatch.setitem(calls.WORLDS, "cpu", 10)  # five designs; the last call is filled up
     sizes = ["--points", "3", "--trials", "2", "--seed", "5"]
     assert cli.main(["landscape", "--run", str(run), *sizes]) == 0
     assert "grasps: 18 in 2 calls" in capsys.readouterr().out
@@ -216,7 +217,7 @@ def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
 
 def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
     """After the first of three calls; another seed begins anew."""
-    monkeypatch.setitem(command.WORLDS, "cpu", 3)
+    monkeypatch.setitem(calls.WORLDS, "cpu", 3)
     made, count = codesign.make_evaluate, []
 
     def stopping(*arguments):

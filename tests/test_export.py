@@ -82,7 +82,7 @@ def test_plain_mujoco_plays_the_files_as_the_engine(grasped, tmp_path):
     assert np.isinf(judged.lost_time).tolist() == [True, False, False]
     found = [grasps.grasp(the_scene, *world) for world in worlds]
     trials = [(f"grasp_{i}", trial) for i, (_, trial) in enumerate(worlds)]
-    tables.write_grasps(tmp_path, the_scene, trials, found)
+    list(tables.write_grasps(tmp_path, the_scene, trials, found))
     for i, (name, _) in enumerate(trials):
         controls = np.loadtxt(tmp_path / f"{name}_controls.csv", delimiter=",", skiprows=1)
         xml = mujoco.MjModel.from_xml_path(str(tmp_path / f"{name}.xml"))
@@ -111,7 +111,7 @@ def test_the_test_would_notice_another_contact(grasped):
 def test_the_player_needs_mujoco_and_numpy_alone(grasped, tmp_path):
     the_scene, worlds, _, judged = grasped
     found = grasps.grasp(the_scene, *worlds[2])
-    tables.write_grasps(tmp_path, the_scene, [("lost", worlds[2][1])], [found])
+    list(tables.write_grasps(tmp_path, the_scene, [("lost", worlds[2][1])], [found]))
     tree = ast.parse((tmp_path / "play.py").read_text())
     imports = [n for n in ast.walk(tree) if isinstance(n, (ast.Import, ast.ImportFrom))]
     assert {a.name for n in imports for a in n.names} == {"sys", "mujoco", "numpy"}
@@ -241,7 +241,7 @@ def test_a_rigid_wrist_leaves_the_binary_model_alone(tmp_path):
     params, trial = hand_world(the_scene)
     found = grasps.grasp(the_scene, params, trial)
     assert found.xml is None and "effects.wrist = false" in found.note
-    tables.write_grasps(tmp_path, the_scene, [("rigid", trial)], [found])
+    list(tables.write_grasps(tmp_path, the_scene, [("rigid", trial)], [found]))
     assert not (tmp_path / "rigid.xml").exists()
     loaded = mujoco.MjModel.from_binary_path(str(tmp_path / "rigid.mjb"))
     with jax.enable_x64(True):

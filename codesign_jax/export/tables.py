@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -78,8 +78,8 @@ def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
 
 def write_grasps(
     folder: Path, scene: Scene, trials: Sequence[tuple[str, Trial]], grasps: Iterable[Grasp]
-) -> list[str]:
-    """Writes models, controls, player and grasps.csv.
+) -> Iterator[str]:
+    """Writes models, controls, player and grasps.csv, as far as its lines are asked for.
 
     Args:
       folder: An existing folder.
@@ -87,10 +87,10 @@ def write_grasps(
       trials: Name and trial of each grasp.
       grasps: The grasps, which are asked for one after the other.
 
-    Returns:
-      What became of each grasp, a line each.
+    Yields:
+      What became of each grasp, a line each, as it is written.
     """
-    rows, lines = [], []
+    rows = []
     for (name, trial), grasp in zip(trials, grasps, strict=True):
         if grasp.xml is not None:
             (folder / f"{name}.xml").write_text(grasp.xml, encoding="utf-8")
@@ -99,11 +99,11 @@ def write_grasps(
         exact = ([repr(float(v)) for v in row] for row in grasp.controls)
         _write(folder / f"{name}_controls.csv", control_columns(scene), exact)
         rows.append(_row(name, scene, trial, grasp))
-        lines.append(f"{name}: {_verdict(grasp)}")
-        lines += [f"{name}: no MJCF: {grasp.note}"] if grasp.note else []
+        yield f"{name}: {_verdict(grasp)}"
+        if grasp.note:
+            yield f"{name}: no MJCF: {grasp.note}"
     _write(folder / GRASPS, [*GRASP_COLUMNS], rows)
     (folder / PLAYER.name).write_text(PLAYER.read_text(encoding="utf-8"), encoding="utf-8")
-    return lines
 
 
 def _row(name: str, scene: Scene, trial: Trial, grasp: Grasp) -> list[str]:

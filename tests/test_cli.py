@@ -507,9 +507,9 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
     assert snapshot(grown) == before
 
 
-@pytest.mark.parametrize("jobs", ["1", pytest.param("2", marks=pytest.mark.slow)])
-def test_seeds_are_compared_and_run_as_jobs(jobs, tmp_path, capsys):
-    """Jobs are local processes, with the bits of one batch; the next test has those of one run."""
+@pytest.mark.parametrize("seeds", ["3", pytest.param("2-3", marks=pytest.mark.slow)])
+def test_seeds_are_compared_and_run_as_jobs(seeds, tmp_path, capsys):
+    """A job a seed is a local process, with the bits of a batch; the next test has a run alone."""
     short = ["--episodes", "2"]
     base = [a for a in RUN if a not in ("--seed", "3")]
     assert command(*base, *short, "--seeds", "2-3", "--out", tmp_path / "both") == 0
@@ -522,20 +522,20 @@ def test_seeds_are_compared_and_run_as_jobs(jobs, tmp_path, capsys):
     assert "of 2 runs have a particle below the limit of success" in table
     assert "% of such runs (95 % interval)" in table
 
-    seeds = [*base, *short, "--seeds", "2-3"]
-    sent = ["--jobs", jobs, "--job-set", "cluster=local", "timeout_min=5"]
-    out = tmp_path / "jobs"
-    assert command(*seeds, *sent, "--out", out) == 0
-    for seed in ("seed-2", "seed-3"):
-        assert stored(out / seed) == stored(tmp_path / "both" / seed)
-    assert (out / "seeds.csv").read_bytes() == (tmp_path / "both" / "seeds.csv").read_bytes()
-    rows = (out / "seeds.csv").read_text().splitlines()
-    assert len(rows) == 3 and rows[1].startswith("2,1,")
+    run = [*base, *short, "--seeds", seeds, "--jobs", "2", "--job-set"]
+    both, out = tmp_path / "both", tmp_path / "jobs"
+    assert command(*run, "cluster=local", "timeout_min=5", "--out", out) == 0
+    header, *rows = (both / "seeds.csv").read_text().splitlines()
+    assert rows[0].startswith("2,1,") and rows[1].startswith("3,1,")
+    chosen = [row for row in rows if row[0] in seeds]
+    assert (out / "seeds.csv").read_text().splitlines() == [header, *chosen]
+    for row in chosen:
+        assert stored(out / f"seed-{row[0]}") == stored(both / f"seed-{row[0]}")
     capsys.readouterr()
     assert command(*base, *short, "--jobs", "2") == 2
     assert "--jobs needs --seeds" in capsys.readouterr().err
     for wrong, words in (("timeout_min", "must be KEY=VALUE"), ("memory=3", "memory")):
-        assert command(*seeds, "--jobs", "2", "--job-set", wrong, "--out", tmp_path / "no") == 2
+        assert command(*run, wrong, "--out", tmp_path / "no") == 2
         assert words in capsys.readouterr().err
 
 

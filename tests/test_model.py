@@ -301,7 +301,7 @@ STIFF = {"length": 0.010, "height": 0.025, "wall": 0.007, "pressure": 150e3}
 """The stiffest finger of Table I."""
 
 
-@pytest.mark.parametrize("damping", ["added", "least", "own"])
+@pytest.mark.parametrize("damping", ["added", "least"])
 def test_implicit_springs_are_stable(damping):
     """A finger of 10 mm at the paper's 10 ms; its own damping time is 6 ms."""
     the_scene = free_scene(spring_damping=damping)
@@ -316,16 +316,6 @@ def test_implicit_springs_are_stable(damping):
         fields = model.model_fields(the_scene, params, trial)
     np.testing.assert_allclose(fields.dof_damping, ours.dof_damping, rtol=1e-12)
     np.testing.assert_allclose(fields.dof_armature, ours.dof_armature, rtol=1e-12)
-
-
-def test_too_little_damping_of_its_own_is_refused():
-    changed = {"discretization.spring_damping": "own", "hand.material.damping_time": 0.004}
-    with pytest.raises(
-        scene.SceneError, match=r"damping_time = 0.004 s must be at least 0.00556 s"
-    ):
-        scene.load("paper", overrides=changed)
-    changed["discretization.timestep"] = 0.005
-    assert scene.load("paper", overrides=changed).discretization.spring_damping == "own"
 
 
 def test_explicit_springs_are_not_stable(tmp_path, monkeypatch):

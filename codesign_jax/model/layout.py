@@ -111,9 +111,9 @@ def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
     """Damping C of a joint whose spring acts implicitly, (M + h C) a = tau - K q - C v.
 
     With the new velocity v + h a that is the spring's force at the step's start and all of the
-    damping at its end.  C = D + h K is the implicit Euler step of both.  As a joint without inertia
-    moves by -h K / C q in a step, C > h K / 2 is stable for every stiffness, and C = max(D, h K)
-    never overshoots: a material with D >= h K then keeps its own damping.
+    damping at its end.  C = D + h K is the implicit Euler step of both.  A joint without inertia
+    moves by -h K / C q in a step: C = max(D, h K) never overshoots, and where D >= h K the joint
+    keeps its own damping.
 
     Args:
       scene: The scene.
@@ -123,10 +123,8 @@ def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
     Returns:
       C by `discretization.spring_damping`, shaped as the stiffness.
     """
-    kind, added = scene.discretization.spring_damping, scene.discretization.timestep * stiffness
-    if kind == "own":
-        return damping
-    if kind == "added":
+    added = scene.discretization.timestep * stiffness
+    if scene.discretization.spring_damping == "added":
         return damping + added
     # Not jnp.maximum: NumPy's numbers, as a MuJoCo spec takes them, stay NumPy's.
     return damping + (added - damping) * (added > damping)

@@ -56,8 +56,6 @@ def load(
             parts[key] = loader(source, overrides=inside[key])
         except schema.SceneError as error:
             problems += error.problems
-    if parsed is not None and "hand" in parts:
-        problems += keypaths.as_given(_undamped(parsed, parts["hand"], path.name), places)
     if problems or parsed is None:
         raise schema.SceneError(problems)
     names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
@@ -135,28 +133,6 @@ def _check(scene: SceneFile, where: str, problems: list[str]) -> None:
         )
 
 
-_OVERSHOOT = 1.8
-"""Most time steps a damping time for `spring_damping = "own"`: springs are unstable at two."""
-
-
-def _undamped(scene: SceneFile, chosen: hand.Hand, where: str) -> list[str]:
-    """Springs whose own damping is too small for `discretization.spring_damping = "own"`."""
-    size, w = scene.discretization, chosen.wrist
-    if size.spring_damping != "own":
-        return []
-    times = {"material.damping_time": chosen.material.damping_time}
-    if scene.effects.wrist:
-        times["wrist.linear_damping / linear_stiffness"] = w.linear_damping / w.linear_stiffness
-        times["wrist.angular_damping / angular_stiffness"] = w.angular_damping / w.angular_stiffness
-    return [
-        f"{where}.discretization.spring_damping = 'own' is unstable: hand.{name} = "
-        f"{time:.3g} s must be at least {size.timestep / _OVERSHOOT:.3g} s, a time step of "
-        f"{size.timestep:g} s over {_OVERSHOOT:g}; 'least' takes every step"
-        for name, time in times.items()
-        if time * _OVERSHOOT < size.timestep
-    ]
-
-
 def check_together(scene: SceneFile, where: str) -> list[str]:
     """Returns what is wrong with numbers that are each in range, but do not go together.
 
@@ -182,8 +158,6 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
             f"must be at least two time steps ({2 * h:g} s): "
             "a stiffer contact is unstable (MuJoCo's refsafe)"
         )
-    if isinstance(scene, Scene):
-        problems += _undamped(scene, scene.hand, where)
     if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:
         problems.append(
             f"{where}.phases ends after {scene.end_time:g} s: the number of steps is structure, "

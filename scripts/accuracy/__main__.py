@@ -3,6 +3,8 @@
 python -m scripts.accuracy --json docs/data/accuracy_cpu.json --quick    # minutes
 python -m scripts.accuracy --json docs/data/accuracy_h200.json           # on a GPU
 python -m scripts.accuracy --report                # figures, pages and presets from data
+python -m scripts.accuracy --share 2/4 --json b.json                     # beside three others
+python -m scripts.accuracy --json docs/data/accuracy_h200.json --merge a.json b.json c.json d.json
 
 Every finished case is kept: the same command goes on where the last one stopped, and exits with 3
 if cases are left.  --parts and --engines choose among the cases.
@@ -18,7 +20,7 @@ import jax
 import codesign_jax
 from codesign_jax.scene.effects import ENGINES
 from scripts.accuracy import study
-from scripts.accuracy.store import Store
+from scripts.accuracy.store import Store, merge
 from scripts.shared import provenance
 
 SCENES = Path(codesign_jax.__file__).parent / "scenes" / "accuracy"
@@ -35,9 +37,14 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--size", choices=list(study.SIZES), default="full")
     parser.add_argument("--quick", dest="size", action="store_const", const="quick")
     parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--without", help="cases whose name does not contain this")
+    parser.add_argument(
+        "--share", default="1/1", metavar="I/N", help="every N-th case from the I-th on, of several"
+    )
     parser.add_argument("--budget", type=float, default=1e9, help="seconds to begin cases in")
-    parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
     provenance.add_commit(parser)
+    parser.add_argument("--merge", type=Path, nargs="+", help="write these files into one and stop")
     parser.add_argument("--list", action="store_true", help="print the cases and stop")
     parser.add_argument("--report", action="store_true", help="draw what docs/data holds and stop")
     parser.add_argument("--docs", type=Path, default=Path("docs"))
@@ -60,9 +67,15 @@ def main() -> int:
         page = args.docs / "accuracy.md"
         report.make_summary(args.docs.parent / "README.md", page, SCENES, found)
         return 0
+    if args.merge:
+        merge(args.merge, args.json)
+        return 0
     gpu = jax.default_backend() == "gpu"
     every = study.cases(study.SIZES[args.size], args.parts, args.engines, args.data, gpu=gpu)
     every = [case for case in every if args.only in case.key]
+    every = [case for case in every if not args.without or args.without not in case.key]
+    first, of = (int(n) for n in args.share.split("/"))
+    every = every[first - 1 :: of]
     if args.list:
         print("\n".join(case.key for case in every))
         return 0

@@ -2,22 +2,21 @@
 
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from codesign_jax.codesign import SUCCESS_COST
-from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.scene import load as load_scene
 from scripts.accuracy import decision, impulse, tip
-from scripts.accuracy.settings import Setting
-from scripts.shared.statistics import bootstrap, slope, spearman
+from scripts.accuracy.settings import HULL, Setting
+from scripts.shared.statistics import slope, spearman, two_way
 
 Records = list[dict[str, Any]]
 
-MOVED = "moved 1 um"
-RESAMPLES = 2000
+RESAMPLES = 500
 ALPHA = 0.2
 """The particle filter's cost offset: its weights are 1 / (0.2 + cost)."""
 
@@ -47,10 +46,6 @@ def bad(record: dict[str, Any]) -> str | None:
     return record.get("refused") or record.get("failed")
 
 
-def _role(records: Records, part: str, role: str) -> dict[str, Any] | None:
-    return next((r for r in measured(records, part) if role in r["more"]), None)
-
-
 def tips(record: dict[str, Any]) -> np.ndarray:
     """Tips of a record [m], shape (hand, time, finger, 3)."""
     return 1e-3 * np.reshape(record["tips_mm"], record["shape"])
@@ -64,11 +59,11 @@ _COMPARE: dict[str, Callable[[dict, dict], dict]] = {
 
 def against_reference(records: Records, part: str) -> Records:
     """Records of the part tip or impulse with their errors; none without a reference."""
-    reference = _role(records, part, "reference")
+    every = measured(records, part)
+    reference = next((r for r in every if "reference" in r["more"]), None)
     if reference is None:
         return []
-    every = (r for r in measured(records, part) if r is not reference)
-    return [r | _COMPARE[part](r, reference) for r in every]
+    return [r | _COMPARE[part](r, reference) for r in every if r is not reference]
 
 
 def order(points: Iterable[tuple[float, float]]) -> float | None:
@@ -91,14 +86,17 @@ def orders(records: Records) -> dict[str, float | None]:
     beams = measured(records, "beam")
     for name in sorted({k for r in beams for k in r if k.startswith(("elastica", "arc"))}):
         found[f"{name}, length of a link"] = order((1 / r["of"].links, r[name]) for r in beams)
-    pushes = [
-        r for r in against_reference(records, "impulse")
-        if not r["more"] and r["of"] == Setting("mujoco", timestep=r["of"].timestep)
-    ]  # fmt: skip
-    found["contact impulse, time step (ten links)"] = order(
-        (r["of"].timestep, r["impulse_error"]) for r in pushes
-    )
+    found["contact impulse, time step"] = order(by_step(records))
     return found
+
+
+def by_step(records: Records) -> list[tuple[float, float]]:
+    """Time steps and errors of the contact impulse, ten links."""
+    return [
+        (r["of"].timestep, r["impulse_error"])
+        for r in against_reference(records, "impulse")
+        if not r["more"] and r["of"] == Setting(timestep=r["of"].timestep)
+    ]
 
 
 Grasps = dict[tuple[Setting, bool, str], np.ndarray]
@@ -109,26 +107,30 @@ def decisions(records: Records) -> Grasps:
 
     Not a number where a trial failed.
     """
-    scene, parts = load_scene("paper_spheres"), {}
-    for r in measured(records, "decision"):
-        cost = decision.costs(scene, r)
-        each = np.split(cost, len(r["populations"]))
-        for name, population in zip(r["populations"], each, strict=True):
-            parts.setdefault((r["of"], MOVED in r["more"], name), []).append(
-                (r["first"], population)
-            )
+    scene = load_scene("paper")
     return {
-        key: np.concatenate([c for _, c in sorted(blocks, key=lambda b: b[0])], 1)
-        for key, blocks in parts.items()
+        (r["of"], each["moved"], each["name"]): decision.costs(scene, each)
+        for r in measured(records, "decision")
+        for each in r["populations"]
+    }
+
+
+def warned(records: Records, population: str) -> dict[Setting, dict[str, float]]:
+    """Share of a population's trials by status bit, by setting."""
+    return {
+        r["of"]: {k: n / (p["particles"] * p["trials"]) for k, n in p["status"].items()}
+        for r in measured(records, "decision")
+        for p in r["populations"]
+        if p["name"] == population and not p["moved"]
     }
 
 
 def finest(grasps: Grasps, population: str) -> Setting | None:
-    """The setting that stands for the truth: shortest time step, then most links."""
+    """The setting that stands for the truth: shortest step, float64, then most links."""
     known = [s for s, moved, name in grasps if name == population and not moved]
     usual = [s for s in known if s.engine == "structured" and s.iterations is None]
-    usual = [s for s in usual if s.axes == 3 and not s.extra]
-    return min(usual, key=lambda s: (s.timestep, -s.links, -s.spheres), default=None)
+    usual = [s for s in usual if s.axes == 3 and not s.extra and s.surface == HULL]
+    return min(usual, key=lambda s: (s.timestep, not s.wide, -s.links), default=None)
 
 
 def means(cost: np.ndarray) -> np.ndarray:
@@ -143,36 +145,49 @@ def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
 
     Args:
       a: Costs, shape (particle, trial), NaN where a trial failed.
-      b: The reference's, with as many trials or more.
+      b: The reference's; of more or fewer trials the first ones.
     """
     trials = min(a.shape[1], b.shape[1])
     a, b = a[:, :trials], b[:, :trials]
-    kept, expected = a < SUCCESS_COST, b < SUCCESS_COST
-    same, mine, theirs = (kept == expected).mean(1), means(a), means(b)
+    mine, theirs = means(a), means(b)
     weights = [1 / (ALPHA + m) for m in (mine, theirs)]
     shares = [w / w.sum() for w in weights]
     top = max(1, len(a) // 6)
     best = [set(np.argsort(m, kind="stable")[:top]) for m in (mine, theirs)]
+
+    intervals = two_way(_judged, a, b, resamples=RESAMPLES)
     return {
         "particles": len(a),
         "trials": trials,
-        "success": wilson(int(kept.sum()), kept.size),
-        "success_reference": wilson(int(expected.sum()), expected.size),
-        "same_verdict": _interval(lambda i: same[i].mean(-1), len(a)),
-        "cost_difference": _interval(lambda i: (mine - theirs)[i].mean(-1), len(a)),
-        "rank": _interval(lambda i: spearman(mine[i], theirs[i]), len(a)),
+        **dict(zip(JUDGED, intervals, strict=True)),
         # Share of the next generation that would come from another particle.
         "offspring_moved": float(0.5 * np.abs(shares[0] - shares[1]).sum()),
         "best_shared": len(best[0] & best[1]) / top,
-        "failed": int((~np.isfinite(a)).sum()),
+        "failed": float((~np.isfinite(a)).mean()),
     }
 
 
-def _interval(statistic: Callable[[np.ndarray], np.ndarray], particles: int) -> Interval:
-    return bootstrap(statistic, particles, resamples=RESAMPLES)
+JUDGED = (
+    "success", "success_reference", "success_difference", "flipped", "cost_difference", "rank",
+)  # fmt: skip
+"""What `_judged` calculates: each with an interval over particles and trials."""
 
 
-def trial_noise(cost: np.ndarray, trials: int = 6) -> Interval | None:
+def _judged(a: np.ndarray, b: np.ndarray) -> list[float]:
+    kept, expected = a < SUCCESS_COST, b < SUCCESS_COST
+    success, right, flips = kept.mean(), expected.mean(), (kept != expected).mean()
+    mine, theirs = means(a), means(b)
+    return [success, right, success - right, flips, (mine - theirs).mean(), spearman(mine, theirs)]  # type: ignore[list-item]
+
+
+def differ(kept: np.ndarray, moved: np.ndarray) -> float:
+    """Share of verdicts that differ."""
+    trials = min(kept.shape[1], moved.shape[1])
+    verdicts = [cost[:, :trials] < SUCCESS_COST for cost in (kept, moved)]
+    return float((verdicts[0] != verdicts[1]).mean())
+
+
+def trial_noise(cost: np.ndarray, trials: int = 6) -> float | None:
     """Rank correlation of a setting with itself over other trials: what an episode's trials give.
 
     Args:
@@ -183,20 +198,15 @@ def trial_noise(cost: np.ndarray, trials: int = 6) -> Interval | None:
     if len(blocks) < 2:
         return None
     each = [means(b) for b in blocks]
-
-    def mean(i: np.ndarray) -> np.ndarray:
-        pairs = zip(each, each[1:], strict=False)
-        return np.mean([spearman(a[i], b[i]) for a, b in pairs], axis=0)
-
-    return _interval(mean, len(cost))
+    return float(np.mean([spearman(a, b) for a, b in zip(each, each[1:], strict=False)]))
 
 
 def times(records: Records) -> dict[tuple[str, Setting], dict[str, Any]]:
-    """Times by engine's name and setting, the engine and float type being the name's."""
+    """Times by engine's name and setting, whose own engine and float type say nothing."""
     found = {}
     for r in measured(records, "time"):
         for name, values in r["engines"].items():
-            found[name, r["of"]] = values
+            found[name, replace(r["of"], engine="structured")] = values
     return found
 
 

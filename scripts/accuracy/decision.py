@@ -1,8 +1,11 @@
 """What a co-design run sees: verdicts, costs and ranks of particles over the same trials."""
 
+import base64
 import time
+import zlib
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +13,13 @@ import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax.scene import Scene, parameters
-from codesign_jax.types import failed
+from codesign_jax.types import Outcome, Status, failed
 from scripts.accuracy import worlds
 from scripts.accuracy.settings import Setting
 from scripts.shared import work
 
-KEPT, FAILED = -1, -2
-"""Marks in place of the time of loss: kept to the end, and failed."""
+KEPT, FAILED, _PARTS = 255, 254, 250
+"""Marks in place of the time of loss: kept to the end, and failed; parts of the time."""
 SEED = 5
 """Seed of the trials; no run of the reproduction tested its particles on it."""
 
@@ -25,8 +28,8 @@ def populations(data: Path, count: int) -> dict[str, np.ndarray]:
     """Final particles of the 23-parameter experiment [SI], each shape (count, 23), float32.
 
     "spread" takes every strategy's, at equal steps of rank of their test costs, as an optimiser
-    meets them from start to end; "late" those of the concurrent run whose median cost is the
-    median of the runs, which differ little.
+    meets them from start to end; "late" distinct ones of all concurrent runs, as many of each as
+    of any other: what a design run ends with.
 
     Args:
       data: Folder with 23d.npz.
@@ -36,56 +39,107 @@ def populations(data: Path, count: int) -> dict[str, np.ndarray]:
         particles, cost = file["final_particles"], file["test_exclude"]
     flat, order = particles.reshape(-1, particles.shape[-1]), np.argsort(cost.ravel())
     rank = (np.arange(count) + 0.5) / count * len(flat)
-    middle = np.median(cost[-1], axis=1)
-    run = int(np.argsort(middle)[len(middle) // 2])
-    late = particles[-1, run][np.linspace(0, particles.shape[2] - 1, count).round().astype(int)]
-    return {"spread": flat[order[rank.astype(int)]], "late": late}
+    return {"spread": flat[order[rank.astype(int)]], "late": _distinct(particles[-1], count)}
 
 
-def simulate(
-    setting: Setting, designs: np.ndarray, first: int, trials: int, *, moved: bool = False
-) -> dict[str, Any]:
-    """Time of loss of every trial [ms], or `KEPT` or `FAILED`, particle by particle.
+def _distinct(runs: np.ndarray, count: int) -> np.ndarray:
+    """Particles of runs, shape (run, particle, 23), in turn one of each, no two alike."""
+    rng = np.random.default_rng(SEED)
+    every = [rng.permutation(np.unique(run, axis=0)) for run in runs]
+    depth = max(len(run) for run in every)
+    chosen = [run[i] for i in range(depth) for run in every if i < len(run)][:count]
+    if len(chosen) < count:
+        raise ValueError(f"{count} particles asked for, the runs end with {len(chosen)} distinct")
+    return np.array(chosen)
+
+
+class Request(NamedTuple):
+    """What is simulated: a population's name, its particles, and a number of trials.
+
+    Attributes:
+      name: Name of the population.
+      designs: Particles, shape (particle, 23).
+      trials: Number of trials, the first ones of all.
+      moved: Whether the objects are displaced by `work.NUDGE`.
+    """
+
+    name: str
+    designs: np.ndarray
+    trials: int
+    moved: bool = False
+
+
+def simulate(setting: Setting, requests: list[Request], block: int) -> dict[str, Any]:
+    """Verdicts and times of loss of every trial, particle by particle; see `encode`.
 
     Args:
       setting: The setting.
-      designs: Particles, shape (particle, 23).
-      first: Number of the first trial.
-      trials: Number of trials.
-      moved: Whether the objects are displaced by `work.NUDGE`.
+      requests: What to simulate.
+      block: Trials of a call: calls of one size share a program.
+
+    Returns:
+      Under "populations" a record for each request, beside seconds with compilation.
     """
+    start, found = time.perf_counter(), []
     with worlds.floats(setting.wide) as dtype:
         scene = setting.scene()
         space = parameters.design_space(scene.hand)
-        drawn = worlds.trials(scene, first + trials, seed=SEED)
-        drawn = worlds.cast(jax.tree.map(lambda x: x[first:], drawn), dtype)
-        if moved:
-            drawn = work.nudged(drawn)
         engine = setting.make(scene)
 
         @jax.jit
         def run(particles, trials):
             return rollout.evaluate(scene, engine, jax.vmap(space.params)(particles), trials)
 
-        start = time.perf_counter()
-        found = jax.tree.map(np.asarray, run(jnp.asarray(designs, dtype), drawn))
-        seconds = time.perf_counter() - start
-    lost = np.where(np.isfinite(found.lost_time), 1e3 * found.lost_time, KEPT)
-    lost = np.where(failed(found.status), FAILED, np.round(lost)).astype(int)
-    status = found.status[found.status != 0]
+        for request in requests:
+            drawn = worlds.cast(worlds.trials(scene, request.trials, seed=SEED), dtype)
+            drawn = work.nudged(drawn) if request.moved else drawn
+            particles = jnp.asarray(request.designs, dtype)
+            size = min(block, request.trials)
+            results = []
+            for i in range(0, request.trials, size):
+                part = jax.tree.map(partial(_rows, i, i + size), drawn)
+                results.append(jax.tree.map(np.asarray, run(particles, part)))
+            found.append(_record(scene, request, results))
+    return {"populations": found, "seconds_with_compile": round(time.perf_counter() - start, 2)}
+
+
+def _rows(first: int, last: int, array: np.ndarray) -> np.ndarray:
+    return array[first:last]
+
+
+def _record(scene: Scene, request: Request, results: list[Outcome]) -> dict[str, Any]:
+    lost, status = (
+        np.concatenate([getattr(r, n) for r in results], 1) for n in ("lost_time", "status")
+    )
+    causes = {str(b.name): int((status & b.value != 0).sum()) for b in Status if b.value}
     return {
-        "particles": len(designs),
-        "first": first,
-        "trials": trials,
-        "lost_ms": lost.ravel().tolist(),
-        "status": {str(s): int((status == s).sum()) for s in np.unique(status)},
-        "seconds_with_compile": round(seconds, 2),
+        "name": request.name,
+        "moved": request.moved,
+        "particles": len(request.designs),
+        "trials": request.trials,
+        "lost": encode(lost, failed(status), scene.window),
+        "status": {name: count for name, count in causes.items() if count},
     }
+
+
+def encode(lost: np.ndarray, bad: np.ndarray, window: tuple[float, float]) -> str:
+    """Times of loss as text: a byte a trial, compressed, in base 64.
+
+    Args:
+      lost: Times of loss [s], infinite where the object is kept, shape (particle, trial).
+      bad: Whether the trial failed, same shape.
+      window: Start and end of the time in which a loss costs [s]; a byte counts its 250th parts.
+    """
+    start, end = window
+    share = np.clip((np.where(np.isfinite(lost), lost, end) - start) / (end - start), 0, 1)
+    code = np.where(np.isfinite(lost), np.round(_PARTS * share), KEPT)
+    code = np.where(bad, FAILED, code).astype(np.uint8)
+    return base64.b64encode(zlib.compress(code.tobytes(), 9)).decode()
 
 
 def costs(scene: Scene, record: dict[str, Any]) -> np.ndarray:
     """Costs of a record's trials, shape (particle, trial); NaN where a trial failed."""
-    lost = np.array(record["lost_ms"], float).reshape(record["particles"], record["trials"])
-    start, end = scene.window
-    cost = scene.cost.maximum * (end - np.where(lost == KEPT, 1e3 * end, lost) * 1e-3)
-    return np.where(lost == FAILED, np.nan, cost / (end - start))
+    code = np.frombuffer(zlib.decompress(base64.b64decode(record["lost"])), np.uint8)
+    code = code.reshape(record["particles"], record["trials"])
+    cost = np.where(code == KEPT, 0.0, scene.cost.maximum * (1 - code / _PARTS))
+    return np.where(code == FAILED, np.nan, cost)

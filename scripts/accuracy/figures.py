@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from codesign_jax.scene import load as load_scene
 from scripts.accuracy import analysis
-from scripts.accuracy.settings import LINKS, TIMESTEPS, Setting
+from scripts.accuracy.settings import LINKS, TIMESTEPS, Setting, of
 from scripts.shared import figures as pictures
 from scripts.shared import labels
 
@@ -20,14 +20,15 @@ MARKERS = {
     "time step": "o",
     "links": "s",
     "axes": "v",
-    "spheres": "D",
     "surface": "h",
+    "damping": "D",
+    "contact": "p",
     "iterations": "P",
     "precision": "X",
     "several": "^",
 }
 REFUSED = "refused or failed"
-GRASP = load_scene("paper_spheres").phases.ungrasp
+GRASP = load_scene("paper").phases.ungrasp
 """Simulated time of a grasp [s]."""
 
 
@@ -56,13 +57,14 @@ class Point(NamedTuple):
 
 def knob(setting: Setting) -> str:
     """What a setting changes of the standard one."""
-    base, found = Setting(engine=setting.engine), []
+    base, found = of(setting.engine), []
     for name, fields in {
         "time step": ("timestep", "keep_contact"),
         "links": ("links",),
         "axes": ("axes",),
-        "spheres": ("spheres",),
-        "surface": ("extra",),
+        "surface": ("surface",),
+        "damping": ("damping",),
+        "contact": ("extra",),
         "iterations": ("iterations",),
         "precision": ("precision",),
     }.items():

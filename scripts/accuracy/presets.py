@@ -18,9 +18,10 @@ def presets_table(studies: dict[str, Study]) -> list[list[str]]:
     """Errors of the first study and costs of all, by machine; the structured engine."""
     full = next(iter(studies.values()))
     costs = [f"{title}: {c}" if i == 0 else c for title in studies for i, c in enumerate(COST)]
-    rows = [["preset", "setting", *(words for words, _ in ERRORS.values()), *costs]]
+    parts = [part for part in ERRORS if full.errors(part)]
+    rows = [["preset", "setting", *(ERRORS[part][0] for part in parts), *costs]]
     for name, setting in PRESETS.items():
-        errors = [full.error(part, setting) for part in ERRORS]
+        errors = [full.error(part, setting) for part in parts]
         cells = ["–" if e is None else f"{e:.3g}" for e in errors]
         for study in studies.values():
             cells += cost_cells(study.cost("structured", setting))

@@ -8,7 +8,7 @@ from scripts.accuracy.results import ERRORS, Study
 from scripts.shared import output
 from scripts.shared.tables import fill, markdown
 
-MACHINES = {"h200": "NVIDIA H200 and 16 CPU cores", "cpu": "2 CPU cores"}
+MACHINES = {"h200": "NVIDIA H200 and CPU cores of its host", "cpu": "2 CPU cores"}
 SHORT = {"h200": "one H200", "cpu": "2 CPU cores"}
 
 
@@ -80,7 +80,10 @@ def _section(study: Study, name: str, docs: Path) -> str:
     for population, words in tables.POPULATIONS.items():
         add(f"Decisions: {words}", tables.decisions_table(study, population))
     add("From preset to preset", tables.preset_to_preset(study))
-    add("What chaos and noise alone do", tables.floors(study))
+    add("Each knob alone, against its own limit", tables.alone(study))
+    add("The winner's curse: the best by a coarse setting, tested again", tables.curse(study))
+    add("What a micrometre and other trials do", tables.floors(study))
+    add("Trials that failed or met the solver's limit", tables.warnings(study))
     return "\n\n".join(parts)
 
 
@@ -92,7 +95,10 @@ def table(study: Study, path: Path) -> None:
             setting = r["of"]
             row = values.setdefault((setting.engine, setting.label), {})
             row |= {"engine": setting.engine, "timestep_ms": setting.timestep}
-            row |= {n: getattr(setting, n) for n in ("links", "axes", "spheres", "iterations")}
+            row |= {
+                n: getattr(setting, n)
+                for n in ("links", "axes", "surface", "damping", "iterations")
+            }
             row |= {"precision": "float64" if setting.engine == "mujoco" else setting.precision}
             row |= {"wall_s_per_simulated_s": study.cost(setting.engine, setting)}
             row |= {"not_measured": analysis.bad(r), key: r.get(key)}

@@ -10,7 +10,7 @@ import numpy as np
 from scripts.accuracy import analysis, figures
 from scripts.accuracy.analysis import Records
 from scripts.accuracy.figures import Point
-from scripts.accuracy.settings import PRESETS, Setting, one_at_a_time
+from scripts.accuracy.settings import HULL, PRESETS, SPHERES, Setting, one_at_a_time
 
 ERRORS = {
     "tip": ("finger tip [mm]", "tip_rms_mm"),
@@ -24,7 +24,7 @@ WANTED = {
     "tip": (5.0, 2.0, 1.0, 0.5),
     "step": (1e-3, 1e-4, 2e-5),
     "impulse": (0.05, 0.03, 0.02, 0.01),
-    "decision": (0.1, 0.08, 0.05, 0.03),
+    "decision": (0.07, 0.05, 0.03, 0.02),
 }
 
 
@@ -36,17 +36,20 @@ class Study:
         self.records, self.runs = analysis.load(files)
         self.times = analysis.times(self.records)
         self.grasps = analysis.decisions(self.records)
-        self.reference = analysis.finest(self.grasps, "spread")
+        self.reference = analysis.finest(self.grasps, "late")
         self._compared: dict[str, dict[Setting, dict[str, Any]]] = {}
+        self._pairs: dict[tuple[bytes, bytes], dict[str, Any]] = {}
 
     def decisions(self, population: str) -> dict[Setting, dict[str, Any]]:
         """Every setting's decisions beside the finest's, over the same particles and trials."""
         if population not in self._compared:
-            truth = self.grasps.get((self.reference, False, population))  # type: ignore[arg-type]
+            reference = analysis.finest(self.grasps, population)
+            truth = self.grasps.get((reference, False, population))  # type: ignore[arg-type]
             found = {
-                setting: analysis.compare(cost, truth)
+                setting: self.compare(cost, truth)
                 for (setting, moved, name), cost in self.grasps.items()
-                if name == population and not moved and setting != self.reference
+                if name == population and not moved and setting != reference
+                if setting.engine == "structured"  # the others have no hull
                 if truth is not None
             }
             found = dict(sorted(found.items(), key=lambda item: place(item[0])))
@@ -68,13 +71,27 @@ class Study:
         if part == "step":
             return analysis.measured(self.records, part)
         return [
-            {"of": setting, "flipped": 1 - row["same_verdict"].value}
-            for setting, row in self.decisions("spread").items()
+            {"of": setting, "flipped": row["flipped"].value}
+            for setting, row in self.decisions("late").items()
         ]
+
+    def compare(self, a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
+        """`analysis.compare`, each pair of tables once: a page asks for most of them twice."""
+        key = a.tobytes(), b.tobytes()
+        if key not in self._pairs:
+            self._pairs[key] = analysis.compare(a, b)
+        return self._pairs[key]
+
+    def floor(self, setting: Setting, population: str = "late") -> float | None:
+        """Share of verdicts that a micrometre changes at a setting; None where not measured."""
+        both = [self.grasps.get((setting, moved, population)) for moved in (False, True)]
+        return None if both[0] is None or both[1] is None else analysis.differ(*both)
 
     def cost(self, engine: str, setting: Setting) -> float | None:
         """Wall seconds of a simulated second of a world; None where it was not timed."""
         of = replace(setting, engine="structured", precision="float32")
+        if engine != "structured" and of.surface == HULL:  # in the air, where it does not matter
+            of = replace(of, surface=SPHERES)
         name = engine if engine == "mujoco" else f"{engine} {setting.precision}"
         found = self.times.get((name, of))
         if found is None and setting.keep_contact:  # refused: drawn where it would have been
@@ -102,8 +119,8 @@ class Study:
 
     def error(self, part: str, setting: Setting) -> float | None:
         """A setting's error of a kind, MuJoCo C's where that stands for it; see `points`."""
-        if part == "tip":  # in the air neither spheres nor the limit of iterations matter
-            setting = replace(setting, spheres=1, iterations=None)
+        if part == "tip":  # in the air neither the surface nor the limit of iterations matter
+            setting = replace(setting, surface=HULL, iterations=None)
         engines = [setting.engine] + ["mujoco"] * (part in SHARED and setting.iterations is None)
         found = {(r["of"].engine, r["of"].label): r for r in self.errors(part)}
         rows = (found.get((engine, setting.label)) for engine in engines)
@@ -150,7 +167,7 @@ class Study:
 _ORDER = {
     (engine, setting.label): (number, i)
     for number, engine in enumerate(("structured", "mujoco", "mjx"))
-    for i, setting in enumerate(one_at_a_time(engine))
+    for i, setting in enumerate([*one_at_a_time("structured"), *one_at_a_time(engine)])
 }
 
 

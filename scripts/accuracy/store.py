@@ -4,7 +4,7 @@ import dataclasses
 import json
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,3 +100,30 @@ class Store:
     def write(self) -> None:
         """Writes the file as a whole or not at all."""
         output.write_json(self.path, self.data, indent=None)
+
+
+def merge(files: Sequence[Path], path: Path) -> None:
+    """Writes the records of several files, as processes with `--share` made them, into one.
+
+    Args:
+      files: JSON files of one size.
+      path: The file.
+
+    Raises:
+      ValueError: If they are of several sizes.
+    """
+    every = [json.loads(file.read_text()) for file in files]
+    sizes = {data["size"] for data in every}
+    if len(sizes) != 1:
+        raise ValueError(f"the files hold the sizes {', '.join(sorted(sizes))}, not one")
+    runs: list[dict[str, Any]] = []
+    records: dict[str, Any] = {}
+    for data in every:
+        kept: dict[int, int] = {}
+        for key, record in data["records"].items():
+            if record["run"] not in kept:  # a run that measured nothing says nothing
+                kept[record["run"]] = len(runs)
+                runs.append(data["runs"][record["run"]])
+            records[key] = record | {"run": kept[record["run"]]}
+    merged = {"size": sizes.pop(), "runs": runs, "attempts": {}, "records": records}
+    output.write_json(path, merged, indent=None)

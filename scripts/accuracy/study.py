@@ -7,18 +7,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from scripts.accuracy import beam, decision, impulse, steps, timing, tip
 from scripts.accuracy.settings import (
+    FINGERS,
     HULL,
     LINKS,
     PRESETS,
+    REFERENCE,
+    SPHERES,
     STANDARD,
     TIMESTEPS,
     Setting,
+    of,
     one_at_a_time,
-    sweep,
+    own_limits,
 )
 from scripts.accuracy.store import Case
 
@@ -38,8 +40,8 @@ class Size:
       seconds: Simulated time of the part tip.
       states: States of each hand in the part step.
       particles: Particles of a population.
-      trials: Trials of a particle.
-      block: Trials of a case of MuJoCo C.
+      trials: Trials of a late particle at the presets.
+      fewer: Trials of a late particle elsewhere.
       worlds: Worlds that are timed, by engine; on a GPU `gpu_worlds`.
       gpu_worlds: Worlds that are timed on a GPU.
       window: Time steps that are timed.
@@ -58,7 +60,7 @@ class Size:
     states: int
     particles: int
     trials: int
-    block: int
+    fewer: int
     worlds: dict[str, int]
     gpu_worlds: dict[str, int]
     window: int
@@ -70,11 +72,11 @@ class Size:
 _GPU = {"structured": 16_384, "mujoco": 96, "mjx": 1_728}
 SIZES = {
     "full": Size(
-        "full", (0.1, 0.05), 40, 80, 12, 2.4, 40, 60, 24, 6,
+        "full", (0.1, 0.05), 40, 80, 12, 2.4, 40, 60, 200, 100,
         {"structured": 480, "mujoco": 60, "mjx": 12}, _GPU, 50, 5,
     ),
     "quick": Size(
-        "quick", (0.5, 0.25), 20, 40, 3, 1.0, 8, 12, 6, 6,
+        "quick", (0.5, 0.25), 20, 40, 3, 1.0, 8, 12, 12, 12,
         {"structured": 240, "mujoco": 24, "mjx": 6}, _GPU, 50, 5, 2.0, 20,
     ),
     "tiny": Size(
@@ -108,7 +110,7 @@ def cases(
 
 
 def reference(size: Size, *, confirm: str = "") -> Setting:
-    """Setting of the reference of the parts tip and impulse, or one that confirms it.
+    """Setting of the reference of the part tip, or one that confirms it.
 
     Args:
       size: Sizes.
@@ -116,17 +118,18 @@ def reference(size: Size, *, confirm: str = "") -> Setting:
     """
     step = size.timesteps[confirm == "timestep"]
     links = size.confirm_links if confirm == "links" else size.links
-    return Setting("mujoco", timestep=step, links=links, iterations=0)
+    return Setting("mujoco", timestep=step, links=links, damping="least", iterations=0)
 
 
 def settings(size: Size, engine: str) -> list[Setting]:
     """Settings of an engine that a size affords."""
+    base = of(engine)
     if engine == "mjx":  # a minute of compilation each: the standard setting alone
-        found = [Setting("mjx"), Setting("mjx", precision="float64"), Setting("mjx", iterations=1)]
+        found = [base, replace(base, precision="float64"), replace(base, iterations=1)]
     else:
         found = one_at_a_time(engine)
     if size.name == "tiny":
-        found = [Setting(engine, links=2), Setting(engine, links=2, timestep=20, keep_contact=True)]
+        found = [replace(base, links=2), replace(base, links=2, timestep=20, keep_contact=True)]
     return list(dict.fromkeys(s for s in found if _affordable(size, s)))
 
 
@@ -151,22 +154,23 @@ def _tip(size: Size, engines: Sequence[str]) -> list[Case]:
     for setting, role in _references(size):
         add(setting, role)
     for engine in ("mujoco", *(e for e in engines if e == "structured")):
-        every = settings(size, engine)
+        # In the air neither the surface nor its constants nor the limit of iterations matter.
+        every = [replace(s, surface=HULL) for s in settings(size, engine)]
+        every = [s for s in every if not s.extra and s.iterations is None]
         if engine == "structured":  # the same equations as MuJoCo C: their rounding is what is new
-            every = [s for s in every if s in (every[0], Setting(precision="float64"))]
-            every += [Setting(timestep=size.finest, links=min(20, size.most_links))]
-        for setting in every:
-            # In the air neither spheres nor the limit of iterations matter.
-            if setting.spheres == 1 and setting.iterations is None:
+            every = [every[0], Setting(precision="float64"), PRESETS["reference"]]
+        for setting in dict.fromkeys(every):
+            if _affordable(size, setting):
                 add(setting)
     if tiny:
         return found
+    limit = reference(size)
     for step in TIMESTEPS:  # the error of time alone, and that of links alone
-        add(Setting("mujoco", timestep=step, links=size.links), "at the reference's links")
+        for damping in ("least", "added"):
+            add(replace(limit, timestep=step, damping=damping), "at the reference's links")
     for links in LINKS:
         if links < size.links:
-            fine = Setting("mujoco", timestep=size.timesteps[0], links=links)
-            add(fine, "at the reference's time step")
+            add(replace(limit, links=links), "at the reference's time step")
     return found
 
 
@@ -184,7 +188,8 @@ TIP_STRIDE = 5
 def _step(size: Size, engines: Sequence[str]) -> list[Case]:
     found = []
     for engine in engines:
-        every = settings(size, engine)
+        # Of spheres, which every engine has.
+        every = list(dict.fromkeys(replace(s, surface=SPHERES) for s in settings(size, engine)))
         # What the error of a step depends on is the solver; discretizations share its equations.
         base = every[0]
         kept = [s for s in every if replace(s, iterations=None, precision="float32") == base]
@@ -198,16 +203,15 @@ def _step(size: Size, engines: Sequence[str]) -> list[Case]:
 
 
 def _impulse(size: Size, engines: Sequence[str]) -> list[Case]:
-    found = [(s, (role,)) for s, role in _references(size) if role != "links"]
-    for engine in ("mujoco", *(e for e in engines if e == "structured")):
-        every = settings(size, engine)
-        if engine == "structured":
-            # MuJoCo C's error stands for the rest; it has no hull.
-            every = [s for s in every if s in (every[0], Setting(precision="float64"), HULL)]
-        found += [(s, ()) for s in every]
-    return [
-        Case("impulse", s, more, partial(_forces, s, size.hands)) for s, more in found
-    ]  # fmt: skip
+    """Of the hull: engines without it have no such force."""
+    if "structured" not in engines:
+        return []
+    step, finer = size.timesteps
+    limit = Setting(timestep=step, links=20, damping="least", iterations=0, precision="float64")
+    found = [(limit, ("reference",)), (replace(limit, timestep=finer), ("timestep",))]
+    every = settings(size, "structured")
+    found += [(s, ()) for s in every if s.surface.startswith("hull") and FINGERS not in s.extra]
+    return [Case("impulse", s, more, partial(_forces, s, size.hands)) for s, more in found]
 
 
 def _forces(setting: Setting, hands: int) -> dict[str, Any]:
@@ -215,67 +219,69 @@ def _forces(setting: Setting, hands: int) -> dict[str, Any]:
 
 
 def _decision(size: Size, engines: Sequence[str], *, data: Path) -> list[Case]:
+    """A setting's populations together: they share its program."""
     found = []
 
-    def add(setting: Setting, first: int, trials: int, *more: str) -> None:
-        names = POPULATIONS if setting.engine == "structured" else POPULATIONS[:1]
-        moved = MOVED in more
-        run = partial(_decide, setting, names, first, trials, size.particles, data, moved)
-        more = (" and ".join(names), f"trials {first} to {first + trials - 1}", *more)
-        found.append(Case("decision", setting, more, run))
+    def add(setting: Setting, *asked: tuple[str, int, bool]) -> None:
+        run = partial(_decide, setting, asked, size, data)
+        words = [f"{n} {trials}" + " moved" * moved for n, trials, moved in asked]
+        found.append(Case("decision", setting, tuple(words), run))
 
-    if "structured" in engines:
-        every = settings(size, "structured")
-        if size.name == "full":
-            every += [Setting(timestep=0.5, links=40), Setting(timestep=2.0, links=40)]
-            every += sweep(STANDARD, iterations=(0,))
-        add(every[0], 0, size.trials)
-        add(every[0], 0, size.trials, MOVED)
-        for setting in every[1:]:
-            add(setting, 0, size.trials)
+    for setting in _decided(size) if "structured" in engines else ():
+        trials = size.trials if setting in PRESETS.values() else size.fewer
+        asked = [("late", trials, False)]
+        if setting.work <= 20 and setting.iterations is None and setting.axes == 3:
+            asked.append(("late", size.fewer, True))
+        if setting.work <= 20 and not setting.wide:
+            asked.append(("spread", size.fewer, False))
+        if setting in PRESETS.values():
+            asked.append(("spread", size.fewer, True))
+        add(setting, *asked)
     if "mujoco" in engines:
-        base = settings(size, "mujoco")[0]
-        blocks = range(0, size.trials, size.block)
-        for more in ((), (MOVED,)):
-            for first in blocks:
-                add(base, first, size.block, *more)
-        fast = Setting("mujoco", links=5, spheres=2)
-        fine = Setting("mujoco", timestep=1.0, links=20)
-        for setting in (s for s in (fast, fine) if _affordable(size, s)):
-            for first in blocks[:2]:  # a fine grasp costs twenty of the standard ones
-                add(setting, first, size.block)
+        few = max(1, size.fewer // 16)
+        add(of("mujoco"), ("spread", few, False), ("spread", few, True))
+        add(replace(of("mujoco"), timestep=max(1.0, size.finest)), ("spread", few, False))
     return found
 
 
-POPULATIONS = ("spread", "late")
-MOVED = "moved 1 um"
+def _decided(size: Size) -> list[Setting]:
+    """Settings of the part decision, those that take longest first."""
+    found = settings(size, "structured")
+    if size.name == "full":
+        found += [s for knob in own_limits().values() for s in knob]
+        found += [replace(STANDARD, iterations=0), replace(REFERENCE, timestep=1.0)]
+        found += [REFERENCE, replace(REFERENCE, precision="float32", links=40)]
+    return sorted(dict.fromkeys(found), key=lambda s: -s.work)
 
 
-def _decide(setting, names, first, trials, particles, data, moved) -> dict[str, Any]:
-    every = decision.populations(data, particles)
-    designs = np.concatenate([every[n] for n in names])
-    found = decision.simulate(setting, designs, first, trials, moved=moved)
-    return found | {"populations": list(names)}
+def _decide(setting: Setting, asked: Sequence[tuple], size: Size, data: Path) -> dict[str, Any]:
+    every = decision.populations(data, size.particles)
+    requests = [decision.Request(name, every[name], *rest) for name, *rest in asked]
+    return decision.simulate(setting, requests, size.fewer)
 
 
 def _time(size: Size, engines: Sequence[str], *, gpu: bool) -> list[Case]:
     batch = size.gpu_worlds if gpu else size.worlds
-    found, timed = [], [e for e in engines if e != "mjx"]
+    found: list[tuple[Setting, list[Setting]]] = []
     every = settings(size, "structured")
     if size.name != "tiny":  # a preset's cost is wanted at every size
-        every = list(dict.fromkeys([*every, *PRESETS.values()]))
-    for setting in every:
-        if setting.precision == "float64" or setting.keep_contact:
-            continue
-        each = [replace(setting, engine=e) for e in timed]
-        if setting.extra:
-            each = [s for s in each if s.engine == "structured"]
-        if not each:
-            continue
-        if setting == settings(size, "structured")[0]:
-            each += [replace(setting, engine=e) for e in engines if e == "mjx"]
-            if "structured" in engines:
-                each.append(replace(setting, precision="float64"))
-        run = partial(timing.measure, each, batch, size.window, size.repeats)
-        found.append(Case("time", setting, tuple(timing.name(s) for s in each), run))
-    return found
+        every += PRESETS.values()
+    if "structured" in engines:
+        for setting in dict.fromkeys(every):
+            if setting.precision == "float32" and not setting.keep_contact:
+                found.append((setting, [setting]))
+        wide = replace(every[0], precision="float64")
+        found[0] = (every[0], [every[0], wide])
+    for setting in settings(size, "mujoco") if "mujoco" in engines else ():
+        # Beside our own spheres: the others have no hull.
+        if not setting.keep_contact and not setting.extra:
+            mine = [replace(setting, engine="structured")] * ("structured" in engines)
+            more = [setting] + [replace(setting, engine="mjx")] * (
+                "mjx" in engines and setting == of("mujoco")
+            )
+            found.append((setting, mine + more))
+    return [
+        Case("time", setting, tuple(timing.name(s) for s in each),
+             partial(timing.measure, each, batch, size.window, size.repeats))
+        for setting, each in found
+    ]  # fmt: skip

@@ -1,6 +1,7 @@
 """Markdown tables of a study: references and orders, errors, decisions, what chaos alone does."""
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,13 @@ from codesign_jax.report.statistics import Interval
 from scripts.accuracy import analysis
 from scripts.accuracy.analysis import Records
 from scripts.accuracy.figures import Point, grasps
-from scripts.accuracy.results import ERRORS, WANTED, Study, named
-from scripts.accuracy.settings import PRESETS, Setting, one_at_a_time
+from scripts.accuracy.results import ERRORS, WANTED, Study, named, place
+from scripts.accuracy.settings import PRESETS, Setting, one_at_a_time, own_limits
 
 COST = ["wall s / simulated s", "grasps/s"]
 POPULATIONS = {
     "spread": "particles of every quality",
-    "late": "the final particles of one run",
+    "late": "final particles of all co-design runs",
 }
 
 
@@ -34,11 +35,7 @@ def lines(records: Records) -> dict[str, list[tuple[float, float]]]:
             for r in tips
             if "at the reference's time step" in r["more"]
         ],
-        "impulse, relative, time step": [
-            (r["of"].timestep, r["impulse_error"])
-            for r in analysis.against_reference(records, "impulse")
-            if not r["more"] and r["of"] == Setting("mujoco", timestep=r["of"].timestep)
-        ],
+        "impulse, relative, time step": analysis.by_step(records),
     }
     for name in sorted({k for r in beams for k in r if k.startswith(("elastica", "arc"))}):
         found[f"{name}, tip / length"] = [(1 / r["of"].links, r[name]) for r in beams]
@@ -102,7 +99,7 @@ def wanted_here(full: Study, small: Study | None) -> list[list[str]]:
     costs += ["2 CPU cores: wall s / simulated s", "grasps/s"] if small else []
     rows = [["error", "wanted below", "setting", "error there", *costs]]
     for part, limits in WANTED.items():
-        for limit in limits:
+        for limit in limits if full.errors(part) else ():
             p = full.cheapest(part, "structured", limit)
             row = [ERRORS[part][0], f"{limit:g}", *_found(full, part, "structured", limit)]
             rows.append(row + _small_cost(small, p))
@@ -156,36 +153,47 @@ def _row(first: list[str], c: dict[str, Any]) -> list[str]:
     return [
         *first,
         f"{c['particles']} x {c['trials']}",
+        _interval(c["flipped"]),
         _interval(c["success"]),
-        _interval(c["success_reference"]),
-        _interval(c["same_verdict"]),
-        _interval(c["cost_difference"], "+.3f"),
-        _interval(c["rank"], ".3f"),
+        _interval(c["success_difference"], "+.1%"),
+        _interval(c["rank"], ".2f"),
         f"{c['offspring_moved']:.1%}",
-        f"{c['best_shared']:.0%}",
-        str(c["failed"]),
+        f"{c['failed']:.2%}",
     ]
 
 
 _DECISION = [
-    "particles x trials", "success", "the reference's", "same verdict", "mean cost, difference",
-    "rank correlation", "offspring moved", "best sixth shared", "failed",
+    "particles x trials", "verdicts that flip", "success", "success, difference",
+    "rank correlation", "offspring moved", "failed",
 ]  # fmt: skip
+FLOOR = "flips by 1 µm"
 
 
 def decisions_table(study: Study, population: str) -> list[list[str]]:
-    """Every setting's decisions beside the finest's, and its cost."""
-    rows = [["engine", "setting", *_DECISION, *COST]]
+    """Every setting's decisions beside the finest's, its own floor, and its cost."""
+    rows = [["engine", "setting", *_DECISION, FLOOR, *COST]]
     for setting, c in study.decisions(population).items():
-        cost = study.cost(setting.engine, setting)
-        rows.append([*_row([setting.engine, title(setting)], c), *cost_cells(cost)])
-    for r in study.errors("decision"):
+        cells = [_number(study.floor(setting, population), ".2%")]
+        cells += cost_cells(study.cost(setting.engine, setting))
+        rows.append([*_row([setting.engine, title(setting)], c), *cells])
+    for r in study.errors("decision") if population == "late" else ():
         if analysis.bad(r):
-            head, cost = (
-                [r["of"].engine, r["of"].label, _why(r)],
-                study.cost(r["of"].engine, r["of"]),
-            )
-            rows.append([*head, *[""] * (len(_DECISION) - 1), *cost_cells(cost)])
+            rows.append(["structured", r["of"].label, _why(r), *[""] * (len(rows[0]) - 3)])
+    return rows
+
+
+def alone(study: Study) -> list[list[str]]:
+    """One knob at a time against its own limit, everything else fine: where flips come from."""
+    rows = [["knob", "setting", "limit", *_DECISION, FLOOR]]
+    for knob, settings in own_limits().items():
+        limit = study.grasps.get((settings[-1], False, "late"))
+        for setting in settings[:-1]:
+            cost = study.grasps.get((setting, False, "late"))
+            if cost is not None and limit is not None:
+                found = _row(
+                    [knob, title(setting), title(settings[-1])], study.compare(cost, limit)
+                )
+                rows.append([*found, _number(study.floor(setting), ".2%")])
     return rows
 
 
@@ -198,7 +206,7 @@ def preset_to_preset(study: Study) -> list[list[str]]:
             costs = [study.grasps.get((PRESETS[names[i]], False, population)) for i in (a, b)]
             if costs[0] is not None and costs[1] is not None:
                 what = f"{names[a]} against {names[b]}"
-                rows.append(_row([what, population], analysis.compare(*costs)))
+                rows.append(_row([what, population], study.compare(*costs)))
     return rows
 
 
@@ -207,19 +215,58 @@ def floors(study: Study) -> list[list[str]]:
     rows = [["comparison", "population", *_DECISION]]
     for (setting, moved, name), cost in study.grasps.items():
         plain = study.grasps.get((setting, False, name))
-        if moved and plain is not None:
+        shown = setting.engine == "mujoco" or setting in PRESETS.values()
+        if moved and shown and plain is not None:
             what = f"{setting.engine}, {title(setting)}: objects moved by 1 µm"
-            rows.append(_row([what, name], analysis.compare(cost, plain)))
-        own = Setting(**{**vars(setting), "engine": "structured"})
-        same = study.grasps.get((own, False, name))
+            rows.append(_row([what, name], study.compare(cost, plain)))
+        same = study.grasps.get((replace(setting, engine="structured"), False, name))
         if setting.engine == "mujoco" and not moved and same is not None:
             what = f"MuJoCo C against structured, {setting.label}"
-            rows.append(_row([what, name], analysis.compare(cost, same)))
+            rows.append(_row([what, name], study.compare(cost, same)))
     for (setting, moved, name), cost in study.grasps.items():
         noise = analysis.trial_noise(cost)
         if setting == Setting() and not moved and noise is not None:
             what = "structured, standard: six trials against six others"
             values = ["–"] * len(_DECISION)
-            values[5] = _interval(noise, ".3f")
+            values[4] = f"{noise:.2f}"
             rows.append([what, name, *values])
+    return rows
+
+
+def curse(study: Study) -> list[list[str]]:
+    """What the best particle by a coarse setting is worth at the reference: the winner's curse.
+
+    Of the population "late" the sixth with the lowest mean costs over the first half of the trials
+    is chosen; the other half tells its success at both settings.
+    """
+    rows = [["chosen and tested at", "tested at", "success there", "success at the reference",
+             "difference"]]  # fmt: skip
+    truth = study.grasps.get((PRESETS["reference"], False, "late"))
+    for name in ("fast", "standard"):
+        cost = study.grasps.get((PRESETS[name], False, "late"))
+        if cost is None or truth is None:
+            continue
+        half = min(cost.shape[1], truth.shape[1]) // 2
+        best = np.argsort(analysis.means(cost[:, :half]), kind="stable")[: max(1, len(cost) // 6)]
+        both = cost[best, half : 2 * half], truth[best, half : 2 * half]
+        found = study.compare(*both)
+        rows.append([
+            f"`{name}`, the best sixth", f"{half} other trials", _interval(found["success"]),
+            _interval(found["success_reference"]), _interval(found["success_difference"], "+.1%"),
+        ])  # fmt: skip
+        found = study.compare(cost[:, half : 2 * half], truth[:, half : 2 * half])
+        rows.append([
+            f"`{name}`, all", f"{half} other trials", _interval(found["success"]),
+            _interval(found["success_reference"]), _interval(found["success_difference"], "+.1%"),
+        ])  # fmt: skip
+    return rows
+
+
+def warnings(study: Study) -> list[list[str]]:
+    """Share of the late population's trials by status bit."""
+    found = analysis.warned(study.records, "late")
+    names = sorted({n for bits in found.values() for n in bits})
+    rows = [["setting", *names]]
+    for setting in sorted(found, key=place):
+        rows.append([title(setting), *(f"{found[setting].get(n, 0.0):.2%}" for n in names)])
     return rows

@@ -1,6 +1,7 @@
 """Wall seconds of a simulated second of a world, engines in turn, compilation apart."""
 
 import statistics
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
 from scripts.accuracy import oracle, worlds
 from scripts.accuracy.impulse import CLOSING
-from scripts.accuracy.settings import Setting
+from scripts.accuracy.settings import SPHERES, Setting
 from scripts.shared.measure import JaxProgram, peak_memory
 
 START = 1.0
@@ -89,19 +90,21 @@ def _contact(
 ) -> tuple[Scene, ModelFields, np.ndarray]:
     """Scene, fields whose starts are states of MuJoCo C in contact, and controls from there."""
     with worlds.floats(True):
-        scene = setting.scene(CLOSING)
+        scene, spheres = (s.scene(CLOSING) for s in (setting, replace(setting, surface=SPHERES)))
         hands = worlds.designs(scene, min(count, distinct), good=True)
         chosen = worlds.paired(hands, worlds.trials(scene, distinct))
         fields, ctrl = worlds.inputs(scene, chosen, np.float64)
+        touching = worlds.inputs(spheres, chosen, np.float64)[0]
     first = round(START / scene.discretization.timestep)
 
     def closed(world: int) -> np.ndarray:
         found: list[np.ndarray] = []
-        model = oracle.model_of(scene, fields, world)
+        model = oracle.model_of(spheres, touching, world)
         visit = lambda _m, d, _k: found.append(d.qpos.copy())  # noqa: E731
-        oracle.advance(model, fields.start[world], ctrl[world], [first], visit)
+        oracle.advance(model, touching.start[world], ctrl[world], [first], visit)
         return found[0]
 
+    # MuJoCo C has no hull: its states are those of spheres, which the first steps settle.
     fields = fields._replace(start=np.array(oracle.each_world(closed, len(ctrl))))
     index = np.arange(count) % len(ctrl)
     window = np.minimum(np.arange(first, first + steps), ctrl.shape[1] - 1)

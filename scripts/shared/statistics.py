@@ -147,6 +147,33 @@ def bootstrap(
     return Interval(float(np.squeeze(statistic(np.arange(count)))), low, high)
 
 
+def two_way(
+    statistics: Callable[..., list[float]],
+    *tables: np.ndarray,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> list[Interval]:
+    """Percentile bootstrap over rows and columns at once: particles and the trials they share.
+
+    Trials are common to all particles, so that resampling particles alone would call what one
+    unlucky trial does to all of them certain (Owen 2007, "The pigeonhole bootstrap").
+
+    Args:
+      statistics: From tables like the given ones to several values.
+      *tables: Arrays of one shape (row, column); resampled together, which keeps the pairing.
+      resamples: Number of resamples.
+      seed: Seed of the resampling.
+    """
+    rng, (rows, columns) = np.random.default_rng(seed), tables[0].shape
+    drawn = []
+    for _ in range(resamples):
+        index = np.ix_(rng.integers(0, rows, rows), rng.integers(0, columns, columns))
+        drawn.append(statistics(*(t[index] for t in tables)))
+    tail = (1 - _CONFIDENCE) / 2
+    low, high = np.nanquantile(np.array(drawn, float), [tail, 1 - tail], axis=0)
+    return [Interval(*map(float, v)) for v in zip(statistics(*tables), low, high, strict=True)]
+
+
 def median(values: np.ndarray) -> Interval:
     """Median over runs with its bootstrap interval; values have shape (run,)."""
     return bootstrap(lambda i: quantile(values[i], 0.5), len(values))

@@ -78,7 +78,12 @@ def orders(records: Records) -> dict[str, float | None]:
     by_time = [r for r in rows if "at the reference's links" in r["more"]]
     by_links = [r for r in rows if "at the reference's time step" in r["more"]]
     found = {
-        "finger tip, time step": order((r["of"].timestep, r["tip_rms_mm"]) for r in by_time),
+        f"finger tip, time step, {kind} damping": order(
+            (r["of"].timestep, r["tip_rms_mm"]) for r in by_time if r["of"].damping == kind
+        )
+        for kind in ("added", "least")
+    }
+    found |= {
         "finger tip, length of a link": order(
             (1 / r["of"].links, r["tip_rms_mm"]) for r in by_links
         ),

@@ -147,7 +147,7 @@ def convergence(lines: dict[str, list[tuple[float, float]]], path: Path) -> None
       lines: (size, error) by name; the names that speak of the time step go left.
       path: Picture.
     """
-    figure = pictures.new(9.6, 4.4)
+    figure = pictures.new(9.6, 5.2)
     left, right = figure.subplots(1, 2)
     for name, points in lines.items():
         axis = left if "time step" in name else right
@@ -163,6 +163,6 @@ def convergence(lines: dict[str, list[tuple[float, float]]], path: Path) -> None
         axis.xaxis.minorticks_off()
         if axis.lines:
             axis.legend(frameon=False, fontsize=7, loc="upper center",
-                        bbox_to_anchor=(0.5, -0.16), ncols=2)  # fmt: skip
+                        bbox_to_anchor=(0.5, -0.16))  # fmt: skip
         axis.grid(alpha=0.3, which="both", lw=0.4)
     pictures.save(figure, path)

@@ -25,11 +25,14 @@ def lines(records: Records) -> dict[str, list[tuple[float, float]]]:
     tips = analysis.against_reference(records, "tip")
     beams = analysis.measured(records, "beam")
     found = {
-        "tip in motion [mm], time step": [
+        f"tip in motion [mm], time step, {kind} damping": [
             (r["of"].timestep, r["tip_rms_mm"])
             for r in tips
-            if "at the reference's links" in r["more"]
-        ],
+            if "at the reference's links" in r["more"] and r["of"].damping == kind
+        ]
+        for kind in ("added", "least")
+    }
+    found |= {
         "tip in motion [mm]": [
             (1 / r["of"].links, r["tip_rms_mm"])
             for r in tips

@@ -143,6 +143,7 @@ FINE = Setting(timestep=2.0, links=20, damping="least")
 REFERENCE = Setting(timestep=0.5, links=20, damping="least", precision="float64")
 """What verdicts are compared with."""
 FINGERS = "effects.finger_finger=true"
+LARGE_STRAIN = "effects.neo_hookean=true"
 PRESETS = {
     "fast": Setting(links=5),
     "standard": STANDARD,
@@ -193,7 +194,7 @@ def one_at_a_time(engine: str) -> list[Setting]:
         found.append(dataclasses.replace(base, precision="float64"))
     found.append(dataclasses.replace(base, timestep=20.0, keep_contact=True))
     if engine == "structured":
-        found += sweep(base, surface=SURFACES, extra=((c,) for c in (*CONTACT, FINGERS)))
+        found += sweep(base, surface=SURFACES, extra=((c,) for c in (*CONTACT, FINGERS, LARGE_STRAIN)))
     else:
         found += sweep(base, surface=("spheres 2", "spheres 4"))
     return list(dict.fromkeys(found))

@@ -194,7 +194,9 @@ def one_at_a_time(engine: str) -> list[Setting]:
         found.append(dataclasses.replace(base, precision="float64"))
     found.append(dataclasses.replace(base, timestep=20.0, keep_contact=True))
     if engine == "structured":
-        found += sweep(base, surface=SURFACES, extra=((c,) for c in (*CONTACT, FINGERS, LARGE_STRAIN)))
+        found += sweep(
+            base, surface=SURFACES, extra=((c,) for c in (*CONTACT, FINGERS, LARGE_STRAIN))
+        )
     else:
         found += sweep(base, surface=("spheres 2", "spheres 4"))
     return list(dict.fromkeys(found))

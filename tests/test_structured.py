@@ -77,7 +77,7 @@ def test_free_motion_equals_mujoco_step_by_step():
 
 
 def test_float32_is_close_to_float64():
-    """The frame at the palm keeps float32 accelerations within 1e-4 in free motion and contact."""
+    """The frame at the object keeps float32 accelerations within 1e-4 of float64's in contact."""
     results = []
     for wide in (True, False):
         with jax.enable_x64(wide):

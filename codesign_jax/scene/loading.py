@@ -9,6 +9,9 @@ from codesign_jax.scene import hand, keypaths, library, objects, schema
 from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.tables import Accuracy
 
+_OF_ACCURACY = ("discretization", "solver", "newton")
+"""Tables of a scene that a preset of accuracy replaces values of."""
+
 
 def load(
     name: str | Path = "paper",
@@ -89,7 +92,7 @@ def with_accuracy(scene: Scene, name: str | Path) -> Scene:
     Raises:
       SceneError: with every problem of the preset's file.
     """
-    tables = {key: getattr(scene, key) for key in ("discretization", "solver", "newton")}
+    tables = {key: getattr(scene, key) for key in _OF_ACCURACY}
     preset = load_accuracy(name)
     return dataclasses.replace(
         scene,
@@ -106,11 +109,7 @@ def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str,
     except schema.SceneError as error:
         problems += error.problems
         return {}
-    return {
-        "discretization": preset.discretization,
-        "solver": preset.solver,
-        "newton": preset.newton,
-    }
+    return {key: getattr(preset, key) for key in _OF_ACCURACY}
 
 
 def _beside(path: Path, name: str) -> str | Path:

@@ -74,8 +74,8 @@ def main() -> int:
     every = study.cases(study.SIZES[args.size], args.parts, args.engines, args.data, gpu=gpu)
     every = [case for case in every if args.only in case.key]
     every = [case for case in every if not args.without or args.without not in case.key]
-    first, of = (int(n) for n in args.share.split("/"))
-    every = every[first - 1 :: of]
+    first, count = (int(n) for n in args.share.split("/"))
+    every = every[first - 1 :: count]
     if args.list:
         print("\n".join(case.key for case in every))
         return 0

@@ -157,32 +157,26 @@ def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
     mine, theirs = means(a), means(b)
     weights = [1 / (ALPHA + m) for m in (mine, theirs)]
     shares = [w / w.sum() for w in weights]
-    top = max(1, len(a) // 6)
-    best = [set(np.argsort(m, kind="stable")[:top]) for m in (mine, theirs)]
 
-    intervals = two_way(_judged, a, b, resamples=RESAMPLES)
+    intervals = two_way(_compared, a, b, resamples=RESAMPLES)
     return {
         "particles": len(a),
         "trials": trials,
-        **dict(zip(JUDGED, intervals, strict=True)),
+        **dict(zip(COMPARED, intervals, strict=True)),
         # Share of the next generation that would come from another particle.
         "offspring_moved": float(0.5 * np.abs(shares[0] - shares[1]).sum()),
-        "best_shared": len(best[0] & best[1]) / top,
         "failed": float((~np.isfinite(a)).mean()),
     }
 
 
-JUDGED = (
-    "success", "success_reference", "success_difference", "flipped", "cost_difference", "rank",
-)  # fmt: skip
-"""What `_judged` calculates: each with an interval over particles and trials."""
+COMPARED = ("success", "success_reference", "success_difference", "flipped", "rank")
+"""What `_compared` calculates: each with an interval over particles and trials."""
 
 
-def _judged(a: np.ndarray, b: np.ndarray) -> list[float]:
+def _compared(a: np.ndarray, b: np.ndarray) -> list[float]:
     kept, expected = a < SUCCESS_COST, b < SUCCESS_COST
     success, right, flips = kept.mean(), expected.mean(), (kept != expected).mean()
-    mine, theirs = means(a), means(b)
-    return [success, right, success - right, flips, (mine - theirs).mean(), spearman(mine, theirs)]  # type: ignore[list-item]
+    return [success, right, success - right, flips, spearman(means(a), means(b))]  # type: ignore[list-item]
 
 
 def differ(kept: np.ndarray, moved: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from codesign_jax.scene import load as load_scene
 from scripts.accuracy import analysis
-from scripts.accuracy.settings import HULL, LINKS, TIMESTEPS, Setting, of
+from scripts.accuracy.settings import HULL, LINKS, TIMESTEPS, Setting, standard_of
 from scripts.shared import figures as pictures
 from scripts.shared import labels
 
@@ -58,7 +58,7 @@ class Point(NamedTuple):
 def knob(setting: Setting) -> str:
     """What a setting changes of the standard one."""
     # MuJoCo C's finger tip in the air stands for that of the hull, see `Study.points`.
-    base, found = of(setting.engine if setting.surface != HULL else "structured"), []
+    base, found = standard_of(setting.engine if setting.surface != HULL else "structured"), []
     for name, fields in {
         "time step": ("timestep", "keep_contact"),
         "links": ("links",),

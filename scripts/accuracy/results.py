@@ -36,9 +36,7 @@ class Study:
         self.records, self.runs = analysis.load(files)
         self.times = analysis.times(self.records)
         self.grasps = analysis.decisions(self.records)
-        self.reference = analysis.finest(self.grasps, "late")
         self._compared: dict[str, dict[Setting, dict[str, Any]]] = {}
-        self._pairs: dict[tuple[bytes, bytes], dict[str, Any]] = {}
 
     def decisions(self, population: str) -> dict[Setting, dict[str, Any]]:
         """Every setting's decisions beside the finest's, over the same particles and trials."""
@@ -46,7 +44,7 @@ class Study:
             reference = analysis.finest(self.grasps, population)
             truth = self.grasps.get((reference, False, population))  # type: ignore[arg-type]
             found = {
-                setting: self.compare(cost, truth)
+                setting: analysis.compare(cost, truth)
                 for (setting, moved, name), cost in self.grasps.items()
                 if name == population and not moved and setting != reference
                 if setting.engine == "structured"  # the others have no hull
@@ -74,13 +72,6 @@ class Study:
             {"of": setting, "flipped": row["flipped"].value}
             for setting, row in self.decisions("late").items()
         ]
-
-    def compare(self, a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
-        """`analysis.compare`, each pair of tables once: a page asks for most of them twice."""
-        key = a.tobytes(), b.tobytes()
-        if key not in self._pairs:
-            self._pairs[key] = analysis.compare(a, b)
-        return self._pairs[key]
 
     def floor(self, setting: Setting, population: str = "late") -> float | None:
         """Share of verdicts that a micrometre changes at a setting; None where not measured."""

@@ -176,14 +176,14 @@ def sweep(base: Setting, **values: Iterable[Any]) -> list[Setting]:
     return [dataclasses.replace(base, **{k: v}) for k, all_v in values.items() for v in all_v]
 
 
-def of(engine: str) -> Setting:
+def standard_of(engine: str) -> Setting:
     """The standard setting of an engine: with its hull, or with spheres where it has none."""
     return Setting(engine=engine, surface=HULL if engine == "structured" else SPHERES)
 
 
 def one_at_a_time(engine: str) -> list[Setting]:
     """The study's settings of an engine: each knob on its own, then some together."""
-    base = of(engine)
+    base = standard_of(engine)
     found = [base]
     found += sweep(base, timestep=TIMESTEPS, links=LINKS, axes=(1, 2), damping=("least",))
     found += sweep(base, iterations=ITERATIONS)

@@ -18,9 +18,9 @@ from scripts.accuracy.settings import (
     STANDARD,
     TIMESTEPS,
     Setting,
-    of,
     one_at_a_time,
     own_limits,
+    standard_of,
 )
 from scripts.accuracy.store import Case
 
@@ -123,7 +123,7 @@ def reference(size: Size, *, confirm: str = "") -> Setting:
 
 def settings(size: Size, engine: str) -> list[Setting]:
     """Settings of an engine that a size affords."""
-    base = of(engine)
+    base = standard_of(engine)
     if engine == "mjx":  # a minute of compilation each: the standard setting alone
         found = [base, replace(base, precision="float64"), replace(base, iterations=1)]
     else:
@@ -207,7 +207,9 @@ def _impulse(size: Size, engines: Sequence[str]) -> list[Case]:
     if "structured" not in engines:
         return []
     step, finer = size.timesteps
-    limit = Setting(timestep=step, links=20, damping="least", iterations=0, precision="float64")
+    limit = Setting(
+        timestep=step, links=min(20, size.links), damping="least", iterations=0, precision="float64"
+    )
     found = [(limit, ("reference",)), (replace(limit, timestep=finer), ("timestep",))]
     every = settings(size, "structured")
     found += [(s, ()) for s in every if s.surface.startswith("hull") and FINGERS not in s.extra]
@@ -239,8 +241,8 @@ def _decision(size: Size, engines: Sequence[str], *, data: Path) -> list[Case]:
         add(setting, *asked)
     if "mujoco" in engines:
         few = max(1, size.fewer // 16)
-        add(of("mujoco"), ("spread", few, False), ("spread", few, True))
-        add(replace(of("mujoco"), timestep=max(1.0, size.finest)), ("spread", few, False))
+        add(standard_of("mujoco"), ("spread", few, False), ("spread", few, True))
+        add(replace(standard_of("mujoco"), timestep=max(1.0, size.finest)), ("spread", few, False))
     return found
 
 
@@ -269,15 +271,14 @@ def _time(size: Size, engines: Sequence[str], *, gpu: bool) -> list[Case]:
     if "structured" in engines:
         for setting in dict.fromkeys(every):
             if setting.precision == "float32" and not setting.keep_contact:
-                found.append((setting, [setting]))
-        wide = replace(every[0], precision="float64")
-        found[0] = (every[0], [every[0], wide])
+                wide = [replace(setting, precision="float64")] * (setting == every[0])
+                found.append((setting, [setting, *wide]))
     for setting in settings(size, "mujoco") if "mujoco" in engines else ():
         # Beside our own spheres: the others have no hull.
         if not setting.keep_contact and not setting.extra:
             mine = [replace(setting, engine="structured")] * ("structured" in engines)
             more = [setting] + [replace(setting, engine="mjx")] * (
-                "mjx" in engines and setting == of("mujoco")
+                "mjx" in engines and setting == standard_of("mujoco")
             )
             found.append((setting, mine + more))
     return [

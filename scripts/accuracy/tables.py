@@ -194,7 +194,7 @@ def alone(study: Study) -> list[list[str]]:
             cost = study.grasps.get((setting, False, "late"))
             if cost is not None and limit is not None:
                 found = _row(
-                    [knob, title(setting), title(settings[-1])], study.compare(cost, limit)
+                    [knob, title(setting), title(settings[-1])], analysis.compare(cost, limit)
                 )
                 rows.append([*found, _number(study.floor(setting), ".2%")])
     return rows
@@ -209,7 +209,7 @@ def preset_to_preset(study: Study) -> list[list[str]]:
             costs = [study.grasps.get((PRESETS[names[i]], False, population)) for i in (a, b)]
             if costs[0] is not None and costs[1] is not None:
                 what = f"{names[a]} against {names[b]}"
-                rows.append(_row([what, population], study.compare(*costs)))
+                rows.append(_row([what, population], analysis.compare(*costs)))
     return rows
 
 
@@ -221,11 +221,11 @@ def floors(study: Study) -> list[list[str]]:
         shown = setting.engine == "mujoco" or setting in PRESETS.values()
         if moved and shown and plain is not None:
             what = f"{setting.engine}, {title(setting)}: objects moved by 1 µm"
-            rows.append(_row([what, name], study.compare(cost, plain)))
+            rows.append(_row([what, name], analysis.compare(cost, plain)))
         same = study.grasps.get((replace(setting, engine="structured"), False, name))
         if setting.engine == "mujoco" and not moved and same is not None:
             what = f"MuJoCo C against structured, {setting.label}"
-            rows.append(_row([what, name], study.compare(cost, same)))
+            rows.append(_row([what, name], analysis.compare(cost, same)))
     for (setting, moved, name), cost in study.grasps.items():
         noise = analysis.trial_noise(cost)
         if setting == Setting() and not moved and noise is not None:
@@ -237,31 +237,27 @@ def floors(study: Study) -> list[list[str]]:
 
 
 def curse(study: Study) -> list[list[str]]:
-    """What the best particle by a coarse setting is worth at the reference: the winner's curse.
+    """What the best particles by a coarse setting are worth at the reference: the winner's curse.
 
     Of the population "late" the sixth with the lowest mean costs over the first half of the trials
     is chosen; the other half tells its success at both settings.
     """
-    rows = [["chosen and tested at", "tested at", "success there", "success at the reference",
-             "difference"]]  # fmt: skip
+    rows = [["designs", "chosen and tested at", "trials of the test", "success there",
+             "success at the reference", "difference"]]  # fmt: skip
     truth = study.grasps.get((PRESETS["reference"], False, "late"))
     for name in ("fast", "standard"):
         cost = study.grasps.get((PRESETS[name], False, "late"))
         if cost is None or truth is None:
             continue
         half = min(cost.shape[1], truth.shape[1]) // 2
-        best = np.argsort(analysis.means(cost[:, :half]), kind="stable")[: max(1, len(cost) // 6)]
-        both = cost[best, half : 2 * half], truth[best, half : 2 * half]
-        found = study.compare(*both)
-        rows.append([
-            f"`{name}`, the best sixth", f"{half} other trials", _interval(found["success"]),
-            _interval(found["success_reference"]), _interval(found["success_difference"], "+.1%"),
-        ])  # fmt: skip
-        found = study.compare(cost[:, half : 2 * half], truth[:, half : 2 * half])
-        rows.append([
-            f"`{name}`, all", f"{half} other trials", _interval(found["success"]),
-            _interval(found["success_reference"]), _interval(found["success_difference"], "+.1%"),
-        ])  # fmt: skip
+        ranked = np.argsort(analysis.means(cost[:, :half]), kind="stable")
+        test = slice(half, 2 * half)
+        best = ranked[: max(1, len(cost) // 6)]
+        for words, chosen in (("best sixth", best), ("all", slice(None))):
+            found = analysis.compare(cost[chosen, test], truth[chosen, test])
+            cells = [_interval(found[n]) for n in ("success", "success_reference")]
+            cells.append(_interval(found["success_difference"], "+.1%"))
+            rows.append([words, f"`{name}`", str(half), *cells])
     return rows
 
 

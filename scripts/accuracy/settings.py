@@ -170,6 +170,16 @@ COMBINED = (
     {"timestep": 1.0, "links": 40, "damping": "least"},
 )
 
+# Few Newton iterations: at short steps the last acceleration is a good start.
+FEW_ITERATIONS = (
+    {"damping": "least", "iterations": 4},
+    {"timestep": 5.0, "damping": "least", "iterations": 3},
+    {"timestep": 5.0, "damping": "least", "iterations": 4},
+    {"timestep": 5.0, "damping": "least", "iterations": 6},
+    {"timestep": 5.0, "links": 20, "damping": "least", "iterations": 4},
+    {"timestep": 2.0, "links": 20, "damping": "least", "iterations": 4},
+)
+
 
 def sweep(base: Setting, **values: Iterable[Any]) -> list[Setting]:
     """Settings in which one field at a time takes other values."""
@@ -194,6 +204,7 @@ def one_at_a_time(engine: str) -> list[Setting]:
         found.append(dataclasses.replace(base, precision="float64"))
     found.append(dataclasses.replace(base, timestep=20.0, keep_contact=True))
     if engine == "structured":
+        found += [dataclasses.replace(base, **changed) for changed in FEW_ITERATIONS]
         found += sweep(
             base, surface=SURFACES, extra=((c,) for c in (*CONTACT, FINGERS, LARGE_STRAIN))
         )

@@ -71,24 +71,35 @@ class Batch:
         Raises:
           RuntimeError: If a run finds no particle that is poor enough.
         """
-        p, width = self.plan, self.worlds.space.num_parameters
         before = self.worlds.grasps
         seeds, cost, drawn = self._seeds()
+        screened = np.int64(self.worlds.grasps - before)
+        return self.blank(seeds[None, :, None]) | {
+            "screened": screened,
+            "seeds": np.asarray(seeds, np.float32),
+            "seed_cost": cost,
+            "seed_candidates": drawn,
+        }
+
+    def blank(self, particles: np.ndarray) -> Arrays:
+        """Returns a record before the first episode, without what was known of the seeds.
+
+        Args:
+          particles: First particles [SI units], which broadcast to the shape (strategy, run,
+            particle, parameter).
+        """
+        p = self.plan
         s, r, n, e, t = len(p.strategies), p.runs, p.particles, p.episodes, p.trials
-        particles = np.broadcast_to(seeds[None, :, None], (s, r, n, width))
+        shape = (s, r, n, self.worlds.space.num_parameters)
         return {
             "step": np.int64(0),
-            "screened": np.int64(self.worlds.grasps - before),
-            "particles": np.array(particles, np.float32),
+            "particles": np.array(np.broadcast_to(particles, shape), np.float32),
             "cost": np.zeros((s, r, e, n), np.float32),
             "lost_step": np.zeros((s, r, e, n, t), np.uint16),
             "status": np.zeros((s, r, e, n, t), np.uint8),
             "test_lost_step": np.zeros((s, r, n, t + p.test_trials), np.uint16),
             "test_status": np.zeros((s, r, n, t + p.test_trials), np.uint8),
             "test_cost": np.zeros((s, r, n, t + p.test_trials), np.float32),
-            "seeds": np.asarray(seeds, np.float32),
-            "seed_cost": cost,
-            "seed_candidates": drawn,
         }
 
     def step(self, record: Arrays) -> str:
@@ -102,6 +113,10 @@ class Batch:
         record["step"] = np.int64(step + 1)
         return line
 
+    def trials(self, episode: int) -> Trial:
+        """Trials of an episode, with leading axes (run, trial): a run's particles share them."""
+        return self._programs.noise(stream_keys(self.keys, STREAM_TRIAL, episode))
+
     def grasps(self, step: int) -> int:
         """Grasps of one step."""
         return self.plan.worlds
@@ -111,8 +126,7 @@ class Batch:
         population = self._programs.move(
             record["particles"], episode, self.keys, self.masks[:, :, e]
         )
-        trials = self._programs.noise(stream_keys(self.keys, STREAM_TRIAL, e))
-        outcome = self.worlds.evaluate(np.asarray(population), trials)
+        outcome = self.worlds.evaluate(np.asarray(population), self.trials(e))
         new, cost, ancestors = jax.tree.map(
             np.asarray,
             self._programs.select(record["particles"], episode, self.keys, population, outcome),

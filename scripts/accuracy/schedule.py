@@ -1,0 +1,169 @@
+"""Whether a search should end on a finer setting: the same runs carried on in several ways.
+
+python -m scripts.accuracy.schedule --json docs/data/schedule.json        # an hour of two cores
+python -m scripts.accuracy.schedule --json docs/data/schedule.json --report --page docs/accuracy.md
+
+Each branch takes the final particles of the concurrent 23-parameter runs of docs/data/paper, which
+were found at `standard`, and lets the particle filter go on: at `standard` for as many episodes as
+the fine setting, at `standard` for as long a time, and at the fine setting.  All particles that a
+branch ends with are then judged at a setting that is finer still, all on the same fresh trials.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign_jax import codesign
+from codesign_jax.engines import Engine
+from codesign_jax.scene import Scene, parameters
+from codesign_jax.types import failed
+from scripts.accuracy.settings import STANDARD, Setting
+from scripts.experiments import Batch, Strategies, Worlds
+from scripts.experiments.worlds import chunking
+from scripts.shared import provenance, statistics, tables
+
+FINER = Setting(timestep=5.0, damping="least")
+"""Where a search may end: the cheapest setting of the study below 5 % of flipped verdicts."""
+JUDGE = Setting(timestep=2.0, links=20, damping="least")
+"""Where all are judged: its verdicts are unbiased, and it costs a third of `reference`."""
+SEED, JUDGE_SEED = 1000, 2000
+"""Root keys of the branches' first run and of the judge's: no run of docs/data/paper has them."""
+TRIALS = 6
+
+
+def branches(finer_episodes: int, equal_time: int) -> dict[str, tuple[Setting, int]]:
+    """Setting and further episodes of each branch; none are the runs as they ended."""
+    return {
+        "as they ended": (STANDARD, 0),
+        "standard, equal episodes": (STANDARD, finer_episodes),
+        "standard, equal time": (STANDARD, equal_time),
+        "finer": (FINER, finer_episodes),
+    }
+
+
+class Simulation:
+    """One setting, compiled once for all branches that need it."""
+
+    def __init__(self, setting: Setting, limit: int):
+        """Takes a setting and the most worlds of a call."""
+        self.scene: Scene = setting.scene()
+        self.engine: Engine = setting.make(self.scene)
+        self.space = parameters.design_space(self.scene.hand)
+        self.limit = limit
+
+    def batch(self, shape: tuple[int, int], episodes: int, seed: int) -> Batch:
+        """Runs that are to be carried on.
+
+        Args:
+          shape: Runs, and particles of each.
+          episodes: Further episodes.
+          seed: Root key of run 0.
+        """
+        plan = Strategies("23d", "23d", ("concurrent",), *shape, episodes, TRIALS, 0)
+        size, _ = chunking(plan.worlds, self.limit)
+        worlds = Worlds(self.scene, self.engine, self.space, chunk=size)
+        optimizer = codesign.make_filter(self.space)
+        return Batch(plan, self.scene, worlds, optimizer, seed=seed)
+
+
+def carry_on(simulation: Simulation, particles: np.ndarray, episodes: int) -> np.ndarray:
+    """Particles of runs, shape (run, particle, 23), after further episodes."""
+    batch = simulation.batch(particles.shape[:2], episodes, SEED)
+    record = batch.blank(particles[None])
+    for _ in range(episodes):
+        print("  " + batch.step(record), flush=True)
+    return record["particles"][0]
+
+
+def judge(simulation: Simulation, particles: np.ndarray) -> dict[str, Any]:
+    """Kept grasps of every run on fresh trials that all branches share."""
+    batch = simulation.batch(particles.shape[:2], 1, JUDGE_SEED)
+    outcome = batch.worlds.evaluate(particles[None], batch.trials(0))
+    good = ~failed(outcome.status[0])
+    kept = ((outcome.cost[0] < codesign.SUCCESS_COST) & good).sum(-1)
+    return {
+        "kept": [round(float(v), 5) for v in (kept / np.maximum(good.sum(-1), 1)).mean(-1)],
+        "lossless": [round(float(v), 5) for v in ((kept == TRIALS) & good.all(-1)).mean(-1)],
+        "failed": round(float((~good).mean()), 6),
+    }
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    """Simulates all branches; writes the file after each, and leaves out what it has."""
+    with np.load(args.data / "23d.npz", allow_pickle=False) as file:
+        particles = file["final_particles"][-1, : args.runs, : args.particles]
+    found = json.loads(args.json.read_text()) if args.json.exists() else {"branches": {}}
+    simulations = {s: Simulation(s, args.chunk) for s in (STANDARD, FINER, JUDGE)}
+    for name, (setting, episodes) in branches(args.episodes, args.equal_time).items():
+        if name in found["branches"]:
+            continue
+        start = time.perf_counter()
+        new = carry_on(simulations[setting], particles, episodes) if episodes else particles
+        seconds = time.perf_counter() - start
+        found["branches"][name] = {
+            "setting": setting.label,
+            "episodes": episodes,
+            "seconds_with_compile": round(seconds, 1),
+            **judge(simulations[JUDGE], new),
+        }
+        found |= {"judge": JUDGE.label, "runs": len(particles), "trials": TRIALS}
+        found |= {"particles": particles.shape[1], "made": provenance.results(args.commit)}
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text(json.dumps(found, indent=1) + "\n")
+        print(name, found["branches"][name], flush=True)
+    return found
+
+
+def table(found: dict[str, Any]) -> str:
+    """The branches, and what each changes of the first, run by run."""
+    rows = [["runs carried on", "setting", "further episodes", "grasps kept", "change, points"]]
+    rows[0] += ["particles that lose nothing", "change, points"]
+    first = found["branches"]["as they ended"]
+    for name, branch in found["branches"].items():
+        row = [name, branch["setting"] if branch["episodes"] else "–", str(branch["episodes"])]
+        for what in ("kept", "lossless"):
+            row.append(f"{100 * np.mean(branch[what]):.1f} %")
+            change = 100 * (np.array(branch[what]) - np.array(first[what]))
+            middle = statistics.bootstrap(lambda k, c=change: c[k].mean(-1), change.size)
+            text = f"{middle.value:+.1f} [{middle.low:+.1f}, {middle.high:+.1f}]"
+            row.append(text if branch is not first else "–")
+        rows.append(row)
+    return tables.markdown(rows)
+
+
+def parse() -> argparse.Namespace:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, default=Path("runs/schedule.json"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
+    parser.add_argument("--runs", type=int, default=30)
+    parser.add_argument("--particles", type=int, default=60)
+    parser.add_argument("--episodes", type=int, default=8, help="further ones at the finer setting")
+    parser.add_argument("--equal-time", type=int, default=19, help="episodes at standard instead")
+    parser.add_argument("--chunk", type=int, default=10_800, help="most worlds of a call")
+    parser.add_argument("--report", action="store_true", help="print the table of the file")
+    parser.add_argument("--page", type=Path, help="page whose table is filled in")
+    provenance.add_commit(parser)
+    return parser.parse_args()
+
+
+def main() -> int:
+    """Runs the command and returns the exit status."""
+    args = parse()
+    found = json.loads(args.json.read_text()) if args.report else run(args)
+    text = table(found)
+    print(text)
+    if args.page:
+        tables.fill(args.page, text, "schedule")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

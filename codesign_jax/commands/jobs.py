@@ -7,9 +7,11 @@ finish.
 
 import dataclasses
 import os
+import signal
 import sys
 import time
-from collections.abc import Sequence
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from codesign_jax import codesign, runs
+from codesign_jax.commands import slurm, status
 from codesign_jax.runs import RunResult
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
@@ -28,7 +31,7 @@ FOLDER = "jobs"
 """Folder of submitit's files and logs, beside the run folders."""
 POLL_SECONDS = 0.5
 MINUTES = 7 * 24 * 60
-"""Time limit of a job where none is given; submitit's own for local processes is five minutes."""
+"""Time limit of a local process where none is given; submitit's own is five minutes."""
 
 
 def executor(options: "Optimize", folder: Path) -> Any:
@@ -43,14 +46,15 @@ def executor(options: "Optimize", folder: Path) -> Any:
     """
     submitit = _submitit()
     given = parameters([*chain.from_iterable(options.job_set)])
-    kind = given.pop("cluster", None)
+    kind, asked = given.pop("cluster", None), slurm.parameters(given)
     try:
         made = submitit.AutoExecutor(folder=folder / FOLDER, cluster=kind)  # type: ignore[arg-type]
-        made.update_parameters(
-            **{"name": "codesign", "timeout_min": MINUTES, "slurm_array_parallelism": options.jobs}
-            | given  # type: ignore[arg-type]
-        )
-    except (NameError, TypeError, ValueError, RuntimeError) as error:
+        ours = {"name": "codesign", "slurm_array_parallelism": options.jobs}
+        if made.cluster != "slurm":
+            ours["timeout_min"] = MINUTES
+        made.update_parameters(**ours | asked)  # type: ignore[arg-type]
+    # submitit asserts that a parameter's type is right.
+    except (AssertionError, NameError, TypeError, ValueError, RuntimeError) as error:
         raise SceneError([f"--job-set: {error}"]) from error
     return made
 
@@ -73,19 +77,31 @@ def _submitit() -> Any:
     return submitit
 
 
-def parameters(pairs: Sequence[str]) -> dict[str, int | str]:
-    """Reads KEY=VALUE pairs; whole numbers become int, as submitit wants them.
+def parameters(pairs: Sequence[str]) -> dict[str, bool | int | float | str]:
+    """Reads KEY=VALUE pairs; numbers, true and false become what submitit wants them to be.
 
     Raises:
       SceneError: If a pair has no key or no value.
     """
-    found: dict[str, int | str] = {}
+    found: dict[str, bool | int | float | str] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not (key and equals and value):
             raise SceneError([f"--job-set {pair!r} must be KEY=VALUE"])
-        found[key] = int(value) if value.isdigit() else value
+        found[key] = _value(value)
     return found
+
+
+def _value(text: str) -> bool | int | float | str:
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            if str(kind(text)) == text:  # an account such as 007 stays a name
+                return kind(text)
+        except ValueError:
+            pass
+    return text
 
 
 def one(options: "Optimize", seed: int, folder: Path, arguments: list[str]) -> int:
@@ -97,12 +113,16 @@ def one(options: "Optimize", seed: int, folder: Path, arguments: list[str]) -> i
       folder: Its run folder.
       arguments: Command line to note in the run folder.
     """
-    from codesign_jax.commands import optimize
-
     sys.argv = arguments
-    return optimize.main(
-        dataclasses.replace(options, seeds=None, jobs=None, job_set=(), seed=seed, out=folder)
-    )
+    slurm.resume_before_the_limit(folder)
+    own = {"seeds": None, "jobs": None, "job_set": (), "seed": seed, "out": folder}
+    fresh = options.fresh and not slurm.restarted()
+    try:
+        return status.of(dataclasses.replace(options, **own, fresh=fresh).run)  # type: ignore[arg-type]
+    except Exception as error:  # whatever it is, the command that started the jobs tells it
+        traceback.print_exc()
+        print(f"error: {type(error).__name__}: {error}", file=sys.stderr)
+        return 1
 
 
 def run(
@@ -118,48 +138,89 @@ def run(
 
     Returns:
       Each run by its seed; None for one that did not finish.
+
+    Raises:
+      SceneError: See `executor`; or if SLURM does not take the jobs.
+      KeyboardInterrupt: When all jobs were cancelled.
     """
     made = executor(options, next(iter(folders.values())).parent)
-    calls = [(seed, folder.absolute()) for seed, folder in folders.items()]
+    calls = {s: (one, options, s, folder.absolute(), sys.argv) for s, folder in folders.items()}
     console.print(
         f"{len(calls)} runs, {options.jobs} at a time, on {made.cluster}; logs: {made.folder}",
         markup=False,
     )
     if made.cluster == "slurm":
-        with made.batch():  # one array, which SLURM keeps within the number at a time
-            started = {s: made.submit(one, options, s, f, sys.argv) for s, f in calls}
-        return _collect(started, [], None, options, scene, folders, console)
-    waiting = list(calls)
-
-    def start(seed: int, folder: Path) -> Any:
-        return made.submit(one, options, seed, folder, sys.argv)
-
-    return _collect({}, waiting, start, options, scene, folders, console)
-
-
-def _collect(running, waiting, start, options, scene, folders, console):
-    """Starts what waits as places become free, and reads each run when its job ends."""
+        place = slurm.Array(made, console)
+    else:
+        place = Processes(made, options.jobs or 1)
+    place.start(calls)
     results: dict[int, RunResult | None] = {}
     try:
-        while running or waiting:
-            while waiting and len(running) < options.jobs:
-                seed, folder = waiting.pop(0)
-                running[seed] = start(seed, folder)
-            for seed in [s for s, job in running.items() if job.done()]:
-                job = running.pop(seed)
-                results[seed] = read(scene, folders[seed]) if _succeeded(job) else None
-                state = "done" if results[seed] else f"failed, see {job.paths.stderr}"
-                console.print(f"seed {seed}: {state}", markup=False)
+        while len(results) < len(folders):
+            for seed, job, state in place.ended():
+                problem = why(job, state)
+                results[seed] = None if problem else read(scene, folders[seed])
+                console.print(f"seed {seed}: {problem or 'done'}", markup=False)
             time.sleep(POLL_SECONDS)
     except KeyboardInterrupt:
-        for job in running.values():
-            job.cancel()
+        place.cancel()
+        console.print("stopped: the jobs are cancelled; the same command resumes")
         raise
     return {seed: results[seed] for seed in folders}
 
 
-def _succeeded(job: Any) -> bool:
-    return job.exception() is None and job.result() == 0
+class Processes:
+    """Jobs as processes of this machine, so many at a time."""
+
+    def __init__(self, made: Any, most: int):
+        """Takes submitit's executor and how many may run at once."""
+        self._made, self._most = made, most
+        self._waiting: dict[int, tuple[Any, ...]] = {}
+        self._running: dict[int, Any] = {}
+
+    def start(self, calls: Mapping[int, tuple[Any, ...]]) -> None:
+        """Takes a call for each seed; each starts when there is room."""
+        self._waiting = dict(calls)
+
+    def ended(self) -> Iterator[tuple[int, Any, str]]:
+        """Seed and job of each run that has ended since, and a word if it left no result."""
+        while self._waiting and len(self._running) < self._most:
+            seed = next(iter(self._waiting))
+            self._running[seed] = self._made.submit(*self._waiting.pop(seed))
+        for seed in [s for s, job in self._running.items() if job.done()]:
+            job = self._running.pop(seed)
+            yield seed, job, "" if job.paths.result_pickle.exists() else "killed"
+
+    def cancel(self) -> None:
+        """Ends what runs, and starts nothing more."""
+        self._waiting = {}
+        for job in self._running.values():
+            job.cancel()
+
+
+def why(job: Any, state: str) -> str:
+    """Why a job that has ended did not succeed, in words; nothing if it did.
+
+    Args:
+      job: submitit's job.
+      state: What ended a job that left no result, else nothing.
+    """
+    if state:
+        return f"failed: {state}; log: {job.paths.stderr}"
+    code = 1 if job.exception() is not None else job.result()
+    if code == 0:
+        return ""
+    if code > 128:
+        return f"stopped by {signal.Signals(code - 128).name}; the same command resumes"
+    return f"failed: {_last_words(job.paths.stderr)}; log: {job.paths.stderr}"
+
+
+def _last_words(log: Path) -> str:
+    """The last error in a log, or its last line."""
+    lines = log.read_text(errors="replace").splitlines() if log.exists() else []
+    lines = [line.strip() for line in lines if line.strip()]
+    errors = [line for line in lines if line.startswith("error: ")]
+    return (errors or lines or ["without a word"])[-1].removeprefix("error: ")
 
 
 def read(scene: Scene, folder: Path) -> RunResult | None:

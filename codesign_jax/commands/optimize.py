@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import signal
 import sys
 from itertools import chain
 from pathlib import Path
@@ -132,7 +133,10 @@ def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
 def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
     """Runs all seeds as jobs and compares them; returns the exit status."""
     console = Console(highlight=False, soft_wrap=True)
-    results = jobs.run(options, scene, folders, console)
+    try:
+        results = jobs.run(options, scene, folders, console)
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
     _compare(results, folders, console)
     return int(any(result is None for result in results.values()))
 
@@ -167,7 +171,8 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         problems.append("--seed and --seeds exclude each other")
     if options.jobs is not None and (options.seeds is None or options.jobs < 1):
         problems.append("--jobs needs --seeds and at least one run at a time")
-    available = jax.local_device_count()
+    # Jobs have the devices of their own hosts, and check there.
+    available = jax.local_device_count() if options.jobs is None else options.devices or 1
     if options.devices is not None and not 1 <= options.devices <= available:
         problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
     reference_trials = options.reference_trials or 0

@@ -32,14 +32,16 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
     deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
     bad = ~(deep <= fields.constants.limits.penetration)
-    for value in jax.tree.leaves(fields):
-        bad |= ~jnp.isfinite(value.reshape(value.shape[0], -1)).all(1)
+    bad |= ~jnp.isfinite(_rows(*jax.tree.leaves(fields))).all(1)
     moving = layout(scene).bodies.ravel()
-    for value in (fields.body_mass[:, moving], fields.body_inertia[:, moving]):
-        bad |= ~(value.reshape(value.shape[0], -1) > 0).all(1)
-    for value in (fields.jnt_stiffness, fields.dof_damping, fields.dof_armature):
-        bad |= ~(value >= 0).all(1)
+    bad |= ~(_rows(fields.body_mass[:, moving], fields.body_inertia[:, moving]) > 0).all(1)
+    bad |= ~(_rows(fields.jnt_stiffness, fields.dof_damping, fields.dof_armature) >= 0).all(1)
     return jnp.where(bad, int(Status.INVALID_START), 0).astype(jnp.int32)
+
+
+def _rows(*arrays: jax.Array) -> jax.Array:
+    """All numbers of each world, of arrays with leading axis (world,), shape (world, number)."""
+    return jnp.concatenate([x.reshape(x.shape[0], -1) for x in arrays], 1)
 
 
 @partial(jax.jit, static_argnums=0)

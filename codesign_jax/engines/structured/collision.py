@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured import mesh
-from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
+from codesign_jax.engines.structured.constants import WorldConstants, apply_columns, apply_rows
 from codesign_jax.engines.structured.contact import Cone, Contacts
 from codesign_jax.engines.structured.kinematics import Kinematics
 from codesign_jax.engines.structured.lanes import Stages, cross, dot
@@ -50,7 +50,7 @@ def spheres_on_object(
 
 def in_object(columns: jax.Array, point: jax.Array) -> jax.Array:
     """Points (3, ...) from the object's centre along the world's axes in the object's frame."""
-    return jnp.stack([dot(columns[k], point) for k in range(3)])
+    return apply_rows(columns, point)
 
 
 def on_surface(

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
+from codesign_jax.engines.structured.constants import WorldConstants, apply_columns, turn_columns
 from codesign_jax.engines.structured.contact import (
     Contacts,
     constraint_update,
@@ -72,7 +72,7 @@ def places(scene: Scene, hand: WorldConstants) -> tuple[jax.Array, jax.Array, ja
 def vertices(scene: Scene, hand: WorldConstants, kin: Kinematics) -> Vertices:
     """Places the hull's contact points."""
     local, weight, share = places(scene, hand)
-    base = jnp.stack([apply_columns(kin.palm, hand.mount[k]) for k in range(3)])
+    base = turn_columns(kin.palm, hand.mount)
     before = jnp.concatenate([base[:, :, None], kin.link], 2)[:, :, :, None]
     after = jnp.concatenate([kin.link, kin.link[:, :, -1:]], 2)[:, :, :, None]
     joint = jnp.concatenate([kin.origin, kin.origin[:, -1:]], 1)[:, :, None]

@@ -5,7 +5,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
+from codesign_jax.engines.structured.constants import (
+    WorldConstants,
+    apply_columns,
+    turn_columns,
+)
 from codesign_jax.engines.structured.kinematics import Kinematics, State
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
 from codesign_jax.model.morphology import softening
@@ -140,18 +144,14 @@ class Smooth(NamedTuple):
 
 def principal_tensor(columns: jax.Array, principal: jax.Array) -> jax.Array:
     """World inertia tensor from body axes (3 columns, 3, ...) and principal moments (3, ...)."""
-    rows = [
-        [total([principal[k] * columns[k, i] * columns[k, j] for k in range(3)]) for j in range(3)]
-        for i in range(3)
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
+    pairs = zip(jnp.unstack(principal), jnp.unstack(columns), strict=True)
+    return total([(p * c)[:, None] * c[None] for p, c in pairs])
 
 
 def turned_tensor(frame: jax.Array, tensor: jax.Array) -> jax.Array:
     """R T R' of a tensor T (3, 3, ...), R given by its columns."""
     # Rows of T first, then columns of T R'.
-    half = jnp.stack([apply_columns(frame, tensor[i]) for i in range(3)], 1)
-    return jnp.stack([apply_columns(frame, half[j]) for j in range(3)])
+    return turn_columns(frame, jnp.moveaxis(turn_columns(frame, tensor), 0, 1))
 
 
 def bodies(run: Stages, hand: WorldConstants, kin: Kinematics) -> Bodies:

@@ -17,6 +17,7 @@ from codesign_jax.engines.structured.constants import (
     WorldConstants,
     apply_columns,
     rotation_columns,
+    turn_columns,
 )
 from codesign_jax.engines.structured.lanes import (
     Stages,
@@ -143,18 +144,15 @@ def kinematics(
 
 
 def straight(hand: WorldConstants, state: State) -> Kinematics:
-    """Places of all bodies with straight fingers, nothing moving: no loop along the links."""
+    """Places of all bodies with straight fingers: no loop along the links, and nothing else."""
     place = _place(state)
-    palm, wrist_axes, *_ = _wrist(place, state.wrist, jnp.zeros_like(state.wrist_vel))
+    palm = _palm_columns(state.wrist)
     frame, base = _mount(place, palm, hand.mount, hand.base)
-    along = jnp.cumsum(hand.offset, axis=0)
-    origin = jnp.stack([base[i] + frame[0][i] * along for i in range(3)])
+    origin = base[:, None] + frame[0][:, None] * jnp.cumsum(hand.offset, axis=0)
     link = jnp.broadcast_to(frame[:, :, None], (3, *origin.shape))
-    columns, _ = _object(state)
+    columns = rotation_columns(state.quat)
     none = jnp.zeros(())
-    return Kinematics(
-        place, palm, wrist_axes, none, none, link, origin, none, none, none, columns, none
-    )
+    return Kinematics(place, palm, none, none, none, link, origin, none, none, none, columns, none)
 
 
 def _place(state: State) -> jax.Array:
@@ -177,8 +175,17 @@ def _wrist(place: jax.Array, wrist: jax.Array, wrist_vel: jax.Array):
     return jnp.stack(frame), jnp.stack(axes), vel, bias
 
 
+def _palm_columns(wrist: jax.Array) -> jax.Array:
+    """Columns of the palm's orientation, as `_wrist` has them beside axes and velocities."""
+    frame = list(jnp.eye(3, dtype=wrist.dtype).reshape(3, 3, *[1] * (wrist.ndim - 1)))
+    cos, sin = jnp.unstack(jnp.cos(wrist[3:])), jnp.unstack(jnp.sin(wrist[3:]))
+    for axis, c, s in zip(_WRIST, cos, sin, strict=True):
+        frame = rotate(frame, axis, c, s)
+    return jnp.stack(jnp.broadcast_arrays(*frame))
+
+
 def _mount(place: jax.Array, palm: jax.Array, mount: jax.Array, base: jax.Array):
-    frame = jnp.stack([apply_columns(palm, mount[k]) for k in range(3)])
+    frame = turn_columns(palm, mount)
     return frame, place + apply_columns(palm, base)
 
 

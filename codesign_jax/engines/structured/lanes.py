@@ -107,14 +107,14 @@ def contract(a: jax.Array, b: jax.Array, axis: int) -> jax.Array:
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     """Sum over the leading axis of a * b; trailing axes broadcast."""
-    return total([a[i] * b[i] for i in range(a.shape[0])])
+    return total([x * y for x, y in zip(jnp.unstack(a), jnp.unstack(b), strict=True)])
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Cross product of vectors with the components in front; trailing axes broadcast."""
-    return jnp.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
+    # Indexing by numbers would be an operation for each use of a component.
+    (x, y, z), (u, v, w) = jnp.unstack(a), jnp.unstack(b)
+    return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def spatial(angular: jax.Array, linear: jax.Array) -> jax.Array:

@@ -6,6 +6,7 @@ import numpy as np
 
 from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.kernel import hull, objects
+from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.kernel.tables import Tables
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.model.layout import palm_touches
@@ -29,8 +30,9 @@ class Packing(Tables):
                 continue
             arrays[f"cone.{name}"] = jnp.stack([v for v in cone if v is not None])
         # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
-        share = jnp.ones((self.links + 1, *lane), dtype)
-        arrays["share"] = share.at[jnp.array([0, self.links])].set(0.5)
+        share = np.ones(self.links + 1, dtype)
+        share[[0, -1]] = 0.5
+        arrays["share"] = jnp.broadcast_to(share[:, None, None], (self.links + 1, *lane))
         if palm_touches(self.scene):
             arrays |= self._palm_slots(hand)
         if hand.section is not None:
@@ -52,15 +54,14 @@ class Packing(Tables):
         arrays["object_id"] = hand.object_id.astype(dtype)
         narrow = {k: arrays[k] for k in self.world.groups}
         packed = self.world.pack(1, self.block, **narrow)
-        ids = jnp.arange(packed.shape[0] * self.block).reshape(-1, self.block)
-        alive = self.world.offset["alive"]
-        packed = packed.at[:, alive].multiply(ids < worlds)
+        ids = np.arange(packed.shape[0] * self.block).reshape(-1, 1, self.block)
+        alive = np.arange(self.world.rows)[:, None] == self.world.offset["alive"]
+        packed = jnp.where(alive & (ids >= worlds), 0, packed)
         return self.hand.pack(self.fingers, self.block, **wide), packed
 
     def _widen(self, array: jax.Array) -> jax.Array:
         """Fingers up to a power of two."""
-        pad = [(0, 0)] * (array.ndim - 2) + [(0, self.fingers - array.shape[-2]), (0, 0)]
-        return jnp.pad(array, pad, mode="edge")
+        return lengthened(array, array.ndim - 2, self.fingers)
 
     def _palm_slots(self, hand: WorldConstants) -> dict[str, jax.Array]:
         """The palm's contact spheres, shared out among the lanes."""
@@ -90,7 +91,7 @@ class Packing(Tables):
     def pack_controls(self, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Commands: arm (block, time, 6, world) and pressure (block, time, lane)."""
         worlds, steps, _ = ctrl.shape
-        ctrl = jnp.pad(ctrl, [(0, -worlds % self.block), (0, 0), (0, 0)], mode="edge")
+        ctrl = lengthened(ctrl, 0, worlds + -worlds % self.block)
         blocks = jnp.moveaxis(ctrl.reshape(-1, self.block, steps, ctrl.shape[2]), 1, 3)
         arm, pressure = blocks[:, :, :6], blocks[:, :, 6:]
         pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]

@@ -1,5 +1,6 @@
 """Parameters to batched model fields, as a pure function: one topology, no recompile."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -101,8 +102,8 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     scene = _in_type(with_trial(scene, trial), dtype)
     beam = morphology.finger_beams(scene.hand, params)
 
-    def base(name: str) -> jax.Array:
-        return jnp.asarray(getattr(template, name), dtype)
+    def filled(name: str, *parts: tuple[Any, Any]) -> jax.Array:
+        return _filled(getattr(template, name), dtype, *parts)
 
     segment = params.length / lay.links
     extents = _extents(segment, lay)
@@ -114,51 +115,80 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         [segment[:, None] / 2, jnp.broadcast_to(segment[:, None], masses[:, 2:].shape)], 1
     )
     palm = scene.hand.palm
-    mass = base("body_mass").at[1].set(palm.mass).at[bodies].set(masses)
-    mass = mass.at[lay.object].set(object_mass)
     h = scene.discretization.timestep
     stiffness, damping = joint_springs(scene, params)
     implicit = implicit_damping(scene, stiffness, damping)
-    geom_size, rbound, aabb = _geom_fields(scene, params, size, base)
-    bias = base("actuator_biasprm").at[:6, 1].set(-stiffness[:6])
-    gain = base("actuator_gainprm").at[:6, 0].set(stiffness[:6])
+    geom_size, rbound, aabb = _geom_fields(scene, params, size, filled)
     friction, solref, solimp = _pairs(scene, dtype)
     return ModelFields(
-        body_pos=base("body_pos").at[lay.stubs].set(mount_pos).at[lay.bodies, 0].set(offsets),
-        body_quat=base("body_quat").at[lay.stubs].set(mount_quat),
-        body_ipos=_centres(base("body_ipos"), bodies, extents, params.height)
-        .at[1, 2]
-        .set(palm.thickness / 2),
-        body_mass=mass,
-        body_subtreemass=_subtree_mass(lay, mass, masses, base("body_subtreemass")),
-        body_inertia=_link_inertia(scene, params, base("body_inertia"), bodies, masses, extents)
-        .at[lay.object]
-        .set(object_inertia)
-        .at[1]
-        .set(jnp.stack(palm_inertia(scene))),
-        geom_pos=_sphere_positions(scene, params, extents, base("geom_pos")),
+        body_pos=filled("body_pos", (lay.stubs, mount_pos), ((lay.bodies, 0), offsets)),
+        body_quat=filled("body_quat", (lay.stubs, mount_quat)),
+        body_ipos=filled(
+            "body_ipos",
+            ((bodies, 0), extents / 2),
+            ((bodies, 2), params.height[:, None] / 2),
+            ((1, 2), palm.thickness / 2),
+        ),
+        body_mass=filled("body_mass", (1, palm.mass), (bodies, masses), (lay.object, object_mass)),
+        body_subtreemass=filled("body_subtreemass", *_subtree_mass(lay, palm, masses, object_mass)),
+        body_inertia=filled(
+            "body_inertia",
+            (bodies, _link_inertia(scene, params, masses, extents)),
+            (lay.object, object_inertia),
+            (1, jnp.stack(palm_inertia(scene))),
+        ),
+        geom_pos=filled("geom_pos", *_sphere_positions(scene, params, extents)),
         geom_size=geom_size,
         geom_rbound=rbound,
         geom_aabb=aabb,
         # The wrist's springs are its position actuators; only the fingers have passive ones.
-        jnt_stiffness=base("jnt_stiffness").at[lay.dofs].set(stiffness[lay.dofs]),
+        jnt_stiffness=filled("jnt_stiffness", (lay.dofs, _picked(stiffness, lay.dofs))),
         dof_damping=implicit,
         dof_armature=h * implicit,
         # MuJoCo takes the inertia of a free body from this constant; of other bodies it does not.
-        dof_M0=base("dof_M0").at[-6:-3].set(object_mass).at[-3:].set(object_inertia),
-        actuator_gainprm=gain.at[6:, 0].set(beam.moment_per_pressure),
-        actuator_biasprm=bias,
+        dof_M0=filled("dof_M0", (slice(-6, -3), object_mass), (slice(-3, None), object_inertia)),
+        actuator_gainprm=filled(
+            "actuator_gainprm",
+            ((slice(6), 0), stiffness[:6]),
+            ((slice(6, None), 0), beam.moment_per_pressure),
+        ),
+        actuator_biasprm=filled("actuator_biasprm", ((slice(6), 1), -stiffness[:6])),
         # Declared, not derived; see contact_invweight.  The world keeps zero.
-        body_invweight0=base("body_invweight0").at[1:].set(contact_invweight(scene)),
+        body_invweight0=filled("body_invweight0", (slice(1, None), contact_invweight(scene))),
         pair_friction=friction,
         pair_solref=solref,
         pair_solimp=solimp,
-        gravity=jnp.zeros(3, dtype).at[2].set(-scene.gravity_on),
+        gravity=_filled(np.zeros(3), dtype, (2, -scene.gravity_on)),
         impratio=scene.contact.friction_ratio,
         start=_start(scene, params, trial, rest),
         constants=scene.constants(),
         section=_section(scene, params),
     )
+
+
+def _filled(base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -> jax.Array:
+    """An array with other numbers in known places, where the last part wins.
+
+    One gather of all numbers: a CPU's XLA makes a loop of every `.at[places].set(values)`.
+
+    Args:
+      base: The array.
+      dtype: Type of the result.
+      *parts: Places, as NumPy's indices, and numbers that broadcast to what is there.
+    """
+    source = np.arange(base.size, dtype=np.int32).reshape(base.shape)
+    numbers, count = [jnp.asarray(base, dtype).ravel()], base.size
+    for places, given in parts:
+        values = jnp.asarray(given, dtype)
+        source[places] = np.arange(count, count + values.size).reshape(values.shape)
+        numbers.append(values.ravel())
+        count += values.size
+    return _picked(jnp.concatenate(numbers), source)
+
+
+def _picked(array: jax.Array, places: np.ndarray) -> jax.Array:
+    """array[places] for places that are known to exist, without operations that check them."""
+    return array.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _in_type(scene: Scene, dtype: Any) -> Scene:
@@ -234,74 +264,54 @@ def _extents(segment: jax.Array, lay: Layout) -> jax.Array:
     return segment[:, None] * factor
 
 
-def _centres(
-    ipos: jax.Array, bodies: np.ndarray, extents: jax.Array, height: jax.Array
-) -> jax.Array:
-    ipos = ipos.at[bodies, 0].set(extents / 2)
-    return ipos.at[bodies, 2].set(jnp.broadcast_to(height[:, None] / 2, bodies.shape))
-
-
-def _link_inertia(
-    scene: Scene,
-    params: Params,
-    inertia: jax.Array,
-    bodies: np.ndarray,
-    masses: jax.Array,
-    extents: jax.Array,
-) -> jax.Array:
-    """Inertia of each link as the block extent x width x height."""
+def _link_inertia(scene: Scene, params: Params, masses: jax.Array, extents: jax.Array) -> jax.Array:
+    """Inertia of each link as the block extent x width x height, shape (finger, N + 1, 3)."""
     width, height = jnp.asarray(scene.hand.section.width), params.height[:, None]
-    return inertia.at[bodies].set(
-        jnp.stack(morphology.block_inertia(masses, extents, width, height), -1)
-    )
+    return jnp.stack(morphology.block_inertia(masses, extents, width, height), -1)
 
 
-def _subtree_mass(lay: Layout, mass: jax.Array, masses: jax.Array, subtree: jax.Array) -> jax.Array:
+def _subtree_mass(lay: Layout, palm: Any, masses: jax.Array, object_mass: jax.Array) -> list[tuple]:
+    """Places and masses of what hangs on each body: fingers, world, palm and object."""
     tails = jnp.cumsum(masses[:, ::-1], 1)[:, ::-1]
-    hand = mass[1] + tails[:, 0].sum()
-    subtree = subtree.at[lay.stubs].set(tails[:, 0]).at[lay.bodies].set(tails[:, 1:])
-    total = hand + mass[lay.object]
-    return subtree.at[0].set(total).at[1].set(hand).at[lay.object].set(mass[lay.object])
+    hand = palm.mass + tails[:, 0].sum()
+    fingers = [(lay.stubs, tails[:, 0]), (lay.bodies, tails[:, 1:])]
+    return [*fingers, (0, hand + object_mass), (1, hand), (lay.object, object_mass)]
 
 
-def _sphere_positions(
-    scene: Scene, params: Params, extents: jax.Array, geom_pos: jax.Array
-) -> jax.Array:
+def _sphere_positions(scene: Scene, params: Params, extents: jax.Array) -> list[tuple]:
     """Spheres spread evenly over each moving link, tangent to the bottom layer, and the palm's."""
     lay = layout(scene)
-    if lay.palm.size:
-        geom_pos = geom_pos.at[lay.palm].set(palm_points(scene))
+    parts: list[tuple] = [(lay.palm, palm_points(scene))] if lay.palm.size else []
     if not lay.spheres.size:
-        return geom_pos
+        return parts
     k = lay.spheres.shape[2]
     along = extents[:, 1:, None] * (np.arange(k) + 0.5) / k
-    up = jnp.broadcast_to(params.height[:, None, None] / 2, lay.spheres.shape)
-    return geom_pos.at[lay.spheres, 0].set(along).at[lay.spheres, 2].set(up)
+    up = params.height[:, None, None] / 2
+    return [*parts, ((lay.spheres, 0), along), ((lay.spheres, 2), up)]
 
 
 def _geom_fields(
-    scene: Scene, params: Params, size: jax.Array, base
+    scene: Scene, params: Params, size: jax.Array, filled: Callable
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Size, bounding radius and box of the geoms."""
     lay = layout(scene)
-    geom_size, rbound, aabb = base("geom_size"), base("geom_rbound"), base("geom_aabb")
-    if lay.palm.size:
-        radius = scene.hand.palm.contact_radius
-        geom_size, rbound = geom_size.at[lay.palm, 0].set(radius), rbound.at[lay.palm].set(radius)
-        aabb = aabb.at[lay.palm, 3:].set(radius)
+    sizes: list[tuple] = []
+    radii: list[tuple] = []
+    boxes: list[tuple] = []
+    spheres = [(lay.palm, scene.hand.palm.contact_radius)] if lay.palm.size else []
     if lay.spheres.size:
-        radius = jnp.broadcast_to(params.height[:, None, None] / 2, lay.spheres.shape)
-        geom_size = geom_size.at[lay.spheres, 0].set(radius)
-        rbound = rbound.at[lay.spheres].set(radius)
-        aabb = aabb.at[lay.spheres, 3:].set(radius[..., None])
+        spheres.append((lay.spheres, params.height[:, None, None] / 2))
+    for where, radius in spheres:
+        sizes.append(((where, 0), radius))
+        radii.append((where, radius))
+        boxes.append(((where, slice(3, None)), jnp.asarray(radius)[..., None]))
     for i, shape in enumerate(scene.objects.object):
         g = lay.object_geoms[i]
-        r, half = geom_bounds(shape.type, size[i])
-        geom_size, rbound, aabb = (
-            geom_size.at[g].set(size[i]),
-            rbound.at[g].set(r),
-            aabb.at[g, 3:].set(half),
-        )
-    return geom_size, rbound, aabb
+        radius, half = geom_bounds(shape.type, size[i])
+        sizes.append((g, size[i]))
+        radii.append((g, radius))
+        boxes.append(((g, slice(3, None)), half))
+    return filled("geom_size", *sizes), filled("geom_rbound", *radii), filled("geom_aabb", *boxes)
 
 
 def _start(scene: Scene, params: Params, trial: Trial, rest: jax.Array) -> jax.Array:

@@ -17,7 +17,8 @@ from codesign_jax.scene import parameters
 from tests.stability.bench import floats, refined
 from tests.stability.table import Found, case
 
-DESIGNS, TRIALS = 40, 6
+DESIGNS, TRIALS, TRIALS_IN_C = 40, 24, 6
+"""MuJoCo C simulates 8 grasps a second: it is compared with over fewer trials."""
 DATA = Path(__file__).parents[2] / "docs" / "data"
 LATE = np.array([[0.050, -0.055], [0.130, 0.060]])
 """Length and arm height [m] among which an optimisation ends: most designs there keep some of their
@@ -25,7 +26,7 @@ objects and lose others.  Of designs of the whole space most lose all of them an
 
 
 @functools.cache
-def evaluated(engine, step, precision, links=10):
+def evaluated(engine, step, precision, links=10, num_trials=TRIALS):
     """Costs (design, trial) of late 2D designs, and what the particle filter makes of them."""
     base = refined(
         scene.load("paper_spheres", overrides={"discretization": {"links": links}}), step
@@ -38,7 +39,7 @@ def evaluated(engine, step, precision, links=10):
         params = jax.vmap(space.params)(jnp.asarray(LATE[0] + (LATE[1] - LATE[0]) * unit, dtype))
         # Drawn in float32 in either case: the same noise.
         with jax.enable_x64(False):
-            drawn = rollout.sample_trials(base, jax.random.key(24), TRIALS)
+            drawn = rollout.sample_trials(base, jax.random.key(24), num_trials)
         trials = jax.tree.map(
             lambda v: jnp.asarray(np.asarray(v), v.dtype if v.dtype == jnp.int32 else dtype), drawn
         )
@@ -69,7 +70,11 @@ def other(step, links=10):
 def ties(one, two) -> str:
     costs = [len(np.unique(np.round(v[1], 3))) for v in (one, two)]
     kept = [np.mean(v[0] == 0) for v in (one, two)]
-    return f"{costs[0]} and {costs[1]} different costs, {kept[0]:.2f} and {kept[1]:.2f} kept"
+    flips = np.mean((one[0] == 0) != (two[0] == 0))
+    return (
+        f"{costs[0]} and {costs[1]} different costs, {kept[0]:.3f} and {kept[1]:.3f} kept, "
+        f"{flips:.1%} of the verdicts flip"
+    )
 
 
 def compare(measure, one, two, bound):
@@ -77,10 +82,11 @@ def compare(measure, one, two, bound):
 
 
 optimistic = (
-    "the paper's step and links flip 9 to 13 % of the verdicts of such designs, more to success "
-    "than to failure; final tests belong to the preset reference (docs/accuracy.md)"
+    "the paper's time step flips verdicts, more to success than to failure; final tests belong to "
+    "the preset reference (docs/accuracy.md)"
 )
 many = f"{DESIGNS} late designs, {TRIALS} trials"
+fewer = f"{DESIGNS} late designs, {TRIALS_IN_C} trials"
 ours = {"precisions": ("float32",)}
 
 
@@ -90,7 +96,6 @@ ours = {"precisions": ("float32",)}
     "rank correlation",
     lower=True,
     steps=(0.5, 0.25),
-    failures={(0.5, "float32"): optimistic, (0.25, "float32"): optimistic},
     **ours,
 )
 def ranks_by_step(engine, step, precision):
@@ -115,7 +120,6 @@ def rates_by_step(engine, step, precision):
     "rank correlation",
     lower=True,
     steps=(1.0,),
-    failures={(1.0, "float32"): optimistic},
     **ours,
 )
 def ranks_by_links(engine, step, precision):
@@ -130,28 +134,33 @@ def rates_by_links(engine, step, precision):
 
 
 def in_c():
-    return evaluated("mujoco", 1.0, "float64")
+    return evaluated("mujoco", 1.0, "float64", num_trials=TRIALS_IN_C)
+
+
+def ours_of_these(precision):
+    """The structured engine in the trials that MuJoCo C simulates."""
+    return evaluated("structured", 1.0, precision, num_trials=TRIALS_IN_C)
 
 
 @case(
     24,
-    f"decision of the structured engine, {many}",
+    f"decision of the structured engine, {fewer}",
     "rank correlation with C",
     steps=(1.0,),
     lower=True,
 )
 def ranks_by_engine(engine, step, precision):
-    return compare(ranks, in_c(), evaluated(engine, 1.0, precision), 0.9)
+    return compare(ranks, in_c(), ours_of_these(precision), 0.9)
 
 
 @case(
     24,
-    f"decision of the structured engine, {many}",
+    f"decision of the structured engine, {fewer}",
     "success rate: change over interval with C",
     steps=(1.0,),
 )
 def rates_by_engine(engine, step, precision):
-    return compare(rates, in_c(), evaluated(engine, 1.0, precision), 1.0)
+    return compare(rates, in_c(), ours_of_these(precision), 1.0)
 
 
 @case(
@@ -159,7 +168,6 @@ def rates_by_engine(engine, step, precision):
     f"the best design stays good, {many}",
     "its rank at h/4, of 40",
     steps=(1.0,),
-    failures={(1.0, "float32"): optimistic},
     **ours,
 )
 def best_stays(engine, step, precision):

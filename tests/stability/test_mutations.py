@@ -51,7 +51,7 @@ FAULTS = {
         "tests/test_codesign.py::test_noise_differs_between_episodes_seeds_and_the_test",
     ),
     "weight normalisation": Fault(
-        "optimize/particle_filter.py",
+        "optimize/protocol.py",
         (("weight = weight / weight.sum()", "weight = weight / 1.0"),),
         "tests/test_particle_filter.py::test_weights_follow_the_paper",
     ),

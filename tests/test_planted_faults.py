@@ -1,14 +1,13 @@
 """Faults planted in the kernel's own physics: the comparison with MuJoCo C notices each of them.
 
-One kernel simulates all faults, each in a world of its own beside a world that is sound: where the
-kernel evaluates a stage of its physics, the worlds of a fault get that stage's wrong result.  So
-the proof costs one compile and not one a fault.  `test_kernel.py` and `test_structured.py` make
-the same comparison of sound kernels, with the same bounds.
+One kernel simulates all faults, each in a world of its own beside a world that is sound, see
+`tests.planted`.  `test_kernel.py` and `test_structured.py` make the same comparison of sound
+kernels, with the same bounds; `test_planted_contacts.py` has the hull's stages and contacts between
+fingers.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,41 +16,11 @@ import numpy as np
 import pytest
 
 from codesign_jax import model
-from codesign_jax.compiler import cache
 from codesign_jax.engines.mujoco import world_model
-from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.kernel import (
-    Limits,
-    Program,
-    contacts,
-    elimination,
-    integration,
-    newton,
-    problem,
-    step,
-)
-from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from tests import small, steps
+from tests.planted import Fault, planted, simulate
 
-FAR = 1e30
-DEEP = 1e6
-"""Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
 STEPS = 8
-
-
-class Fault(NamedTuple):
-    """What is wrong in a world.
-
-    Attributes:
-      stages: Wrong result by the qualified name of the stage, a function of the right stage and of
-        its arguments.
-      check: The comparison that must notice: "acceleration", "position" or "distance".
-    """
-
-    stages: dict[str, Callable]
-    check: str = "acceleration"
-
 
 # Stages of the kernel: functions that it evaluates lane by lane.
 PALM, LINK = "Step._palm.<locals>.compute", "_link"
@@ -186,61 +155,14 @@ BOUNDS = {"acceleration": 1e-8, "position": 1e-12, "distance": 1e-12}
 """As in test_kernel.py and test_structured.py."""
 
 
-def name_of(function: Callable) -> str:
-    return getattr(getattr(function, "func", function), "__qualname__", "")
-
-
-class Planted:
-    """Evaluates stages of the kernel, wrong in the worlds of the faults."""
-
-    def __init__(self):
-        self.world, self.used = None, set()
-
-    def __call__(self, function, *args):
-        result = lanewise(function, *args)
-        stage = name_of(function)
-        for number, (name, fault) in enumerate(FAULTS.items()):
-            if stage in fault.stages:
-                self.used.add((name, stage))
-                mine = lanes([self.world == number], (), wide=False)
-                wrong = lanewise(partial(self.wrong, fault.stages[stage], function), *args)
-                result = lanewise(self.choose, mine, wrong, result)
-        return result
-
-    @staticmethod
-    def wrong(change, function, *args):
-        given = getattr(function, "args", ())
-        return change(getattr(function, "func", function), *given, *args)
-
-    @staticmethod
-    def choose(mine, wrong, right):
-        return jax.tree.map(partial(jnp.where, mine), wrong, right)
-
-
 @pytest.fixture(scope="module")
-def planted():
+def wrong():
     """Path of every fault's world, and of a sound one at the end, with what MuJoCo C needs."""
-    with pytest.MonkeyPatch.context() as patch, jax.enable_x64(True):
+    with jax.enable_x64(True), planted(FAULTS):
         scene = small.pinch("box", links=2, effects__palm_object=False, effects__palm_table=False)
-        fault = Planted()
-        for module in (contacts, problem, elimination, newton, integration, step):
-            patch.setattr(module, "lanewise", fault)
-        start_step = step.Step.__init__
-
-        def prepare(self, *args):
-            start_step(self, *args)
-            fault.world = self.constant("penetration").lane - DEEP
-
-        patch.setattr(step.Step, "__init__", prepare)
-        # Sound kernels must neither be found in the place of this one nor find it.
-        patch.setattr(cache, "sources", lambda *_: "planted faults")
-        patch.setattr(cache, "kept", lambda name, build: build())
         fields, state, ctrl = touching(scene)
-        run = jax.jit(partial(simulate, scene))
-        found = run(fields, state, ctrl)
+        found = jax.jit(partial(simulate, scene))(fields, state, ctrl, np.arange(len(ctrl)))
     path = steps.Path(*(np.asarray(found[n]) for n in steps.Path._fields))
-    wanted = {(name, stage) for name, f in FAULTS.items() for stage in f.stages}
-    assert fault.used == wanted, f"stages that the kernel has no more: {wanted - fault.used}"
     return scene, fields, np.asarray(ctrl), path
 
 
@@ -266,20 +188,9 @@ def touching(scene):
     return many[0], (np.repeat(qpos[None], count, 0), np.repeat(qvel[None], count, 0)), many[1]
 
 
-def simulate(scene, fields, state, ctrl):
-    """The kernel's states of a few steps; solved to rounding, so that only faults are left."""
-    hand, engine = world_constants(scene, fields), StructuredEngine(scene)
-    number = jnp.arange(len(ctrl), dtype=ctrl.dtype)[None]
-    far = FAR + 0 * number
-    hand = hand._replace(bounds=hand.bounds._replace(speed=far, penetration=DEEP + number))
-    start = engine.place(engine.reset(fields), *state)
-    program = Program.here(scene, Limits(30, 40, 1e-24), np.float64)
-    return program.simulate(hand, start, ctrl, trajectory=True, states=True)[0]
-
-
-def errors(planted, world):
+def errors(wrong, world):
     """Errors of a world's steps by what is compared with MuJoCo C."""
-    scene, fields, ctrl, path = planted
+    scene, fields, ctrl, path = wrong
     one = slice(world, world + 1)
     own = steps.Path(*(v[one] for v in path))
     batch = jax.tree.map(lambda v: v[one], fields)
@@ -293,16 +204,16 @@ def errors(planted, world):
     return found, touching
 
 
-def test_the_sound_world_equals_mujoco(planted):
+def test_the_sound_world_equals_mujoco(wrong):
     """All checks pass without a fault, and everything touches that a fault could hide in."""
-    found, touching = errors(planted, len(FAULTS))
+    found, touching = errors(wrong, len(FAULTS))
     assert all(found[name] < bound for name, bound in BOUNDS.items()), found
     assert touching.max() >= 4 and touching.min() > 0
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_planted_fault_is_noticed(planted, name):
+def test_a_planted_fault_is_noticed(wrong, name):
     """By a hundred times its bound, or because nothing is left but NaN."""
     check = FAULTS[name].check
-    found, _ = errors(planted, list(FAULTS).index(name))
+    found, _ = errors(wrong, list(FAULTS).index(name))
     assert not found[check] < 100 * BOUNDS[check], found

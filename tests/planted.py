@@ -1,0 +1,206 @@
+"""Plants faults in the kernel's own physics: each in one world of a kernel that has them all.
+
+Where the kernel evaluates a stage of its physics, the worlds of a fault get that stage's wrong
+result, so that the proof that checks notice them costs one compile and not one a fault.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from codesign_jax.compiler import cache
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import (
+    Limits,
+    Program,
+    contacts,
+    coupling,
+    elimination,
+    fingers,
+    hull,
+    integration,
+    newton,
+    pairs,
+    problem,
+    slots,
+    step,
+)
+from codesign_jax.engines.structured.kernel.contacts import ContactSet
+from codesign_jax.engines.structured.lanewise import lanes, lanewise
+
+FAR = 1e30
+DEEP = 1e6
+"""Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
+MODULES = (contacts, coupling, elimination, fingers, hull, integration, newton, pairs, problem)
+MODULES += (slots, step)
+
+
+class Fault(NamedTuple):
+    """What is wrong in a world.
+
+    Attributes:
+      stages: Wrong result by the qualified name of the stage, a function of the right stage and of
+        its arguments.
+      check: The comparison that must notice, such as "acceleration".
+      methods: Wrong methods by class and name, functions of the right method, of whether a lane is
+        one of the world, of the object, and of its arguments.
+      finger: Number of the finger on whose lanes the stages are wrong; None for all.
+      later: Whether the first step is sound, in which there is no state of a step before.
+    """
+
+    stages: dict[str, Callable]
+    check: str = "acceleration"
+    methods: dict[tuple[type, str], Callable] = {}
+    finger: int | None = None
+    later: bool = False
+
+
+def name_of(function: Callable) -> str:
+    """Qualified name of a stage."""
+    return getattr(getattr(function, "func", function), "__qualname__", "")
+
+
+def chosen(mine, wrong, right, *, wide=True):
+    """The wrong numbers on a fault's lanes."""
+    mask = lanes([mine], (), wide=wide)
+    return lanewise(lambda m, w, r: jax.tree.map(partial(jnp.where, m), w, r), mask, wrong, right)
+
+
+class Named(NamedTuple):
+    """What `ContactSet.cone` reads of a set of contacts."""
+
+    scene: object
+    name: str
+
+
+def cone_of(name, other):
+    """Contacts of a pair of bodies have the friction cone of another pair."""
+
+    def cone(right, mine, self, read):
+        found = right(self, read)
+        if self.name != name:
+            return found
+        return chosen(mine, right(Named(self.scene, other), read), found, wide=False)
+
+    return Fault({}, methods={(ContactSet, "cone"): cone})
+
+
+class Planted:
+    """Evaluates stages of the kernel, wrong in the worlds of the faults.
+
+    Attributes:
+      used: Names of the faults with the stages that the kernel has evaluated wrong.
+    """
+
+    def __init__(self, faults: Mapping[str, Fault]):
+        """Takes the faults; a fault's world has its number."""
+        self.faults, self.used = faults, set()
+        self.step: Any = None
+
+    def __call__(self, function: Callable, *args: Any) -> Any:
+        """Instead of `lanewise`."""
+        result = lanewise(function, *args)
+        stage = name_of(function)
+        for number, (name, fault) in enumerate(self.faults.items()):
+            if stage in fault.stages:
+                self.used.add((name, stage))
+                mine = lanes([self.lanes(number)], (), wide=fault.finger is not None)
+                wrong = lanewise(partial(self.wrong, fault.stages[stage], function), *args)
+                result = lanewise(self.choose, mine, wrong, result)
+        return result
+
+    @staticmethod
+    def wrong(change, function, *args):
+        """A stage's wrong result."""
+        given = getattr(function, "args", ())
+        return change(getattr(function, "func", function), *given, *args)
+
+    @staticmethod
+    def choose(mine, wrong, right):
+        """The wrong result on a fault's lanes, else the right one."""
+        return jax.tree.map(partial(jnp.where, mine), wrong, right)
+
+    def lanes(self, number: int) -> jax.Array:
+        """Lanes on which a fault is now."""
+        fault, step = [*self.faults.values()][number], self.step
+        own = step.constant("penetration").lane - DEEP == number
+        if fault.finger is not None:
+            own = own & (step.block.finger == fault.finger)
+        if fault.later:
+            state, world = step.p.world_state, step.block.world
+            own = own & (state.read(step.world_state, "acc_object", 0, world)[0].lane != 0)
+        return own
+
+    def method(self, owner: type, name: str) -> Callable:
+        """A method that is wrong in the worlds of all faults that have it."""
+        right = getattr(owner, name)
+
+        def call(this, *args):
+            own = right
+            for number, (title, fault) in enumerate(self.faults.items()):
+                change = fault.methods.get((owner, name))
+                if change is not None:
+                    self.used.add((title, name))
+                    own = partial(change, own, self.lanes(number))
+            return own(this, *args)
+
+        return call
+
+    def wanted(self) -> set[tuple[str, str]]:
+        """What `used` has once the kernel was traced, if it has all stages of the faults."""
+        return {
+            (name, stage)
+            for name, fault in self.faults.items()
+            for stage in (*fault.stages, *(method for _, method in fault.methods))
+        }
+
+
+@contextlib.contextmanager
+def planted(faults: Mapping[str, Fault]) -> Iterator[Planted]:
+    """Kernels that are made within have the faults, see `simulate`."""
+    fault = Planted(faults)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in MODULES:
+            patch.setattr(module, "lanewise", fault)
+        for owner, name in {key for f in faults.values() for key in f.methods}:
+            patch.setattr(owner, name, fault.method(owner, name))
+        start_step = step.Step.__init__
+
+        def prepare(self, *args):
+            start_step(self, *args)
+            fault.step = self
+
+        patch.setattr(step.Step, "__init__", prepare)
+        # Sound kernels must neither be found in the place of this one nor find it.
+        patch.setattr(cache, "sources", lambda *_: f"planted: {sorted(faults)}")
+        patch.setattr(cache, "kept", lambda name, build: build())
+        yield fault
+    missing = fault.wanted() - fault.used
+    assert not missing, f"stages that the kernel has no more: {missing}"
+
+
+def simulate(scene, fields, state, ctrl, number, iterations=30):
+    """The kernel's trace with the states of all steps; solved to rounding.
+
+    Args:
+      scene: The scene.
+      fields: Model fields of the worlds.
+      state: Their qpos and qvel.
+      ctrl: Controls, shape (world, time, nu).
+      number: Number of the fault of each world; one that no fault has for sound worlds.
+      iterations: Largest number of Newton iterations of a step.
+    """
+    hand, engine = world_constants(scene, fields), StructuredEngine(scene)
+    number = jnp.asarray(number, ctrl.dtype)[None]
+    far = FAR + 0 * number
+    hand = hand._replace(bounds=hand.bounds._replace(speed=far, penetration=DEEP + number))
+    start = engine.place(engine.reset(fields), *state)
+    program = Program.here(scene, Limits(iterations, 40, 1e-24), np.float64)
+    return program.simulate(hand, start, ctrl, trajectory=True, states=True)[0]

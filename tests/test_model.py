@@ -11,7 +11,14 @@ import pytest
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import spec
-from tests.small import hand_world, nth, pinch, random_constants, random_worlds
+from tests.small import (
+    hand_world,
+    nth,
+    pinch,
+    random_constants,
+    random_worlds,
+    world_inputs,
+)
 
 # Arrays of mjModel that differ between hands although no ModelFields entry carries them, and why
 # nothing in these scenes reads them.
@@ -313,7 +320,7 @@ def test_implicit_springs_are_stable(damping):
     assert np.abs(speeds).max() < 50.0  # the first steps throw the hand towards its target
     assert np.abs(speeds[-100:, :-6]).max() < 1e-6  # and then it rests
     with jax.enable_x64(True):
-        fields = model.model_fields(the_scene, params, trial)
+        fields, _ = world_inputs(the_scene, params, trial)
     np.testing.assert_allclose(fields.dof_damping, ours.dof_damping, rtol=1e-12)
     np.testing.assert_allclose(fields.dof_armature, ours.dof_armature, rtol=1e-12)
 

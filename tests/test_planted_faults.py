@@ -184,7 +184,7 @@ def touching(scene):
     qvel[-4] = -0.2  # onto the table
     ctrl = np.repeat(np.asarray(ctrl[:1]), STEPS, 0)
     ctrl[:, :6], ctrl[:, 6:] = qpos[:6] + 0.01, 90e3
-    many = jax.tree.map(lambda v: jnp.repeat(jnp.asarray(v)[None], count, 0), (fields, ctrl))
+    many = small.repeat((fields, ctrl), count)
     return many[0], (np.repeat(qpos[None], count, 0), np.repeat(qvel[None], count, 0)), many[1]
 
 

@@ -4,15 +4,14 @@ import dataclasses
 import math
 import tomllib
 
-import jax
 import numpy as np
 import pytest
 
-from codesign_jax import control, model, rollout, scene
+from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import hand, keypaths, library, objects, parameters, schema
-from tests.small import DATA, nth, stack
+from tests.small import DATA, batch_inputs, nth, repeat, stack, still
 
 HANDS, OBJECTS = sorted(library.available("hands")), sorted(library.available("objects"))
 
@@ -349,11 +348,9 @@ def test_every_hand_and_object_set_steps_finitely(hand_name, object_set):
     spheres = {"effects": {"surface": "spheres"}}  # MuJoCo C has no contact with the skinned hull
     the_scene = scene.load("paper", hand_name=hand_name, object_set=object_set, overrides=spheres)
     space = parameters.design_space(the_scene.hand)
-    params = space.params(space.default())
-    shapes = range(len(the_scene.objects.object))
-    trials = [rollout.nominal_trial(the_scene, i) for i in shapes]
-    fields = jax.jit(jax.vmap(lambda t: model.model_fields(the_scene, params, t)))(stack(*trials))
-    ctrl = stack(*(control.commands(the_scene, params, t) for t in trials))
+    trials = [still(i) for i in range(len(the_scene.objects.object))]
+    params = parameters.params_of(space, repeat(space.default(), len(trials)))
+    fields, ctrl = batch_inputs(the_scene, params, stack(*trials))
     trace = make_engine("mujoco", the_scene).rollout(fields, ctrl[:, :60])
     assert np.isfinite(trace.distance).all()
     assert (trace.speed < 20.0).all()  # a hand at rest that starts an approach, in rad/s and m/s

@@ -93,17 +93,9 @@ class DesignSpace:
         Returns:
           The projected vector, shape (parameter,).
         """
-        design = jnp.asarray(design)
-        full = self.expand(design)
-        offsets = _offsets(self.hand)
-        wall = full[offsets["wall"] : offsets["wall"] + len(self.hand.finger)]
-        caps = self.hand.pressure_limit.per_wall * wall * _STRICT
-        start = offsets["pressure"]
-        for i in range(len(self.hand.finger)):
-            j = self.source[start + i]
-            if j >= 0:
-                design = design.at[j].min(caps[i])
-        return design
+        self._refuse_shape(design, "")
+        self.refuse_unit_slips(design)
+        return _projected(self, jnp.asarray(design))
 
     def refuse_unit_slips(self, designs: np.typing.ArrayLike) -> None:
         """Refuses designs that were given in other units than SI; see `from_units` for those.
@@ -166,6 +158,20 @@ class DesignSpace:
     def from_units(self, design: np.ndarray) -> np.ndarray:
         """Converts design vectors from the hand file's units to SI, shape (..., parameter)."""
         return np.asarray(design, float) * np.asarray(self.scale)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
+    """`DesignSpace.project` of a design whose units are known to be right; one program a space."""
+    full, offsets = space.expand(design), _offsets(space.hand)
+    wall = full[offsets["wall"] : offsets["wall"] + len(space.hand.finger)]
+    caps = space.hand.pressure_limit.per_wall * wall * _STRICT
+    start = offsets["pressure"]
+    for i in range(len(space.hand.finger)):
+        j = space.source[start + i]
+        if j >= 0:
+            design = design.at[j].min(caps[i])
+    return design
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -106,8 +106,8 @@ def contract(a: jax.Array, b: jax.Array, axis: int) -> jax.Array:
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Sum over the leading axis of a * b; trailing axes broadcast."""
-    return total([x * y for x, y in zip(jnp.unstack(a), jnp.unstack(b), strict=True)])
+    """Sum over the leading axis of a, of a * b; trailing axes broadcast, and b may be longer."""
+    return total([x * y for x, y in zip(jnp.unstack(a), jnp.unstack(b)[: len(a)], strict=True)])
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -62,7 +62,7 @@ def kinetic(the_bench, inputs) -> tuple[float, float]:
         reader, every = Reader(the_bench.scene, fields, world), max(1, ctrl.shape[1] // 900)
         states = zip(history.qpos[world, ::every], history.qvel[world, ::every], strict=True)
         worst = max(worst, *(reader.kinetic(q, v, moving) for q, v in states))
-    return worst, history.speed.max()
+    return float(worst), float(history.speed.max())
 
 
 @functools.cache

@@ -1,58 +1,25 @@
-"""Co-design: one episode, that is ask, simulate and tell, as one jitted program.
+"""Programs: the evaluation of a population, one episode, and a whole optimisation."""
 
-Source: Deimel, Irmisch, Wall, Brock (2017), section VI.1 and Fig. 5; the measures are those of
-section VI.4.  Everything here is a pure function of arrays; files and progress are the caller's.
-
-The front page has an optimisation in ten lines; `notebooks/` go on from there.
-
->>> from codesign_jax import codesign, parameters, scene
->>> space = parameters.design_space(scene.load("paper").hand, "2d")
->>> codesign.make_filter(space).sigma  # of a move, as a share of the parameter's range
-0.05
->>> codesign.convergence_episode([3.0, 0.5, 1.2, 0.9])  # below 1 from then on
-3
-"""
-
-import dataclasses
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import optimize, rollout
+from codesign_jax import rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
-from codesign_jax.optimize import (
-    Info,
-    Optimizer,
-    ParticleFilter,
-    Space,
-    State,
-    answer,
-    rejection,
-    translated,
-)
+from codesign_jax.optimize import Info, Optimizer, State
 from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene, SceneError
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
-# Four ASCII letters each, as the optimiser's streams, so that no two streams of a seed meet.
+# Four ASCII letters, as the optimiser's streams and `experiment`'s, so that no two streams of a
+# seed meet.
 STREAM_TRIAL = 0x7472696C
 """Stream of the noise of an episode's trials ("tril")."""
-STREAM_SCREEN = 0x7363726E
-"""Stream of the noise with which seed candidates are screened ("scrn")."""
-STREAM_TEST = 0x74657374
-"""Stream of the noise of the final test ("test")."""
-
-SUCCESS_COST = 0.01
-"""Mean test cost below which a particle has solved the task (section VI.4)."""
-CONVERGED_COST = 1.0
-"""Mean particle cost of an episode below which a run counts as converged (section VI.4)."""
-SEED_COST = 2.0
-"""Cost that a seed particle must exceed, so that no run starts with a solution (section VI.4)."""
 
 EpisodeFunction = Callable[..., tuple[State, "EpisodeInfo"]]
 EvaluateFunction = Callable[..., Outcome]
@@ -73,59 +40,6 @@ class EpisodeInfo(NamedTuple):
     trials: Outcome
     selection: Info
     last: jax.Array | None = None
-
-
-class FinalTest(NamedTuple):
-    """How particles did in the final test.
-
-    Attributes:
-      trials: Outcomes, every array of shape (particle, trial).
-      cost: Mean cost of each particle by the scene's failure rule, shape (particle,).
-      success: Whether the cost is below `SUCCESS_COST`, bool, shape (particle,).
-    """
-
-    trials: Outcome
-    cost: jax.Array
-    success: jax.Array
-
-
-@dataclasses.dataclass(frozen=True)
-class _Projection:
-    """`DesignSpace.project`, equal for equal spaces, so that their filters share programs."""
-
-    space: DesignSpace
-
-    def __call__(self, design: jax.Array) -> jax.Array:
-        return self.space.project(design)
-
-
-def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) -> ParticleFilter:
-    """Returns the particle filter over a design space, by default with the paper's constants.
-
-    Args:
-      space: Free parameters with bounds and pressure limit.
-      sigma: Standard deviation of a move as a fraction of the parameter's range.
-      alpha: Cost offset of the weight 1 / (alpha + cost).
-    """
-    return ParticleFilter(_box(space), sigma=sigma, alpha=alpha)
-
-
-def make_optimizer(name: str, space: DesignSpace) -> Optimizer:
-    """Returns an optimiser over a design space; see `optimize.make_optimizer`.
-
-    Args:
-      name: One of `optimize.NAMES`.
-      space: Free parameters with bounds and pressure limit.
-
-    Raises:
-      ValueError: If there is no such optimiser.
-      ModuleNotFoundError: If it needs evosax, which is not installed.
-    """
-    return optimize.make_optimizer(name, _box(space))
-
-
-def _box(space: DesignSpace) -> Space:
-    return Space(np.asarray(space.low), np.asarray(space.high), _Projection(space))
 
 
 def make_evaluate(
@@ -352,138 +266,3 @@ def closed(optimizer: Optimizer, population: jax.Array, key: jax.Array) -> tuple
 def stream_key(key: jax.Array, stream: int, index: jax.typing.ArrayLike = 0) -> jax.Array:
     """Derives the key of one draw from the root key, the stream and a running number."""
     return jax.random.fold_in(jax.random.fold_in(key, stream), index)
-
-
-def find_seed(
-    scene: Scene,
-    evaluate: EvaluateFunction,
-    optimizer: Optimizer,
-    key: jax.Array,
-    *,
-    batch: int,
-    threshold: float = SEED_COST,
-) -> tuple[jax.Array, float, int]:
-    """Draws the particle that a run starts from by rejection sampling (section VI.4).
-
-    Args:
-      scene: The scene.
-      evaluate: See `make_evaluate`.
-      optimizer: Optimiser whose space is sampled.
-      key: Root key of the run.
-      batch: Candidates simulated at once.
-      threshold: Cost above which a candidate is poor enough.
-
-    Returns:
-      The seed particle [SI units], shape (parameter,), its cost and the number of candidates drawn.
-
-    Raises:
-      RuntimeError: If no candidate is poor enough.
-    """
-    search = seed_search(scene, optimizer, key, batch=batch, threshold=threshold)
-    return answer(search, lambda asked: evaluate(*asked))
-
-
-def seed_search(
-    scene: Scene,
-    optimizer: Optimizer,
-    key: jax.Array,
-    *,
-    batch: int,
-    threshold: float = SEED_COST,
-) -> Generator[tuple[jax.Array, jax.Array], Outcome, tuple[jax.Array, float, int]]:
-    """`find_seed` as a generator: yields (population, key), and is sent their outcomes.
-
-    Args:
-      scene: The scene.
-      optimizer: Optimiser whose space is sampled.
-      key: Root key of the run.
-      batch: Candidates of one request.
-      threshold: Cost above which a candidate is poor enough.
-    """
-    noise = stream_key(key, STREAM_SCREEN)
-    seeds, costs, drawn = yield from translated(
-        rejection(key, optimizer.space, 1, threshold=threshold, batch=batch),
-        lambda population: (population, noise),
-        lambda outcomes: particle_cost(scene, outcomes),
-    )
-    return seeds[0], float(costs[0]), drawn
-
-
-def final_test(
-    scene: Scene,
-    evaluate: EvaluateFunction,
-    particles: jax.Array,
-    key: jax.Array,
-    *,
-    num_trials: int,
-    previous: Outcome | None = None,
-) -> FinalTest:
-    """Tests final particles on new trials, together with the trials they had already.
-
-    The paper's test: 36 more trials in 2D, which makes 42 with the last episode's 6, and 72 more
-    in 23D, which makes 78.
-
-    Args:
-      scene: The scene.
-      evaluate: See `make_evaluate`; called until there are at least `num_trials` more trials, so
-        that a multiple of its own number of trials gives exactly that many.
-      particles: Particles [SI units], shape (particle, parameter).
-      key: Root key of the run.
-      num_trials: Further trials of each particle.
-      previous: Outcomes that count as well, shape (particle, trial), such as the last episode's.
-    """
-    asked = testing(scene, particles, key, num_trials=num_trials, previous=previous)
-    return answer(asked, lambda request: evaluate(*request))
-
-
-def testing(
-    scene: Scene,
-    particles: jax.Array,
-    key: jax.Array,
-    *,
-    num_trials: int,
-    previous: Outcome | None = None,
-) -> Generator[tuple[jax.Array, jax.Array], Outcome, FinalTest]:
-    """`final_test` as a generator: yields (population, key), and is sent their outcomes.
-
-    Args:
-      scene: See `final_test`, as the others.
-      particles: Particles [SI units], shape (particle, parameter).
-      key: Root key of the run.
-      num_trials: Further trials of each particle.
-      previous: Outcomes that count as well.
-    """
-    parts = [] if previous is None else [previous]
-    done, chunk = 0, 0
-    while done < num_trials:
-        parts.append((yield particles, stream_key(key, STREAM_TEST, chunk)))
-        done, chunk = done + parts[-1].cost.shape[1], chunk + 1
-    return summarize_test(scene, jax.tree.map(lambda *v: jnp.concatenate(v, axis=1), *parts))
-
-
-def summarize_test(scene: Scene, trials: Outcome) -> FinalTest:
-    """Returns cost and success of particles from the outcomes of their test.
-
-    Args:
-      scene: The scene.
-      trials: Outcomes, every array of shape (particle, trial).
-    """
-    cost = particle_cost(scene, trials)
-    return FinalTest(trials, cost, cost < SUCCESS_COST)
-
-
-def convergence_episode(
-    mean_cost: np.typing.ArrayLike, *, threshold: float = CONVERGED_COST
-) -> int | None:
-    """Returns the first episode from which the mean particle cost stays below the threshold.
-
-    Args:
-      mean_cost: Mean particle cost of each episode, shape (episode,).
-      threshold: The paper's c_convergence.
-
-    Returns:
-      Zero-based episode, or None if the last episode is not below the threshold.
-    """
-    above = np.flatnonzero(~(np.asarray(mean_cost) < threshold))
-    first = int(above[-1]) + 1 if above.size else 0
-    return first if first < np.size(mean_cost) else None

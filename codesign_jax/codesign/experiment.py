@@ -1,0 +1,176 @@
+"""How the paper's experiments begin, end and are measured (section VI.4)."""
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.codesign.episode import EvaluateFunction, stream_key
+from codesign_jax.cost import particle_cost
+from codesign_jax.optimize import Optimizer, answer, rejection, translated
+from codesign_jax.scene import Scene
+from codesign_jax.types import Outcome
+
+# Four ASCII letters each, see `episode.STREAM_TRIAL`.
+STREAM_SCREEN = 0x7363726E
+"""Stream of the noise with which seed candidates are screened ("scrn")."""
+STREAM_TEST = 0x74657374
+"""Stream of the noise of the final test ("test")."""
+
+SUCCESS_COST = 0.01
+"""Mean test cost below which a particle has solved the task (section VI.4)."""
+CONVERGED_COST = 1.0
+"""Mean particle cost of an episode below which a run counts as converged (section VI.4)."""
+SEED_COST = 2.0
+"""Cost that a seed particle must exceed, so that no run starts with a solution (section VI.4)."""
+
+
+class FinalTest(NamedTuple):
+    """How particles did in the final test.
+
+    Attributes:
+      trials: Outcomes, every array of shape (particle, trial).
+      cost: Mean cost of each particle by the scene's failure rule, shape (particle,).
+      success: Whether the cost is below `SUCCESS_COST`, bool, shape (particle,).
+    """
+
+    trials: Outcome
+    cost: jax.Array
+    success: jax.Array
+
+
+def find_seed(
+    scene: Scene,
+    evaluate: EvaluateFunction,
+    optimizer: Optimizer,
+    key: jax.Array,
+    *,
+    batch: int,
+    threshold: float = SEED_COST,
+) -> tuple[jax.Array, float, int]:
+    """Draws the particle that a run starts from by rejection sampling (section VI.4).
+
+    Args:
+      scene: The scene.
+      evaluate: See `make_evaluate`.
+      optimizer: Optimiser whose space is sampled.
+      key: Root key of the run.
+      batch: Candidates simulated at once.
+      threshold: Cost above which a candidate is poor enough.
+
+    Returns:
+      The seed particle [SI units], shape (parameter,), its cost and the number of candidates drawn.
+
+    Raises:
+      RuntimeError: If no candidate is poor enough.
+    """
+    search = seed_search(scene, optimizer, key, batch=batch, threshold=threshold)
+    return answer(search, lambda asked: evaluate(*asked))
+
+
+def seed_search(
+    scene: Scene,
+    optimizer: Optimizer,
+    key: jax.Array,
+    *,
+    batch: int,
+    threshold: float = SEED_COST,
+) -> Generator[tuple[jax.Array, jax.Array], Outcome, tuple[jax.Array, float, int]]:
+    """`find_seed` as a generator: yields (population, key), and is sent their outcomes.
+
+    Args:
+      scene: The scene.
+      optimizer: Optimiser whose space is sampled.
+      key: Root key of the run.
+      batch: Candidates of one request.
+      threshold: Cost above which a candidate is poor enough.
+    """
+    noise = stream_key(key, STREAM_SCREEN)
+    seeds, costs, drawn = yield from translated(
+        rejection(key, optimizer.space, 1, threshold=threshold, batch=batch),
+        lambda population: (population, noise),
+        lambda outcomes: particle_cost(scene, outcomes),
+    )
+    return seeds[0], float(costs[0]), drawn
+
+
+def final_test(
+    scene: Scene,
+    evaluate: EvaluateFunction,
+    particles: jax.Array,
+    key: jax.Array,
+    *,
+    num_trials: int,
+    previous: Outcome | None = None,
+) -> FinalTest:
+    """Tests final particles on new trials, together with the trials they had already.
+
+    The paper's test: 36 more trials in 2D, which makes 42 with the last episode's 6, and 72 more
+    in 23D, which makes 78.
+
+    Args:
+      scene: The scene.
+      evaluate: See `make_evaluate`; called until there are at least `num_trials` more trials, so
+        that a multiple of its own number of trials gives exactly that many.
+      particles: Particles [SI units], shape (particle, parameter).
+      key: Root key of the run.
+      num_trials: Further trials of each particle.
+      previous: Outcomes that count as well, shape (particle, trial), such as the last episode's.
+    """
+    asked = testing(scene, particles, key, num_trials=num_trials, previous=previous)
+    return answer(asked, lambda request: evaluate(*request))
+
+
+def testing(
+    scene: Scene,
+    particles: jax.Array,
+    key: jax.Array,
+    *,
+    num_trials: int,
+    previous: Outcome | None = None,
+) -> Generator[tuple[jax.Array, jax.Array], Outcome, FinalTest]:
+    """`final_test` as a generator: yields (population, key), and is sent their outcomes.
+
+    Args:
+      scene: See `final_test`, as the others.
+      particles: Particles [SI units], shape (particle, parameter).
+      key: Root key of the run.
+      num_trials: Further trials of each particle.
+      previous: Outcomes that count as well.
+    """
+    parts = [] if previous is None else [previous]
+    done, chunk = 0, 0
+    while done < num_trials:
+        parts.append((yield particles, stream_key(key, STREAM_TEST, chunk)))
+        done, chunk = done + parts[-1].cost.shape[1], chunk + 1
+    return summarize_test(scene, jax.tree.map(lambda *v: jnp.concatenate(v, axis=1), *parts))
+
+
+def summarize_test(scene: Scene, trials: Outcome) -> FinalTest:
+    """Returns cost and success of particles from the outcomes of their test.
+
+    Args:
+      scene: The scene.
+      trials: Outcomes, every array of shape (particle, trial).
+    """
+    cost = particle_cost(scene, trials)
+    return FinalTest(trials, cost, cost < SUCCESS_COST)
+
+
+def convergence_episode(
+    mean_cost: np.typing.ArrayLike, *, threshold: float = CONVERGED_COST
+) -> int | None:
+    """Returns the first episode from which the mean particle cost stays below the threshold.
+
+    Args:
+      mean_cost: Mean particle cost of each episode, shape (episode,).
+      threshold: The paper's c_convergence.
+
+    Returns:
+      Zero-based episode, or None if the last episode is not below the threshold.
+    """
+    above = np.flatnonzero(~(np.asarray(mean_cost) < threshold))
+    first = int(above[-1]) + 1 if above.size else 0
+    return first if first < np.size(mean_cost) else None

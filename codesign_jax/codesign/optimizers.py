@@ -1,0 +1,49 @@
+"""Optimisers over a design space."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from codesign_jax import optimize
+from codesign_jax.optimize import Optimizer, ParticleFilter, Space
+from codesign_jax.scene.parameters import DesignSpace
+
+
+@dataclasses.dataclass(frozen=True)
+class _Projection:
+    """`DesignSpace.project`, equal for equal spaces, so that their filters share programs."""
+
+    space: DesignSpace
+
+    def __call__(self, design: jax.Array) -> jax.Array:
+        return self.space.project(design)
+
+
+def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) -> ParticleFilter:
+    """Returns the particle filter over a design space, by default with the paper's constants.
+
+    Args:
+      space: Free parameters with bounds and pressure limit.
+      sigma: Standard deviation of a move as a fraction of the parameter's range.
+      alpha: Cost offset of the weight 1 / (alpha + cost).
+    """
+    return ParticleFilter(_box(space), sigma=sigma, alpha=alpha)
+
+
+def make_optimizer(name: str, space: DesignSpace) -> Optimizer:
+    """Returns an optimiser over a design space; see `optimize.make_optimizer`.
+
+    Args:
+      name: One of `optimize.NAMES`.
+      space: Free parameters with bounds and pressure limit.
+
+    Raises:
+      ValueError: If there is no such optimiser.
+      ModuleNotFoundError: If it needs evosax, which is not installed.
+    """
+    return optimize.make_optimizer(name, _box(space))
+
+
+def _box(space: DesignSpace) -> Space:
+    return Space(np.asarray(space.low), np.asarray(space.high), _Projection(space))

@@ -37,8 +37,8 @@ class Optimize:
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
     accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, reference (their errors and
-    costs: docs/accuracy.md), or a .toml."""
+    """Instead of the scene's discretization and solver: fast, standard, fine, reference (their errors
+    and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control."""

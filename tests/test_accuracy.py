@@ -43,7 +43,10 @@ def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
         assert dataclasses.replace(preset, spheres_per_link=1) == mine
         assert setting in one_at_a_time("structured")
     fast = scene.load("paper_spheres", accuracy="fast", overrides={"discretization": {"links": 7}})
-    assert (fast.discretization.links, fast.discretization.spheres_per_link) == (7, 2)
+    assert (fast.discretization.links, fast.newton.iterations) == (7, 4)
+    for preset_name in ("fast", "fine"):
+        found = scene.load("paper", accuracy=preset_name)
+        assert StructuredEngine(found).limits.iterations == PRESETS[preset_name].iterations
 
 
 def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
@@ -62,10 +65,10 @@ def test_the_command_line_takes_a_preset(capsys):
     found, _ = optimize.resolve(
         cli.Optimize(accuracy="fast", engine="mujoco", overrides=(("solver.iterations=7",),))
     )
-    assert found.discretization == scene.Discretization(0.01, 5, 2)
+    assert found.discretization == scene.Discretization(0.01, 10, 1, spring_damping="least")
     assert found.solver.iterations == 7
-    assert cli.main(["evaluate", "--accuracy", "finest"]) == 2
-    assert "'finest' unknown; did you mean 'fast'" in capsys.readouterr().err
+    assert cli.main(["evaluate", "--accuracy", "fastest"]) == 2
+    assert "'fastest' unknown; did you mean 'fast'" in capsys.readouterr().err
 
 
 # --- settings ------------------------------------------------------------------------------------

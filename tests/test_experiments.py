@@ -439,7 +439,7 @@ def test_figures_and_page_are_made_from_files_alone(finished, landscape, tmp_pat
     assert text in filled and "old" not in filled
     assert filled.startswith("before") and filled.endswith("after\n")
     assert json.loads((tmp_path / "2d.json").read_text())["grasps"] == PLAN.grasps
-    both = report.make(tmp_path, tmp_path / "figures", touching=tmp_path)
+    both = report.make(tmp_path, tmp_path / "figures", touching=[tmp_path])
     assert "with it" in both.split(text)[1]
 
 

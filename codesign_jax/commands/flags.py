@@ -62,8 +62,8 @@ class Subject:
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
     accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, reference (their errors and
-    costs: docs/accuracy.md), or a .toml."""
+    """Instead of the scene's discretization and solver: fast, standard, fine, reference (their errors
+    and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
     engine: Text = None
     """Engine that simulates; default: the run's, or structured."""

@@ -28,7 +28,7 @@ def load(
       hand_name: Hand to use instead of the scene's.
       object_set: Object set to use instead of the scene's.
       accuracy: Preset of discretization and solver to use instead of the scene's: "fast",
-        "standard", "reference", or a path ending in .toml; see `load_accuracy`.
+        "standard", "fine", "reference", or a path ending in .toml; see `load_accuracy`.
       overrides: Values by key path that replace the files' and the preset's, nested or dotted,
         e.g. {"discretization": {"links": 5}, "hand.material.shear_modulus": 60e3}; see `keypaths`.
 

@@ -97,7 +97,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     """Simulates all branches; writes the file after each, and leaves out what it has."""
     with np.load(args.data / "23d.npz", allow_pickle=False) as file:
         particles = file["final_particles"][-1, : args.runs, : args.particles]
-    found = json.loads(args.json.read_text()) if args.json.exists() else {"branches": {}}
+    found: dict[str, Any] = {"branches": {}}
+    if args.json.exists():
+        found = json.loads(args.json.read_text())
     simulations = {s: Simulation(s, args.chunk) for s in (STANDARD, FINER, JUDGE)}
     for name, (setting, episodes) in branches(args.episodes, args.equal_time).items():
         if name in found["branches"]:

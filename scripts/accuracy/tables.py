@@ -203,12 +203,11 @@ def alone(study: Study) -> list[list[str]]:
 def preset_to_preset(study: Study) -> list[list[str]]:
     """Decisions from preset to preset, the coarser beside the finer."""
     rows = [["presets", "population", *_DECISION]]
-    names = list(PRESETS)
     for population in POPULATIONS:
-        for a, b in ((0, 1), (1, 2), (0, 2)):
-            costs = [study.grasps.get((PRESETS[names[i]], False, population)) for i in (a, b)]
+        for a, b in itertools.combinations(PRESETS, 2):
+            costs = [study.grasps.get((PRESETS[n], False, population)) for n in (a, b)]
             if costs[0] is not None and costs[1] is not None:
-                what = f"{names[a]} against {names[b]}"
+                what = f"{a} against {b}"
                 rows.append(_row([what, population], analysis.compare(*costs)))
     return rows
 
@@ -245,7 +244,7 @@ def curse(study: Study) -> list[list[str]]:
     rows = [["designs", "chosen and tested at", "trials of the test", "success there",
              "success at the reference", "difference"]]  # fmt: skip
     truth = study.grasps.get((PRESETS["reference"], False, "late"))
-    for name in ("fast", "standard"):
+    for name in (n for n in PRESETS if n != "reference"):
         cost = study.grasps.get((PRESETS[name], False, "late"))
         if cost is None or truth is None:
             continue

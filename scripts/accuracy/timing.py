@@ -77,7 +77,7 @@ def _program(setting: Setting, count: int, steps: int) -> _Program:
     # What JAX has traced in the other float type must not be met again.
     jax.clear_caches()
     with worlds.floats(setting.wide) as dtype:
-        scene, fields, ctrl = _contact(setting, count, steps, dtype)
+        scene, fields, ctrl = contact(setting, count, steps, dtype)
         engine = setting.make(scene)
         args = jax.device_put((fields, ctrl))
 
@@ -85,10 +85,18 @@ def _program(setting: Setting, count: int, steps: int) -> _Program:
         return _Program(setting.wide, lambda f, c: engine.rollout(f, c).distance[:, -1], *args)
 
 
-def _contact(
+def contact(
     setting: Setting, count: int, steps: int, dtype: type, distinct: int = 6
 ) -> tuple[Scene, ModelFields, np.ndarray]:
-    """Scene, fields whose starts are states of MuJoCo C in contact, and controls from there."""
+    """Scene, fields whose starts are states of MuJoCo C in contact, and controls from there.
+
+    Args:
+      setting: The setting.
+      count: Worlds, which repeat the distinct ones in turn.
+      steps: Time steps of the controls.
+      dtype: Float type of the fields.
+      distinct: Distinct worlds: pairs of a hand that holds objects and a trial.
+    """
     with worlds.floats(True):
         scene, spheres = (s.scene(CLOSING) for s in (setting, replace(setting, surface=SPHERES)))
         hands = worlds.designs(scene, min(count, distinct), good=True)

@@ -62,7 +62,13 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
     parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
-    parser.add_argument("--touching", type=Path, help="the same with contact between fingers")
+    parser.add_argument(
+        "--touching",
+        type=Path,
+        nargs="+",
+        default=[],
+        help="folders of the same with contact between fingers",
+    )
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--videos", type=Path, help="folder for a video of each grasp type")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")

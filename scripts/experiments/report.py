@@ -1,5 +1,6 @@
 """From committed results to figures and the table of the paper's statements beside ours."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +18,16 @@ _THRESHOLDS = (0.1, 0.5, 1.0)
 _HEAD = "| the paper | here |\n|---|---|"
 
 
-def make(data: Path, pictures: Path, page: Path | None = None, touching: Path | None = None) -> str:
+def make(
+    data: Path, pictures: Path, page: Path | None = None, touching: Sequence[Path] = ()
+) -> str:
     """Draws the figures of whatever results there are and writes the table.
 
     Args:
       data: Folder of the results.
       pictures: Folder of the figures.
       page: Markdown page whose text between the marks is replaced; None for none.
-      touching: Folder of the experiments with contact between fingers; None for none.
+      touching: Folders of the experiments with contact between fingers.
 
     Returns:
       The table in Markdown.
@@ -33,9 +36,9 @@ def make(data: Path, pictures: Path, page: Path | None = None, touching: Path | 
     grid = load(data, "landscape")
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
     for name, study in studies.items():
-        other = load_study(touching, name) if touching else None
-        if study and other:
-            text += f"\n\n{with_fingers(study, other)}"
+        for other in (load_study(folder, name) for folder in touching):
+            if study and other:
+                text += f"\n\n{with_fingers(study, other)}"
     if studies["2d"]:
         figures.evolution(studies["2d"], pictures / "fig6_cost_evolution.png")
     for number, study in zip("79", studies.values(), strict=True):
@@ -127,24 +130,36 @@ def _against_last(study: Study) -> list[str]:
 
 
 def with_fingers(plain: Study, touching: Study) -> str:
-    """Convergence without and with contact between fingers, over the episodes that both have."""
+    """Experiments without and with contact between fingers, over the episodes that both have.
+
+    Of one that is complete also what `details` tells.
+    """
     count = min(plain.episodes, touching.episodes)
     lines = [
         f"{plain.plan['name']}, the first {count} episodes "
-        f"({count * plain.per_episode:,} simulations): mean cost stays below 1",
+        f"({count * plain.per_episode:,} simulations), contact between fingers by commit "
+        f"{touching.notes.get('commit')}: mean cost stays below 1",
         "",
         "| strategy | without contact between fingers | median simulations [quartiles] "
         "| with it | median simulations [quartiles] |",
         "|---|---|---|---|---|",
     ]
-    found = [v.convergence(episodes=count) for v in (plain, touching)]
-    for s, strategy in enumerate(plain.strategies):
+    both = [
+        (v.per_episode, dict(zip(v.strategies, v.convergence(episodes=count), strict=True)))
+        for v in (plain, touching)
+    ]
+    for strategy in touching.strategies:
         cells = [figures.label(strategy)]
-        for v in found:
-            cells += [f"{int(np.isfinite(v[s]).sum())}/{v.shape[1]}"]
-            cells += [_quartiles(v[s] * plain.per_episode)]
+        for per_episode, episodes in both:
+            each = episodes[strategy]
+            cells += [f"{int(np.isfinite(each).sum())}/{each.size}"]
+            cells += [_quartiles(each * per_episode)]
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    if not touching.tested:
+        return "\n".join(lines)
+    rows = [f"| {a} | {b} |" for a, b in _rows(plain.plan["name"], touching)]
+    lines += ["", _HEAD.replace("here", "here, with contact between fingers"), *rows]
+    return "\n".join([*lines, "", f"With contact between fingers, {details(touching)}"])
 
 
 def _quartiles(values: np.ndarray) -> str:

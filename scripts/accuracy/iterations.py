@@ -1,0 +1,94 @@
+"""Newton iterations of a step of the structured engine in contact, by the contact's constants.
+
+python -m scripts.accuracy.iterations --json docs/data/iterations_cpu.json
+python -m scripts.accuracy.iterations --json docs/data/iterations_cpu.json --report --page PAGE
+
+A block of the kernel iterates until its last world has converged.  Each world fills a block alone
+here, as copies of itself, so that the iterations are its own.
+"""
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import lanes_here
+from scripts.accuracy import timing, worlds
+from scripts.accuracy.settings import CONTACT, FINGERS, STANDARD, Setting, sweep
+from scripts.shared import provenance, tables
+
+DISTINCT, STEPS = 24, 50
+"""Worlds, and steps from the time on at which the fingers are inflated and touch the object."""
+
+
+def settings() -> list[Setting]:
+    """The standard setting and what changes the contact, or the start of an iteration."""
+    found = [STANDARD, *sweep(STANDARD, extra=tuple((c,) for c in (*CONTACT, FINGERS)))]
+    found += sweep(STANDARD, damping=("least",), timestep=(5.0, 2.0))
+    return [dataclasses.replace(s, iterations=None) for s in found]
+
+
+def measure(setting: Setting) -> dict[str, float]:
+    """Iterations a step of a setting: mean, 99 % quantile, and share of steps above tolerance."""
+    with worlds.floats(setting.wide) as dtype:
+        scene, fields, ctrl = timing.contact(setting, DISTINCT, STEPS, dtype, distinct=DISTINCT)
+        engine = setting.make(scene)
+        assert isinstance(engine, StructuredEngine)
+        fingers = 1 << (scene.num_fingers - 1).bit_length()
+        copies = max(1, lanes_here(scene, np.dtype(dtype)) // fingers)
+        fields, ctrl = jax.tree.map(lambda x: np.repeat(x, copies, 0), (fields, ctrl))
+
+        @jax.jit
+        def run(fields, ctrl):
+            hand, start = world_constants(scene, fields), engine.reset(fields)
+            found, _ = engine.advance(hand, start, ctrl)
+            return found["iterations"], found["residual"]
+
+        iterations, residual = (np.asarray(v)[::copies] for v in run(fields, ctrl))
+    return {
+        "mean": round(float(iterations.mean()), 3),
+        "p99": float(np.quantile(iterations, 0.99)),
+        "above_tolerance": round(float((residual > engine.limits.tolerance).mean()), 5),
+    }
+
+
+def table(found: dict[str, Any]) -> str:
+    """Iterations of all settings."""
+    rows = [["setting", "Newton iterations a step: mean", "99 %", "steps above the tolerance"]]
+    for label, each in found["settings"].items():
+        share = f"{each['above_tolerance']:.2%}"
+        rows.append([label, f"{each['mean']:.2f}", f"{each['p99']:.0f}", share])
+    return tables.markdown(rows)
+
+
+def main() -> int:
+    """Runs the command and returns the exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, default=Path("runs/iterations.json"))
+    parser.add_argument("--report", action="store_true", help="draw what the file holds and stop")
+    parser.add_argument("--page", type=Path, help="page whose table is filled in")
+    provenance.add_commit(parser)
+    args = parser.parse_args()
+    if not args.report:
+        found = {"worlds": DISTINCT, "steps": STEPS, **provenance.results(args.commit)}
+        found["settings"] = {s.label: measure(s) for s in settings()}
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text(json.dumps(found, indent=1) + "\n")
+    text = table(json.loads(args.json.read_text()))
+    print(text)
+    if args.page:
+        tables.fill(args.page, text, "iterations")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

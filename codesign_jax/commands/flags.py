@@ -62,7 +62,7 @@ class Subject:
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
     accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, fine, reference (their errors
+    """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
     and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
     engine: Text = None

@@ -101,7 +101,7 @@ def bends(scene: Scene, params: Params) -> np.ndarray:
 
 def places(scene: Scene, params: Params) -> tuple[np.ndarray, np.ndarray]:
     """Base points [m] and azimuths [rad] of the fingers, shape (finger, 2) and (finger,)."""
-    position, _ = mounts(scene, np.asarray(params.spread))
+    position, _ = mounts(scene.hand, np.asarray(params.spread))
     azimuth = [np.radians(f.azimuth) + f.spread * float(params.spread) for f in scene.hand.finger]
     return np.asarray(position)[:, :2], np.array(azimuth)
 

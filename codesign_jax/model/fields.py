@@ -108,9 +108,9 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     segment = params.length / lay.links
     extents = _extents(segment, lay)
     masses = beam.line_density[:, None] * extents
-    size, object_mass, object_inertia, rest = object_size(scene, trial)
+    size, object_mass, object_inertia, rest = object_size(scene.objects, trial)
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
-    mount_pos, mount_quat = mounts(scene, params.spread)
+    mount_pos, mount_quat = mounts(scene.hand, params.spread)
     offsets = jnp.concatenate(
         [segment[:, None] / 2, jnp.broadcast_to(segment[:, None], masses[:, 2:].shape)], 1
     )
@@ -320,5 +320,5 @@ def _start(scene: Scene, params: Params, trial: Trial, rest: jax.Array) -> jax.A
     height = jnp.asarray(scene.arm.start_height, dtype)
     wrist = jnp.stack([arm[0], arm[1], height, arm[3] + tilt[0], arm[5], tilt[1] - arm[4]])
     fingers = jnp.zeros(layout(scene).dofs.size, dtype)
-    parts = [wrist, fingers, trial.position, rest[None], object_quat(scene, trial)]
+    parts = [wrist, fingers, trial.position, rest[None], object_quat(scene.objects, trial)]
     return jnp.concatenate(parts).astype(dtype)

@@ -12,7 +12,8 @@ import numpy as np
 
 from codesign_jax.model import morphology
 from codesign_jax.scene import Scene, by_structure
-from codesign_jax.scene.objects import Shape
+from codesign_jax.scene.hand import Hand
+from codesign_jax.scene.objects import ObjectSet, Shape
 from codesign_jax.types import Trial
 
 # An object body carries one geom for each shape of the set; those that a trial does not use shrink
@@ -158,16 +159,16 @@ def palm_points(scene: Scene) -> jax.Array:
     return jnp.stack([jnp.stack([x * ring, y * ring, up]) for x, y in _PALM_RING])
 
 
-def mounts(scene: Scene, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
+def mounts(hand: Hand, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Base position (finger, 3) and orientation (finger, 4) of the fingers in the palm frame."""
 
     def each(name: str) -> jax.Array:
-        return jnp.stack([jnp.asarray(getattr(f, name)) for f in scene.hand.finger])
+        return jnp.stack([jnp.asarray(getattr(f, name)) for f in hand.finger])
 
     azimuth = jnp.deg2rad(each("azimuth")) + each("spread") * spread
     tilt = jnp.deg2rad(each("tilt"))
     around = zip(jnp.cos(azimuth), jnp.sin(azimuth), strict=True)
-    points = [f.base_point(c, s) for f, (c, s) in zip(scene.hand.finger, around, strict=True)]
+    points = [f.base_point(c, s) for f, (c, s) in zip(hand.finger, around, strict=True)]
     x, y = (jnp.stack([jnp.asarray(p[i], azimuth.dtype) for p in points]) for i in (0, 1))
     position = jnp.stack([x, y, jnp.zeros_like(azimuth)], -1)
     # Rotation about z by the azimuth, then about y by the tilt: x leaves the palm outwards and
@@ -176,9 +177,11 @@ def mounts(scene: Scene, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
     return position, jnp.stack([ca * ct, -sa * st, ca * st, sa * ct], -1)
 
 
-def object_size(scene: Scene, trial: Trial) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+def object_size(
+    objects: ObjectSet, trial: Trial
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Geom sizes (shape, 3), mass, principal inertia (3,) and rest height of the object."""
-    shapes = scene.objects.object
+    shapes = objects.object
     full = jnp.stack([jnp.stack([jnp.asarray(v) for v in s.half_sizes]) for s in shapes])
     size = trial.size * full
     mass = trial.mass * jnp.stack([jnp.asarray(s.mass) for s in shapes])[trial.shape]
@@ -189,9 +192,9 @@ def object_size(scene: Scene, trial: Trial) -> tuple[jax.Array, jax.Array, jax.A
     return jnp.where(active[:, None], size, INACTIVE * size), mass, mass * unit, height
 
 
-def object_quat(scene: Scene, trial: Trial) -> jax.Array:
+def object_quat(objects: ObjectSet, trial: Trial) -> jax.Array:
     """Start orientation, shape (4,): upright, a mesh as in its file, turned by the yaw."""
-    upright = [s.mesh.upright if s.mesh else (1.0, 0.0, 0.0, 0.0) for s in scene.objects.object]
+    upright = [s.mesh.upright if s.mesh else (1.0, 0.0, 0.0, 0.0) for s in objects.object]
     w, x, y, z = jnp.array(upright)[trial.shape]
     c, s = jnp.cos(trial.yaw / 2), jnp.sin(trial.yaw / 2)
     return jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])

@@ -25,8 +25,10 @@ from codesign_jax.model.layout import (
     wrist_springs,
 )
 from codesign_jax.model.morphology import Beam
-from codesign_jax.scene import Constants, Scene, by_structure
+from codesign_jax.scene import Constants, Scene, by_structure, schema
 from codesign_jax.scene.constants import with_trial
+from codesign_jax.scene.hand import Hand
+from codesign_jax.scene.objects import ObjectSet
 from codesign_jax.types import Params, Trial
 
 _GEOM = {
@@ -85,12 +87,18 @@ def compile_model(
     return model
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _numbers(structure: Scene, constants: Constants, params: Params, trial: Trial) -> tuple:
-    """Beams, mounts, and the object's size and orientation; one program, not one an operation."""
-    scene = structure.with_constants(constants)
-    beams, place = morphology.finger_beams(scene.hand, params), mounts(scene, params.spread)
-    return beams, place, object_size(scene, trial), object_quat(scene, trial)
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _numbers(
+    hand: Hand, objects: ObjectSet, constants: Constants, params: Params, trial: Trial
+) -> tuple:
+    """Beams, mounts, and the object's size and orientation; one program, not one an operation.
+
+    Hand and objects are of a scene's structure: scenes that differ in effects share the program.
+    """
+    hand = schema.with_numbers(hand, constants.hand)
+    objects = schema.with_numbers(objects, constants.objects)
+    beams, place = morphology.finger_beams(hand, params), mounts(hand, params.spread)
+    return beams, place, object_size(objects, trial), object_quat(objects, trial)
 
 
 @_float64()
@@ -104,7 +112,10 @@ def build_spec(
     world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.05], **_PASSIVE)
     _add_palm(scene, spec, visual)
     concrete = jax.tree.map(np.asarray, (scene.constants(), params, trial))
-    beams, place, solid, quat = jax.tree.map(np.asarray, _numbers(scene.structure, *concrete))
+    bodies = scene.structure
+    beams, place, solid, quat = jax.tree.map(
+        np.asarray, _numbers(bodies.hand, bodies.objects, *concrete)
+    )
     for f in range(scene.num_fingers):
         beam = Beam(*(float(v[f]) for v in beams))
         _add_finger(scene, spec, params, f, beam, (place[0][f], place[1][f]), visual)

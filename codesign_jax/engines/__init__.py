@@ -90,9 +90,9 @@ def solver_problem(given: str, key: str = "") -> str:
 
 @functools.cache
 def _usual_solvers() -> tuple[Solver, ...]:
-    """The defaults and what the presets of accuracy set, each with its [newton] table."""
+    """The defaults, the one that older runs have, and what the presets of accuracy set."""
     presets = (load_accuracy(name).solver for name in library.available("accuracy"))
-    return Solver(), *(Solver(**values) for values in presets)
+    return Solver(), Solver(ls_iterations=20), *(Solver(**values) for values in presets)
 
 
 __all__ = ["DEFAULT", "NAMES", "Engine", "make_engine", "solver_problem", "solver_problems"]

@@ -13,6 +13,7 @@ Traceback (most recent call last):
 codesign_jax.scene.schema.SceneError: params have no axis (world,); ... makes a batch
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -166,14 +167,20 @@ def prepare(
       Model fields, controls of shape (world, time, nu), and bits of `Status` that the worlds start
       with, shape (world,).
     """
-
-    def world(p: Params, t: Trial, c: Constants) -> tuple[model.ModelFields, jax.Array]:
-        own = scene.with_constants(c)
-        return model.model_fields(own, p, t), control.commands(own, p, t)
-
+    constants = jax.tree.map(lambda v: jnp.asarray(v, float), constants)
     every = (0, 0, batch_axes(constants))
+    world = functools.partial(_world, scene.structure)
     fields, ctrl = jax.vmap(world, in_axes=every)(params, trials, constants)
     return fields, ctrl, invalid_start(scene, fields)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _world(
+    structure: Scene, params: Params, trial: Trial, constants: Constants
+) -> tuple[model.ModelFields, jax.Array]:
+    """Model fields and controls of a world; a process traces them once for batches of any size."""
+    own = structure.with_constants(constants)
+    return model.model_fields(own, params, trial), control.commands(own, params, trial)
 
 
 def judge(

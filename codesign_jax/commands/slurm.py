@@ -152,7 +152,8 @@ class Array:
         if since is None or time.monotonic() - since < RESULT_SECONDS:
             return ""
         state = self._states.get(job_id, State("unknown: it has left the queue"))
-        return state.name if state.reason == "None" else f"{state.name} ({state.reason})"
+        # A job that was cancelled as it waited still has the reason for that.
+        return state.name if state.reason in NORMAL else f"{state.name} ({state.reason})"
 
 
 def _remove(folder: Path, before: set[Path], missing: list[Path]) -> None:

@@ -200,7 +200,8 @@ def test_numbers_of_a_batch_equal_those_of_single_worlds():
     for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(second), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-15)
     for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(hand), strict=True):
-        np.testing.assert_allclose(a[..., 0], b[..., 1], rtol=1e-12, atol=1e-15)
+        a, b = np.asarray(a)[..., 0], np.asarray(b)[..., 1]
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-15)
     friction = np.asarray(hand.cones.hand_object.friction)[0]
     wanted = constants.objects.object[0].friction * np.asarray(trials.friction)
     np.testing.assert_allclose(friction, wanted, rtol=1e-6)

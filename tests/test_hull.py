@@ -88,7 +88,7 @@ def test_velocities_are_derivatives_of_positions():
         _, data = bent(the_scene)
         hand, trial = small.hand_world(the_scene, length=LENGTH, height=HEIGHT)
         fields, _ = small.world_inputs(the_scene, hand, trial)
-        fields = jax.tree.map(lambda x: x[None], fields)
+        fields = small.repeat(fields, 1)
         engine, lanes = StructuredEngine(the_scene), small.lanes(the_scene, fields)
         rate = np.random.default_rng(1).normal(size=data.qvel.shape)
         rate[-6:] = 0.0  # the object's are no differences of its coordinates

@@ -34,7 +34,7 @@ def setting(shape, **params):
     world, trial = small.hand_world(scene, **params)
     trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
     fields, ctrl = small.world_inputs(scene, world, trial)
-    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
+    batch = small.repeat(fields, 1)
     oracle = world_model(scene, fields)
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
     return scene, oracle, np.asarray(fields.start), batch, np.asarray(ctrl)
@@ -66,7 +66,8 @@ def test_free_motion_equals_mujoco_step_by_step():
         data.qpos[:] = start
         # Lift the object off the table: it falls for 20 steps without reaching it.
         data.qpos[-5] += 0.5
-        lifted = fields._replace(start=fields.start.at[0, -5].add(0.5))
+        lifted = fields._replace(start=fields.start.copy())
+        lifted.start[0, -5] += 0.5
         found = steps.path(StructuredEngine(scene, **EXACT), lifted, ctrl[None, :20])
     for k in range(20):
         # Rounding of 1e-16 relative, grown over twenty steps of a stiff chain.
@@ -83,14 +84,14 @@ def test_float32_is_close_to_float64():
         with jax.enable_x64(wide):
             scene, _, start, fields, ctrl = setting("cylinder")
             dtype = jnp.float64 if wide else jnp.float32
-            fields = jax.tree.map(lambda x, t=dtype: x.astype(t), fields)
+            fields = jax.tree.map(lambda x, t=dtype: np.asarray(x).astype(t), fields)
             engine = StructuredEngine(scene, iterations=60, evaluations=12, tolerance=1e-10)
             hand = small.lanes(scene, fields)
             # The palm at 60 mm presses the straight fingers onto the table.
             qpos = np.array(start)
             qpos[2] = 0.06
             state = lanes_state(engine, scene, fields, qpos, np.zeros(len(qpos) - 1))
-            state = jax.tree.map(lambda x, t=dtype: x.astype(t), state)
+            state = jax.tree.map(lambda x, t=dtype: np.asarray(x).astype(t), state)
             u = jnp.asarray(ctrl[150], dtype)[:, None]
             new, info = jax.jit(engine.step)(hand, state, u)
             results.append(np.asarray(engine.qvel(new))[0].astype(float))

@@ -171,7 +171,7 @@ class Bench:
         """States before every step, and (qpos, qvel) after the last one, (world, 1, ...)."""
         dtype = jnp.float64 if self.wide else jnp.float32
         with floats(self.wide):
-            fields = jax.tree.map(lambda v: jnp.asarray(v, dtype), fields._replace(start=qpos))
+            fields = jax.tree.map(lambda v: np.asarray(v, dtype), fields._replace(start=qpos))
             count, (start, advance) = ctrl.shape[1], self._program
             hand, state = start(fields, jnp.asarray(qvel, dtype))
             ctrl = np.concatenate([ctrl, np.repeat(ctrl[:, -1:], -count % CHUNK, 1)], 1)

@@ -146,7 +146,8 @@ def _why(record: dict[str, Any]) -> str:
     return f"{kind}: {(analysis.bad(record) or '').split(':')[-1].strip()}"
 
 
-def _interval(value: Interval, form: str = ".1%") -> str:
+def interval(value: Interval, form: str = ".1%") -> str:
+    """A value with its interval; a dash where it is not defined."""
     if not np.isfinite(value.value):
         return "–"
     return f"{value.value:{form}} [{value.low:{form}}, {value.high:{form}}]"
@@ -156,10 +157,10 @@ def _row(first: list[str], c: dict[str, Any]) -> list[str]:
     return [
         *first,
         f"{c['particles']} x {c['trials']}",
-        _interval(c["flipped"]),
-        _interval(c["success"]),
-        _interval(c["success_difference"], "+.1%"),
-        _interval(c["rank"], ".2f"),
+        interval(c["flipped"]),
+        interval(c["success"]),
+        interval(c["success_difference"], "+.1%"),
+        interval(c["rank"], ".2f"),
         f"{c['offspring_moved']:.1%}",
         f"{c['failed']:.2%}",
     ]
@@ -254,8 +255,8 @@ def curse(study: Study) -> list[list[str]]:
         best = ranked[: max(1, len(cost) // 6)]
         for words, chosen in (("best sixth", best), ("all", slice(None))):
             found = analysis.compare(cost[chosen, test], truth[chosen, test])
-            cells = [_interval(found[n]) for n in ("success", "success_reference")]
-            cells.append(_interval(found["success_difference"], "+.1%"))
+            cells = [interval(found[n]) for n in ("success", "success_reference")]
+            cells.append(interval(found["success_difference"], "+.1%"))
             rows.append([words, f"`{name}`", str(half), *cells])
     return rows
 

@@ -230,13 +230,14 @@ def _decision(size: Size, engines: Sequence[str], *, data: Path) -> list[Case]:
         found.append(Case("decision", setting, tuple(words), run))
 
     for setting in _decided(size) if "structured" in engines else ():
-        trials = size.trials if setting in PRESETS.values() else size.fewer
-        asked = [("late", trials, False)]
-        if setting.work <= 20 and setting.iterations is None and setting.axes == 3:
+        preset = setting in PRESETS.values()
+        asked = [("late", size.trials if preset else size.fewer, False)]
+        usual = setting.iterations is None and setting.axes == 3
+        if preset or (setting.work <= 20 and usual):
             asked.append(("late", size.fewer, True))
         if setting.work <= 20 and not setting.wide:
             asked.append(("spread", size.fewer, False))
-        if setting in PRESETS.values():
+        if preset:
             asked.append(("spread", size.fewer, True))
         add(setting, *asked)
     if "mujoco" in engines:

@@ -46,7 +46,10 @@ def on_cluster(conf, tmp_path, monkeypatch):
 
 def launch(*arguments):
     """Starts the command in a process of its own."""
-    program = f"import sys; {POLLING}; from codesign_jax import cli; sys.exit(cli.main())"
+    # Python does not listen to Ctrl-C where the tests are a shell's job in the background.
+    interruptible = "signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = f"import signal, sys; {interruptible}; {POLLING}; "
+    program += "from codesign_jax import cli; sys.exit(cli.main())"
     return subprocess.Popen(
         [sys.executable, "-c", program, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -177,5 +180,6 @@ def test_why_jobs_wait_and_a_stop_that_cancels_them(on_cluster):
     lines = iter(process.stdout.readline, "")
     assert any("SLURM: 3 pending (PartitionTimeLimit)" in line for line in lines)
     process.send_signal(2)
-    assert "the jobs are cancelled" in process.communicate()[0] and process.returncode == 130
+    assert "the jobs are cancelled" in process.communicate(timeout=60)[0]
+    assert process.returncode == 130
     assert ask("squeue", "--noheader") == ""

@@ -56,13 +56,15 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
       fields: Model fields with leading axis (world,).
 
     Returns:
-      Shape (world,).
+      Shape (world,); 0 where nothing may touch.
     """
     alone = dataclasses.replace(scene.effects, finger_finger=False)
     scene = dataclasses.replace(scene, effects=alone)
     state, hand = reset(scene, fields), world_constants(scene, fields)
     every = contacts(scene, Stages(None), hand, straight(hand, state), state.position[2])
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
+    if not found:
+        return jnp.zeros(fields.body_mass.shape[0], fields.body_mass.dtype)
     return jnp.stack(found).max(0)
 
 

@@ -17,7 +17,7 @@ from codesign_jax.scene import load
 from scripts.accuracy import analysis, decision
 from scripts.accuracy.settings import FINE, FINGERS, PRESETS, Setting
 from scripts.accuracy.tables import interval
-from scripts.shared import provenance, tables
+from scripts.shared import addition, output, provenance, tables
 
 PARTICLES, TRIALS = 60, 12
 
@@ -41,8 +41,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         made = decision.simulate(setting, [request], TRIALS)
         found["settings"][name] = made["populations"][0]
         found["made"] = provenance.results(args.commit)
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps(found, indent=1) + "\n")
+        output.write_json(args.json, found)
         print(f"{name}: {made['seconds_with_compile']} s", flush=True)
     return found
 
@@ -69,20 +68,9 @@ def table(found: dict[str, Any]) -> str:
 
 def main() -> int:
     """Runs the command and returns the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, default=Path("runs/fingers.json"))
+    parser = addition.parser(__doc__, "fingers")
     parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
-    parser.add_argument("--report", action="store_true", help="print the table of the file")
-    parser.add_argument("--page", type=Path, help="page whose table is filled in")
-    provenance.add_commit(parser)
-    args = parser.parse_args()
-    text = table(json.loads(args.json.read_text()) if args.report else run(args))
-    print(text)
-    if args.page:
-        tables.fill(args.page, text, "fingers")
-    return 0
+    return addition.main(parser.parse_args(), run, table, "fingers")
 
 
 if __name__ == "__main__":

@@ -8,10 +8,7 @@ here, as copies of itself, so that the iterations are its own.
 """
 
 import argparse
-import dataclasses
-import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,20 +16,19 @@ import numpy as np
 
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.kernel import lanes_here
+from codesign_jax.engines.structured.kernel import Program
 from scripts.accuracy import timing, worlds
 from scripts.accuracy.settings import CONTACT, FINGERS, STANDARD, Setting, sweep
-from scripts.shared import provenance, tables
+from scripts.shared import addition, output, provenance, tables
 
 DISTINCT, STEPS = 24, 50
 """Worlds, and steps from the time on at which the fingers are inflated and touch the object."""
 
 
 def settings() -> list[Setting]:
-    """The standard setting and what changes the contact, or the start of an iteration."""
+    """The standard setting, other constants of the contact, and other springs and time steps."""
     found = [STANDARD, *sweep(STANDARD, extra=tuple((c,) for c in (*CONTACT, FINGERS)))]
-    found += sweep(STANDARD, damping=("least",), timestep=(5.0, 2.0))
-    return [dataclasses.replace(s, iterations=None) for s in found]
+    return [*found, *sweep(STANDARD, damping=("least",), timestep=(5.0, 2.0))]
 
 
 def measure(setting: Setting) -> dict[str, float]:
@@ -41,8 +37,7 @@ def measure(setting: Setting) -> dict[str, float]:
         scene, fields, ctrl = timing.contact(setting, DISTINCT, STEPS, dtype, distinct=DISTINCT)
         engine = setting.make(scene)
         assert isinstance(engine, StructuredEngine)
-        fingers = 1 << (scene.num_fingers - 1).bit_length()
-        copies = max(1, lanes_here(scene, np.dtype(dtype)) // fingers)
+        copies = Program.here(scene, engine.limits, np.dtype(dtype)).block
         fields, ctrl = jax.tree.map(lambda x: np.repeat(x, copies, 0), (fields, ctrl))
 
         @jax.jit
@@ -59,6 +54,14 @@ def measure(setting: Setting) -> dict[str, float]:
     }
 
 
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    """Measures all settings and writes the file."""
+    found = {"worlds": DISTINCT, "steps": STEPS, **provenance.results(args.commit)}
+    found["settings"] = {s.label: measure(s) for s in settings()}
+    output.write_json(args.json, found)
+    return found
+
+
 def table(found: dict[str, Any]) -> str:
     """Iterations of all settings."""
     rows = [["setting", "Newton iterations a step: mean", "99 %", "steps above the tolerance"]]
@@ -70,24 +73,8 @@ def table(found: dict[str, Any]) -> str:
 
 def main() -> int:
     """Runs the command and returns the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, default=Path("runs/iterations.json"))
-    parser.add_argument("--report", action="store_true", help="draw what the file holds and stop")
-    parser.add_argument("--page", type=Path, help="page whose table is filled in")
-    provenance.add_commit(parser)
-    args = parser.parse_args()
-    if not args.report:
-        found = {"worlds": DISTINCT, "steps": STEPS, **provenance.results(args.commit)}
-        found["settings"] = {s.label: measure(s) for s in settings()}
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps(found, indent=1) + "\n")
-    text = table(json.loads(args.json.read_text()))
-    print(text)
-    if args.page:
-        tables.fill(args.page, text, "iterations")
-    return 0
+    args = addition.parser(__doc__, "iterations").parse_args()
+    return addition.main(args, run, table, "iterations")
 
 
 if __name__ == "__main__":

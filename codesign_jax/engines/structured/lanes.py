@@ -106,7 +106,10 @@ def contract(a: jax.Array, b: jax.Array, axis: int) -> jax.Array:
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Sum over the leading axis of a, of a * b; trailing axes broadcast, and b may be longer."""
+    """Sum of a * b over a's leading axis; trailing axes broadcast.
+
+    Of a b with more components, such as a spatial motion, the first ones count.
+    """
     return total([x * y for x, y in zip(jnp.unstack(a), jnp.unstack(b)[: len(a)], strict=True)])
 
 

@@ -176,8 +176,11 @@ def test_hulls_equal_a_dense_solve():
         hand, _ = small.hand_world(scene, length=0.1)
         bends = [(1, 0.8), (3, 1.0), (3, 1.2), (7, 0.8)]
         worlds = [curled(scene, seed, bend, height=0.07) for seed, bend in bends]
-        inputs = batched(worlds)
-        qvel, trace = one_step(scene)(*inputs)
+        inputs, step, order = batched(worlds), one_step(scene), np.array([2, 0, 3, 1])
+        qvel, trace = step(*inputs)
+        # A world passes through its contacts as often in other company, which converges elsewhere.
+        mixed, _ = step(*jax.tree.map(lambda v: v[order], inputs))
+        np.testing.assert_array_equal(mixed, np.asarray(qvel)[order])
         acc = (np.asarray(qvel) - inputs[2]) / scene.discretization.timestep
         most = merged = 0
         for k, (model, data, _) in enumerate(worlds):

@@ -79,9 +79,12 @@ class Newton:
           last: Length of the last step, see `Elimination.backward`.
           idle: Lanes of worlds whose step is of no use.
         """
+        pairs = self.problem.pairs
+        if pairs is not None:
+            # A world that has converged keeps its iterate, so its contacts need not be looked at.
+            pairs.busy = ~idle
         node, work = self.elimination.backward(last)
         step, done = self.elimination.at_palm(now, node, self.elimination.slot_pushes(last))
-        pairs = self.problem.pairs
         if pairs is None:
             return step
         done = done._replace(work=lanewise(jnp.add, done.work, work))

@@ -90,7 +90,12 @@ class PairSet(HullSet):
 
 
 class BoundPairs(BoundSlots):
-    """Contacts between fingers with their memory."""
+    """Contacts between fingers with their memory.
+
+    Attributes:
+      busy: Lanes of the worlds that still iterate, through whose contacts alone a pass goes; None
+        for those of all worlds.
+    """
 
     set: PairSet  # type: ignore[assignment]
 
@@ -98,6 +103,14 @@ class BoundPairs(BoundSlots):
         """See `ContactSet.bind`."""
         super().__init__(of, table, ref, cone)
         self.block = Block(*of.block)
+        self.busy: jax.Array | None = None
+
+    def used(self, row: Any) -> jax.Array:
+        """See `BoundSlots`; of the lanes that are `busy`, if that is set."""
+        if self.busy is None:
+            return super().used(row)
+        count = jnp.where(self.busy, self.read("count", row).lane, 0.0)
+        return jnp.minimum(jnp.max(count.astype(jnp.int32)), self.set.slots)
 
     def pairing(self, row: Any) -> Pairing:
         """A row's pairing of the fingers."""

@@ -161,10 +161,9 @@ class Batch:
         return results
 
     def _joined(self, packed: Sequence[_Packed]) -> Sequence[tuple]:
-        """The blocks of all runs, an equal part of them on each device."""
-        home, runs, size = self.devices[0], len(packed), _length(packed[0].blocks)
-        shares = _shares(runs * size, len(self.devices))
-        parts = _deal(tuple(p.blocks for p in packed), tuple(shares))
+        """The blocks of all runs, dealt to the devices."""
+        home, runs = self.devices[0], len(packed)
+        parts = _deal(tuple(p.blocks for p in packed), len(self.devices))
         running = [
             self._call(blocks, packed[0].common, device)
             for blocks, device in zip(parts, self.devices, strict=False)
@@ -271,32 +270,46 @@ def _length(blocks: tuple) -> int:
 
 
 def _shares(total: int, parts: int) -> list[int]:
-    """Sizes of the parts that blocks are cut into: equal ones, the last may be smaller."""
-    size = -(-total // parts)
-    return [min(size, total - start) for start in range(0, total, size)]
+    """Numbers of blocks that `_deal` gives to each device; none to those that get none."""
+    return [len(range(part, total, parts)) for part in range(min(parts, total))]
 
 
 def _resized(blocks: tuple, count: int) -> tuple:
     return jax.tree.map(lambda v: jax.ShapeDtypeStruct((count, *v.shape[1:]), v.dtype), blocks)
 
 
-def _deal(runs: tuple[tuple, ...], shares: tuple[int, ...]) -> Sequence[tuple]:
-    """Blocks of all runs, cut into parts of these sizes."""
-    return runs if len(runs) == len(shares) == 1 else _cut(runs, shares)
+def _deal(runs: tuple[tuple, ...], parts: int) -> Sequence[tuple]:
+    """Blocks of all runs, dealt like cards.
+
+    Runs whose hands touch and hold more take longer: so dealt, each device has some of every run.
+    """
+    return runs if len(runs) == parts == 1 else _split(runs, parts)
 
 
 def _collect(parts: tuple[tuple, ...], runs: int) -> Sequence[tuple]:
-    """What parts of the blocks have become, run by run."""
-    if len(parts) == runs == 1:
-        return parts
-    return _cut(parts, (sum(map(_length, parts)) // runs,) * runs)
+    """What the dealt blocks have become, run by run."""
+    return parts if len(parts) == runs == 1 else _gather(parts, runs)
 
 
-def _cut_now(arrays: tuple[tuple, ...], sizes: tuple[int, ...]) -> list[tuple]:
-    whole = jax.tree.map(lambda *v: jnp.concatenate(v), *arrays)
-    ends = list(itertools.accumulate(sizes, initial=0))
-    return [jax.tree.map(lambda v, a=a, b=b: v[a:b], whole) for a, b in itertools.pairwise(ends)]
+def _split_now(runs: tuple[tuple, ...], parts: int) -> list[tuple]:
+    whole = jax.tree.map(lambda *v: jnp.concatenate(v), *runs)
+    shares = len(_shares(_length(whole), parts))
+    return [jax.tree.map(lambda v, p=part: v[p::parts], whole) for part in range(shares)]
 
 
-_cut = jax.jit(_cut_now, static_argnums=1)
-"""Arrays one behind the other, cut into parts of these sizes along their leading axis."""
+def _gather_now(parts: tuple[tuple, ...], runs: int) -> list[tuple]:
+    def in_place(*dealt: jax.Array) -> jax.Array:
+        total, first = sum(len(v) for v in dealt), dealt[0]
+        whole = jnp.zeros((total, *first.shape[1:]), first.dtype)
+        for part, values in enumerate(dealt):
+            whole = whole.at[part :: len(dealt)].set(values)
+        return whole.reshape(runs, -1, *first.shape[1:])
+
+    whole = jax.tree.map(in_place, *parts)
+    return [jax.tree.map(lambda v, r=run: v[r], whole) for run in range(runs)]
+
+
+_split = jax.jit(_split_now, static_argnums=1)
+"""Blocks of all runs one behind the other, every n-th of them in a part."""
+_gather = jax.jit(_gather_now, static_argnums=1)
+"""Inverse of `_split`, cut into runs of one length."""

@@ -34,7 +34,7 @@ from scripts.experiments import (
     results,
     study,
 )
-from scripts.experiments.worlds import chunking
+from scripts.experiments.worlds import chunking, dealt
 from scripts.shared import record, statistics
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
@@ -144,6 +144,13 @@ def test_chunks_are_equal_and_waste_little():
         assert size <= limit and 0 <= size * calls - worlds < calls
         # One device finds the same chunk, so that a run can be repeated there bit by bit.
         assert chunking(worlds, size).size == size
+
+
+def test_particles_are_dealt_to_calls_like_cards():
+    worlds = dealt(particles=7, trials=3, calls=2)
+    np.testing.assert_array_equal(np.sort(worlds), np.arange(21))
+    np.testing.assert_array_equal(worlds[::3] // 3, [0, 2, 4, 6, 1, 3, 5])
+    np.testing.assert_array_equal(worlds.reshape(-1, 3) % 3, np.tile(np.arange(3), (7, 1)))
 
 
 TWO_DEVICES = """
@@ -293,6 +300,7 @@ def test_a_state_of_another_experiment_or_a_damaged_one_is_refused(finished, tmp
     path, settings = tmp_path / "state.npz", settings_of()
     record.save(path, finished[1], settings)
     assert_equal(record.load(path, settings), finished[1])
+    assert_equal(record.load(path, settings | {"chunk": 9}), finished[1])
     with pytest.raises(record.StateError, match="seed: 5 there, 6 here"):
         record.load(path, settings | {"seed": 6})
     whole, refused = path.read_bytes(), 0

@@ -1,5 +1,7 @@
 """Flat batches of worlds: one program, called chunk by chunk, on one or more devices."""
 
+import itertools
+from collections import deque
 from functools import partial
 from typing import NamedTuple
 
@@ -78,6 +80,8 @@ class Worlds:
         self.scene, self.space, self.chunk = scene, space, chunk
         self.devices = available[:devices] if devices > 1 else [None]
         self.grasps = 0
+        # Each of several devices has its next call waiting while the host reads the last one's.
+        self._ahead = 2 * devices if devices > 1 else 1
         # A program of its own on each device instead of one over all: its shapes, and with them
         # its bits, are those of a single device.
         self._simulate = partial(_simulate, scene, engine, space)
@@ -96,24 +100,49 @@ class Worlds:
         shape = (strategies, runs, particles, np.shape(trials.yaw)[1])
         trials = jax.tree.map(np.asarray, trials)
         flat = np.asarray(designs).reshape(-1, designs.shape[-1])
-        total, parts = int(np.prod(shape)), []
+        total = int(np.prod(shape))
         starts = list(range(0, total, self.chunk))
+        order = dealt(len(flat), shape[3], len(starts))
         if self.grasps == 0:  # every device compiles now, also those with nothing to do yet
             starts += starts[-1:] * (len(self.devices) - len(starts))
-        for first in range(0, len(starts), len(self.devices)):
-            # Calls return at once; the devices work until the results are asked for.
-            running = [
-                self._call(flat, trials, shape, start, device)
-                for start, device in zip(starts[first:], self.devices, strict=False)
-            ]
-            parts += [jax.tree.map(np.asarray, part) for part in running]
+        parts, running = [], deque()
+        for start, device in zip(starts, itertools.cycle(self.devices), strict=False):
+            if len(running) == self._ahead:
+                parts.append(jax.tree.map(np.asarray, running.popleft()))
+            # Filled up with the last world, so that every call has the compiled size.
+            world = order[np.minimum(np.arange(start, start + self.chunk), total - 1)]
+            running.append(self._call(flat, trials, shape, world, device))
+        parts += [jax.tree.map(np.asarray, part) for part in running]
         self.grasps += total
-        return jax.tree.map(lambda *v: np.concatenate(v)[:total].reshape(shape), *parts)
 
-    def _call(self, flat, trials: Trial, shape: tuple[int, ...], start: int, device) -> Outcome:
-        """Begins to simulate the chunk that starts at a world."""
-        # Filled up with the last world, so that every call has the compiled size.
-        world = np.minimum(np.arange(start, start + self.chunk), int(np.prod(shape)) - 1)
+        def in_place(*values: np.ndarray) -> np.ndarray:
+            joined = np.concatenate(values)[:total]
+            sorted_ = np.empty_like(joined)
+            sorted_[order] = joined
+            return sorted_.reshape(shape)
+
+        return jax.tree.map(in_place, *parts)
+
+    def _call(self, flat, trials: Trial, shape: tuple[int, ...], world, device) -> Outcome:
+        """Begins to simulate some worlds."""
         _, run, _, trial = np.unravel_index(world, shape)
         chosen = flat[world // shape[3]], jax.tree.map(lambda v: v[run, trial], trials)
         return self._simulate(*jax.device_put(chosen, device))
+
+
+def dealt(particles: int, trials: int, calls: int) -> np.ndarray:
+    """Order of the worlds, in which particles are dealt to the calls like cards.
+
+    Some runs' hands touch and hold more than others', and take longer: so dealt, calls that run
+    side by side on several devices take about the same time.
+
+    Args:
+      particles: Number of particles of all strategies and runs.
+      trials: Trials of each; a particle's worlds stay together.
+      calls: Number of calls.
+
+    Returns:
+      Numbers of the worlds, particle by particle, shape (particles * trials,).
+    """
+    order = np.concatenate([np.arange(call, particles, calls) for call in range(calls)])
+    return (order[:, None] * trials + np.arange(trials)).ravel()

@@ -38,10 +38,15 @@ def scene_hash(scene: Scene) -> str:
     return hashlib.sha256("\n".join(texts[n] for n in sorted(texts)).encode()).hexdigest()
 
 
+FREE = ("chunk",)
+"""Settings that may change while an experiment goes on: like another device, another size of a call
+moves the last bits and nothing else, and a continued experiment needs no bits of an earlier one."""
+
+
 def settings(plan: Any, scene: Scene, engine: str, seed: int, chunk: int) -> dict[str, object]:
     """What determines the numbers of an experiment, beside code, versions and device.
 
-    The chunk is part of it: another size rounds differently.
+    The chunk is kept with it, but may change on the way, see `load`.
 
     Args:
       plan: Sizes of the experiment, a dataclass of numbers and names.
@@ -72,7 +77,7 @@ def load(path: Path, settings: dict[str, object]) -> Arrays:
 
     Args:
       path: File written by `save`.
-      settings: What it must belong to.
+      settings: What it must belong to, but for `FREE`.
 
     Raises:
       StateError: If the file is damaged or belongs to something else.
@@ -86,7 +91,8 @@ def load(path: Path, settings: dict[str, object]) -> Arrays:
     if digest(record) != expected:
         raise StateError(f"{path} is damaged: its digest differs")
     wanted = json.loads(json.dumps(settings))
-    different = [k for k in {*found, *wanted} if found.get(k) != wanted.get(k)]
+    names = {*found, *wanted}.difference(FREE)
+    different = [k for k in names if found.get(k) != wanted.get(k)]
     if different:
         text = "; ".join(f"{k}: {found.get(k)} there, {wanted.get(k)} here" for k in different)
         raise StateError(f"{path} belongs to another experiment ({text}); delete it to start anew")

@@ -36,6 +36,12 @@ RATES: dict[str, dict[str, Any]] = {
     "spheres and fingers": {"effects": {"finger_finger": True}},
     # Hands whose fingers start apart; the other cases' designs put fingers into one another.
     "hull and fingers": {"scene": "paper"},
+    # The same scene with less of it: its constants alone take more iterations than paper_spheres'.
+    "hull, the paper's constants": {"scene": "paper", "effects": {"finger_finger": False}},
+    "spheres, the paper's constants": {
+        "scene": "paper",
+        "effects": {"finger_finger": False, "surface": "spheres"},
+    },
     "household meshes": {"objects": "household"},
 }
 RATES |= {

@@ -1,6 +1,7 @@
 """Imports point one way: nothing imports what comes after it, and no modules import in a circle."""
 
 import ast
+import functools
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -44,9 +45,27 @@ def modules(root=ROOT):
     return found
 
 
+def parse(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def inner(node):
+    """Statements right inside of a node; expressions, which hold no imports, are most nodes."""
+    for field in ("body", "handlers", "orelse", "finalbody", "cases"):
+        yield from getattr(node, field, ())
+
+
+def statements(tree, *, inside=True):
+    """All statements of a syntax tree; `inside`: also those of functions."""
+    for node in inner(tree):
+        yield node
+        if inside or not isinstance(node, ast.FunctionDef):
+            yield from statements(node, inside=inside)
+
+
 def imports(tree, names, *, inside=True):
     """Modules that a syntax tree imports; what only the type checker sees is left out."""
-    for node in ast.iter_child_nodes(tree):
+    for node in inner(tree):
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             continue
         if isinstance(node, ast.Import):
@@ -61,13 +80,11 @@ def imports(tree, names, *, inside=True):
             yield from imports(node, names, inside=inside)
 
 
+@functools.cache
 def graph(*, inside=True):
     """Modules that each module imports; `inside`: also those that functions import when called."""
     names = modules()
-    return {
-        name: set(imports(ast.parse(path.read_text(encoding="utf-8")), names, inside=inside))
-        for name, path in names.items()
-    }
+    return {n: set(imports(parse(path), names, inside=inside)) for n, path in names.items()}
 
 
 def wrong(name, other):
@@ -150,32 +167,41 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
     assert not {n for n in found if n.split(".")[1:2] and n.split(".")[1] in program.UNRELATED}
 
 
-def defined(path):
+def defined(tree):
     """Names that a module's own text defines, its imports among them."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in statements(tree, inside=False):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            found.add(node.id)
         elif isinstance(node, ast.Import | ast.ImportFrom):
             found |= {(a.asname or a.name).split(".")[0] for a in node.names}
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = (part for target in targets for part in ast.walk(target))
+            found |= {part.id for part in names if isinstance(part, ast.Name)}
     return found
+
+
+def used(tree):
+    """Module and name of everything that a file imports from modules of ours."""
+    for node in statements(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in TOPS:
+            yield from ((node.module, alias.name) for alias in node.names)
 
 
 def test_what_is_imported_is_there():
     """Also inside of functions, of studies that no quick test runs, and of tests and notebooks."""
     names = modules()
-    known = {name: defined(path) for name, path in names.items()}
     others = [path for top in ("tests", "notebooks") for path in (ROOT / top).rglob("*.py")]
+    known, asked = {}, {}
+    for path in [*names.values(), *others]:
+        tree = parse(path)
+        known[path], asked[path] = defined(tree), set(used(tree))
     missing = [
-        f"{path.relative_to(ROOT)}: {node.module}.{alias.name}"
-        for path in [*names.values(), *others]
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in TOPS
-        for alias in node.names
-        if f"{node.module}.{alias.name}" not in names
-        and alias.name not in known.get(node.module, ())
+        f"{path.relative_to(ROOT)}: {module}.{name}"
+        for path, pairs in asked.items()
+        for module, name in pairs
+        if f"{module}.{name}" not in names and name not in known.get(names.get(module), ())
     ]
     assert not missing, "\n".join(missing)
 

@@ -7,10 +7,14 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import apply_columns, world_constants
+from codesign_jax.engines.structured.constants import (
+    WorldConstants,
+    apply_columns,
+    world_constants,
+)
 from codesign_jax.engines.structured.coordinates import reset
 from codesign_jax.engines.structured.differentiable import contacts
-from codesign_jax.engines.structured.kinematics import straight
+from codesign_jax.engines.structured.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
@@ -59,9 +63,9 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
       Shape (world,); 0 where nothing may touch.
     """
     alone = dataclasses.replace(scene.effects, finger_finger=False)
+    hand, kin, height = _straight(scene.structure, fields)
     scene = dataclasses.replace(scene, effects=alone)
-    state, hand = reset(scene, fields), world_constants(scene, fields)
-    every = contacts(scene, Stages(None), hand, straight(hand, state), state.position[2])
+    every = contacts(scene, Stages(None), hand, kin, height)
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
     if not found:
         return jnp.zeros(fields.body_mass.shape[0], fields.body_mass.dtype)
@@ -78,8 +82,8 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
     worlds, count = fields.start.shape[0], scene.num_fingers
     if not scene.effects.finger_finger or count == 1:
         return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
-    state, hand = reset(scene, fields), world_constants(scene, fields)
-    kin, up = straight(hand, state), hand.centre[2]
+    hand, kin, _ = _straight(scene.structure, fields)
+    up = hand.centre[2]
     middle = kin.origin + apply_columns(kin.link, hand.centre)
     deepest = []
     for a, b in itertools.combinations(range(count), 2):
@@ -87,3 +91,10 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
         reach = up[:, None, a] + up[None, :, b]
         deepest.append((reach - jnp.sqrt((away**2).sum(0))).reshape(-1, worlds).max(0))
     return jnp.stack(deepest).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldConstants, Kinematics, jax.Array]:
+    """Worlds with straight fingers, and the height of the object above the table, (1, world)."""
+    state, hand = reset(scene, fields), world_constants(scene, fields)
+    return hand, straight(hand, state), state.position[2]

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -67,37 +68,48 @@ class MjxEngine(Equal):
         return mjx.step(self.model(fields), data.replace(ctrl=ctrl))
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """See `Engine.rollout`."""
-        with jax.default_matmul_precision("highest"):  # TF32 would spoil the solver on a GPU
-            return jax.vmap(lambda f, c: self._world(f, c, trajectory))(fields, ctrl)
+        """See `Engine.rollout`.
 
-    def _world(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
+        The worlds are mapped within the loop over time: around it, `jax.vmap` would take apart and
+        build again what JAX has traced of a step.
+        """
+
+        def start(fields: ModelFields) -> _Carry:
+            zero = jnp.zeros(self.template.nv, ctrl.dtype)
+            return _Carry(fields.start, zero, zero, jnp.zeros((), ctrl.dtype), jnp.array(True))
+
+        def body(carry: _Carry, x: tuple[jax.Array, jax.Array]) -> tuple[_Carry, Trace]:
+            step = jax.vmap(partial(self._advance, trajectory), in_axes=(0, 0, 0, None))
+            return step(fields, carry, *x)
+
+        with jax.default_matmul_precision("highest"):  # TF32 would spoil the solver on a GPU
+            steps = jnp.moveaxis(ctrl, 1, 0), jnp.arange(ctrl.shape[1])
+            end, trace = jax.lax.scan(body, jax.vmap(start)(fields), steps)
+        trace = jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), trace)
+        return trace._replace(last=jnp.concatenate([end.qpos, end.qvel], 1))
+
+    def _advance(
+        self, trajectory: bool, fields: ModelFields, carry: _Carry, u: jax.Array, step: jax.Array
+    ) -> tuple[_Carry, Trace]:
+        """One time step of a world, and the trace's entry of the state before it."""
         lay = layout(self.scene)
         bounds = verdict.bounds(self.scene.with_constants(fields.constants))
-        weights = jnp.asarray(lay.centre_weights, ctrl.dtype)
-
-        def body(carry: _Carry, x: tuple) -> tuple[_Carry, Trace]:
-            u, step = x
-            data = self.reset(fields).replace(
-                qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart
-            )
-            new = self.step(fields, data, u)
-            # Positions computed by a step belong to the state before it.
-            centre, middle = weights @ new.xipos, new.xipos[lay.object]
-            distance, height = jnp.linalg.norm(middle - centre), middle[2]
-            qpos = carry.qpos if trajectory else carry.qpos[:0]
-            entry = Trace(distance, height, carry.speed, qpos)
-            # The sum makes the speed not finite if any position is not.
-            speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()
-            goes_on = carry.alive & verdict.goes_on(
-                bounds, distance, height, carry.speed, step, to_end=trajectory
-            )
-            moved = goes_on & verdict.slow(bounds, speed)
-            state = _Carry(new.qpos, new.qvel, new.qacc_warmstart, speed, moved)
-            kept = carry._replace(speed=jnp.where(goes_on, speed, carry.speed), alive=moved)
-            return jax.tree.map(lambda a, b: jnp.where(moved, a, b), state, kept), entry
-
-        zero = jnp.zeros(self.template.nv, ctrl.dtype)
-        start = _Carry(fields.start, zero, zero, jnp.zeros((), ctrl.dtype), jnp.array(True))
-        end, trace = jax.lax.scan(body, start, (ctrl, jnp.arange(ctrl.shape[0])))
-        return trace._replace(last=jnp.concatenate([end.qpos, end.qvel]))
+        data = self.reset(fields).replace(
+            qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart
+        )
+        new = self.step(fields, data, u)
+        # Positions computed by a step belong to the state before it.
+        weights = jnp.asarray(lay.centre_weights, u.dtype)
+        centre, middle = weights @ new.xipos, new.xipos[lay.object]
+        distance, height = jnp.linalg.norm(middle - centre), middle[2]
+        qpos = carry.qpos if trajectory else carry.qpos[:0]
+        entry = Trace(distance, height, carry.speed, qpos)
+        # The sum makes the speed not finite if any position is not.
+        speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()
+        goes_on = carry.alive & verdict.goes_on(
+            bounds, distance, height, carry.speed, step, to_end=trajectory
+        )
+        moved = goes_on & verdict.slow(bounds, speed)
+        state = _Carry(new.qpos, new.qvel, new.qacc_warmstart, speed, moved)
+        kept = carry._replace(speed=jnp.where(goes_on, speed, carry.speed), alive=moved)
+        return jax.tree.map(lambda a, b: jnp.where(moved, a, b), state, kept), entry

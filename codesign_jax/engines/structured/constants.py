@@ -1,5 +1,6 @@
 """Constants of a rollout in lane layout, taken from the same model fields as every engine uses."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -125,7 +126,15 @@ def _items(columns: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
-    """Transposes batched model fields, leading axis (world,), into lane layout."""
+    """Transposes batched model fields, leading axis (world,), into lane layout.
+
+    A rollout asks for them at its start and in the engine, and traces them once.
+    """
+    return _world_constants(scene.structure, fields)
+
+
+@partial(jax.jit, static_argnums=0)
+def _world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
     lay, template = layout(scene), compile_template(scene)
 
     def last(array: jax.Array) -> jax.Array:

@@ -3,6 +3,7 @@
 trimesh's own proximity query needs rtree, one more dependency; SciPy is there wherever JAX is.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -109,14 +110,27 @@ def _chunk(surface: Surface, points: np.ndarray, proven: bool) -> np.ndarray:
 
 def _squares(surface: Surface, face: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Squared distances of points, broadcasting to (..., 3), to the faces of indices (...)."""
-    away = points[..., None, :] - surface.corner[face]
-    edge = surface.edge[face]
-    along = np.einsum("...i,...i", away, edge) / np.einsum("...i,...i", edge, edge)
-    off = away - np.clip(along, 0.0, 1.0)[..., None] * edge
-    nearest = np.einsum("...i,...i", off, off).min(-1)
-    height = np.einsum("...i,...i", away[..., 0, :], surface.normal[face])
-    inside = (np.einsum("...i,...i", away, surface.inward[face]) >= 0).all(-1)
+    # Component by component, an edge at a time: three times as fast as arrays (..., edge, axis).
+    point = np.moveaxis(points, -1, 0)
+    nearest, inside = np.inf, True
+    for k in range(3):
+        away = _minus(point, surface.corner[:, k], face)
+        edge = [column[face] for column in surface.edge[:, k].T]
+        along = _dot(away, edge) / (surface.edge[:, k] ** 2).sum(1)[face]
+        np.clip(along, 0.0, 1.0, out=along)
+        off = [a - along * e for a, e in zip(away, edge, strict=True)]
+        nearest = np.minimum(nearest, _dot(off, off))
+        inside &= _dot(away, [column[face] for column in surface.inward[:, k].T]) >= 0
+    height = _dot(away, [column[face] for column in surface.normal.T])
     return np.where(inside, height**2, nearest)
+
+
+def _minus(point: np.ndarray, corner: np.ndarray, face: np.ndarray) -> list[np.ndarray]:
+    return [p - column[face] for p, column in zip(point, corner.T, strict=True)]
+
+
+def _dot(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> np.ndarray:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _sign(surface: Surface, face: np.ndarray, points: np.ndarray) -> np.ndarray:

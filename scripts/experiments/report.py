@@ -97,7 +97,7 @@ def details(study: Study) -> str:
             f"{100 * capped[s] / trials:.1f} %",
         ]
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines, "", *_against_last(study)])
+    return "\n".join([*lines, "", *_against_last(study)] if len(study.strategies) > 1 else lines)
 
 
 def _against_last(study: Study) -> list[str]:
@@ -180,6 +180,12 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
         for s, e in zip(study.strategies, episodes, strict=True)
     )
     both = [statistics.median(study.convergence(r)[-1] * study.per_episode) for r in RULES]
+    converged = (
+        f"{name}: {paper} simulations to convergence (concurrent)",
+        f"{_interval(both[0])}; failed trials at the maximum: {_interval(both[1])}",
+    )
+    if len(study.strategies) == 1:
+        return [converged]
     return [
         (
             f"{name}: success grows with more switching, concurrent best",
@@ -189,10 +195,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
             f"{name}: convergence quickens with more switching, concurrent fastest",
             f"median episodes: {medians}; Page's trend test p {_p(statistics.trend(-finite))}",
         ),
-        (
-            f"{name}: {paper} simulations to convergence (concurrent)",
-            f"{_interval(both[0])}; failed trials at the maximum: {_interval(both[1])}",
-        ),
+        converged,
     ]
 
 

@@ -263,17 +263,28 @@ def test_derivatives_equal_differences():
 def test_later_noise_leaves_earlier_draws_alone():
     """Friction, stiffness and the hand's masses have keys of their own; their factors are 1."""
     the_scene, key = scene.load("paper_spheres"), jax.random.key(3)
-    plain = rollout.sample_trials(the_scene, key, 5)
+    plain = jax.device_get(rollout.sample_trials(the_scene, key, 5))
     np.testing.assert_array_equal(plain.friction, 1.0)
     np.testing.assert_array_equal(plain.stiffness, 1.0)
     np.testing.assert_array_equal(plain.hand_mass, 1.0)
-    z = jnp.stack([jax.random.normal(jax.random.fold_in(key, t), (7,)) for t in range(5)])
+
+    @jax.jit
+    @jax.vmap
+    def normals(t):
+        own = jax.random.fold_in(key, t)
+        one, two = jax.random.fold_in(own, 1), jax.random.fold_in(own, 2)
+        return jax.random.normal(own, (7,)), jax.random.normal(one, (2,)), jax.random.normal(two)
+
+    z, later, last = jax.device_get(normals(np.arange(5)))
     np.testing.assert_allclose(plain.mass, 1 + 0.05 * z[:, 5], rtol=1e-6)
     c = the_scene.constants()
     noise = c.objects.noise._replace(friction=0.3, stiffness=0.1, hand_mass=0.2)
     noisy = c._replace(objects=c.objects._replace(noise=noise))
-    drawn = rollout.sample_trials(the_scene, key, 2000, constants=noisy)
+    drawn = jax.device_get(rollout.sample_trials(the_scene, key, 2000, constants=noisy))
     np.testing.assert_array_equal(drawn.mass[:5], plain.mass)
+    factors = drawn.friction[:5], drawn.stiffness[:5], drawn.hand_mass[:5]
+    expected = np.exp(0.3 * later[:, 0]), np.exp(0.1 * later[:, 1]), np.exp(0.2 * last)
+    np.testing.assert_allclose(factors, expected, rtol=1e-6)
     # Standard deviations of 2000 draws scatter by 1.6 %.
     friction, stiffness = np.asarray(drawn.friction), np.asarray(drawn.stiffness)
     assert abs(np.log(friction).std() - 0.3) < 0.03
@@ -285,7 +296,7 @@ def test_later_noise_leaves_earlier_draws_alone():
     assert np.abs(np.corrcoef(draws) - np.eye(5)).max() < 0.1
     params, _ = jax.tree.map(jnp.asarray, hand_world(the_scene))
     fields_of = jax.jit(lambda p, t: model.model_fields(the_scene, p, t), compiler_options=QUICK)
-    fields, one = (fields_of(params, nth(trials, 1)) for trials in (drawn, plain))
+    fields, one = (jax.device_get(fields_of(params, nth(t, 1))) for t in (drawn, plain))
     materials = fields.constants.hand.material.shear_modulus / 56e3
     np.testing.assert_allclose(materials, stiffness[1], rtol=1e-6)
     ratio = fields.pair_friction[:, 0] / one.pair_friction[:, 0]
@@ -293,12 +304,12 @@ def test_later_noise_leaves_earlier_draws_alone():
     lay = model.layout(the_scene)
     dofs, bodies = lay.dofs, np.r_[1, lay.stubs.ravel(), lay.bodies.ravel()]
     heavier = [
-        (getattr(fields, k) / getattr(one, k))[bodies] for k in ("body_mass", "body_inertia")
+        getattr(fields, k)[bodies] / getattr(one, k)[bodies] for k in ("body_mass", "body_inertia")
     ]
     for ratio in heavier:
         np.testing.assert_allclose(ratio, hand_mass[1], rtol=1e-5)
     np.testing.assert_array_equal(fields.body_mass[lay.object], one.body_mass[lay.object])
-    stiffer = (fields.jnt_stiffness / one.jnt_stiffness)[dofs]
+    stiffer = fields.jnt_stiffness[dofs] / one.jnt_stiffness[dofs]
     np.testing.assert_allclose(stiffer, stiffness[1], rtol=1e-6)
 
 

@@ -179,9 +179,17 @@ def some_contacts(friction, rng, count):
     return contact.Contacts(
         point=jnp.asarray(0.05 * rng.normal(size=(3, 1, count))),
         normal=jnp.asarray(normal / np.linalg.norm(normal, axis=0)),
-        distance=jnp.full((1, count), -1e-3),
-        cone=cones.make_cone(scene, 0.8, bodies=2),
+        distance=jnp.asarray(np.full((1, count), -1e-3)),
+        cone=jax.jit(lambda: cones.make_cone(scene, 0.8, bodies=2))(),
     )
+
+
+@jax.jit
+def pushes(c, relative):
+    """Wrenches, inertias and forces of contacts that accelerate so, relative to their aims."""
+    answer = contact.constraint_update(c, relative)
+    inertia = contact.contact_inertia(c, answer.hessian)
+    return contact.contact_wrench(c, answer.force), inertia, answer.force
 
 
 @pytest.mark.parametrize(
@@ -205,9 +213,7 @@ def test_force_and_inertia_are_derivatives_of_the_cost(friction):
 
         along = jnp.eye(6)[:, :, None, None] * jnp.ones_like(a)
         hessian = jax.jit(jax.vmap(lambda v: jax.jvp(gradient, (a,), (v,))[1]))(along)
-        answer = contact.constraint_update(c, c.relative(a))
-        wrench = contact.contact_wrench(c, answer.force)
-        inertia = contact.contact_inertia(c, answer.hessian)
+        wrench, inertia, _ = pushes(c, c.relative(a))
         size = float(jnp.abs(hessian).max())
         np.testing.assert_allclose(-wrench, jax.jit(gradient)(a), rtol=1e-9, atol=1e-9 * size)
         np.testing.assert_allclose(inertia, hessian, rtol=1e-9, atol=1e-9 * size)
@@ -224,8 +230,7 @@ def test_normal_motion_needs_no_friction_model():
     forces = []
     for friction in ("none", "coulomb", "full"):
         c = some_contacts(friction, np.random.default_rng(1), 1)
-        answer = contact.constraint_update(c, -2.0 * c.direction)
-        forces.append(np.asarray(contact.contact_wrench(c, answer.force)))
+        forces.append(np.asarray(pushes(c, -2.0 * c.direction)[0]))
     np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6)
     np.testing.assert_allclose(forces[2], forces[0], rtol=1e-6)
     assert np.abs(forces[0]).max() > 0
@@ -239,7 +244,6 @@ def test_a_coefficient_of_zero_is_no_friction():
     smooth = cones.make_cone(small.pinch(effects__friction="coulomb"), 0.0, bodies=2)
     bare = some_contacts("none", rng, count).cone
     a = jnp.asarray(30 * rng.normal(size=(3, 1, count)))
-    force = contact.constraint_update(rough._replace(cone=smooth), a).force
-    expected = contact.constraint_update(rough._replace(cone=bare), a).force
+    force, expected = (pushes(rough._replace(cone=cone), a)[2] for cone in (smooth, bare))
     np.testing.assert_allclose(force, expected, atol=1e-12)
     assert (np.abs(expected).sum((0, 1)) == 0).any() and (np.abs(expected).sum((0, 1)) > 0).any()

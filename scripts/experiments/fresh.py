@@ -174,6 +174,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--label", help="what --set changes, in the names of the results")
     parser.add_argument("--report", action="store_true", help="print the tables and stop")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
+    parser.add_argument("--table", default="fresh", help="name of that table's marks")
     provenance.add_commit(parser)
     return parser.parse_args()
 
@@ -192,7 +193,7 @@ def main() -> int:
         sys.exit(f"error: {error}")
     print(text)
     if args.page:
-        tables.fill(args.page, text, "fresh")
+        tables.fill(args.page, text, args.table)
     return 0
 
 

@@ -48,6 +48,7 @@ def limit(particle):
 SPACE = Space(LOW, HIGH, limit)
 ask = jax.jit(lambda optimizer, *rest: optimizer.ask(*rest))
 tell = jax.jit(lambda optimizer, *rest: optimizer.tell(*rest))
+begin = jax.jit(lambda optimizer, key: optimizer.init(key, SEED, PARTICLES))
 
 
 def sphere(population):
@@ -68,7 +69,7 @@ def run(optimizer, state, masks, cost=sphere):
 
 
 def start(optimizer, seed=0):
-    return optimizer.init(jax.random.key(seed), SEED, PARTICLES)
+    return begin(optimizer, jax.random.key(seed))
 
 
 @pytest.fixture(scope="module", params=NAMES)

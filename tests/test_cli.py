@@ -436,7 +436,7 @@ def test_conflicts_are_told_before_the_preflight(finished, monkeypatch, capsys):
 
 
 def test_evaluate_prints_costs_of_each_object(capsys):
-    design = ["length=100", "arm_z=-20", "--engine", "mujoco"]
+    design = ["length=100", "arm_z=-20"]  # by the default engine, the only such evaluation here
     assert command("evaluate", "--scene", TINY, "--design", *design, "--trials", "3") == 0
     output = capsys.readouterr().out
     assert "design: length=100 mm arm_z=-20 mm" in output

@@ -59,7 +59,7 @@ benchmark: $(STAMP)
 effects: $(STAMP)
 	$(BIN)/python -m scripts.effects $(ARGS)
 
-# Minutes at the quick size, hours of CPU at the full one; goes on where it stopped.
+# An hour on two cores at the quick size, hours of a GPU and its host at the full one; goes on where it stopped.
 ACCURACY ?= runs/accuracy_cpu.json
 SIZE ?= quick
 accuracy: $(STAMP)

@@ -270,7 +270,7 @@ def _length(blocks: tuple) -> int:
 
 
 def _shares(total: int, parts: int) -> list[int]:
-    """Numbers of blocks that `_deal` gives to each device; none to those that get none."""
+    """How many blocks `_deal` gives to each device that gets any."""
     return [len(range(part, total, parts)) for part in range(min(parts, total))]
 
 

@@ -1,6 +1,6 @@
 """Measures what accuracy costs in time, and draws it.
 
-python -m scripts.accuracy --json docs/data/accuracy_cpu.json --quick    # minutes
+python -m scripts.accuracy --json docs/data/accuracy_cpu.json --quick    # an hour on two cores
 python -m scripts.accuracy --json docs/data/accuracy_h200.json           # on a GPU
 python -m scripts.accuracy --report                # figures, pages and presets from data
 python -m scripts.accuracy --share 2/4 --json b.json                     # beside three others

@@ -105,12 +105,10 @@ class BoundPairs(BoundSlots):
         self.block = Block(*of.block)
         self.busy: jax.Array | None = None
 
-    def used(self, row: Any) -> jax.Array:
-        """See `BoundSlots`; of the lanes that are `busy`, if that is set."""
-        if self.busy is None:
-            return super().used(row)
-        count = jnp.where(self.busy, self.read("count", row).lane, 0.0)
-        return jnp.minimum(jnp.max(count.astype(jnp.int32)), self.set.slots)
+    def filled(self, row: Any) -> jax.Array:
+        """See `BoundSlots`; none of the lanes that are not `busy`, if that is set."""
+        count = super().filled(row)
+        return count if self.busy is None else jnp.where(self.busy, count, 0.0)
 
     def pairing(self, row: Any) -> Pairing:
         """A row's pairing of the fingers."""

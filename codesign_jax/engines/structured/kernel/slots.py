@@ -91,8 +91,11 @@ class BoundSlots(BoundContacts):
 
     def used(self, row: Any) -> jax.Array:
         """Number of slots that any lane has filled, a scalar."""
-        most = jnp.max(self.read("count", row).lane.astype(jnp.int32))
-        return jnp.minimum(most, self.set.slots)
+        return jnp.minimum(jnp.max(self.filled(row).astype(jnp.int32)), self.set.slots)
+
+    def filled(self, row: Any) -> jax.Array:
+        """Number of slots that each lane has filled and that a pass goes through, shape (lane,)."""
+        return self.read("count", row).lane
 
     def overflow(self) -> jax.Array:
         """One for lanes that had too few slots in any row, else zero, shape (lane,)."""

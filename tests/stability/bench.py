@@ -208,12 +208,12 @@ class Bench:
 
 
 def loaded(fields, factor):
-    """Fields whose object is heavier by a factor."""
-    scaled = {n: getattr(fields, n) for n in ("body_mass", "body_inertia")}
-    return fields._replace(
-        **{n: v.at[:, -1].multiply(factor) for n, v in scaled.items()},
-        dof_M0=fields.dof_M0.at[:, -6:].multiply(factor),
-    )
+    """Fields, NumPy arrays, whose object is heavier by a factor."""
+    heavier = {n: np.array(getattr(fields, n)) for n in ("body_mass", "body_inertia", "dof_M0")}
+    heavier["body_mass"][:, -1] *= factor
+    heavier["body_inertia"][:, -1] *= factor
+    heavier["dof_M0"][:, -6:] *= factor
+    return fields._replace(**heavier)
 
 
 def moving(engine: StructuredEngine, fields, qvel):

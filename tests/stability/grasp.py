@@ -17,6 +17,8 @@ from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
 from tests.test_grasp import GOOD
 
+MICROMETRE = 1e-6
+
 
 @functools.cache
 def paper(**settings):
@@ -51,10 +53,18 @@ def whole_inputs(the_bench, designs, shapes=(0,)):
     return the_bench.fields(params, trials), the_bench.commands(params, trials)
 
 
-def kinetic(the_bench, inputs) -> tuple[float, float]:
-    """Largest kinetic energy of the hand in all worlds [J], and its largest speed [rad/s]."""
+def kinetic(the_bench, inputs, displaced=0.0) -> tuple[float, float]:
+    """Largest kinetic energy of the hand in all worlds [J], and its largest speed [rad/s].
+
+    Args:
+      the_bench: What steps the worlds.
+      inputs: Function of it that returns fields and controls.
+      displaced: How far the objects start from their places [m].
+    """
     fields, ctrl = inputs(the_bench)
-    history, worst = the_bench.run(fields, ctrl), 0.0
+    start, worst = np.array(fields.start), 0.0
+    start[:, -7] += displaced
+    history = the_bench.run(fields, ctrl, start)
     if not (np.isfinite(history.qpos).all() and np.isfinite(history.qvel).all()):
         return np.inf, np.inf
     moving = slice(0, int(model.layout(the_bench.scene).dofs.max()) + 1)
@@ -67,8 +77,13 @@ def kinetic(the_bench, inputs) -> tuple[float, float]:
 
 @functools.cache
 def fine_kinetic(base, inputs):
-    """The same in MuJoCo C at an eighth of the paper's step."""
-    return kinetic(bench(base(), "mujoco", 1 / 8, "float64"), inputs)[0]
+    """The same in MuJoCo C at an eighth of the paper's step: the largest of three starts.
+
+    Where fingers start in one place (spread 0) the peak is a matter of chance: objects that start
+    a micrometre to either side make it 25.5 mJ, and 9.8 mJ where they start in between.
+    """
+    fine = bench(base(), "mujoco", 1 / 8, "float64")
+    return max(kinetic(fine, inputs, x)[0] for x in (-MICROMETRE, 0.0, MICROMETRE))
 
 
 def resting(the_bench, fields, ctrl, until, last) -> Found:

@@ -46,7 +46,7 @@ FAULTS = {
         "tests/test_cost.py::test_failures_are_flagged_with_their_step",
     ),
     "key reuse": Fault(
-        "codesign.py",
+        "codesign/episode.py",
         (("fold_in(jax.random.fold_in(key, stream), index)", "fold_in(key, stream)"),),
         "tests/test_codesign.py::test_noise_differs_between_episodes_seeds_and_the_test",
     ),

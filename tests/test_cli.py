@@ -18,6 +18,7 @@ import pytest
 from toy import TINY
 
 from codesign_jax import cli, codesign, runs
+from codesign_jax.batch import Batch
 from codesign_jax.commands import common, preflight, reference
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import choice, columns
@@ -545,20 +546,20 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     base = [a for a in RUN if a not in ("--seed", "3")]
     run = [*base, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]
     assert command(*RUN, "--episodes", "1", "--out", tmp_path / "runs" / "seed-3") == 0
-    save = Checkpoints.save
+    save, simulate = Checkpoints.save, Batch.__call__
 
-    def interrupted(store, step, arrays):
-        if step == 2:
-            os.kill(os.getpid(), signal.SIGTERM)
-        save(store, step, arrays)
+    def interrupted(batch, requests):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return simulate(batch, requests)
 
     def full(store, step, arrays):
         if store.folder.parent.name == "seed-5" and step == 2:
             raise OSError("no space left")
         save(store, step, arrays)
 
-    monkeypatch.setattr(Checkpoints, "save", interrupted)
+    monkeypatch.setattr(Batch, "__call__", interrupted)
     assert command(*run) == 128 + signal.SIGTERM
+    monkeypatch.setattr(Batch, "__call__", simulate)
     assert "seed 3: extended from 1 to 3 episodes" in capsys.readouterr().out
     first = runs.load_record(tmp_path / "runs" / "seed-3")
     assert first is not None and first.done == 2
@@ -570,10 +571,26 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     monkeypatch.setattr(Checkpoints, "save", save)
     assert command(*run) == 0
     assert "of 3 runs have a particle" in capsys.readouterr().out
+    events = []
+
+    def noted_save(store, step, arrays):
+        events.append(f"save {step}")
+        save(store, step, arrays)
+
+    def noted_simulation(batch, requests):
+        events.append("begin")
+        return simulate(batch, requests)
+
+    monkeypatch.setattr(Checkpoints, "save", noted_save)
+    monkeypatch.setattr(Batch, "__call__", noted_simulation)
     for seed in ("3", "5"):
         alone = [*base, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
         assert command(*alone) == 0
         assert_same_run(tmp_path / "runs" / f"seed-{seed}", tmp_path / f"alone-{seed}")
+    # An episode is saved when the next one has begun, the last one before the test begins.
+    start = events.index("save 0")
+    after = ["begin", "begin", "save 1", "begin", "save 2", "save 3", "begin"]
+    assert events[start + 1 : start + 8] == after
 
 
 @pytest.mark.slow

@@ -62,12 +62,36 @@ class Interrupts:
         Raises:
           Stopped: If a signal came before.
         """
+        return self.begin(function, *arguments)()
+
+    def begin(self, function: Callable[..., T], *arguments: Any) -> Callable[[], T]:
+        """Runs a function; returns what waits for its arrays, which devices may still compute.
+
+        Raises:
+          Stopped: If a signal came before.
+        """
         if self.signum:
             raise Stopped(self.signum)
-        future = self._worker.submit(lambda: jax.block_until_ready(function(*arguments)))
-        while not future.done():
-            concurrent.futures.wait([future], timeout=0.2)
-        return future.result()
+        returned = threading.Event()
+
+        def work() -> T:
+            try:
+                found = function(*arguments)
+            finally:
+                returned.set()
+            return jax.block_until_ready(found)
+
+        future = self._worker.submit(work)
+        # Until it has told the devices what to do, other Python code would only slow it down.
+        while not returned.wait(0.2):
+            pass
+
+        def result() -> T:
+            while not future.done():
+                concurrent.futures.wait([future], timeout=0.2)
+            return future.result()
+
+        return result
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.signum:

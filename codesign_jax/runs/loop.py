@@ -1,11 +1,13 @@
 """The optimisation of one run: seed, episodes, final test; saved after every step and resumable.
 
 A run is a generator that yields the episodes it wants and is sent what became of them, so that
-`together` simulates those of several runs at once.
+`together` simulates those of several runs at once.  An episode is saved while the devices simulate
+the next one, see `Loop.save`.
 """
 
 import dataclasses
-from collections.abc import Generator
+from collections.abc import Callable, Generator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,6 +94,7 @@ class Loop:
         """Takes the run, its open folder and checkpoints, and what to tell."""
         self.plan, self.run_directory, self.store = plan, run, store
         self.progress = progress
+        self._unsaved: Callable[[], None] | None = None
 
     def run(self) -> Generator[Request, tuple[State, EpisodeInfo], RunResult]:
         """Runs what is left of the run; to stop it, `Stopped` is thrown in.
@@ -107,12 +110,27 @@ class Loop:
                     record = yield from self._seed()
                 self._write_tables(record, 0)
                 yield from self._episodes(record)
+                self.save()
                 yield from self._test(record)
         except Stopped as stop:
+            self.save()
             signum = stop.signum
             self.run_directory.log(f"stopped by signal {signum}; the same command resumes")
         test = None if record is None else _final_test(self.plan, record)
         return RunResult(record, test, signum)
+
+    def save(self) -> None:
+        """Saves and reports the last episode, unless that has been done.
+
+        The run does so by itself before its next episode is over; whoever drives it may ask for it
+        while that episode is simulated. It asks nothing of the devices, which are busy then.
+
+        Raises:
+          OSError: If the episode cannot be saved; earlier ones stay intact.
+        """
+        unsaved, self._unsaved = self._unsaved, None
+        if unsaved is not None:
+            unsaved()
 
     def _tested(self, record: Record) -> bool:
         return record.test is not None or self.plan.settings.test_trials == 0
@@ -165,13 +183,22 @@ class Loop:
         for e in range(record.done, self.plan.settings.episodes):
             key = record.state.key
             with self.progress.busy("simulating") as watch:
-                record.state, info = yield Request(record.state, self.plan.mask[e])
+                state, info = yield Request(record.state, self.plan.mask[e])
+            self.save()
+            record.state = state
             records.report(record.history, e, info)
             self._save_failures(key, e, info)
-            self._save(e + 1, record)
-            self._write_tables(record, e)
-            self._report(record.history, e, watch.seconds)
-            _check_failures(record.history.trials.status[e], self.run_directory.path)
+            arrays = records.to_arrays(record)
+            self._unsaved = partial(self._close, record, e, arrays, watch.seconds)
+            if types.failed(record.history.trials.status[e]).all():
+                self.save()
+                _all_failed(record.history.trials.status[e], self.run_directory.path)
+
+    def _close(self, record: Record, e: int, arrays: dict, seconds: float) -> None:
+        """Saves an episode and reports it."""
+        self.store.save(e + 1, arrays)
+        self._write_tables(record, e)
+        self._report(record.history, e, seconds)
 
     def _save_failures(self, key: jax.Array, e: int, info: EpisodeInfo) -> None:
         """Saves failed worlds with their last good states, for `codesign replay`."""
@@ -245,9 +272,7 @@ def _final_test(plan: Plan, record: Record) -> FinalTest | None:
     return None if record.test is None else codesign.summarize_test(plan.scene, record.test)
 
 
-def _check_failures(status: np.ndarray, folder: Path) -> None:
-    if not types.failed(status).all():
-        return
+def _all_failed(status: np.ndarray, folder: Path) -> None:
     advice = [text for bit, text in _ADVICE.items() if (status & bit).any()]
     raise AllFailed(
         f"every one of {status.size} trials failed ({tables.status_counts(status)}); see "

@@ -130,7 +130,7 @@ class _Together:
         devices: int | None,
     ):
         self.plan, self.loops, self.progress = plan, loops, progress
-        self.interrupts, self.timing = interrupts, Timing()
+        self.interrupts, self.timing, self.seconds = interrupts, Timing(), 0.0
         how = plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
         self.batch = Batch(*how, devices=devices)
         self.waiting: dict[int, tuple[Generator, Request]] = {}
@@ -145,10 +145,12 @@ class _Together:
             while self.waiting:
                 self._round()
         except Stopped as stop:
-            self.progress.message(f"stopped by signal {stop.signum}; the same command resumes")
             self._throw(stop)
+            self._show()
+            self.progress.message(f"stopped by signal {stop.signum}; the same command resumes")
         except RuntimeError as error:  # what simulates all of them
             self._throw(error)
+        self._show()
         signum = self.interrupts.signum
         ended = {
             seed: r._replace(signum=signum) if isinstance(r, RunResult) else r
@@ -179,20 +181,34 @@ class _Together:
         self.timing = Timing(watch.seconds, runs=len(self.waiting))
 
     def _round(self) -> None:
-        """One episode of every run that wants one."""
+        """One episode of every run that wants one; the episodes before are saved meanwhile."""
         start = time.perf_counter()
-        asked = [request for _, request in self.waiting.values()]
-        answers = self.interrupts.call(self.batch, asked)
-        waiting, self.waiting = self.waiting, {}
-        for (seed, (asking, _)), reply in zip(waiting.items(), answers, strict=True):
-            self._go_on(seed, asking, reply)
-        seconds = time.perf_counter() - start
-        grasps = self.plan.settings.particles * self.plan.settings.trials * len(waiting)
-        if isinstance(self.progress, GroupProgress):
-            self.progress.round(seconds)
+        asked = {seed: request for seed, (_, request) in self.waiting.items()}
+        answers = self.interrupts.begin(self.batch, list(asked.values()))
+        self._save()
+        self._show()
+        for seed, reply in zip(asked, answers(), strict=True):
+            if seed in self.waiting:
+                self._go_on(seed, self.waiting.pop(seed)[0], reply)
+        self.seconds = time.perf_counter() - start
+        grasps = self.plan.settings.particles * self.plan.settings.trials * len(asked)
         self.timing = self.timing._replace(
-            seconds=self.timing.seconds + seconds, grasps=self.timing.grasps + grasps
+            seconds=self.timing.seconds + self.seconds, grasps=self.timing.grasps + grasps
         )
+
+    def _save(self) -> None:
+        """Saves the last episode of each run; those that cannot be saved end."""
+        for seed in list(self.waiting):
+            try:
+                self.loops[seed].save()
+            except FAILURES as error:
+                self.waiting.pop(seed)[0].close()
+                self._fail(seed, error)
+
+    def _show(self) -> None:
+        """Reports what was saved since the last round."""
+        if isinstance(self.progress, GroupProgress):
+            self.progress.round(self.seconds)
 
     def _throw(self, error: Exception) -> None:
         """Ends every run that still waits."""

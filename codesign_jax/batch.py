@@ -121,10 +121,30 @@ class Batch:
 
     def __call__(self, requests: Sequence[Request]) -> list[tuple[State, EpisodeInfo]]:
         """Runs an episode for each request; states and reports in their order."""
-        found, size = [], self._group(requests[0]) if requests else 1
-        for start in range(0, len(requests), size):
-            found += self._episodes(requests[start : start + size])
-        return found
+        return self.begin(requests)()
+
+    def begin(self, requests: Sequence[Request]) -> Callable[[], list[tuple[State, EpisodeInfo]]]:
+        """Lets the devices begin to simulate an episode for each request.
+
+        Returns:
+          A function that goes on and returns states and reports in the requests' order. It takes
+          about as long as the simulation, although it only tells the devices what to do: JAX lets
+          a program wait its turn while 32 are under way on a GPU (`max_inflight_computations` of
+          XLA's GPU client), and each run is judged by a program of its own.
+        """
+        size = self._group(requests[0]) if requests else 1
+        groups = [requests[k : k + size] for k in range(0, len(requests), size)]
+        first = [self._launched(group) for group in groups[:1]]
+
+        def finish() -> list[tuple[State, EpisodeInfo]]:
+            found = []
+            for k, group in enumerate(groups):
+                # Not before the group before has been judged: its arrays leave the memory first.
+                running = first.pop() if k == 0 else self._launched(group)
+                found += self._judged(group, *running)
+            return found
+
+        return finish
 
     def _group(self, request: Request) -> int:
         """Runs that are simulated in one call."""
@@ -149,32 +169,39 @@ class Batch:
             self._parts = _Stages(before, _launch(*how), after)
         return self._parts
 
-    def _episodes(self, requests: Sequence[Request]) -> list[tuple[State, EpisodeInfo]]:
+    def _launched(self, requests: Sequence[Request]) -> tuple[list[_Packed], list[tuple]]:
+        """The runs' episodes without their blocks, and what the devices make of these."""
         parts = self._stages(requests[0], len(requests))
         before = self._program("before", parts.before.compile, *requests[0])
         packed = [before(*request) for request in requests]
-        found = self._joined(packed) if self._joins else self._one_by_one(packed)
+        running = self._joined(packed) if self._joins else self._one_by_one(packed)
+        return [_light(p) for p in packed], running
+
+    def _judged(
+        self, requests: Sequence[Request], packed: list[_Packed], running: list[tuple]
+    ) -> list[tuple[State, EpisodeInfo]]:
+        """What becomes of the runs, after `_launched`."""
+        assert self._parts is not None
+        home = tuple(jax.device_put(out, self.devices[0]) for out in running)
+        found = _collect(home, len(requests)) if self._joins else home
         results = []
         for (state, mask), mine, out in zip(requests, packed, found, strict=True):
-            told = (state, _light(mine)), (mask, out)
-            results.append(self._program("after", parts.after.compile, *told)(*told))
+            told = (state, mine), (mask, out)
+            results.append(self._program("after", self._parts.after.compile, *told)(*told))
         return results
 
-    def _joined(self, packed: Sequence[_Packed]) -> Sequence[tuple]:
+    def _joined(self, packed: Sequence[_Packed]) -> list[tuple]:
         """The blocks of all runs, dealt to the devices."""
-        home, runs = self.devices[0], len(packed)
         parts = _deal(tuple(p.blocks for p in packed), len(self.devices))
-        running = [
+        return [
             self._call(blocks, packed[0].common, device)
             for blocks, device in zip(parts, self.devices, strict=False)
         ]
-        return _collect(tuple(jax.device_put(part, home) for part in running), runs)
 
     def _one_by_one(self, packed: Sequence[_Packed]) -> list[tuple]:
         """Every run by itself, in turn on each device."""
         turns = zip(packed, itertools.cycle(self.devices), strict=False)
-        running = [self._call(p.blocks, p.common, device) for p, device in turns]
-        return [jax.device_put(out, self.devices[0]) for out in running]
+        return [self._call(p.blocks, p.common, device) for p, device in turns]
 
     def _call(self, blocks: tuple, common: tuple, device: Device) -> tuple:
         """Begins to simulate on a device; returns at once."""

@@ -546,7 +546,7 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     base = [a for a in RUN if a not in ("--seed", "3")]
     run = [*base, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]
     assert command(*RUN, "--episodes", "1", "--out", tmp_path / "runs" / "seed-3") == 0
-    save, simulate = Checkpoints.save, Batch.__call__
+    save, simulate = Checkpoints.save, Batch.begin
 
     def interrupted(batch, requests):
         os.kill(os.getpid(), signal.SIGTERM)
@@ -557,9 +557,9 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
             raise OSError("no space left")
         save(store, step, arrays)
 
-    monkeypatch.setattr(Batch, "__call__", interrupted)
+    monkeypatch.setattr(Batch, "begin", interrupted)
     assert command(*run) == 128 + signal.SIGTERM
-    monkeypatch.setattr(Batch, "__call__", simulate)
+    monkeypatch.setattr(Batch, "begin", simulate)
     assert "seed 3: extended from 1 to 3 episodes" in capsys.readouterr().out
     first = runs.load_record(tmp_path / "runs" / "seed-3")
     assert first is not None and first.done == 2
@@ -582,7 +582,7 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
         return simulate(batch, requests)
 
     monkeypatch.setattr(Checkpoints, "save", noted_save)
-    monkeypatch.setattr(Batch, "__call__", noted_simulation)
+    monkeypatch.setattr(Batch, "begin", noted_simulation)
     for seed in ("3", "5"):
         alone = [*base, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
         assert command(*alone) == 0

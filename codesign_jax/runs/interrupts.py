@@ -62,28 +62,28 @@ class Interrupts:
         Raises:
           Stopped: If a signal came before.
         """
-        return self.begin(function, *arguments)()
+        return self.begin(lambda: lambda: function(*arguments))()
 
-    def begin(self, function: Callable[..., T], *arguments: Any) -> Callable[[], T]:
-        """Runs a function; returns what waits for its arrays, which devices may still compute.
+    def begin(self, function: Callable[..., Callable[[], T]], *arguments: Any) -> Callable[[], T]:
+        """Runs a function, and goes on with the one that it returns; returns what waits for that.
 
         Raises:
           Stopped: If a signal came before.
         """
         if self.signum:
             raise Stopped(self.signum)
-        returned = threading.Event()
+        begun = threading.Event()
 
         def work() -> T:
             try:
-                found = function(*arguments)
+                finish = function(*arguments)
             finally:
-                returned.set()
-            return jax.block_until_ready(found)
+                begun.set()
+            return jax.block_until_ready(finish())
 
         future = self._worker.submit(work)
-        # Until it has told the devices what to do, other Python code would only slow it down.
-        while not returned.wait(0.2):
+        # Until the devices have something to do, other Python code would only slow them down.
+        while not begun.wait(0.2):
             pass
 
         def result() -> T:

@@ -184,7 +184,7 @@ class _Together:
         """One episode of every run that wants one; the episodes before are saved meanwhile."""
         start = time.perf_counter()
         asked = {seed: request for seed, (_, request) in self.waiting.items()}
-        answers = self.interrupts.begin(self.batch, list(asked.values()))
+        answers = self.interrupts.begin(self.batch.begin, list(asked.values()))
         self._save()
         self._show()
         for seed, reply in zip(asked, answers(), strict=True):

@@ -1,7 +1,9 @@
 """The command line: errors create nothing, runs resume bit for bit, whatever ended them."""
 
+import contextlib
 import dataclasses
 import fcntl
+import io
 import json
 import os
 import shutil
@@ -11,6 +13,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -19,7 +22,7 @@ from toy import TINY
 
 from codesign_jax import cli, codesign, runs
 from codesign_jax.batch import Batch
-from codesign_jax.commands import common, preflight, reference
+from codesign_jax.commands import common, jobs, preflight, reference
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import choice, columns
 from codesign_jax.runs.checkpoint import Checkpoints, digest
@@ -143,8 +146,8 @@ def test_another_hand_compiles_nothing(finished, tmp_path):
         for arguments in (run, evaluate):
             assert command(*arguments, "--hand", tmp_path / "softer.toml") == 0
         assert not compiled
-        # One more trial is another program: what the count would have seen.
-        assert command(*evaluate[:-1], "2") == 0
+        # What the count would have seen of any other program.
+        jax.jit(lambda x: x + len(compiled))(np.ones(3))
         assert compiled
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
@@ -447,10 +450,10 @@ def test_evaluate_prints_costs_of_each_object(capsys):
 def test_evaluate_takes_the_best_of_a_run(finished, capsys):
     rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
     best = min(rows, key=lambda row: float(row[1]))
-    assert command("evaluate", "--run", finished, "--trials", "2") == 0
+    assert command("evaluate", "--run", finished, "--trials", "1") == 0
     output = capsys.readouterr().out
     assert f"length={float(best[-2]):.4g} mm" in output
-    assert "over 2 trials" in output and "% of grasps (95 % interval)" in output
+    assert "over 1 trial" in output and "% of grasps (95 % interval)" in output
 
 
 def test_evaluate_judges_a_run_on_other_objects_and_settings(finished, tmp_path, capsys):
@@ -509,33 +512,74 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
     assert snapshot(grown) == before
 
 
-@pytest.mark.parametrize("seeds", ["3", pytest.param("2-3", marks=pytest.mark.slow)])
-def test_seeds_are_compared_and_run_as_jobs(seeds, tmp_path, capsys):
-    """A job a seed is a local process, with the bits of a batch; the next test has a run alone."""
-    short = ["--episodes", "2"]
-    base = [a for a in RUN if a not in ("--seed", "3")]
-    assert command(*base, *short, "--seeds", "2-3", "--out", tmp_path / "both") == 0
-    output = capsys.readouterr().out
+BASE = [a for a in RUN if a not in ("--seed", "3")]
+TWO = [*BASE, "--episodes", "2", "--seeds", "2-3"]
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """Folder of two seeds in one batch, and what was printed."""
+    folder, text = tmp_path_factory.mktemp("compared") / "both", io.StringIO()
+    with contextlib.redirect_stdout(text):
+        assert command(*TWO, "--out", folder) == 0
+    return folder, text.getvalue()
+
+
+def test_seeds_are_compared(compared):
+    both, output = compared
     assert output.count("compiled in") == 1 and "  2 runs  mean" in output
-    assert stored(tmp_path / "both" / "seed-2") != stored(tmp_path / "both" / "seed-3")
+    assert stored(both / "seed-2") != stored(both / "seed-3")
     table = output.split("best test cost")[1]
     rows = [line.split() for line in table.splitlines()]
     assert [row[0] for row in rows if row[-1:] == ["particles"]] == ["2", "3"]
     assert "of 2 runs have a particle below the limit of success" in table
     assert "% of such runs (95 % interval)" in table
-
-    run = [*base, *short, "--seeds", seeds, "--jobs", "2", "--job-set"]
-    both, out = tmp_path / "both", tmp_path / "jobs"
-    assert command(*run, "cluster=local", "timeout_min=5", "--out", out) == 0
-    header, *rows = (both / "seeds.csv").read_text().splitlines()
+    _, *rows = (both / "seeds.csv").read_text().splitlines()
     assert rows[0].startswith("2,1,") and rows[1].startswith("3,1,")
-    chosen = [row for row in rows if row[0] in seeds]
-    assert (out / "seeds.csv").read_text().splitlines() == [header, *chosen]
-    for row in chosen:
-        assert stored(out / f"seed-{row[0]}") == stored(both / f"seed-{row[0]}")
-    capsys.readouterr()
-    assert command(*base, *short, "--jobs", "2") == 2
+
+
+class Here:
+    """In the place of submitit's executor: runs each job in this process as it is submitted."""
+
+    cluster, folder = "here", "none"
+
+    def submit(self, function, *arguments):
+        code = function(*arguments)
+        there = SimpleNamespace(exists=lambda: True)
+        return SimpleNamespace(
+            done=lambda: True,
+            exception=lambda: None,
+            result=lambda: code,
+            paths=SimpleNamespace(result_pickle=there, stderr=Path("none")),
+        )
+
+
+def assert_jobs_are_the_batch(compared, out, *more):
+    both, _ = compared
+    assert command(*TWO, "--jobs", "2", *more, "--out", out) == 0
+    assert (out / "seeds.csv").read_bytes() == (both / "seeds.csv").read_bytes()
+    for seed in ("seed-2", "seed-3"):
+        assert stored(out / seed) == stored(both / seed)
+
+
+def test_jobs_have_the_bits_of_a_batch(compared, tmp_path, monkeypatch, capsys):
+    """Each a run by itself, here within this process; the next test has processes, other SLURM."""
+    monkeypatch.setattr(jobs, "executor", lambda options, folder: Here())
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    assert_jobs_are_the_batch(compared, tmp_path / "jobs")
+    assert "2 runs, 2 at a time, on here" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_jobs_are_processes_where_there_is_no_slurm(compared, tmp_path):
+    local = ("--job-set", "cluster=local", "timeout_min=5")
+    assert_jobs_are_the_batch(compared, tmp_path / "jobs", *local)
+
+
+def test_wrong_jobs_are_refused(tmp_path, capsys):
+    assert command(*BASE, "--episodes", "2", "--jobs", "2") == 2
     assert "--jobs needs --seeds" in capsys.readouterr().err
+    run = [*TWO, "--jobs", "2", "--job-set", "cluster=local"]
     for wrong, words in (("timeout_min", "must be KEY=VALUE"), ("memory=3", "memory")):
         assert command(*run, wrong, "--out", tmp_path / "no") == 2
         assert words in capsys.readouterr().err
@@ -543,8 +587,7 @@ def test_seeds_are_compared_and_run_as_jobs(seeds, tmp_path, capsys):
 
 def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch, capsys):
     """A signal, a disk that is full for one of them, and runs that are at other episodes."""
-    base = [a for a in RUN if a not in ("--seed", "3")]
-    run = [*base, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]
+    run = [*BASE, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]
     assert command(*RUN, "--episodes", "1", "--out", tmp_path / "runs" / "seed-3") == 0
     save, simulate = Checkpoints.save, Batch.begin
 
@@ -584,7 +627,7 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     monkeypatch.setattr(Checkpoints, "save", noted_save)
     monkeypatch.setattr(Batch, "begin", noted_simulation)
     for seed in ("3", "5"):
-        alone = [*base, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
+        alone = [*BASE, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
         assert command(*alone) == 0
         assert_same_run(tmp_path / "runs" / f"seed-{seed}", tmp_path / f"alone-{seed}")
     # An episode is saved when the next one has begun, the last one before the test begins.
@@ -596,8 +639,7 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
 @pytest.mark.slow
 def test_hosts_share_the_seeds(tmp_path, capsys):
     """Two processes of JAX's distributed runtime on this host: the runs are those of one."""
-    base = [a for a in RUN if a not in ("--seed", "3")]
-    run = [*base, "--episodes", "2", "--seeds", "3-5"]
+    run = [*BASE, "--episodes", "2", "--seeds", "3-5"]
     assert command(*run, "--out", tmp_path / "one") == 0
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

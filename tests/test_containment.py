@@ -90,6 +90,9 @@ def test_the_cap_is_flagged_step_by_step():
     engine = StructuredEngine(pinch("box"), tolerance=1e-6)
     found = {"residual": jnp.array([0.0, 1e-6, 2e-6, jnp.nan])}
     np.testing.assert_array_equal(engine._status(found), [0, 0, Status.SOLVER_CAP, 0])
+    overflow, cap = Status.CONTACT_OVERFLOW, Status.SOLVER_CAP  # too few slots in the last two
+    found["overflow"] = jnp.array([0.0, 0.0, 1.0, 1.0])
+    np.testing.assert_array_equal(engine._status(found), [0, 0, overflow | cap, overflow])
 
 
 # --- the cap's meaning -----------------------------------------------------------------------

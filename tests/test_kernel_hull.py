@@ -19,6 +19,9 @@ from codesign_jax.types import Status
 from tests import small
 from tests import test_hull_contact as oracle
 
+# The quick tests have one state against the same dense solve, and states with too few slots, among
+# worlds with planted faults (test_planted_contacts), and rigid rings against MuJoCo C.
+pytestmark = pytest.mark.slow
 STEPS = 420
 
 
@@ -61,7 +64,7 @@ def velocity(first, second, h):
     return np.concatenate([found, omega])
 
 
-@pytest.mark.parametrize("shape", ["box", pytest.param("sphere", marks=oracle.SLOW)])
+@pytest.mark.parametrize("shape", ["box", "sphere"])
 def test_accelerations_equal_a_dense_solve(shape):
     """States of a grasp, one world each: one step of each against dense Jacobians and SciPy."""
     with jax.enable_x64(True):
@@ -130,7 +133,6 @@ def wound(scene, model, qpos, turn=0.05):
     return qpos, qvel
 
 
-@oracle.SLOW
 def test_a_belt_around_a_cylinder_equals_a_dense_solve():
     """A finger wound about a cylinder by most of a turn, rubbing on it: one step."""
     with jax.enable_x64(True):

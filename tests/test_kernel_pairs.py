@@ -35,12 +35,12 @@ def batched(worlds):
     return fields, *(np.stack([getattr(d, n) for d in data]) for n in ("qpos", "qvel", "ctrl"))
 
 
-SLOW = pytest.mark.slow  # half a minute of compiling each
+# The quick tests have one state of spheres and one of hulls against the same oracles, among worlds
+# with planted faults (test_planted_contacts).
+pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize(
-    "friction", ["coulomb", pytest.param("none", marks=SLOW), pytest.param("full", marks=SLOW)]
-)
+@pytest.mark.parametrize("friction", ["coulomb", "none", "full"])
 def test_accelerations_equal_mujoco_on_curled_hands(friction):
     """Fingers touch one another and the object, sliding at up to a metre a second; or nothing."""
     with jax.enable_x64(True):

@@ -1,4 +1,8 @@
-"""The structured engine against MuJoCo C: one step in contact, and free motion step by step."""
+"""The structured engine against MuJoCo C: every step of a grasp, and free motion step by step.
+
+The quick tests have the same of a cylinder, a box and a sphere: blocks of worlds in test_kernel,
+and the sound ones among worlds with planted faults (test_planted_faults, test_planted_contacts).
+"""
 
 import dataclasses
 import functools
@@ -14,6 +18,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from tests import small, steps
 
+pytestmark = pytest.mark.slow
 EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-24}
 """Limits at which the kernel solves a step to rounding in float64."""
 
@@ -40,10 +45,7 @@ def setting(shape, **params):
     return scene, oracle, np.asarray(fields.start), batch, np.asarray(ctrl)
 
 
-# A box and a cylinder are in the quick tests of effects and of blocks (test_effects, test_kernel).
-@pytest.mark.parametrize(
-    "shape", ["sphere", *(pytest.param(s, marks=pytest.mark.slow) for s in ("box", "cylinder"))]
-)
+@pytest.mark.parametrize("shape", ["sphere", "box", "cylinder"])
 def test_every_step_of_a_grasp_equals_mujocos(shape):
     """Converged accelerations along the kernel's own path, contacts included."""
     with jax.enable_x64(True):
@@ -77,30 +79,7 @@ def test_free_motion_equals_mujoco_step_by_step():
         mujoco.mj_step(oracle, data)
 
 
-def test_float32_is_close_to_float64():
-    """The frame at the object keeps float32 accelerations within 1e-4 of float64's in contact."""
-    results = []
-    for wide in (True, False):
-        with jax.enable_x64(wide):
-            scene, _, start, fields, ctrl = setting("cylinder")
-            dtype = jnp.float64 if wide else jnp.float32
-            fields = jax.tree.map(lambda x, t=dtype: np.asarray(x).astype(t), fields)
-            engine = StructuredEngine(scene, iterations=60, evaluations=12, tolerance=1e-10)
-            hand = small.lanes(scene, fields)
-            # The palm at 60 mm presses the straight fingers onto the table.
-            qpos = np.array(start)
-            qpos[2] = 0.06
-            state = lanes_state(engine, scene, fields, qpos, np.zeros(len(qpos) - 1))
-            state = jax.tree.map(lambda x, t=dtype: np.asarray(x).astype(t), state)
-            u = jnp.asarray(ctrl[150], dtype)[:, None]
-            new, info = jax.jit(engine.step)(hand, state, u)
-            results.append(np.asarray(engine.qvel(new))[0].astype(float))
-            assert float(info.residual.max()) < 1e-6
-    error = np.linalg.norm(results[1] - results[0]) / np.linalg.norm(results[0])
-    assert error < 1e-4
-
-
-@pytest.mark.slow  # quick: test_a_decided_world_stays, test_a_trajectory_changes_no_outcome
+# Quick: test_a_decided_world_stays, test_a_trajectory_changes_no_outcome.
 def test_worlds_that_end_early():
     """They change no verdict, and the block's other worlds no bit."""
     with jax.enable_x64(True):

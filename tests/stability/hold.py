@@ -87,12 +87,12 @@ def pinch_drops(engine, step, precision):
     return Found(abs(ratio - 1), 0.1, f"slips at {load:.2f} N, {ratio:.3f} mu N")
 
 
-for title, what, unit, function in (
-    ("pinch held for 60 s", "slip of the object", "m", pinch_holds),
-    ("pinch, mass ramped until it drops", "load when it slips over mu N, error", "", pinch_drops),
-):
-    case(12, title, what, unit=unit)(function)
-    case(12, title, what, unit=unit, engine="mujoco", quick=((1.0, "float64"),))(function)
+minute = (12, "pinch held for 60 s", "slip of the object")
+case(*minute, unit="m")(pinch_holds)
+case(*minute, unit="m", engine="mujoco")(pinch_holds)
+ramp = (12, "pinch, mass ramped until it drops", "load when it slips over mu N, error")
+case(*ramp)(pinch_drops)
+case(*ramp, engine="mujoco", quick=((1.0, "float64"),))(pinch_drops)
 
 
 # --- 13: mass ratio --------------------------------------------------------------------------

@@ -43,7 +43,7 @@ test-gpu: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow
 
-# All hard cases; their margins go to docs/stability.md. About an hour on two cores.
+# All hard cases; their margins go to docs/stability.md. About half an hour on two cores.
 stability: $(STAMP)
 	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
 

@@ -425,7 +425,8 @@ def write_small(finished, grid, folder):
     batch, got = finished
     arrays = results.summarize(batch, got)
     for name in ("2d", "23d"):
-        notes = {"settings": {"plan": dataclasses.asdict(PLAN) | {"name": name}}}
+        plan = dataclasses.asdict(PLAN) | {"name": name}
+        notes = {"settings": {"plan": plan, "scene": "paper"}, "commit": "0123abc"}
         results.write(folder, name, arrays, notes | {"grasps": PLAN.grasps, "wall_seconds": 1.0})
     grid_record = grid.start()
     grid.step(grid_record)
@@ -449,6 +450,30 @@ def test_figures_and_page_are_made_from_files_alone(finished, landscape, tmp_pat
     assert json.loads((tmp_path / "2d.json").read_text())["grasps"] == PLAN.grasps
     both = report.make(tmp_path, tmp_path / "figures", touching=[tmp_path])
     assert "with it" in both.split(text)[1]
+
+
+def test_strategies_of_the_same_runs_are_joined(finished):
+    batch, got = finished
+    arrays, order = results.summarize(batch, got), [str(s) for s in PLAN.strategies]
+
+    def part(rows, commit, **changed):
+        names = [order[k] for k in rows]
+        own = {
+            k: v[rows] if len(v) == len(order) and k not in ("first", "seeds") else v
+            for k, v in arrays.items()
+        } | changed
+        plan = dataclasses.asdict(PLAN) | {"strategies": names}
+        notes = {"settings": {"plan": plan, "scene": "paper"}, "commit": commit}
+        return study.Study(plan, notes, own)
+
+    last = list(range(1, len(order)))
+    parts = part(last, "1111111"), part([0], "2222222")
+    (whole,) = study.joined(parts, order)
+    assert whole.strategies == order and whole.notes["commit"] == "2222222 and 1111111"
+    assert all(np.array_equal(whole.data[k], v) for k, v in arrays.items())
+    assert report.details(whole) == report.details(part([*range(len(order))], ""))
+    other = part([0], "2222222", seeds=arrays["seeds"] + 1)
+    assert study.joined([parts[0], other], order) == [parts[0], other], "other runs"
 
 
 def test_an_experiment_that_was_stopped_has_no_test(setup):

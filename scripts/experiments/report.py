@@ -10,7 +10,7 @@ from codesign_jax.types import WARNINGS
 from scripts.experiments import figures, grasp_types
 from scripts.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
 from scripts.experiments.results import BITS
-from scripts.experiments.study import RULES, Study, load, load_study, regions
+from scripts.experiments.study import RULES, Study, joined, load, load_study, regions
 from scripts.shared import statistics
 from scripts.shared.tables import fill
 
@@ -36,8 +36,9 @@ def make(
     grid = load(data, "landscape")
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
     for name, study in studies.items():
-        for other in (load_study(folder, name) for folder in touching):
-            if study and other:
+        found = [load_study(folder, name) for folder in touching]
+        if study:
+            for other in joined([s for s in found if s], study.strategies):
                 text += f"\n\n{with_fingers(study, other)}"
     if studies["2d"]:
         figures.evolution(studies["2d"], pictures / "fig6_cost_evolution.png")
@@ -116,8 +117,9 @@ def _against_last(study: Study) -> list[str]:
     )
     columns = [statistics.holm(p) for p in tests]
     lines = [
-        f"{study.plan['name']}: p of a difference to {study.strategies[-1]}, adjusted by Holm's "
-        f"method for the {len(others)} comparisons of a column",
+        f"{study.plan['name']}: p of a difference to {study.strategies[-1]}"
+        + f", adjusted by Holm's method for the {len(others)} comparisons of a column"
+        * (len(others) > 1),
         "",
         "| strategy | success, paired (McNemar) | unpaired (Fisher) "
         "| convergence, paired (Wilcoxon) | unpaired (Mann-Whitney) |",
@@ -157,8 +159,9 @@ def with_fingers(plain: Study, touching: Study) -> str:
         lines.append(f"| {' | '.join(cells)} |")
     if not touching.tested:
         return "\n".join(lines)
-    rows = [f"| {a} | {b} |" for a, b in _rows(plain.plan["name"], touching)]
-    lines += ["", _HEAD.replace("here", "here, with contact between fingers"), *rows]
+    if touching.strategies[-1] == plain.strategies[-1]:  # the paper's statements are of that one
+        rows = [f"| {a} | {b} |" for a, b in _rows(plain.plan["name"], touching)]
+        lines += ["", _HEAD.replace("here", "here, with contact between fingers"), *rows]
     return "\n".join([*lines, "", f"With contact between fingers, {details(touching)}"])
 
 
@@ -184,7 +187,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
         f"{name}: {paper} simulations to convergence (concurrent)",
         f"{_interval(both[0])}; failed trials at the maximum: {_interval(both[1])}",
     )
-    if len(study.strategies) == 1:
+    if len(study.strategies) < 3:  # a trend needs three
         return [converged]
     return [
         (

@@ -47,19 +47,20 @@ def save(folder: Path, episode: int, info: EpisodeInfo, trials: Trial) -> list[P
       info: Its report.
       trials: Its trials, leading axis (trial,).
     """
-    status = np.asarray(info.trials.status)
-    files = []
+    # From the device as a whole: to index there would be a program for each number.
+    info, trials = jax.tree.map(np.asarray, (info, trials))
+    status, files = info.trials.status, []
     for p, t in np.argwhere(types.failed(status))[:MOST]:
-        trial = jax.tree.map(lambda v, t=t: np.asarray(v)[t], trials)
-        state = np.zeros(0) if info.last is None else np.asarray(info.last[p, t])
+        trial = jax.tree.map(lambda v, t=t: v[t], trials)
+        state = np.zeros(0) if info.last is None else info.last[p, t]
         path = folder / FOLDER / f"episode-{episode}-particle-{p}-trial-{t}.npz"
         path.parent.mkdir(exist_ok=True)
         np.savez(
             path,
-            design=np.asarray(info.population[p]),
+            design=info.population[p],
             state=state,
             status=status[p, t],
-            bad_step=np.asarray(info.trials.bad_step)[p, t],
+            bad_step=info.trials.bad_step[p, t],
             place=np.array([episode, p, t]),
             **{f"trial_{k}": v for k, v in trial._asdict().items()},
         )

@@ -25,12 +25,31 @@ def pytest_configure(config):
         return
     if config.option.markexpr not in AS_FOR_USERS:
         quick_compile.use()
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        folder = tempfile.mkdtemp(prefix="codesign-tests-")
-        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+    folder = tempfile.mkdtemp(prefix="codesign-tests-")
+    config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    os.environ["CODESIGN_TESTS_FOLDER"] = folder  # see tiny_run.py
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
+    # Grids of meshes and rates of runs: shared as well, and never those of the user.
+    os.environ["XDG_CACHE_HOME"] = os.path.join(folder, "xdg")
     # Small programs too: JAX keeps those that take a second.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+# Files of more than ten seconds, the longest first: what is left for the end is short, so that no
+# worker waits for the other.
+LONG = """
+test_cli test_compose test_effects test_engines test_kernel test_containment test_mesh_grasps
+test_calibration test_constants test_codesign test_planted_contacts test_winners test_docs
+test_experiments test_accuracy test_hard_cases test_rollout test_model test_particle_filter
+test_grasp test_batch test_export_sheet test_report test_showing test_effects_physics
+test_optimizers test_parquet test_accuracy_report
+""".split()
+
+
+def pytest_collection_modifyitems(items):
+    """Begins with the longest files; xdist keeps this order with --no-loadscope-reorder."""
+    place = {name: number for number, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
 
 
 def pytest_collection_finish():

@@ -57,6 +57,7 @@ def stored(folder):
     return digest(to_arrays(record))
 
 
+@pytest.mark.slow  # quick: the same with one device in the place of two, below
 def test_runs_on_two_devices_are_those_of_one_run_on_one(tmp_path):
     """By the kernel, whose blocks are cut without regard to runs, and are narrower for one run."""
     command = [sys.executable, "-c", TWO_DEVICES, str(tmp_path), *RUN]
@@ -67,6 +68,27 @@ def test_runs_on_two_devices_are_those_of_one_run_on_one(tmp_path):
     shares = [int(n) for n in done.stdout.split("shares")[1].split("end")[0].split()]
     # Of a run at least two blocks, and an odd number of all: the middle run is cut.
     assert shares[0] == shares[1] + 1 and sum(shares) % 3 == 0
+    assert stored(tmp_path / "many" / "seed-1") == stored(tmp_path / "one")
+    assert stored(tmp_path / "many" / "seed-2") != stored(tmp_path / "one")
+
+
+def test_shares_of_joined_runs_are_those_of_one_run(tmp_path, monkeypatch):
+    """By the kernel, on one device that stands for two: the middle run of three is cut."""
+    shares, call = [], Batch._call
+
+    def spy(self, blocks, *rest):
+        shares.append(jax.tree.leaves(blocks)[0].shape[0])
+        return call(self, blocks, *rest)
+
+    monkeypatch.setattr(Batch, "_call", spy)
+    with monkeypatch.context() as patch:
+        patch.setattr("codesign_jax.batch.take", lambda count: 2 * take(1))
+        assert cli.main([*RUN, "--seeds", "0-2", "--out", str(tmp_path / "many")]) == 0
+    first, second = shares[:2]
+    assert first == second + 1 and (first + second) % 3 == 0
+    shares.clear()
+    assert cli.main([*RUN, "--seed", "1", "--out", str(tmp_path / "one")]) == 0
+    assert 3 * shares[0] == first + second
     assert stored(tmp_path / "many" / "seed-1") == stored(tmp_path / "one")
     assert stored(tmp_path / "many" / "seed-2") != stored(tmp_path / "one")
 

@@ -98,13 +98,6 @@ def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     assert len(np.unique(np.asarray(rows), axis=0)) == 5
 
 
-def test_noise_does_not_depend_on_the_number_of_particles(setup):
-    *_, optimizer, episode = setup
-    few = episode(start(optimizer, particles=2), np.zeros(2, bool))[1].trials.cost
-    many = episode(start(optimizer), np.zeros(2, bool))[1].trials.cost
-    np.testing.assert_array_equal(few[0], many[0])
-
-
 def test_concurrent_design_of_the_toy_converges(setup):
     the_scene, space, _, optimizer, episode = setup
     state, means = start(optimizer), []
@@ -117,16 +110,48 @@ def test_concurrent_design_of_the_toy_converges(setup):
     assert float(state.particles[:, 0].mean()) > 0.07
 
 
-def test_failed_trials_are_left_out_of_the_mean():
+@pytest.fixture(scope="module")
+def failing():
+    """An episode of three particles whose mask is closed, some of whose worlds fail."""
     the_scene, space, _ = tiny()
     # Worlds are particle-major: the first particle fails once, the second always.
     engine = ToyEngine(the_scene, failing=[0, 3, 4, 5])
     optimizer = codesign.make_filter(space)
     episode = codesign.make_episode(the_scene, engine, space, optimizer, TRIALS)
-    _, info = episode(start(optimizer, particles=3), np.zeros(2, bool))
+    return the_scene, episode(start(optimizer, particles=3), np.zeros(2, bool))[1]
+
+
+def test_failed_trials_are_left_out_of_the_mean(failing):
+    the_scene, info = failing
     np.testing.assert_array_equal((info.trials.status != 0).sum(1), [1, 3, 0])
     np.testing.assert_allclose(info.selection.cost[0], info.trials.cost[0, 1:].mean(), rtol=1e-6)
     assert float(info.selection.cost[1]) == the_scene.cost.maximum
+
+
+def test_noise_does_not_depend_on_the_number_of_particles(setup, failing):
+    *_, optimizer, episode = setup
+    few = failing[1].trials.cost[2]  # which does not fail
+    many = episode(start(optimizer), np.zeros(2, bool))[1].trials.cost
+    np.testing.assert_array_equal(few, many[0])
+
+
+def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):
+    """Each seed of a batch with its own schedule, as a loop over single episodes."""
+    the_scene, space, engine, optimizer, episode = setup
+    run = codesign.make_run(the_scene, engine, space, optimizer, TRIALS)
+    masks = np.stack(
+        [schedule(n, np.array(space.is_morphology), 3) for n in ("concurrent", "control")]
+    )
+    starts = [start(optimizer, 0), start(optimizer, 7, design=(0.09, 0.03))]
+    ends, infos = jax.jit(jax.vmap(run))(jax.tree.map(lambda *v: jnp.stack(v), *starts), masks)
+    # Two programs round differently, which may move a loss by one time step.
+    step = the_scene.discretization.timestep
+    for k, state in enumerate(starts):
+        for e in range(3):
+            state, want = episode(state, masks[k, e])
+            np.testing.assert_allclose(infos.trials.cost[k, e], want.trials.cost, atol=3 * step)
+        np.testing.assert_allclose(ends.particles[k], state.particles, rtol=1e-5)
+    assert np.ptp(infos.trials.cost) > 0.1
 
 
 def test_evaluate_by_an_episode_equals_evaluate(setup):
@@ -196,6 +221,7 @@ def test_convergence_episode(means, expected):
     assert codesign.convergence_episode(means) == expected
 
 
+@pytest.mark.slow  # quick: whole runs by the command line, bit for bit (test_cli)
 def test_episode_on_real_physics_is_repeatable():
     the_scene, space, _ = tiny()
     optimizer = codesign.make_filter(space)

@@ -1,5 +1,6 @@
 """The default engine under JAX's transformations, and what a trace means on every engine."""
 
+import functools
 from functools import partial
 
 import jax
@@ -72,7 +73,9 @@ def engines(scene):
 
 @pytest.fixture(scope="module")
 def decided():
-    """Traces of every engine, without and with a trajectory, of a lost and of failing worlds.
+    """Traces, without and with a trajectory, of a lost and of failing worlds, and their outcomes.
+
+    A function of engine and trajectory, which simulates what nobody has asked for yet.
 
     The hand of world 0 stays above the object, which is lost as the window opens, and rises on;
     world 1 starts below the table; a pressure of world 2 is not a number from step 10 on.
@@ -86,38 +89,38 @@ def decided():
         # A micrometre above the table: exactly on it, rounding decides whether an object touches.
         start = fields.start.at[:, -5].add(1e-6)
         fields = fields._replace(start=start.at[1, -5].set(-0.05))
-        found = {
-            (name, trajectory): jax.tree.map(
-                np.asarray,
-                jax.jit(partial(e.rollout, trajectory=trajectory), compiler_options=QUICK)(
-                    fields, ctrl
-                ),
-            )
-            for name, e in engines(scene).items()
-            for trajectory in (False, True)
-        }
-        outcomes = {k: jax.tree.map(np.asarray, small.outcomes(scene, v)) for k, v in found.items()}
-    return scene, found, outcomes
+
+    @functools.cache
+    def simulated(name, trajectory):
+        with jax.enable_x64(True):
+            run = partial(engines(scene)[name].rollout, trajectory=trajectory)
+            trace = jax.jit(run, compiler_options=QUICK)(fields, ctrl)
+            return jax.tree.map(np.asarray, (trace, small.outcomes(scene, trace)))
+
+    return scene, simulated
 
 
-@pytest.mark.parametrize("trajectory", [False, True])
+# By the kernel a trajectory is another program: quick tests compare its path with MuJoCo C step by
+# step (test_kernel, test_effects).
+TRAJECTORY = [False, pytest.param(True, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("trajectory", TRAJECTORY)
 def test_a_trace_means_the_same_on_every_engine(decided, trajectory):
     """Where worlds are decided, what later entries show, and the state in which they stay."""
-    scene, found, outcomes = decided
+    scene, simulated = decided
     first, end = round(scene.window[0] / 0.01), scene.num_steps
-    want = found["mujoco", trajectory]
+    (got, ours), (want, outcome) = (simulated(n, trajectory) for n in ("structured", "mujoco"))
     lost_at = 0.01 * first
-    assert outcomes["mujoco", trajectory].lost_time[0] == pytest.approx(lost_at)
-    assert outcomes["mujoco", trajectory].bad_step.tolist() == [-1, 0, 11]
-    pairs = zip(outcomes["structured", trajectory], outcomes["mujoco", trajectory], strict=True)
-    for a, b in pairs:
+    assert outcome.lost_time[0] == pytest.approx(lost_at)
+    assert outcome.bad_step.tolist() == [-1, 0, 11]
+    for a, b in zip(ours, outcome, strict=True):
         np.testing.assert_allclose(a, b)
-    got = found["structured", trajectory]
     for field in ("distance", "height", "speed", "qpos", "last"):
         # No contact but the object's with the table, where MuJoCo stops at its tolerance.
         a, b = getattr(got, field), getattr(want, field)
         np.testing.assert_allclose(a, b, atol=1e-6, err_msg=field)
-    for trace in (found[name, trajectory] for name in ("structured", "mujoco")):
+    for trace in (got, want):
         rest = trace.distance[0, first:]
         if trajectory:
             assert rest[-1] - rest[0] > 0.03 and trace.qpos.shape[1] == end
@@ -130,16 +133,18 @@ def test_a_trace_means_the_same_on_every_engine(decided, trajectory):
         assert np.isnan(trace.speed[2, 11:]).all() and np.isfinite(trace.last).all()
 
 
-def test_a_trajectory_changes_no_outcome(decided):
-    _, _, outcomes = decided
-    for name in ("structured", "mujoco"):
-        for a, b in zip(outcomes[name, False], outcomes[name, True], strict=True):
-            np.testing.assert_array_equal(a, b)
+@pytest.mark.parametrize("name", ["mujoco", pytest.param("structured", marks=pytest.mark.slow)])
+def test_a_trajectory_changes_no_outcome(decided, name):
+    """That of MuJoCo C goes to the end: what ends early, by the test before, has its outcome."""
+    _, simulated = decided
+    for a, b in zip(simulated(name, False)[1], simulated(name, True)[1], strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 # --- a whole optimisation as one program ---------------------------------------------------------
 
 
+@pytest.mark.slow  # quick: by the toy engine (test_codesign)
 def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes():
     """By the kernel: each seed of a batch with its own schedule, as a loop over single episodes."""
     scene = small.pinch("sphere", **SHORT)

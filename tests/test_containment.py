@@ -61,6 +61,7 @@ def traces(batches):
 # --- structured engine -----------------------------------------------------------------------
 
 
+@pytest.mark.slow  # quick: without the path, in test_kernel
 def test_neighbours_of_a_failing_world_are_bitwise_unaffected(traces):
     good, bad = traces
     for index in (GOOD, NEIGHBOUR):
@@ -69,6 +70,7 @@ def test_neighbours_of_a_failing_world_are_bitwise_unaffected(traces):
     assert not np.array_equal(good.speed[SUDDEN], bad.speed[SUDDEN])
 
 
+@pytest.mark.slow  # quick: in test_kernel, and against MuJoCo C in test_compose
 def test_a_failed_world_returns_its_last_good_state(batches, traces):
     """First bad step, frozen from then on, and the state before it, at most one step old."""
     the_scene, *_ = batches

@@ -13,6 +13,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.start import invalid_start
+from codesign_jax.types import Status
 from tests import small, steps
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
@@ -50,8 +51,13 @@ def test_machine_code_equals_the_interpreter(grasp):
     "effects",
     [
         {},
-        {"neo_hookean": True, "wrist": False, "surface": "hull", "finger_finger": True},
-        pytest.param({"friction": "full", "wrist": False}, marks=pytest.mark.slow),
+        *(
+            pytest.param(effects, marks=pytest.mark.slow)
+            for effects in (
+                {"neo_hookean": True, "wrist": False, "surface": "hull", "finger_finger": True},
+                {"friction": "full", "wrist": False},
+            )
+        ),
     ],
 )
 def test_kernel_becomes_ptx(effects, monkeypatch):
@@ -214,6 +220,21 @@ def test_neighbours_in_a_block_change_no_bit(grasp):
         for name in ("distance", "height", "speed", "status"):
             want = np.asarray(getattr(alone, name))[order]
             np.testing.assert_array_equal(getattr(mixed, name), want, err_msg=name)
+
+
+def test_neighbours_of_a_failing_world_are_bitwise_unaffected(grasp):
+    """A finger of the world in the middle is blown up; it keeps its last good state."""
+    scene, fields, ctrl = grasp
+    run = jax.jit(StructuredEngine(scene).rollout)
+    good, bad = run(fields, ctrl), run(fields, ctrl.at[1, 20:, 6].set(1e12))
+    for index in (0, 2):
+        for a, b in zip(*map(jax.tree.leaves, (good, bad)), strict=True):
+            np.testing.assert_array_equal(a[index], b[index])
+    result = small.outcomes(scene, bad)
+    assert int(result.status[1]) & (Status.SPEED | Status.NONFINITE)
+    assert 20 < int(result.bad_step[1]) < 25
+    assert np.isfinite(bad.last[1]).all()
+    assert np.abs(bad.last[1, fields.start.shape[1] :]).max() <= scene.limits.speed
 
 
 def test_a_kernel_is_traced_once(grasp, monkeypatch):

@@ -107,7 +107,7 @@ def test_exact_distance_is_the_least_over_all_faces():
     np.testing.assert_array_equal(found < 0, inside)
 
 
-@pytest.mark.parametrize("bound", [5e-4, 3e-4])
+@pytest.mark.parametrize("bound", [5e-4, pytest.param(3e-4, marks=pytest.mark.slow)])
 def test_voxel_error_is_what_is_said(bound):
     """On an L, at points that the grid was not chosen by."""
     mesh = bracket()

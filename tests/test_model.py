@@ -65,7 +65,7 @@ SCENES = {
 }
 
 
-QUICK = ("pneuflex4", "tripod3, two spheres", "one link")
+QUICK = ("pneuflex4", "tripod3, two spheres")
 
 
 @pytest.fixture(
@@ -208,7 +208,14 @@ def grasp():
         return the_scene, nth((params, trials, *both(params, trials)), slice(None))
 
 
-@pytest.mark.parametrize("shape, resting", [(0, 4), (1, 4), (2, 1)])
+@pytest.mark.parametrize(
+    "shape, resting",
+    [
+        (0, 4),
+        pytest.param(1, 4, marks=pytest.mark.slow),
+        pytest.param(2, 1, marks=pytest.mark.slow),
+    ],
+)
 def test_contact_rich_steps_as_a_fresh_compile(grasp, shape, resting):
     """Approach, inflation and lift: every step from the same state, with both models."""
     the_scene, worlds = grasp

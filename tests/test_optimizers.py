@@ -215,7 +215,7 @@ def test_steps_of_cma_es_do_not_shrink_on_a_plateau():
     assert 0.2 < float(state.memory["strategy"]["std"]) / 0.25 < 5
 
 
-# The same of the particle filter, by the kernel, is one of the quick tests (test_compose).
+# The same of the particle filter is one of the quick tests (test_codesign).
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVOSAX)
 def test_a_whole_run_is_its_episodes_with_one_compile(name):

@@ -40,13 +40,6 @@ def run_installed(installed, program, cwd):
     return json.loads(done.stdout)
 
 
-def test_the_mjx_engine_says_nothing_when_it_is_imported():
-    """MuJoCo's MJX prints that it lacks an optional package."""
-    program = [sys.executable, "-c", "import codesign_jax.engines.mjx"]
-    done = subprocess.run(program, check=True, capture_output=True, text=True)
-    assert done.stdout == ""
-
-
 def test_installed_wheel_finds_its_files(installed, tmp_path):
     program = """
 import json

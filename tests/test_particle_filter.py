@@ -290,6 +290,7 @@ def test_resumed_run_equals_the_uninterrupted_one():
     assert_same_bits(state, uninterrupted)
 
 
+@pytest.mark.slow
 def test_jit_equals_eager():
     """Draws and ancestors bitwise; a move may round once less where jit fuses multiply and add."""
     state = FILTER.init(jax.random.key(4), TARGET, 4)

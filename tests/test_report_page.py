@@ -80,7 +80,7 @@ def test_grasp_is_the_one_of_the_table(run):
     np.testing.assert_array_equal(best.design, chosen.design)
     assert float(best.outcome.cost) == record.history.trials.cost[-1, chosen.row].min()
     with pytest.raises(SceneError) as error:
-        choice.find_grasp(the_scene, record, episode=4, trial=2)
+        choice.find_grasp(the_scene, record, episode=4, trial=3)
     assert len(error.value.problems) == 2 and "--episode = 4 is outside [1, 3]" in str(error.value)
 
 

@@ -196,6 +196,7 @@ def test_outcomes_do_not_depend_on_the_number_of_particles_and_trials(batch):
     assert_same(few, (v[:3, :2] for v in whole))
 
 
+@pytest.mark.slow  # quick: numbers of particles and trials, above
 def test_jit_and_single_worlds_agree(batch):
     """A world by itself, with its trace, costs what it costs in the batch."""
     evaluate, _, designs, trials, (the_scene, engine, space) = batch

@@ -1,6 +1,7 @@
 """Scene, hand and object files: every problem is found, said once, and said helpfully."""
 
 import dataclasses
+import itertools
 import math
 import tomllib
 
@@ -342,8 +343,18 @@ def test_every_hand_and_object_set_builds(hand_name, object_set):
 
 
 # Sets with meshes are stepped in test_mesh_grasps.py: stock MuJoCo does not take them.
-@pytest.mark.parametrize("object_set", [o for o in OBJECTS if of_primitives(o)])
-@pytest.mark.parametrize("hand_name", HANDS)
+STEPPED = [o for o in OBJECTS if of_primitives(o)]
+# The quick tests have each hand and each set, not each with the other.
+QUICK = {(hand, STEPPED[i % len(STEPPED)]) for i, hand in enumerate(HANDS)}
+
+
+@pytest.mark.parametrize(
+    "hand_name, object_set",
+    [
+        pair if pair in QUICK else pytest.param(*pair, marks=pytest.mark.slow)
+        for pair in itertools.product(HANDS, STEPPED)
+    ],
+)
 def test_every_hand_and_object_set_steps_finitely(hand_name, object_set):
     spheres = {"effects": {"surface": "spheres"}}  # MuJoCo C has no contact with the skinned hull
     the_scene = scene.load("paper", hand_name=hand_name, object_set=object_set, overrides=spheres)

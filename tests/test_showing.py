@@ -102,7 +102,7 @@ def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
         ("render", *DESIGN, "--out", "a.jpg"): "must end in .gif or .png",
         ("render", *DESIGN, "--out", "a.png", "--times", "5"): "outside [0, 1.2] s",
         ("render", *own, "--trial", "0", "--object", "sphere"): "exclude each other",
-        ("render", *own, "--trial", "2"): "--trial = 2 is outside [0, 1]",
+        ("render", *own, "--trial", "3"): "--trial = 3 is outside [0, 2]",
         ("render", "--run", str(workplace)): "is not a run folder",
         ("replay", str(run), *own): "give one of them",
         ("replay", *own, "--objects", "household"): "--object must say",
@@ -218,9 +218,16 @@ def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
 
 
 def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
-    """After the first of three calls; another seed begins anew."""
+    """After the first of three calls; another seed begins anew.  Costs are made of the designs."""
     monkeypatch.setitem(calls.WORLDS, "cpu", 3)
-    made, count = codesign.make_evaluate, []
+    count = []
+
+    def made(*arguments):
+        def evaluate(designs, *rest):
+            cost = np.asarray(designs)[:, :1]
+            return Outcome(cost, np.zeros(cost.shape, int), cost, np.zeros(cost.shape, int))
+
+        return evaluate
 
     def stopping(*arguments):
         evaluate = made(*arguments)
@@ -234,6 +241,7 @@ def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
         return call
 
     grid = ["landscape", *DESIGN, "--points", "3", "--trials", "1", "--out"]
+    monkeypatch.setattr(codesign, "make_evaluate", made)
     assert cli.main([*grid, "whole"]) == 0
     monkeypatch.setattr(codesign, "make_evaluate", stopping)
     assert cli.main([*grid, "part"]) == 130

@@ -20,6 +20,7 @@ PAD = 0.014
 COARSEST = 0.0025
 MAX_NODES = 3_000_000  # 12 MB in float32
 _NEAR = 0.002  # how far from the surface "near the surface" goes [m]
+_WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
 _FORMAT = 1  # of the files in the cache; change it with anything that changes a grid
 
 
@@ -124,7 +125,7 @@ def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
 
 
 def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
-    """As `build`, but what took longer than a second is kept on disk.
+    """As `build`, but what took longer than a tenth of a second is kept on disk.
 
     Args:
       key: Digest of all that the grid depends on.
@@ -138,7 +139,7 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> G
         return stored
     start = time.perf_counter()
     grid = build(vertices, faces, bound)
-    if time.perf_counter() - start > 1.0:
+    if time.perf_counter() - start > _WORTH_KEEPING:
         _write(path, grid)
     return grid
 

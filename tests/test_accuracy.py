@@ -217,6 +217,7 @@ def test_mujoco_converges_with_the_scene_s_own_limits():
     assert errors[0]["step_max"] < 1e-3 and errors[1]["step_max"] > 1e-2
 
 
+@pytest.mark.slow  # quick: a tiny study of them (test_accuracy_report)
 def test_tips_of_a_shorter_step_come_closer_to_the_reference():
     """The error of the implicit Euler step falls at first order."""
     reference = tip.motion(Setting("mujoco", timestep=0.5, links=2, iterations=0), 1, 0.4)

@@ -120,10 +120,8 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     assert len(compiled) == 2 and len(set(compiled)) == 1
 
 
-SLOW = pytest.mark.slow
-
-
-@pytest.mark.parametrize("engine", ["mujoco", pytest.param("structured", marks=SLOW)])
+@pytest.mark.slow  # quick: the fields of changed numbers are those of a fresh compile (test_model)
+@pytest.mark.parametrize("engine", ["mujoco", "structured"])
 def test_constants_equal_a_scene_file_with_those_numbers(engine):
     """The programs differ in what XLA folds and fuses; MuJoCo C gets fields in float32."""
     the_scene, wide = short(), engine != "mujoco"
@@ -206,6 +204,7 @@ def test_numbers_of_a_batch_equal_those_of_single_worlds():
     np.testing.assert_allclose(friction, wanted, rtol=1e-6)
 
 
+@pytest.mark.slow  # quick: worlds with numbers of their own (test_model)
 def test_mujoco_worlds_with_own_friction_equal_separate_runs():
     """A batch of three frictions against three batches of one each."""
     the_scene = short()

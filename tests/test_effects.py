@@ -165,6 +165,7 @@ def test_inert_without_stimulus(effect):
     np.testing.assert_allclose(changed, plain, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow  # quick: angles at rest against the closed form (test_effects_physics)
 def test_neo_hookean_is_inert_at_small_strain():
     """Its share of the moment falls with the strain; at 1e-6 the angles differ by as much."""
     weightless = {"gravity": False, "wrist": False}

@@ -126,6 +126,7 @@ def test_huge_and_tiny_weights_need_no_normalisation():
         np.testing.assert_array_equal(sample(0.2, weights * scale), sample(0.2, weights))
 
 
+@pytest.mark.slow
 def test_same_bits_under_eager_jit_and_vmap():
     rng = np.random.default_rng(1)
     weights = rng.exponential(size=(5, 4)).astype(np.float32)

@@ -72,6 +72,7 @@ def finals():
     return winners.finals(DATA, "23d", runs=2, particles=2)
 
 
+@pytest.mark.slow  # quick: runs of an experiment's batch are single ones (test_experiments)
 def test_a_call_is_an_evaluation_of_these_particles(finals):
     """The costs are those of `rollout.evaluate` in trials drawn from the block's own key."""
     found = Task(finals, QUICK, 1, 3).run(SMALL)

@@ -60,6 +60,9 @@ def test_the_command_simulates_once_and_reports(tmp_path, monkeypatch, capsys):
         fresh.main()
 
 
+WHAT = ("cost", "status")
+
+
 def test_shares_leave_out_failed_trials_and_compare_runs():
     cost = np.array([[[0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 0.0]]], np.float16)
     status = np.array([[[0, 8, 0, 2], [0, 0, 0, 0]]], np.uint8)  # a warning counts, a failure not
@@ -73,4 +76,8 @@ def test_shares_leave_out_failed_trials_and_compare_runs():
     np.testing.assert_allclose(fresh._kept(arrays, "2d", "standard"), [[2 / 3, 1.0]])
     line = fresh._table("2d", arrays, ["standard", "reference"]).splitlines()[-1]
     assert "| 83.3 % | 1 of 2" in line and "| -83.3 [-100.0, -66.7] |" in line
+    # One trial only is compared with the first one.
+    arrays |= {f"2d|short|{what}": arrays[f"2d|standard|{what}"][..., :1] for what in WHAT}
+    line = fresh._table("2d", arrays, ["standard", "short"]).splitlines()[-1]
+    assert "| 100.0 % | 2 of 2" in line and "| +0.0 [+0.0, +0.0] |" in line
     assert scene.load("paper", accuracy="reference").discretization.links == 20

@@ -128,7 +128,10 @@ def report(data: Path) -> str:
 
 
 def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> str:
-    """Kept grasps and runs of each strategy; differences to the first label, run by run."""
+    """Kept grasps and runs of each strategy; differences to the first label, run by run.
+
+    They are differences in the same trials: fewer trials are the first ones of more.
+    """
     head = ["strategy"]
     for i, label in enumerate(labels):
         head += [f"{label}: grasps kept", "runs whose particle keeps all"]
@@ -143,7 +146,8 @@ def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> s
             cells += [f"{int((share == 1).sum())} of {share.size} [{100 * whole.low:.0f}, "]
             cells[-1] += f"{100 * whole.high:.0f} %]"
             if i:
-                change = 100 * (share - kept[0])
+                count = arrays[f"{name}|{labels[i]}|cost"].shape[-1]
+                change = 100 * (share - _kept(arrays, name, labels[0], count)[s])
                 middle = statistics.bootstrap(lambda k, c=change: c[k].mean(-1), change.size)
                 cells += [f"{middle.value:+.1f} [{middle.low:+.1f}, {middle.high:+.1f}]"]
         rows.append(cells)
@@ -151,9 +155,18 @@ def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> s
     return f"{name}: {trials} fresh trials of each run's best particle\n\n{tables.markdown(rows)}"
 
 
-def _kept(arrays: dict[str, np.ndarray], name: str, label: str) -> np.ndarray:
-    """Share of grasps that kept the object, failed trials left out, shape (strategy, run)."""
-    cost, status = (arrays[f"{name}|{label}|{what}"] for what in ("cost", "status"))
+def _kept(
+    arrays: dict[str, np.ndarray], name: str, label: str, trials: int | None = None
+) -> np.ndarray:
+    """Share of grasps that kept the object, failed trials left out, shape (strategy, run).
+
+    Args:
+      arrays: What was simulated.
+      name: Name of the experiment.
+      label: Accuracy.
+      trials: Number of the first trials that count; None for all.
+    """
+    cost, status = (arrays[f"{name}|{label}|{what}"][..., :trials] for what in ("cost", "status"))
     good = ~failed(status)
     return ((cost == 0) & good).sum(-1) / np.maximum(good.sum(-1), 1)
 

@@ -32,7 +32,7 @@ test: $(STAMP)
 
 # What needs a browser: the report and its 3D replay in a headless Chromium.
 test-browser: $(STAMP)
-	$(BIN)/python -m pytest -q -m browser -rs
+	$(BIN)/python -m pytest -q -m browser -rs $$(grep -l mark.browser tests/test_*.py)
 
 # Everything that needs a GPU; GPU=docs/data/gpu_suite_h200.json keeps what it found.
 GPU ?= runs/gpu_suite.json
@@ -81,12 +81,12 @@ format: $(STAMP)
 types: $(STAMP)
 	$(BIN)/pyright --threads 2 --pythonpath $(BIN)/python
 
-# Installed again only when the dependencies change.
+# Installed again only when the dependencies change. Python compiles what is imported, a tenth of what pip would compile.
 $(STAMP): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found: apt-get install python3 python3-venv" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
 		{ echo "No venv module: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[notebooks,report,test,docs,dev]'
+	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -e '.[notebooks,report,test,docs,dev]'
 	@touch $@
 
 clean:

@@ -156,11 +156,10 @@ def test_mjx_with_changed_constants_equals_mujoco_with_a_file_of_those_numbers()
 
     def reference(constants):
         file = as_file(the_scene, constants)
-        oracle = make_engine("mujoco", file)
-        _, trace = jax.jit(lambda p, t: rollout.simulate(file, oracle, p, t, trajectory=True))(
-            *worlds
-        )
-        return trace
+        prepare = jax.jit(lambda p, t: rollout.prepare(file, p, t, file.constants()))
+        fields, ctrl, _ = prepare(*worlds)
+        # Outside of `jax.jit`: there JAX calls C in a thread that `jax.enable_x64` does not reach.
+        return make_engine("mujoco", file).rollout(fields, ctrl, trajectory=True)
 
     with jax.enable_x64(True):
         # Compiling for speed takes ten times as long as all that is simulated here.

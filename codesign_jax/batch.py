@@ -138,10 +138,10 @@ class Batch:
 
         def finish() -> list[tuple[State, EpisodeInfo]]:
             found = []
-            for k, group in enumerate(groups):
-                # Not before the group before has been judged: its arrays leave the memory first.
-                running = first.pop() if k == 0 else self._launched(group)
-                found += self._judged(group, *running)
+            for group in groups:
+                # A group begins when the one before it has been judged and its arrays have left
+                # the memory, so no name here may hold on to them.
+                found += self._judged(group, *(first.pop() if first else self._launched(group)))
             return found
 
         return finish

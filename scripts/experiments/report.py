@@ -116,10 +116,10 @@ def _against_last(study: Study) -> list[str]:
         [statistics.mann_whitney(episodes[s], episodes[-1]) for s in others],
     )
     columns = [statistics.holm(p) for p in tests]
+    many = f", adjusted by Holm's method for the {len(others)} comparisons of a column"
     lines = [
         f"{study.plan['name']}: p of a difference to {study.strategies[-1]}"
-        + f", adjusted by Holm's method for the {len(others)} comparisons of a column"
-        * (len(others) > 1),
+        f"{many if len(others) > 1 else ''}",
         "",
         "| strategy | success, paired (McNemar) | unpaired (Fisher) "
         "| convergence, paired (Wilcoxon) | unpaired (Mann-Whitney) |",

@@ -11,13 +11,12 @@ from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
 from codesign_jax.types import Params, failed
+from scripts.shared.work import NUDGE
 from tests import small
 from tests.stability.bench import CREEP, FIRM, bench, floats, refined
 from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
 from tests.test_grasp import GOOD
-
-MICROMETRE = 1e-6
 
 
 @functools.cache
@@ -83,7 +82,7 @@ def fine_kinetic(base, inputs):
     a micrometre to either side make it 25.5 mJ, and 9.8 mJ where they start in between.
     """
     fine = bench(base(), "mujoco", 1 / 8, "float64")
-    return max(kinetic(fine, inputs, x)[0] for x in (-MICROMETRE, 0.0, MICROMETRE))
+    return max(kinetic(fine, inputs, x)[0] for x in (-NUDGE, 0.0, NUDGE))
 
 
 def resting(the_bench, fields, ctrl, until, last) -> Found:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from codesign_jax.compiler import trigonometry
-from codesign_jax.compiler.values import Value, is_float, kind_of, numpy_type
+from codesign_jax.compiler.values import SIZES, Value, is_float, kind_of, numpy_type
 
 if TYPE_CHECKING:
     from codesign_jax.compiler.writer import Writer
@@ -135,6 +135,21 @@ def _logic(name: str) -> Rule:
     return rule
 
 
+def _shift(operation: str) -> Rule:
+    """A shift of integers; by all bits or more XLA gives 0, and LLVM leaves it open."""
+
+    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+        bits = 8 * SIZES[a.kind]
+        moved = w.compute(operation, a, b)
+        if b.is_known and np.all((0 <= b.known) & (b.known < bits)):
+            return moved
+        negative = RULES["lt"](w, None, b, w.like(b, 0))
+        outside = RULES["or"](w, None, negative, RULES["ge"](w, None, b, w.like(b, bits)))
+        return w.select(outside, w.like(moved, 0), moved)
+
+    return rule
+
+
 def _not(w: "Writer", equation: Any, a: Value) -> Value:
     return w.compute("xor", a, Value(a.kind, a.wide, None, 1 if a.kind == "b" else -1))
 
@@ -251,6 +266,8 @@ RULES: dict[str, Rule] = {
     **{name: _compare(name) for name in ("lt", "le", "gt", "ge", "eq", "ne")},
     **{name: _logic(name) for name in ("and", "or", "xor")},
     "not": _not,
+    "shift_left": _shift("shl"),
+    "shift_right_logical": _shift("lshr"),
     "select_n": _select_n,
     "convert_element_type": _convert,
     "iota": lambda w, e: w.lane_index(),

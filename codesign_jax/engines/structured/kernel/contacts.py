@@ -178,10 +178,11 @@ class BoundContacts:
             matrix = contact.contact_inertia(c, r.hessian)
             return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
 
-        jar, step = self.read("jar", item), self.read("step", item)
+        # All is read before anything is stored, see `pairs.OwnSide`.
+        jar, step, place = self.read("jar", item), self.read("step", item), self.place(item)
         jar = lanewise(tree_add_scaled, alpha, jar, step)
         self.write("jar", jar, item)
-        matrix, wrench = lanewise(response, self.place(item), self.cone, jar)
+        matrix, wrench = lanewise(response, place, self.cone, jar)
         return [upper(matrix), wrench]
 
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:

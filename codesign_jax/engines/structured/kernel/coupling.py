@@ -85,8 +85,10 @@ class Coupling:
             curvature = bent - turn * size / jnp.where(length > 0, length, one)
             sound = misses(size, work) & (curvature > 0)
             length = jnp.where(sound, size / jnp.where(sound, curvature, one), none)
-            work = work + length * self._advance(length, turn)
-            new, bent = self._products()
+            # What a world that has converged would add is multiplied by zero.
+            with self.pairs.only(sound):
+                work = work + length * self._advance(length, turn)
+                new, bent = self._products()
             # A world that has converged keeps its values: they must not depend on other worlds.
             kept = jnp.where(sound, jnp.maximum(new, 0.0), none)
             return count + 1, kept, bent, jnp.where(sound, size, one), length, work
@@ -108,13 +110,14 @@ class Coupling:
         pairs.clear_wrenches()
 
         def store(item: Any, pairing: Pairing) -> None:
+            own, hessian = pairs.own_side(item), pairs.read("hessian", item)
             change = pairs.relative(item, pairing)
-            left = lanewise(lambda b, f: jnp.where(b, -f, 0.0), busy, pairs.stiff(item, change))
+            left = lanewise(lambda b, f: jnp.where(b, -f, 0.0), busy, pairs.stiff(hessian, change))
             none = lanewise(jnp.zeros_like, left)
             fields = {"first": change, "left": left, "along": none, "moved": none, "sum": none}
             for field, value in fields.items():
                 pairs.write(field, value, item)
-            pairs.load(item, left)
+            pairs.load(item, own, left)
 
         pairs.do(store)
 
@@ -128,6 +131,7 @@ class Coupling:
         self.substitute("z_again", self.again())
 
         def add(item: Any, pairing: Pairing, sums: list[Lanes]) -> list[Lanes]:
+            left, hessian = pairs.read("left", item), pairs.read("hessian", item)
             answer = pairs.relative(item, pairing)
             pairs.write("answer", answer, item)
 
@@ -136,8 +140,7 @@ class Coupling:
                 product, stiff = (0.5 * sum_axis(dot(v, answer), 0) for v in (left, force))
                 return [sums[0] + product, sums[1] + product + stiff]
 
-            stiff = pairs.stiff(item, answer)
-            return lanewise(both, sums, pairs.read("left", item), answer, stiff)
+            return lanewise(both, sums, left, answer, pairs.stiff(hessian, answer))
 
         sums = pairs.each(add, [zeros((), self.problem.like)] * 2)
         size, bent = (self.block.fold(v.lane, jnp.add) for v in sums)
@@ -163,14 +166,14 @@ class Coupling:
             return along, moved, total_ + alpha * along, left - alpha * along
 
         def store(item: Any, pairing: Pairing, gain: Lanes) -> Lanes:
-            old = [pairs.read(name, item) for name in names]
+            own, hessian = pairs.own_side(item), pairs.read("hessian", item)
+            old, first = [pairs.read(name, item) for name in names], pairs.read("first", item)
             along, moved, total_, left = lanewise(move, alpha, beta, *old)
-            stiff = pairs.stiff(item, moved)
+            stiff = pairs.stiff(hessian, moved)
             left = lanewise(lambda a, r, f: r - a * f, alpha, left, stiff)
             for name, value in zip(("left", *names[2:]), (left, along, moved, total_), strict=True):
                 pairs.write(name, value, item)
-            pairs.load(item, left)
-            first = pairs.read("first", item)
+            pairs.load(item, own, left)
             return lanewise(lambda g, a, b: g + 0.5 * sum_axis(dot(a, b), 0), gain, along, first)
 
         gain = pairs.each(store, zeros((), self.problem.like))
@@ -183,7 +186,7 @@ class Coupling:
 
         def store(item: Any, pairing: Pairing) -> None:
             value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, pairs.read("sum", item))
-            pairs.load(item, value)
+            pairs.load(item, pairs.own_side(item), value)
 
         pairs.do(store)
         return self.again()

@@ -17,6 +17,7 @@ from codesign_jax.engines.structured.kernel.problem import (
     make_body,
     relative,
 )
+from codesign_jax.engines.structured.kernel.slots import only
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
@@ -147,10 +148,12 @@ class LineSearch:
 
         def body(carry: list) -> list:
             count, old = carry[0], rebuild(carry[1:])
-            one, two = evaluate(old[0])
-            new = (*lanewise(solver.refine, *old[:3], one, two), one)
             # A world that has found its step length keeps it: it must not depend on other worlds.
-            searching = lanes([jnp.abs(carry[-1]) > goal], (), wide=False)
+            left = jnp.abs(carry[-1]) > goal
+            searching = lanes([left], (), wide=False)
+            with only(self.problem.slotted, left):
+                one, two = evaluate(old[0])
+            new = (*lanewise(solver.refine, *old[:3], one, two), one)
             new = [lanewise(jnp.where, searching, a, b) for a, b in zip(new, old, strict=True)]
             return [count + 1, *solid(tuple(new), self.block.size)[0]]
 

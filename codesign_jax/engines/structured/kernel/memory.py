@@ -19,16 +19,37 @@ class MemoryLayout:
     """
 
     def __init__(self, wide: bool, **groups: tuple[int, tuple[int, ...]]):
-        """Lays the table out.
+        """Lays the table out, name by name.
 
         Args:
           wide: Whether a row has a value for each finger and not only for each world.
           **groups: Number of items (links, slots) and shape of an item, by name.
         """
-        self.wide, self.groups, self.offset, self.rows = wide, groups, {}, 0
-        for name, (count, shape) in groups.items():
+        self.wide, self.groups, self.rows = wide, groups, 0
+        self.offset: dict[str, int] = {}
+        self.stride = {name: int(np.prod(shape)) for name, (_, shape) in groups.items()}
+        for name, (count, _) in groups.items():
             self.offset[name] = self.rows
-            self.rows += count * int(np.prod(shape))
+            self.rows += count * self.stride[name]
+
+    @classmethod
+    def by_item(cls, wide: bool, **groups: tuple[int, tuple[int, ...]]) -> "MemoryLayout":
+        """Lays out a table that nobody packs or unpacks: what belongs to an item lies together.
+
+        All names before a dot, and those without one, with the same number of items share these. A
+        kernel then finds a slot's or a link's numbers at one address and fixed distances from it.
+        """
+        table, records = cls(wide, **groups), {}
+        for name, (count, _) in groups.items():
+            records.setdefault((name.rpartition(".")[0], count), []).append(name)
+        table.rows = 0
+        for (_, count), names in records.items():
+            sizes = {name: table.stride[name] for name in names}
+            for name in names:
+                table.offset[name], table.stride[name] = table.rows, sum(sizes.values())
+                table.rows += sizes[name]
+            table.rows += (count - 1) * sum(sizes.values())
+        return table
 
     def pack(self, fingers: int, block: int, **arrays: jax.Array) -> jax.Array:
         """The table of arrays (item, component, ..., finger or 1, world), worlds padded to blocks.
@@ -72,7 +93,7 @@ class MemoryLayout:
 
     def _row(self, name: str, item: Any) -> tuple[Any, tuple[int, ...]]:
         _, shape = self.groups[name]
-        return self.offset[name] + item * int(np.prod(shape)), shape
+        return self.offset[name] + item * self.stride[name], shape
 
     def read(self, ref: Any, name: str, item: Any = 0, world: Any = None) -> Lanes:
         """Lanes of an item; `world` is the world of each lane, for a table of worlds."""

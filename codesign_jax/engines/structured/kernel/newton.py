@@ -11,6 +11,7 @@ from codesign_jax.engines.structured.kernel.elimination import Elimination
 from codesign_jax.engines.structured.kernel.linesearch import LINE_TOLERANCE, LineSearch
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop, solid
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
+from codesign_jax.engines.structured.kernel.slots import only
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 
 
@@ -50,12 +51,14 @@ class Newton:
 
         def body(carry: list) -> list:
             count, (now, before, last) = carry[0], rebuild(carry[1:])
-            step = self.direction(now, last, ~waiting | (before.lane <= tolerance))
-            slope, curvature, first = self.search.prepare(now, step)
-            residual, scale = lanewise(_residual, slope, first, problem.palm, now.object_motion)
-            floor = LINE_TOLERANCE * tolerance * scale.lane
-            floor = jnp.where(waiting & (before.lane > tolerance), floor, solver.FAR)
-            alpha = self.search.find(slope, curvature, first, floor, evaluations)
+            busy = waiting & (before.lane > tolerance)
+            # A world that has converged keeps its iterate, so its contacts need not be looked at.
+            with only(problem.slotted, busy):
+                step = self.direction(now, last, ~busy)
+                slope, curvature, first = self.search.prepare(now, step)
+                residual, scale = lanewise(_residual, slope, first, problem.palm, now.object_motion)
+                floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, solver.FAR)
+                alpha = self.search.find(slope, curvature, first, floor, evaluations)
             alpha, residual = lanewise(hold, before, alpha, residual)
             now = lanewise(solver.tree_add_scaled, alpha, now, step)
             return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
@@ -80,9 +83,6 @@ class Newton:
           idle: Lanes of worlds whose step is of no use.
         """
         pairs = self.problem.pairs
-        if pairs is not None:
-            # A world that has converged keeps its iterate, so its contacts need not be looked at.
-            pairs.busy = ~idle
         node, work = self.elimination.backward(last)
         step, done = self.elimination.at_palm(now, node, self.elimination.slot_pushes(last))
         if pairs is None:

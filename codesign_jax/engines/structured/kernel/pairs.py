@@ -9,7 +9,7 @@ before that joint.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,8 +51,9 @@ class PairSet(HullSet):
           gathers: Whether lanes read rows of their own as fast as a common one: on GPUs.
         """
         fingers, worlds = block
-        super().__init__(scene, "finger_finger", fingers - 1, slots, fingers * worlds)
-        self.block, self.links, self.gathers = block, links, gathers
+        how = "finger_finger", fingers - 1, slots, fingers * worlds
+        super().__init__(scene, *how, gathers=gathers)
+        self.block, self.links = block, links
         self.skin = scene.effects.surface == "hull"
         if not self.skin:
             self.places, self.of_lines = ContactSet.places, ContactSet.of_lines
@@ -89,13 +90,25 @@ class PairSet(HullSet):
         return BoundPairs(self, table, ref, self.cone(read))
 
 
-class BoundPairs(BoundSlots):
-    """Contacts between fingers with their memory.
+class OwnSide(NamedTuple):
+    """What `BoundPairs.load` needs of a slot's own side, read before anything is stored.
+
+    A GPU's thread cannot move a load over a store, which might be to the same place: what is read
+    behind a store is waited for a second time.
 
     Attributes:
-      busy: Lanes of the worlds that still iterate, through whose contacts alone a pass goes; None
-        for those of all worlds.
+      place: Where the contact is, see `ContactSet.places`.
+      row: Row of each lane's side, int32, shape (lane,); None where lanes do not gather.
+      wrench: Wrench of all contacts so far on that row, (6 or 9, ...); None likewise.
     """
+
+    place: tuple[Lanes, ...]
+    row: jax.Array | None
+    wrench: Lanes | None
+
+
+class BoundPairs(BoundSlots):
+    """Contacts between fingers with their memory."""
 
     set: PairSet  # type: ignore[assignment]
 
@@ -103,12 +116,6 @@ class BoundPairs(BoundSlots):
         """See `ContactSet.bind`."""
         super().__init__(of, table, ref, cone)
         self.block = Block(*of.block)
-        self.busy: jax.Array | None = None
-
-    def filled(self, row: Any) -> jax.Array:
-        """See `BoundSlots`; none of the lanes that are not `busy`, if that is set."""
-        count = super().filled(row)
-        return count if self.busy is None else jnp.where(self.busy, count, 0.0)
 
     def pairing(self, row: Any) -> Pairing:
         """A row's pairing of the fingers."""
@@ -260,18 +267,25 @@ class BoundPairs(BoundSlots):
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
 
-    def load(self, item: Any, force: Lanes) -> None:
+    def own_side(self, item: Any) -> OwnSide:
+        """Reads a slot's own side, for `load`; before anything of the slot is stored."""
+        if not self.set.gathers:
+            return OwnSide(self.place(item), None, None)
+        row = self.read("row", item).lane.astype(jnp.int32)
+        wrench = self.table.gather(self.ref, "side.push", row, self.block.lane)
+        return OwnSide(self.place(item), row, wrench)
+
+    def load(self, item: Any, own: OwnSide, force: Lanes) -> None:
         """Adds a slot's force to its own side's wrench."""
         contacts = self.set.contacts
 
         def wrench(place, cone, force):
             return sum_axis(contact.contact_wrench(contacts(place, cone), force), 1)
 
-        more = lanewise(wrench, self.place(item), self.cone, force)
-        if self.set.gathers:
-            row, lane = self.read("row", item).lane.astype(jnp.int32), self.block.lane
-            sums = lanewise(jnp.add, self.table.gather(self.ref, "side.push", row, lane), more)
-            self.table.scatter(self.ref, "side.push", sums, row, lane)
+        more = lanewise(wrench, own.place, self.cone, force)
+        if own.row is not None and own.wrench is not None:
+            sums = lanewise(jnp.add, own.wrench, more)
+            self.table.scatter(self.ref, "side.push", sums, own.row, self.block.lane)
             return
 
         def add(row: Any, chosen: jax.Array, nothing: list) -> list:
@@ -293,17 +307,19 @@ class BoundPairs(BoundSlots):
             return found.hessian, found.force
 
         def store(item: Any, pairing: Pairing) -> None:
+            own = self.own_side(item)
             jar = lanewise(tree_add_scaled, alpha, self.read("jar", item), self.read("step", item))
             self.write("jar", jar, item)
-            hessian, force = lanewise(response, self.place(item), self.cone, jar)
+            hessian, force = lanewise(response, own.place, self.cone, jar)
             self.write("hessian", hessian, item)
-            self.load(item, force)
+            self.load(item, own, force)
 
         self.do(store)
 
-    def stiff(self, item: Any, change: Lanes) -> Lanes:
-        """The slot's Hessian times a relative motion."""
-        return lanewise(_times, self.read("hessian", item), change)
+    @staticmethod
+    def stiff(hessian: Lanes, change: Lanes) -> Lanes:
+        """A slot's Hessian times a relative motion."""
+        return lanewise(_times, hessian, change)
 
     def prepare_all(self) -> Lanes:
         """Prepares the line search of all slots; returns the sum of the slopes at 0."""

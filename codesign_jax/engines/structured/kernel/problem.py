@@ -10,6 +10,7 @@ from codesign_jax.engines.structured.kernel import solver
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
+from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 
 
@@ -58,6 +59,7 @@ class Problem:
       fingers: Contacts of the fingers' spheres.
       skin: Contacts of the hull.
       slots: Contacts of the palm, and of the object with the table.
+      slotted: Those of `skin` and `pairs`, in slots.
       like: Zeros of the lanes' shape and type.
     """
 
@@ -66,8 +68,13 @@ class Problem:
         self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
         self.pairs: BoundPairs | None = m.contacts.get("finger_finger")  # type: ignore[assignment]
         self.fingers = [m.contacts[n] for n in ("finger_object", "finger_table") if n in m.contacts]
-        self.skin = [c for n, c in m.contacts.items() if n.startswith("hull_")]
+        self.skin: list[BoundSlots] = [
+            c  # type: ignore[misc]
+            for n, c in m.contacts.items()
+            if n.startswith("hull_")
+        ]
         self.slots = [c for n, c in m.contacts.items() if not n.startswith(("finger", "hull_"))]
+        self.slotted = [*self.skin, *([self.pairs] if self.pairs else [])]
         self.like = jnp.zeros((block.size,), palm.armature.dtype)
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:

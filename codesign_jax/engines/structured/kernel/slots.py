@@ -1,18 +1,22 @@
 """Contacts in slots: few of the many places that may touch do, and only those get a slot.
 
 Every lane fills the slots of a row from the first one on.  A pass through a row ends after the
-largest number of slots that any lane of the block has filled, so its cost grows with the contacts
-that exist and not with those that are possible.
+largest number of slots that any lane has filled, of the lanes that the pass is for: so its cost
+grows with the contacts that exist, and of worlds that still iterate, and not with those that are
+possible.
 """
 
-from collections.abc import Callable
-from typing import Any
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.contact import Cone, Contacts
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, ContactSet, zeros
+from codesign_jax.engines.structured.kernel.counts import Counts
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, full, solid
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
@@ -26,24 +30,29 @@ def hull_slots(scene: Scene) -> int:
 class SlotSet(ContactSet):
     """Contacts of one pair of bodies in slots, one contact each, several to a row."""
 
-    def __init__(self, scene: Scene, name: str, rows: int, slots: int, size: int):
+    def __init__(self, scene: Scene, name: str, rows: int, slots: int, size: int, *, gathers: bool):
         """Prepares the set.
 
         Args:
           scene: The scene.
           name: Pair of bodies, as in `problem.relative`.
           rows: Number of rows.
-          slots: Slots of a row, on each lane; one more takes what finds no room.
+          slots: Slots of a row, on each lane; one more takes what finds no room. Where lanes
+            gather, one more item of the set is what they read in slots that are not theirs.
           size: Lanes of a block.
+          gathers: Whether lanes read items of their own as fast as a common one: on GPUs.
         """
-        super().__init__(scene, name, rows * (slots + 1), 1, size)
-        self.rows, self.slots = rows, slots
+        super().__init__(scene, name, rows * (slots + 1) + int(gathers), 1, size)
+        self.rows, self.slots, self.gathers = rows, slots, gathers
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """The set's part of the scratch table."""
-        more = {field: (self.count, (n, 1)) for field, n in self.more.items()}
-        more["count"] = (self.rows, ())
-        return super().groups() | {f"{self.name}.{f}": group for f, group in more.items()}
+        return self.fields() | {f"{self.name}.count": (self.rows, ())}
+
+    def fields(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+        """What is kept of each slot."""
+        more = {f"{self.name}.{field}": (self.count, (n, 1)) for field, n in self.more.items()}
+        return super().groups() | more
 
     more: dict[str, int] = {}
     """Components of further fields of a slot."""
@@ -79,23 +88,84 @@ def _soft(cone: Cone, share: jax.Array) -> Cone:
     return cone._replace(normal=cone.normal * share, tangent=tangent)
 
 
+class Slot(NamedTuple):
+    """A slot in a pass through a row, where lanes gather.
+
+    Lanes that have filled it, and whose worlds the pass is for, use it. All others read an item
+    where nothing touches, the same in every slot, and write to one that nobody reads. So a GPU's
+    memory, which is what its threads wait for, is asked for little that no lane uses.
+
+    Attributes:
+      source: Item that each lane reads, int32, shape (lane,).
+      sink: Item that each lane writes, int32, shape (lane,).
+    """
+
+    source: jax.Array
+    sink: jax.Array
+
+
 class BoundSlots(BoundContacts):
     """Slots with their memory; methods work on a row."""
 
     set: SlotSet  # type: ignore[assignment]
+    _counts: Counts | None = None
 
     def clear(self, row: Any) -> None:
         """Empties a row."""
         none = jnp.zeros((self.set.size,), self.ref.dtype)
         self.write("count", lanes([none], (), wide=True), row)
 
-    def used(self, row: Any) -> jax.Array:
-        """Number of slots that any lane has filled, a scalar."""
-        return jnp.minimum(jnp.max(self.filled(row).astype(jnp.int32)), self.set.slots)
+    def read(self, field: str, item: Any) -> Lanes:
+        """See `BoundContacts`; an item may be a `Slot`."""
+        if not isinstance(item, Slot):
+            return super().read(field, item)
+        return self.table.gather(self.ref, f"{self.set.name}.{field}", item.source, self._lane())
 
-    def filled(self, row: Any) -> jax.Array:
-        """Number of slots that each lane has filled and that a pass goes through, shape (lane,)."""
-        return self.read("count", row).lane
+    def write(self, field: str, value: Lanes, item: Any) -> None:
+        """See `BoundContacts`; an item may be a `Slot`."""
+        if not isinstance(item, Slot):
+            return super().write(field, value, item)
+        name = f"{self.set.name}.{field}"
+        return self.table.scatter(self.ref, name, value, item.sink, self._lane())
+
+    def _lane(self) -> jax.Array:
+        return jax.lax.broadcasted_iota(jnp.int32, (self.set.size,), 0)
+
+    def counted(self) -> None:
+        """Keeps in registers how many slots lanes have filled, once all contacts have theirs."""
+        rows, most = range(self.set.rows), self.set.slots
+        found = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
+        self._counts = Counts.of_rows([jnp.minimum(n, most) for n in found], most)
+        if self.set.gathers:
+            self._write_empty()
+
+    def _write_empty(self) -> None:
+        """Stores what lanes read in slots that are not theirs: a contact that does not touch."""
+        none = jnp.zeros((self.set.size,), self.ref.dtype)
+        one, prefix = jnp.ones_like(none), f"{self.set.name}."
+        sound = {"gap": [one], "share": [one], "normal": [none, none, one]}
+        for name, (_, shape) in self.set.fields().items():
+            values = sound.get(name.removeprefix(prefix), [none] * math.prod(shape))
+            self.table.write(self.ref, name, lanes(values, shape, wide=True), self.set.count - 1)
+
+    def used(self, row: Any) -> jax.Array:
+        """Number of slots that any lane has filled, a scalar; within `only` any of its lanes."""
+        assert self._counts is not None
+        return jnp.max(self._counts.of(row))
+
+    @contextlib.contextmanager
+    def only(self, busy: jax.Array) -> Iterator[None]:
+        """Within it a pass goes through the slots that some lanes have filled.
+
+        Args:
+          busy: Those lanes, bool, shape (lane,): of the worlds that the pass is made for. What it
+            makes of other worlds is of no use.
+        """
+        before = self._counts
+        assert before is not None
+        self._counts = before.masked(busy)
+        yield
+        self._counts = before
 
     def overflow(self) -> jax.Array:
         """One for lanes that had too few slots in any row, else zero, shape (lane,)."""
@@ -118,14 +188,15 @@ class BoundSlots(BoundContacts):
         """
         count, first = self.read("count", row).lane, row * (self.set.slots + 1)
         filled = count.astype(jnp.int32)
-        # Lanes without a contact in a slot have sound numbers there, and no touch.
-        fresh = first + jnp.minimum(jnp.max(filled), self.set.slots)
+        if not self.set.gathers:
+            # Lanes without a contact in a slot have sound numbers there, and no touch.
+            fresh = first + jnp.minimum(jnp.max(filled), self.set.slots)
+            for field, value in fields.items():
+                away = lanewise(jnp.ones_like, value) if field == "gap" else value
+                self.write(field, away, fresh)
         mine = jnp.where(which, jnp.minimum(filled, self.set.slots), self.set.slots)
         for field, value in fields.items():
-            away = lanewise(jnp.ones_like, value) if field == "gap" else value
-            self.write(field, away, fresh)
-            name = f"{self.set.name}.{field}"
-            self.table.scatter(self.ref, name, value, first + mine, lane)
+            self.table.scatter(self.ref, f"{self.set.name}.{field}", value, first + mine, lane)
         more = jnp.where(which, count + 1.0, count)
         self.write("count", lanes([more], (), wide=True), row)
 
@@ -135,12 +206,19 @@ class BoundSlots(BoundContacts):
         arrays, rebuild = solid(start, self.set.size)
 
         def step(carry: list) -> list:
-            return [
-                carry[0] + 1,
-                *solid(body(first + carry[0], rebuild(carry[1:])), self.set.size)[0],
-            ]
+            slot = self._slot(row, first, carry[0])
+            return [carry[0] + 1, *solid(body(slot, rebuild(carry[1:])), self.set.size)[0]]
 
         return rebuild(jax.lax.while_loop(lambda c: c[0] < used, step, [jnp.int32(0), *arrays])[1:])
+
+    def _slot(self, row: Any, first: Any, k: jax.Array) -> Any:
+        """A row's k-th slot, behind the row's first item."""
+        if not self.set.gathers:
+            return first + k
+        assert self._counts is not None
+        mine, item = k < self._counts.of(row), jnp.full((self.set.size,), first + k, jnp.int32)
+        empty, spare = self.set.count - 1, self.set.slots  # that of the first row
+        return Slot(*(jnp.where(mine, item, jnp.int32(away)) for away in (empty, spare)))
 
     def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Adds the last step to jar; the row's contact inertia (9, 9) and wrench (9,)."""
@@ -172,6 +250,15 @@ class BoundSlots(BoundContacts):
     def _zeros(self, *shapes: tuple[int, ...]) -> list[Lanes]:
         like = jnp.zeros((self.set.size,), self.ref.dtype)
         return [zeros(shape, like) for shape in shapes]
+
+
+@contextlib.contextmanager
+def only(sets: Sequence[BoundSlots], busy: jax.Array) -> Iterator[None]:
+    """`BoundSlots.only` of several sets."""
+    with contextlib.ExitStack() as stack:
+        for slots in sets:
+            stack.enter_context(slots.only(busy))
+        yield
 
 
 def any_of(which: jax.Array, then: Callable[[], None]) -> None:

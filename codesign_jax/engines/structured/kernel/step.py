@@ -232,6 +232,9 @@ class Step:
             skin.row(p.links, origin, tip, tip)
         if search:
             search.find()
+        for contacts in m.contacts.values():
+            if isinstance(contacts, BoundSlots):
+                contacts.counted()
         spheres.of_palm_and_object(state)
         count = p.num_fingers * p.links
         middle = self.block.sum(middle)

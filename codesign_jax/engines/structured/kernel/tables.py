@@ -13,6 +13,9 @@ from codesign_jax.model import layout
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
 
+GATHERING = ("gpu",)
+"""Backends whose lanes read rows of their own as fast as a common one."""
+
 
 class Tables:
     """Contacts and tables of a scene's kernel for one size of block.
@@ -54,7 +57,7 @@ class Tables:
             sets += [self._skin(name) for name in on if on[name]]
         if e.finger_finger and self.num_fingers > 1:
             block, slots = (self.fingers, self.block), pair_slots(self.scene)
-            gathers = self.backend == "gpu"
+            gathers = self.backend in GATHERING
             sets.append(PairSet(self.scene, block, self.links, slots, gathers=gathers))
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
@@ -62,8 +65,9 @@ class Tables:
         return [*sets, *on_table]
 
     def _skin(self, name: str) -> HullSet:
-        slots = hull_slots(self.scene)
-        return HullSet(self.scene, name, rows=self.links + 1, slots=slots, size=self.size)
+        slots, gathers = hull_slots(self.scene), self.backend in GATHERING
+        how = name, self.links + 1, slots, self.size
+        return HullSet(self.scene, *how, gathers=gathers)
 
     def _tables(self) -> None:
         n, a = self.links, self.axes
@@ -146,4 +150,4 @@ class Tables:
             fields |= contacts.groups()
         if any(isinstance(s, PairSet) for s in self.sets):
             fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))} | fingers.fields(n, self.k)
-        self.scratch = MemoryLayout(True, **fields)
+        self.scratch = MemoryLayout.by_item(True, **fields)

@@ -23,6 +23,7 @@ from codesign_jax.optimize import Optimizer, State
 from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
+from codesign_jax.types import Trial
 
 Device = Any
 """A `jax.Device`, which type checkers do not know."""
@@ -59,9 +60,24 @@ class _Packed(NamedTuple):
     common: tuple
 
 
+class _Launched(NamedTuple):
+    """What the devices have been told to simulate.
+
+    Attributes:
+      packed: The runs' episodes without their blocks.
+      drawn: Their trials.
+      running: What the devices make of the blocks.
+    """
+
+    packed: list[_Packed]
+    drawn: list[Trial]
+    running: list[tuple]
+
+
 class _Stages(NamedTuple):
     """The programs of an episode, see `engines.base.Staged`."""
 
+    draw: Program
     before: Program
     launch: Any
     after: Program
@@ -107,6 +123,7 @@ class Batch:
     def compile(self, request: Request, runs: int) -> None:
         """Compiles the programs that so many such episodes take."""
         parts = self._stages(request, runs)
+        self._program("draw", parts.draw.compile, *request)
         self._program("before", parts.before.compile, *request)
         packed = jax.eval_shape(parts.before, *request)
         total, count = min(runs, self._group(request)), len(self.devices)
@@ -141,7 +158,7 @@ class Batch:
             for group in groups:
                 # A group begins when the one before it has been judged and its arrays have left
                 # the memory, so no name here may hold on to them.
-                found += self._judged(group, *(first.pop() if first else self._launched(group)))
+                found += self._judged(group, first.pop() if first else self._launched(group))
             return found
 
         return finish
@@ -164,30 +181,36 @@ class Batch:
             (scene, engine, *_), joined = self._how, min(runs, self._group(request))
             worlds = -(-joined * self._worlds(request) // len(self.devices))
             how = *self._how, block_lanes(engine, worlds), None
-            before = Program(scene, _before(*how), self._optimizer)
-            after = Program(scene, _after(*how), self._optimizer)
-            self._parts = _Stages(before, _launch(*how), after)
+            draw, before, after = (
+                Program(scene, make(*how), self._optimizer) for make in (_draw, _before, _after)
+            )
+            self._parts = _Stages(draw, before, _launch(*how), after)
         return self._parts
 
-    def _launched(self, requests: Sequence[Request]) -> tuple[list[_Packed], list[tuple]]:
-        """The runs' episodes without their blocks, and what the devices make of these."""
+    def _launched(self, requests: Sequence[Request]) -> _Launched:
+        """Tells the devices to simulate the runs' episodes."""
         parts = self._stages(requests[0], len(requests))
+        draw = self._program("draw", parts.draw.compile, *requests[0])
         before = self._program("before", parts.before.compile, *requests[0])
-        packed = [before(*request) for request in requests]
+        # Trials are drawn once more by themselves: in `before` they would be another result, for
+        # which XLA might round the others differently. A later program would wait its turn.
+        drawn, packed = ([program(*request) for request in requests] for program in (draw, before))
         running = self._joined(packed) if self._joins else self._one_by_one(packed)
-        return [_light(p) for p in packed], running
+        return _Launched([_light(p) for p in packed], drawn, running)
 
     def _judged(
-        self, requests: Sequence[Request], packed: list[_Packed], running: list[tuple]
+        self, requests: Sequence[Request], launched: _Launched
     ) -> list[tuple[State, EpisodeInfo]]:
-        """What becomes of the runs, after `_launched`."""
+        """What becomes of the runs."""
         assert self._parts is not None
+        packed, drawn, running = launched
         home = tuple(jax.device_put(out, self.devices[0]) for out in running)
         found = _collect(home, len(requests)) if self._joins else home
         results = []
-        for (state, mask), mine, out in zip(requests, packed, found, strict=True):
+        for (state, mask), mine, trials, out in zip(requests, packed, drawn, found, strict=True):
             told = (state, mine), (mask, out)
-            results.append(self._program("after", self._parts.after.compile, *told)(*told))
+            new, info = self._program("after", self._parts.after.compile, *told)(*told)
+            results.append((new, info._replace(drawn=trials)))
         return results
 
     def _joined(self, packed: Sequence[_Packed]) -> list[tuple]:
@@ -226,6 +249,18 @@ class Batch:
         if (name, shapes) not in self._programs:
             self._programs[name, shapes] = compile(first, second)
         return self._programs[name, shapes]
+
+
+@shared
+def _draw(
+    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, lanes: int | None, _: None
+) -> Callable:
+    """Draws an episode's trials."""
+
+    def draw(state: State, mask: Any, constants: Constants, optimizer: Optimizer) -> Trial:
+        return episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
+
+    return draw
 
 
 @shared

@@ -34,12 +34,14 @@ class EpisodeInfo(NamedTuple):
       selection: Particle costs, and weights and ancestors of a resampling; see `optimize.Info`.
       last: States at which the worlds ended, failed ones frozen at their last good one, shape
         (particle, trial, nq + nv), or None if the engine does not tell.
+      drawn: The trials themselves, leading axis (trial,), of episodes that `batch.Batch` ran.
     """
 
     population: jax.Array
     trials: Outcome
     selection: Info
     last: jax.Array | None = None
+    drawn: Trial | None = None
 
 
 def make_evaluate(

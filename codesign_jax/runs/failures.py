@@ -38,18 +38,17 @@ class Failure(NamedTuple):
     place: tuple[int, int, int]
 
 
-def save(folder: Path, episode: int, info: EpisodeInfo, trials: Trial) -> list[Path]:
+def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
     """Saves an episode's first failed worlds, a file each; returns the files.
 
     Args:
       folder: The run folder.
       episode: Number of the episode, from 1.
-      info: Its report.
-      trials: Its trials, leading axis (trial,).
+      info: Its report, with the trials that were drawn.
     """
     # From the device as a whole: to index there would be a program for each number.
-    info, trials = jax.tree.map(np.asarray, (info, trials))
-    status, files = info.trials.status, []
+    info = jax.tree.map(np.asarray, info)
+    status, trials, files = info.trials.status, info.drawn, []
     for p, t in np.argwhere(types.failed(status))[:MOST]:
         trial = jax.tree.map(lambda v, t=t: v[t], trials)
         state = np.zeros(0) if info.last is None else info.last[p, t]

@@ -123,9 +123,11 @@ class Loop:
         """Saves and reports the last episode, unless that has been done.
 
         The run does so by itself before its next episode is over; whoever drives it may ask for it
-        while that episode is simulated. It asks nothing of the devices, which are busy then.
+        while that episode is simulated. It only copies what the devices have computed: another
+        program would wait until they have simulated.
 
         Raises:
+          AllFailed: If every trial of the episode failed.
           OSError: If the episode cannot be saved; earlier ones stay intact.
         """
         unsaved, self._unsaved = self._unsaved, None
@@ -181,32 +183,32 @@ class Loop:
 
     def _episodes(self, record: Record) -> Asking:
         for e in range(record.done, self.plan.settings.episodes):
-            key = record.state.key
             with self.progress.busy("simulating") as watch:
                 state, info = yield Request(record.state, self.plan.mask[e])
             self.save()
             record.state = state
-            records.report(record.history, e, info)
-            self._save_failures(key, e, info)
-            arrays = records.to_arrays(record)
-            self._unsaved = partial(self._close, record, e, arrays, watch.seconds)
-            if types.failed(record.history.trials.status[e]).all():
-                self.save()
-                _all_failed(record.history.trials.status[e], self.run_directory.path)
+            # The devices wait for the next episode: all that it does not need comes later.
+            self._unsaved = partial(self._close, record, e, info, watch.seconds)
 
-    def _close(self, record: Record, e: int, arrays: dict, seconds: float) -> None:
-        """Saves an episode and reports it."""
-        self.store.save(e + 1, arrays)
+    def _close(self, record: Record, e: int, info: EpisodeInfo, seconds: float) -> None:
+        """Saves an episode and reports it.
+
+        Raises:
+          AllFailed: If every trial failed; the episode is saved.
+        """
+        records.report(record.history, e, info)
+        self._save_failures(e, info)
+        self.store.save(e + 1, records.to_arrays(record))
         self._write_tables(record, e)
         self._report(record.history, e, seconds)
+        if types.failed(record.history.trials.status[e]).all():
+            _all_failed(record.history.trials.status[e], self.run_directory.path)
 
-    def _save_failures(self, key: jax.Array, e: int, info: EpisodeInfo) -> None:
+    def _save_failures(self, e: int, info: EpisodeInfo) -> None:
         """Saves failed worlds with their last good states, for `codesign replay`."""
         if not types.failed(np.asarray(info.trials.status)).any():
             return
-        plan = self.plan
-        trials = codesign.episode_trials(plan.scene, key, e, plan.settings.trials)
-        for path in failures.save(self.run_directory.path, e + 1, info, trials):
+        for path in failures.save(self.run_directory.path, e + 1, info):
             self.run_directory.log(f"failed world: codesign replay {path}")
 
     def _test(self, record: Record) -> Asking:

@@ -36,7 +36,10 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
     deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
     bad = ~(deep <= fields.constants.limits.penetration)
-    bad |= ~jnp.isfinite(_rows(*jax.tree.leaves(fields))).all(1)
+    # Numbers in their ranges have a finite sum, which is one loop; rows would be one loop a number.
+    bad |= ~jnp.isfinite(sum(jax.tree.leaves(fields.constants)))
+    others = jax.tree.leaves(fields._replace(constants=()))
+    bad |= ~jnp.isfinite(_rows(*others)).all(1)
     moving = layout(scene).bodies.ravel()
     bad |= ~(_rows(fields.body_mass[:, moving], fields.body_inertia[:, moving]) > 0).all(1)
     bad |= ~(_rows(fields.jnt_stiffness, fields.dof_damping, fields.dof_armature) >= 0).all(1)

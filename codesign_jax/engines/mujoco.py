@@ -1,6 +1,7 @@
 """MuJoCo C in float64, the oracle: `mujoco.batch` on all cores, called from jitted programs."""
 
 import threading
+from functools import partial
 
 import jax
 import mujoco
@@ -10,7 +11,7 @@ import numpy as np
 from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
-from codesign_jax.scene import Scene, effects
+from codesign_jax.scene import Constants, Scene, effects
 from codesign_jax.types import Status, Trace
 
 # Steps between looking at the worlds: a lost object or a failed world stops being simulated at this
@@ -59,15 +60,22 @@ class MujocoEngine(Equal):
             jax.ShapeDtypeStruct((worlds, steps), np.int32),
             jax.ShapeDtypeStruct((worlds, self.template.nq + self.template.nv), ctrl.dtype),
         )
-        return jax.pure_callback(
-            lambda f, c: self._run(f, c, trajectory), shapes, fields, ctrl, vmap_method="sequential"
+        # Of the constants C needs the bounds alone: each argument is an array for XLA to fill.
+        inputs = (
+            fields._replace(constants=()),
+            _bounds(self.scene.structure, fields.constants),
+            ctrl,
         )
+        run = partial(self._run, trajectory)
+        return jax.pure_callback(run, shapes, *inputs, vmap_method="sequential")
 
-    def _run(self, fields: ModelFields, ctrl: jax.Array, trajectory: bool) -> Trace:
-        dtype = np.asarray(ctrl).dtype
-        fields = jax.tree.map(lambda v: np.asarray(v, np.float64), fields)
+    def _run(
+        self, trajectory: bool, fields: ModelFields, bounds: verdict.Bounds, ctrl: jax.Array
+    ) -> Trace:
+        dtype, inputs = np.asarray(ctrl).dtype, (fields, bounds, ctrl)
+        fields, bounds, wide = jax.tree.map(lambda v: np.asarray(v, np.float64), inputs)
         with self._lock:
-            trace = self._simulate(fields, np.asarray(ctrl, np.float64), trajectory)
+            trace = self._simulate(fields, bounds, wide, trajectory)
         return Trace(
             *(v if v.dtype == np.int32 else v.astype(dtype) for v in trace)  # type: ignore[union-attr]
         )
@@ -79,7 +87,9 @@ class MujocoEngine(Equal):
             )
         return self._batches[num_worlds]
 
-    def _simulate(self, fields: ModelFields, ctrl: np.ndarray, trajectory: bool) -> Trace:
+    def _simulate(
+        self, fields: ModelFields, bounds: verdict.Bounds, ctrl: np.ndarray, trajectory: bool
+    ) -> Trace:
         (worlds, steps), scene, nq = ctrl.shape[:2], self.scene, self.template.nq
         batch = self._batch(worlds)
         write_fields(batch, fields)
@@ -90,8 +100,7 @@ class MujocoEngine(Equal):
         )
         series = (distance, height, speed, qpos, status)
         last = np.concatenate([fields.start, np.zeros((worlds, self.template.nv))], 1)
-        bounds = verdict.bounds(scene.with_constants(fields.constants))
-        bounds = verdict.Bounds(*(np.asarray(v)[:, None] for v in bounds))
+        bounds = verdict.Bounds(*(v[:, None] for v in bounds))
         going = np.arange(worlds)
         chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
         for first in range(0, steps, chunk):
@@ -159,6 +168,12 @@ class MujocoEngine(Equal):
         kept = qpos if trajectory else qpos[..., :0]
         states = np.concatenate([qpos, qvel], -1)
         return Trace(distance, middle[..., 2], speed, kept, status), taken, states
+
+
+@partial(jax.jit, static_argnums=0)
+def _bounds(structure: Scene, constants: Constants) -> verdict.Bounds:
+    """What decides each world, arrays of shape (world,)."""
+    return verdict.bounds(structure.with_constants(constants))
 
 
 def _decisions(

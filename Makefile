@@ -9,6 +9,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CHECKED := codesign_jax scripts tests notebooks
 
+# What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo docs test test-browser test-gpu test-slow stability notebooks benchmark effects accuracy lint format types clean help
 
 help:

@@ -10,7 +10,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import jupytext
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
@@ -62,6 +61,8 @@ def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Files) -> 
 def _page(path: Path) -> str:
     """The Markdown of a file outside of docs/."""
     if path.suffix == ".py":
+        import jupytext  # it takes longer to import than everything else here
+
         return jupytext.writes(jupytext.read(path), "md")
     text = path.read_text(encoding="utf-8")
     if path.name == "README.md" and path.parent == ROOT:

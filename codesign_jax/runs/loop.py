@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import codesign, types
@@ -33,6 +34,25 @@ from codesign_jax.types import Outcome, Status
 
 Asking = Generator[Request, tuple[State, EpisodeInfo], Any]
 """What yields episodes and is sent the state after each and its report."""
+
+
+def fetch(tree: Any) -> Any:
+    """The tree as NumPy arrays, keys as numbers; its own arrays remember their copies as well."""
+    arrays = jax.tree.map(_numbers, tree)
+    begin_fetch(arrays)
+    return jax.tree.map(np.asarray, arrays)
+
+
+def begin_fetch(tree: Any) -> None:
+    """Lets copies from the devices begin, which `fetch` waits for: all at once they take less."""
+    for array in jax.tree.leaves(jax.tree.map(_numbers, tree)):
+        if isinstance(array, jax.Array):
+            array.copy_to_host_async()
+
+
+def _numbers(array: Any) -> Any:
+    typed = isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jax.dtypes.prng_key)
+    return jax.random.key_data(array) if typed else array
 
 
 class AllFailed(RuntimeError):
@@ -123,8 +143,7 @@ class Loop:
         """Saves and reports the last episode, unless that has been done.
 
         The run does so by itself before its next episode is over; whoever drives it may ask for it
-        while that episode is simulated. It only copies what the devices have computed: another
-        program would wait until they have simulated.
+        while that episode is simulated. It asks nothing of the devices, which are busy then.
 
         Raises:
           AllFailed: If every trial of the episode failed.
@@ -187,8 +206,10 @@ class Loop:
                 state, info = yield Request(record.state, self.plan.mask[e])
             self.save()
             record.state = state
-            # The devices wait for the next episode: all that it does not need comes later.
-            self._unsaved = partial(self._close, record, e, info, watch.seconds)
+            # The devices wait for the next episode: only what they have computed is fetched now, as
+            # a copy might wait until they have simulated that. Everything else comes later.
+            fetched = fetch((state, info))[1]
+            self._unsaved = partial(self._close, record, e, fetched, watch.seconds)
 
     def _close(self, record: Record, e: int, info: EpisodeInfo, seconds: float) -> None:
         """Saves an episode and reports it.

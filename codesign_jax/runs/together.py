@@ -14,7 +14,7 @@ from codesign_jax.batch import Batch, Request
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.runs.loop import Loop, Plan, RunResult, with_seed
+from codesign_jax.runs.loop import Loop, Plan, RunResult, begin_fetch, with_seed
 from codesign_jax.runs.progress import GroupProgress, Progress
 
 MOST = 100
@@ -187,7 +187,9 @@ class _Together:
         answers = self.interrupts.begin(self.batch.begin, list(asked.values()))
         self._save()
         self._show()
-        for seed, reply in zip(asked, answers(), strict=True):
+        replies = answers()
+        begin_fetch(replies)
+        for seed, reply in zip(asked, replies, strict=True):
             if seed in self.waiting:
                 self._go_on(seed, self.waiting.pop(seed)[0], reply)
         self.seconds = time.perf_counter() - start

@@ -27,6 +27,7 @@ from scripts.experiments import (
     Stop,
     Strategies,
     Worlds,
+    continued,
     drive,
     figures,
     plan,
@@ -34,6 +35,7 @@ from scripts.experiments import (
     results,
     study,
 )
+from scripts.experiments.study import Study
 from scripts.experiments.worlds import chunking, dealt
 from scripts.shared import record, statistics
 
@@ -529,3 +531,29 @@ def test_the_structured_engine_gives_the_same_bits_on_two_devices(tmp_path):
     found = json.loads(path.read_text())
     assert found["settings"]["chunk"] == 12 and found["compared"]["arrays"] > 10
     assert [row["different_arrays"] for row in found["devices"].values()] == [[], []]
+
+
+def published(episodes, value):
+    """Results of one strategy in so many episodes of four, all numbers alike."""
+    sizes = {"quartiles": (3,), "failed": (7,)}
+    data = {
+        name: np.full((1, 2, episodes, *sizes.get(name, ())), value, np.float32)
+        for name in continued.BY_EPISODE
+    }
+    data |= {"particle_cost": np.full((2, episodes, 5), value, np.float16)}
+    data |= {"strategies": np.array(["single"]), "final_particles": np.full((1, 2, 5, 2), value)}
+    sizes = dict(runs=2, particles=5, episodes=4, trials=3, test_trials=3)
+    return Study(dict(name="2d", preset="2d", strategies=["single"], **sizes), {}, data)
+
+
+def test_published_results_are_continued():
+    """The earlier episodes stay as they were published; complete ones cannot be gone on with."""
+    earlier, later = published(3, 1.0), published(4, 2.0)
+    joined = continued.join(earlier, later)
+    for name in (*continued.BY_EPISODE, "particle_cost"):
+        axis = 1 if name == "particle_cost" else 2
+        first, rest = np.split(joined[name], [3], axis)
+        assert (first == 1).all() and (rest == 2).all() and rest.shape[axis] == 1
+    assert (joined["final_particles"] == 2).all()
+    with pytest.raises(ValueError, match="all episodes were simulated"):
+        continued.start(later)

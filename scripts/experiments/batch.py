@@ -88,9 +88,14 @@ class Batch:
           particles: First particles [SI units], which broadcast to the shape (strategy, run,
             particle, parameter).
         """
-        p = self.plan
+        return self.blank_of(self.plan, self.worlds.space.num_parameters, particles)
+
+    @staticmethod
+    def blank_of(plan: Strategies, num_parameters: int, particles: np.ndarray) -> Arrays:
+        """`blank` of a plan and a number of parameters."""
+        p = plan
         s, r, n, e, t = len(p.strategies), p.runs, p.particles, p.episodes, p.trials
-        shape = (s, r, n, self.worlds.space.num_parameters)
+        shape = (s, r, n, num_parameters)
         return {
             "step": np.int64(0),
             "particles": np.array(np.broadcast_to(particles, shape), np.float32),

@@ -51,10 +51,12 @@ def tips(record: dict[str, Any]) -> np.ndarray:
     return 1e-3 * np.reshape(record["tips_mm"], record["shape"])
 
 
-_COMPARE: dict[str, Callable[[dict, dict], dict]] = {
-    "tip": lambda a, b: tip.compare(tips(a), tips(b)),
-    "impulse": impulse.compare,
-}
+def _comparison(part: str, reference: dict[str, Any]) -> Callable[[dict], dict]:
+    """Function from a record to its errors; the reference's long lists are read once."""
+    if part == "impulse":
+        return lambda record: impulse.compare(record, reference)
+    finest = tips(reference)
+    return lambda record: tip.compare(tips(record), finest)
 
 
 def against_reference(records: Records, part: str) -> Records:
@@ -63,7 +65,8 @@ def against_reference(records: Records, part: str) -> Records:
     reference = next((r for r in every if "reference" in r["more"]), None)
     if reference is None:
         return []
-    return [r | _COMPARE[part](r, reference) for r in every if r is not reference]
+    errors = _comparison(part, reference)
+    return [r | errors(r) for r in every if r is not reference]
 
 
 def order(points: Iterable[tuple[float, float]]) -> float | None:

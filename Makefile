@@ -44,7 +44,7 @@ test-gpu: $(STAMP)
 	$(BIN)/python -m scripts.gpu_suite --json $(GPU) $(ARGS)
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -q -m slow
+	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile --durations=10
 
 # All hard cases; their margins go to docs/stability.md. About half an hour on two cores.
 stability: $(STAMP)

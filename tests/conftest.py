@@ -9,8 +9,9 @@ import pytest
 
 from tests import quick_compile
 
-# Selections that compile as for users: margins go into the documentation, rates are measured.
-AS_FOR_USERS = ("stability", "gpu")
+# Selections that compile as for users: margins go into the documentation, rates are measured, and
+# slow tests run longer than they compile; some hard cases hold by what optimised code rounds.
+AS_FOR_USERS = ("stability", "gpu", "slow")
 
 
 def pytest_configure(config):

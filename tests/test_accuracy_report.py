@@ -68,6 +68,13 @@ def test_comparing_a_setting_with_itself_and_with_its_opposite():
     assert analysis.differ(failed, cost) == pytest.approx(1 / 12)
 
 
+def test_equal_particles_have_no_rank_correlation_and_no_interval_of_it():
+    """Six particles of a tiny study may all lose alike; the other intervals are there."""
+    found = analysis.compare(np.ones((6, 2)), np.zeros((6, 2)))
+    assert np.isnan(found["rank"]).all()
+    assert found["flipped"] == (1.0, 1.0, 1.0)
+
+
 def test_fronts_and_orders():
     assert analysis.front([(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (0.5, 9.0)]) == [3, 0, 2]
     assert analysis.order([(h, 3.0 * h**2) for h in (1, 2, 4)]) == pytest.approx(2.0)

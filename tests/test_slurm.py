@@ -140,8 +140,10 @@ def test_runs_are_cancelled_queued_again_resumed_and_those_of_one_batch(on_clust
     ask("scontrol", "update", f"JobId={number}_1", "StartTime=now")
     output = process.communicate()[0]
     assert process.returncode == 1
-    assert "seed 2: stopped by SIGTERM; the same command resumes" in output
-    assert "seed 4: failed: CANCELLED" in output and "seed 3: done" in output
+    said = output + "".join(p.read_text() for p in (folder / "jobs").glob("*_log.*"))
+    assert "seed 2: stopped by SIGTERM; the same command resumes" in output, said
+    assert "seed 4: failed: CANCELLED" in output, said
+    assert "seed 3: done" in output, said
     log = next((folder / "jobs").glob("*_1_0_log.out")).read_text()
     assert "queued again, to resume" in log and "resuming episode" in log
     assert 0 < checkpoint.newest(started[0]) < 40 and not (folder / "seed-4").exists()

@@ -163,14 +163,20 @@ def two_way(
       *tables: Arrays of one shape (row, column); resampled together, which keeps the pairing.
       resamples: Number of resamples.
       seed: Seed of the resampling.
+
+    Returns:
+      An interval for each value; resamples in which it is NaN are left out, and its ends are NaN if
+      it is in all of them.
     """
     rng, (rows, columns) = np.random.default_rng(seed), tables[0].shape
     drawn = []
     for _ in range(resamples):
         index = np.ix_(rng.integers(0, rows, rows), rng.integers(0, columns, columns))
         drawn.append(statistics(*(t[index] for t in tables)))
-    tail = (1 - _CONFIDENCE) / 2
-    low, high = np.nanquantile(np.array(drawn, float), [tail, 1 - tail], axis=0)
+    tail, found = (1 - _CONFIDENCE) / 2, np.array(drawn, float)
+    low, high = np.full((2, found.shape[1]), np.nan)
+    some = ~np.isnan(found).all(0)
+    low[some], high[some] = np.nanquantile(found[:, some], [tail, 1 - tail], axis=0)
     return [Interval(*map(float, v)) for v in zip(statistics(*tables), low, high, strict=True)]
 
 

@@ -614,7 +614,15 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     monkeypatch.setattr(Checkpoints, "save", save)
     assert command(*run) == 0
     assert "of 3 runs have a particle" in capsys.readouterr().out
-    events = []
+    events, fetch, report = [], runs.loop.fetch, runs.loop.records.report
+
+    def noted_fetch(tree):
+        events.append("fetch")
+        return fetch(tree)
+
+    def noted_report(history, episode, info):
+        events.append(f"report {episode + 1}")
+        report(history, episode, info)
 
     def noted_save(store, step, arrays):
         events.append(f"save {step}")
@@ -624,16 +632,19 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
         events.append("begin")
         return simulate(batch, requests)
 
+    monkeypatch.setattr(runs.loop, "fetch", noted_fetch)
+    monkeypatch.setattr(runs.loop.records, "report", noted_report)
     monkeypatch.setattr(Checkpoints, "save", noted_save)
     monkeypatch.setattr(Batch, "begin", noted_simulation)
     for seed in ("3", "5"):
         alone = [*BASE, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
         assert command(*alone) == 0
         assert_same_run(tmp_path / "runs" / f"seed-{seed}", tmp_path / f"alone-{seed}")
-    # An episode is saved when the next one has begun, the last one before the test begins.
-    start = events.index("save 0")
-    after = ["begin", "begin", "save 1", "begin", "save 2", "save 3", "begin"]
-    assert events[start + 1 : start + 8] == after
+    # An episode is read from the devices before the next one begins, and then reported and saved;
+    # the last one before the test begins.
+    start, after = events.index("save 0"), ["begin", "fetch", "begin", "report 1", "save 1"]
+    after += ["fetch", "begin", "report 2", "save 2", "fetch", "report 3", "save 3", "begin"]
+    assert events[start + 1 : start + 14] == after
 
 
 @pytest.mark.slow

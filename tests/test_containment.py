@@ -271,7 +271,6 @@ def failing_run(tmp_path_factory):
         with jax.transfer_guard_host_to_device("disallow_explicit"):
             save(loop)
 
-
     folder = tmp_path_factory.mktemp("failing") / "run"
     sizes = ["--particles", "3", "--trials", "2", "--episodes", "1", "--test-trials", "0"]
     run = ["optimize", "--scene", str(TINY), "--out", str(folder), *sizes]

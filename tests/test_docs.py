@@ -38,7 +38,7 @@ def examples(program):
     return found
 
 
-CODESIGN = list(dict.fromkeys(" ".join(words) for words in examples("codesign")))
+CODESIGN = list(dict.fromkeys(shlex.join(words) for words in examples("codesign")))
 
 
 def test_the_pages_have_examples():

@@ -192,8 +192,9 @@ class Batch:
         parts = self._stages(requests[0], len(requests))
         draw = self._program("draw", parts.draw.compile, *requests[0])
         before = self._program("before", parts.before.compile, *requests[0])
-        # Trials are drawn once more by themselves: in `before` they would be another result, for
-        # which XLA might round the others differently. A later program would wait its turn.
+        # Trials are drawn by a program of their own. `before` draws them as well, but with one more
+        # result XLA might round its others differently; a program that is started later would wait
+        # until the devices have simulated.
         drawn, packed = ([program(*request) for request in requests] for program in (draw, before))
         running = self._joined(packed) if self._joins else self._one_by_one(packed)
         return _Launched([_light(p) for p in packed], drawn, running)

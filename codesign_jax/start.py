@@ -36,7 +36,8 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
     deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
     bad = ~(deep <= fields.constants.limits.penetration)
-    # Numbers in their ranges have a finite sum, which is one loop; rows would be one loop a number.
+    # Constants in their ranges have a finite sum, for which XLA writes one loop; as rows of an
+    # array they would be one loop each.
     bad |= ~jnp.isfinite(sum(jax.tree.leaves(fields.constants)))
     others = jax.tree.leaves(fields._replace(constants=()))
     bad |= ~jnp.isfinite(_rows(*others)).all(1)

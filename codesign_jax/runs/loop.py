@@ -37,20 +37,22 @@ Asking = Generator[Request, tuple[State, EpisodeInfo], Any]
 
 
 def fetch(tree: Any) -> Any:
-    """The tree as NumPy arrays, keys as numbers; its own arrays remember their copies as well."""
-    arrays = jax.tree.map(_numbers, tree)
-    begin_fetch(arrays)
-    return jax.tree.map(np.asarray, arrays)
+    """The tree as NumPy arrays, and keys as numbers.
+
+    JAX keeps the host's copy with each array of the tree, so that nothing is copied a second time.
+    """
+    return jax.tree.map(np.asarray, jax.tree.map(_numbers, tree))
 
 
 def begin_fetch(tree: Any) -> None:
-    """Lets copies from the devices begin, which `fetch` waits for: all at once they take less."""
+    """Starts the copies from the devices that `fetch` waits for, all of them at once."""
     for array in jax.tree.leaves(jax.tree.map(_numbers, tree)):
         if isinstance(array, jax.Array):
             array.copy_to_host_async()
 
 
 def _numbers(array: Any) -> Any:
+    """The numbers of a typed key, and anything else as it is."""
     typed = isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jax.dtypes.prng_key)
     return jax.random.key_data(array) if typed else array
 
@@ -206,8 +208,8 @@ class Loop:
                 state, info = yield Request(record.state, self.plan.mask[e])
             self.save()
             record.state = state
-            # The devices wait for the next episode: only what they have computed is fetched now, as
-            # a copy might wait until they have simulated that. Everything else comes later.
+            # The devices have nothing to do until the next episode begins. Their results are copied
+            # now, since a copy may wait for a simulation that has begun; all else is done then.
             fetched = fetch((state, info))[1]
             self._unsaved = partial(self._close, record, e, fetched, watch.seconds)
 

@@ -85,7 +85,7 @@ class Coupling:
             curvature = bent - turn * size / jnp.where(length > 0, length, one)
             sound = misses(size, work) & (curvature > 0)
             length = jnp.where(sound, size / jnp.where(sound, curvature, one), none)
-            # What a world that has converged would add is multiplied by zero.
+            # The step of a world that has converged has length zero: its contacts add nothing.
             with self.pairs.only(sound):
                 work = work + length * self._advance(length, turn)
                 new, bent = self._products()

@@ -34,10 +34,11 @@ class MemoryLayout:
 
     @classmethod
     def by_item(cls, wide: bool, **groups: tuple[int, tuple[int, ...]]) -> "MemoryLayout":
-        """Lays out a table that nobody packs or unpacks: what belongs to an item lies together.
+        """Lays out a table item by item, which `pack` and `unpack` cannot be used with.
 
-        All names before a dot, and those without one, with the same number of items share these. A
-        kernel then finds a slot's or a link's numbers at one address and fixed distances from it.
+        Names with the same part before the dot, or without one, and with the same number of items
+        belong to the same items. A kernel finds all numbers of a slot or of a link at fixed
+        distances from one address.
         """
         table, records = cls(wide, **groups), {}
         for name, (count, _) in groups.items():

@@ -93,8 +93,8 @@ class PairSet(HullSet):
 class OwnSide(NamedTuple):
     """What `BoundPairs.load` needs of a slot's own side, read before anything is stored.
 
-    A GPU's thread cannot move a load over a store, which might be to the same place: what is read
-    behind a store is waited for a second time.
+    NVIDIA's assembler moves no load before a store that might be to the same place, so a thread
+    waits a second time for what is read behind a store.
 
     Attributes:
       place: Where the contact is, see `ContactSet.places`.

@@ -131,8 +131,8 @@ class BoundSlots(BoundContacts):
     def _lane(self) -> jax.Array:
         return jax.lax.broadcasted_iota(jnp.int32, (self.set.size,), 0)
 
-    def counted(self) -> None:
-        """Keeps in registers how many slots lanes have filled, once all contacts have theirs."""
+    def keep_counts(self) -> None:
+        """Keeps in registers how many slots lanes have filled, when all contacts are found."""
         rows, most = range(self.set.rows), self.set.slots
         found = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
         self._counts = Counts.of_rows([jnp.minimum(n, most) for n in found], most)
@@ -155,7 +155,7 @@ class BoundSlots(BoundContacts):
 
     @contextlib.contextmanager
     def only(self, busy: jax.Array) -> Iterator[None]:
-        """Within it a pass goes through the slots that some lanes have filled.
+        """Within this context a pass goes through the slots that some lanes have filled.
 
         Args:
           busy: Those lanes, bool, shape (lane,): of the worlds that the pass is made for. What it

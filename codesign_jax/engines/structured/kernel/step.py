@@ -234,7 +234,7 @@ class Step:
             search.find()
         for contacts in m.contacts.values():
             if isinstance(contacts, BoundSlots):
-                contacts.counted()
+                contacts.keep_counts()
         spheres.of_palm_and_object(state)
         count = p.num_fingers * p.links
         middle = self.block.sum(middle)

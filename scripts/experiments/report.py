@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from scripts.experiments.results import BITS
 from scripts.experiments.study import RULES, Study, joined, load, load_study, regions
 from scripts.shared import statistics
 from scripts.shared.tables import fill
+
+Loaded = tuple[dict[str, np.ndarray], dict[str, Any]]
+"""Arrays and provenance of a landscape, see `study.load`."""
 
 _THRESHOLDS = (0.1, 0.5, 1.0)
 _HEAD = "| the paper | here |\n|---|---|"
@@ -27,37 +31,68 @@ def make(
       data: Folder of the results.
       pictures: Folder of the figures.
       page: Markdown page whose text between the marks is replaced; None for none.
-      touching: Folders of the experiments with contact between fingers.
+      touching: Folders of the experiments with contact between fingers; the landscape of the first
+        has a figure of its own, and the first grasp types of them go before those of `data`.
 
     Returns:
       The table in Markdown.
     """
     studies = {name: load_study(data, name) for name in ("2d", "23d")}
     grid = load(data, "landscape")
+    others = [found for folder in touching if (found := load(folder, "landscape"))]
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
     for name, study in studies.items():
         found = [load_study(folder, name) for folder in touching]
         if study:
             for other in joined([s for s in found if s], study.strategies):
                 text += f"\n\n{with_fingers(study, other)}"
+    if grid and others:
+        text += f"\n\n{landscapes(grid, others)}"
     if studies["2d"]:
         figures.evolution(studies["2d"], pictures / "fig6_cost_evolution.png")
     for number, study in zip("79", studies.values(), strict=True):
         if study:
             figures.success(study, pictures / f"fig{number}a_success.png")
             figures.convergence(study, pictures / f"fig{number}b_convergence.png")
-    types = load(data, "types")
-    if grid:
-        dots = types[0]["type"] if types else None
-        figures.landscape(grid[0], pictures / "fig8_landscape.png", types=dots)
+    for folder, name in zip((data, *touching[:1]), ("", "_fingers"), strict=False):
+        _draw_landscape(folder, pictures / f"fig8_landscape{name}.png")
     if page:
         fill(page, text, "results")
-    if grid and types:
-        table = grasp_types.describe(grid[0], types[0])
+    table = next(filter(None, map(_types, (*touching, data))), "")
+    if table:
         if page:
             fill(page, table, "types")
         text += f"\n\n{table}"
     return text
+
+
+def _draw_landscape(folder: Path, path: Path) -> None:
+    """Draws a folder's landscape, if it has one, with its grasp types, if it has them."""
+    grid, types = load(folder, "landscape"), load(folder, "types")
+    if grid:
+        figures.landscape(grid[0], path, types=types[0]["type"] if types else None)
+
+
+def _types(folder: Path) -> str:
+    """The table of a folder's grasp types; empty where it has none."""
+    grid, types = load(folder, "landscape"), load(folder, "types")
+    return grasp_types.describe(grid[0], types[0]) if grid and types else ""
+
+
+def landscapes(plain: Loaded, touching: Sequence[Loaded]) -> str:
+    """The landscape without contact between fingers beside those with it, as a Markdown table."""
+    lines = [
+        "| landscape | trials a design | regions | correlation with the first |",
+        "|---|---|---|---|",
+    ]
+    for k, grid in enumerate((plain, *touching)):
+        data, notes = grid
+        how = "with contact between fingers" if k else "without contact between fingers"
+        trials = notes["grasps"] // data["exclude"].size  # fewer than planned if it was stopped
+        alike = np.corrcoef(data["exclude"].ravel(), plain[0]["exclude"].ravel())[0, 1]
+        cells = f"{how}, commit {notes['commit']}", str(trials), _regions(grid), f"{alike:.3f}"
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def comparison(studies: dict[str, Study | None], grid) -> str:

@@ -484,7 +484,7 @@ def test_strategies_of_the_same_runs_are_joined(finished):
     last = list(range(1, len(order)))
     parts = part(last, "1111111"), part([0], "2222222")
     (whole,) = study.joined(parts, order)
-    assert whole.strategies == order and whole.notes["commit"] == "2222222 and 1111111"
+    assert whole.strategies == order and whole.notes["commit"] == "2222222, 1111111"
     assert all(np.array_equal(whole.data[k], v) for k, v in arrays.items())
     assert report.details(whole) == report.details(part([*range(len(order))], ""))
     other = part([0], "2222222", seeds=arrays["seeds"] + 1)

@@ -87,7 +87,8 @@ def main() -> int:
     later = study.load_study(args.out, args.experiment)
     if later is None:
         sys.exit(f"error: {args.out} has no results of {args.experiment}")
-    before = {k: earlier.notes[k] for k in ("command", "commit", "device", "num_devices")}
+    kept = ("command", "commit", "device", "num_devices", "first_episodes")
+    before = {k: earlier.notes[k] for k in kept if k in earlier.notes}
     notes = later.notes | {"first_episodes": before | {"episodes": earlier.episodes}}
     results.write(args.published, args.experiment, join(earlier, later), notes)
     return 0

@@ -46,8 +46,9 @@ def success(study: Study, path: Path) -> Path:
         at = np.arange(len(rates)) + offset
         axes.bar(at, value, 0.36, color=_COLORS[rule], alpha=0.75, label=_RULE_LABELS[rule])
         axes.errorbar(at, value, [value - low, high - value], fmt="none", color="black", capsize=3)
-    axes.set(ylabel="ratio of successful runs", ylim=(0, 1.02))
+    axes.set(ylabel="ratio of successful runs", ylim=(0, 1.2), yticks=np.linspace(0, 1, 6))
     _strategies(axes, study)
+    axes.legend(frameon=False, fontsize=8, loc="upper center", ncols=2)  # above the bars
     return pictures.save(figure, path)
 
 

@@ -31,8 +31,9 @@ def make(
       data: Folder of the results.
       pictures: Folder of the figures.
       page: Markdown page whose text between the marks is replaced; None for none.
-      touching: Folders of the experiments with contact between fingers; the landscape of the first
-        has a figure of its own, and the first grasp types of them go before those of `data`.
+      touching: Folders of the experiments with contact between fingers. Those that are complete
+        have figures of their own, as has the landscape of the first folder; the first grasp types
+        of them go before those of `data`.
 
     Returns:
       The table in Markdown.
@@ -44,16 +45,13 @@ def make(
     for name, study in studies.items():
         found = [load_study(folder, name) for folder in touching]
         if study:
+            _draw(name, study, pictures, "")
             for other in joined([s for s in found if s], study.strategies):
                 text += f"\n\n{with_fingers(study, other)}"
+                if other.tested and other.strategies == study.strategies:
+                    _draw(name, other, pictures, "_fingers")
     if grid and others:
         text += f"\n\n{landscapes(grid, others)}"
-    if studies["2d"]:
-        figures.evolution(studies["2d"], pictures / "fig6_cost_evolution.png")
-    for number, study in zip("79", studies.values(), strict=True):
-        if study:
-            figures.success(study, pictures / f"fig{number}a_success.png")
-            figures.convergence(study, pictures / f"fig{number}b_convergence.png")
     for folder, name in zip((data, *touching[:1]), ("", "_fingers"), strict=False):
         _draw_landscape(folder, pictures / f"fig8_landscape{name}.png")
     if page:
@@ -64,6 +62,15 @@ def make(
             fill(page, table, "types")
         text += f"\n\n{table}"
     return text
+
+
+def _draw(name: str, study: Study, pictures: Path, suffix: str) -> None:
+    """Draws the figures of an experiment on strategies."""
+    if name == "2d":
+        figures.evolution(study, pictures / f"fig6_cost_evolution{suffix}.png")
+    number = {"2d": 7, "23d": 9}[name]
+    figures.success(study, pictures / f"fig{number}a_success{suffix}.png")
+    figures.convergence(study, pictures / f"fig{number}b_convergence{suffix}.png")
 
 
 def _draw_landscape(folder: Path, path: Path) -> None:

@@ -133,7 +133,7 @@ def _join(studies: list[Study], order: Sequence[str]) -> Study:
     }
     commits = dict.fromkeys(study.notes["commit"] for *_, study in one)
     plan = last.plan | {"strategies": [str(name) for name in data["strategies"]]}
-    return Study(plan, last.notes | {"commit": " and ".join(commits)}, data)
+    return Study(plan, last.notes | {"commit": ", ".join(commits)}, data)
 
 
 class Region(NamedTuple):

@@ -43,6 +43,7 @@ test-gpu: $(STAMP)
 	mkdir -p $(dir $(GPU))
 	$(BIN)/python -m scripts.gpu_suite --json $(GPU) $(ARGS)
 
+# About 22 minutes on two idle cores.
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile --durations=10
 

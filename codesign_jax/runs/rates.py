@@ -92,9 +92,9 @@ def _shipped(engine: str, device: str, grasps: int, rate: float, seconds: float 
 # Two cores of an AMD EPYC and one H200: docs/performance.md has the same numbers and how they were
 # measured.
 _REFERENCE = (
-    _shipped("structured", "cpu x2", 60, 129.3, 10.0),
-    _shipped("mujoco", "cpu x2", 60, 7.9, 2.7),
-    _shipped("mjx", "cpu x2", 12, 0.07, None),
+    _shipped("structured", "cpu x2", 60, 498.4, 4.9),
+    _shipped("mujoco", "cpu x2", 60, 11.1, 1.6),
+    _shipped("mjx", "cpu x2", 12, 0.08, 43.9),
     _shipped("structured", "gpu x1", 1728, 7154.0, 10.3),
 )
 

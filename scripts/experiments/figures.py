@@ -74,6 +74,7 @@ def convergence(study: Study, path: Path) -> Path:
     axes.text(len(at) - 0.55, limit, "not converged", ha="right", va="bottom", fontsize=8)
     axes.set(ylabel="episodes until converged", ylim=(0, 1.15 * limit), xlim=(-0.5, len(at) - 0.5))
     _strategies(axes, study, [f"{n}/{episodes.shape[1]}" for n in converged.sum(1)])
+    axes.legend(frameon=False, fontsize=8, loc="best")
     return pictures.save(figure, path)
 
 
@@ -125,4 +126,3 @@ def _strategies(axes, study: Study, below: list[str] | None = None) -> None:
         labels = [f"{name}\n{text}" for name, text in zip(labels, below, strict=True)]
     axes.set_xticks(range(len(labels)), labels)
     axes.set_xlabel("strategy (s.d.: single domain; number of switches; conc.: concurrent)")
-    axes.legend(frameon=False, fontsize=8, loc="best")

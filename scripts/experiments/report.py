@@ -39,8 +39,10 @@ def make(
       The table in Markdown.
     """
     studies = {name: load_study(data, name) for name in ("2d", "23d")}
-    grid = load(data, "landscape")
-    others = [found for folder in touching if (found := load(folder, "landscape"))]
+    grids = {folder: load(folder, "landscape") for folder in (data, *touching)}
+    types = {folder: load(folder, "types") for folder in grids}
+    grid = grids[data]
+    others = [found for folder in touching if (found := grids[folder])]
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
     for name, study in studies.items():
         found = [load_study(folder, name) for folder in touching]
@@ -52,15 +54,20 @@ def make(
                     _draw(name, other, pictures, "_fingers")
     if grid and others:
         text += f"\n\n{landscapes(grid, others)}"
-    for folder, name in zip((data, *touching[:1]), ("", "_fingers"), strict=False):
-        _draw_landscape(folder, pictures / f"fig8_landscape{name}.png")
+    _draw_landscape(grid, types[data], pictures / "fig8_landscape.png")
+    for folder in touching[:1]:
+        _draw_landscape(grids[folder], types[folder], pictures / "fig8_landscape_fingers.png")
     if page:
         fill(page, text, "results")
-    table = next(filter(None, map(_types, (*touching, data))), "")
-    if table:
+    for folder in (*touching, data):
+        shown, found = grids[folder], types[folder]
+        if not (shown and found):
+            continue
+        table = grasp_types.describe(shown[0], found[0])
         if page:
             fill(page, table, "types")
         text += f"\n\n{table}"
+        break
     return text
 
 
@@ -73,17 +80,10 @@ def _draw(name: str, study: Study, pictures: Path, suffix: str) -> None:
     figures.convergence(study, pictures / f"fig{number}b_convergence{suffix}.png")
 
 
-def _draw_landscape(folder: Path, path: Path) -> None:
-    """Draws a folder's landscape, if it has one, with its grasp types, if it has them."""
-    grid, types = load(folder, "landscape"), load(folder, "types")
+def _draw_landscape(grid: Loaded | None, types: Loaded | None, path: Path) -> None:
+    """Draws a landscape, if there is one, with its grasp types, if they were found."""
     if grid:
         figures.landscape(grid[0], path, types=types[0]["type"] if types else None)
-
-
-def _types(folder: Path) -> str:
-    """The table of a folder's grasp types; empty where it has none."""
-    grid, types = load(folder, "landscape"), load(folder, "types")
-    return grasp_types.describe(grid[0], types[0]) if grid and types else ""
 
 
 def landscapes(plain: Loaded, touching: Sequence[Loaded]) -> str:

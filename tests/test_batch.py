@@ -73,7 +73,10 @@ def test_runs_on_two_devices_are_those_of_one_run_on_one(tmp_path):
 
 
 def test_shares_of_joined_runs_are_those_of_one_run(tmp_path, monkeypatch):
-    """By the kernel, on one device that stands for two: the middle run of three is cut."""
+    """By the kernel, on one device that stands for two: the middle run of three is cut.
+
+    Then in calls of one run each, as --chunk has no room for two.
+    """
     shares, call = [], Batch._call
 
     def spy(self, blocks, *rest):
@@ -87,15 +90,19 @@ def test_shares_of_joined_runs_are_those_of_one_run(tmp_path, monkeypatch):
     first, second = shares[:2]
     assert first == second + 1 and (first + second) % 3 == 0
     shares.clear()
-    assert cli.main([*RUN, "--seed", "1", "--out", str(tmp_path / "one")]) == 0
-    assert 3 * shares[0] == first + second
-    assert stored(tmp_path / "many" / "seed-1") == stored(tmp_path / "one")
-    assert stored(tmp_path / "many" / "seed-2") != stored(tmp_path / "one")
+    single = ["--seeds", "1,2", "--chunk", "39", "--out", str(tmp_path / "single")]
+    assert cli.main([*RUN, *single]) == 0
+    assert {3 * share for share in shares} == {first + second}
+    for seed in ("seed-1", "seed-2"):
+        assert stored(tmp_path / "many" / seed) == stored(tmp_path / "single" / seed)
+    assert stored(tmp_path / "many" / "seed-2") != stored(tmp_path / "single" / "seed-1")
 
 
-def test_devices_that_there_are_not(tmp_path, capsys):
+def test_devices_that_there_are_not_and_calls_without_grasps(tmp_path, capsys):
     assert cli.main([*RUN, "--devices", "99", "--out", str(tmp_path / "no")]) == 2
     assert "--devices = 99 is not valid; this process has" in capsys.readouterr().err
+    assert cli.main([*RUN, "--chunk", "0", "--out", str(tmp_path / "no")]) == 2
+    assert "--chunk" in capsys.readouterr().err
     with pytest.raises(ValueError, match="99 devices asked for, "):
         take(99)
     assert take(None) == jax.local_devices()

@@ -49,7 +49,8 @@ def main(options: "Optimize") -> int:
         return 0
     if options.jobs is not None:
         return _jobs(options, scene, folders)
-    found = runs.optimize(plan, folders, sys.argv, fresh=options.fresh, devices=options.devices)
+    how = {"devices": options.devices, "chunk": options.chunk}
+    found = runs.optimize(plan, folders, sys.argv, fresh=options.fresh, **how)
     _record_rate(plan, found, options.devices)
     results: dict[int, RunResult | None] = {}
     for seed, result in found.runs.items():
@@ -175,9 +176,11 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     available = jax.local_device_count() if options.jobs is None else options.devices or 1
     if options.devices is not None and not 1 <= options.devices <= available:
         problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
-    reference_trials = options.reference_trials or 0
-    problem = schema.range_problem("--reference-trials", reference_trials, "", 0, 100_000)
-    problems += [problem] if problem else []
+    counts = [("--reference-trials", options.reference_trials, 0, 100_000)]
+    counts += [("--chunk", options.chunk, 1, 10_000_000)]
+    for name, count, low, high in counts:
+        problem = None if count is None else schema.range_problem(name, count, "", low, high)
+        problems += [problem] if problem else []
     problems += runs.check(settings, scene.hand if scene else None)
     if problems or scene is None:
         raise SceneError(problems)

@@ -10,7 +10,7 @@ from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from codesign_jax.batch import Batch, Request
+from codesign_jax.batch import LIMIT, Batch, Request
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.interrupts import Interrupts, Stopped
@@ -65,6 +65,7 @@ def optimize(
     *,
     fresh: bool = False,
     devices: int | None = None,
+    chunk: int | None = None,
 ) -> Results:
     """Runs an optimisation of each seed, or goes on with it; the same call does both.
 
@@ -74,6 +75,7 @@ def optimize(
       command: Command line to note in the folders.
       fresh: Deletes earlier runs in the folders first.
       devices: Devices that simulate; None for all of this host.
+      chunk: Most worlds of one device in one call; None for `batch.LIMIT`.
 
     Raises:
       SceneError: If a folder cannot be used; see `open_run`.
@@ -82,7 +84,7 @@ def optimize(
     timing, seeds = None, list(folders)
     for start in range(0, len(seeds), MOST):
         group = {seed: folders[seed] for seed in seeds[start : start + MOST]}
-        results = _group(plan, group, command, fresh, devices)
+        results = _group(plan, group, command, fresh, devices, chunk)
         found |= results.runs
         timing = timing or results.timing
         if results.signum:
@@ -96,6 +98,7 @@ def _group(
     command: list[str],
     fresh: bool,
     devices: int | None,
+    chunk: int | None,
 ) -> Results:
     """`optimize` of as many runs as fit into one process."""
     total, many = plan.settings.episodes, len(folders) > 1
@@ -115,7 +118,14 @@ def _group(
                 voice.message(note)
             loops[seed] = Loop(own, run, store, voice)
         interrupts = stack.enter_context(Interrupts(progress.message))
-        return _Together(plan, loops, progress, interrupts, devices).run()
+        batch = _batch(plan, devices, chunk)
+        return _Together(plan, loops, progress, interrupts, batch).run()
+
+
+def _batch(plan: Plan, devices: int | None, chunk: int | None) -> Batch:
+    """What simulates the runs' episodes."""
+    how = plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
+    return Batch(*how, devices=devices, limit=LIMIT if chunk is None else chunk)
 
 
 class _Together:
@@ -127,12 +137,11 @@ class _Together:
         loops: Mapping[int, Loop],
         progress: Progress,
         interrupts: Interrupts,
-        devices: int | None,
+        batch: Batch,
     ):
         self.plan, self.loops, self.progress = plan, loops, progress
         self.interrupts, self.timing, self.seconds = interrupts, Timing(), 0.0
-        how = plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
-        self.batch = Batch(*how, devices=devices)
+        self.batch = batch
         self.waiting: dict[int, tuple[Generator, Request]] = {}
         self.found: dict[int, RunResult | Exception] = {}
 

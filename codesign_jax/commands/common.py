@@ -160,6 +160,11 @@ def preflight_notes(
     return [f"warning: {text}" for text in report.warnings] + report.notes
 
 
+def trials(count: int) -> str:
+    """A number of trials in words."""
+    return f"{count} trial" if count == 1 else f"{count} trials"
+
+
 def verdict(mean: float, cost: np.ndarray, status: np.ndarray) -> str:
     """Says how a design did, with how sure that is.
 
@@ -170,7 +175,7 @@ def verdict(mean: float, cost: np.ndarray, status: np.ndarray) -> str:
     """
     limit = codesign.SUCCESS_COST
     side = "below" if mean < limit else "not below"
-    text = f"mean cost {mean:.4f} over {cost.size} trials, {side} the limit of success, {limit}"
+    text = f"mean cost {mean:.4f} over {trials(cost.size)}, {side} the limit of success, {limit}"
     counted = ~types.failed(status)
     if not counted.any():
         return f"{text}; every trial failed, which says nothing about the grasp"

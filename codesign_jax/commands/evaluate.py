@@ -94,8 +94,8 @@ def _evaluate(case: Case, engine: engines.Engine, options: "Evaluate", console: 
         lost = np.isfinite(outcomes.lost_time[0, k :: len(names)]).sum()
         counts = runs.status_counts(status)
         console.print(
-            f"{name:>12}: mean cost {cost.mean():.3f} over {cost.size} trials, {lost} lost, "
-            f"{types.failed(status).sum()} failed" + (f" ({counts})" if counts else "")
+            f"{name:>12}: mean cost {cost.mean():.3f} over {common.trials(cost.size)}, "
+            f"{lost} lost, {types.failed(status).sum()} failed" + (f" ({counts})" if counts else "")
         )
     total = float(particle_cost(case.scene, outcomes)[0])
     console.print(f"{'all':>12}: {common.verdict(total, outcomes.cost[0], outcomes.status[0])}")

@@ -2,6 +2,8 @@
 
 import re
 import resource
+import shutil
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +57,26 @@ def test_round_trip_is_bitwise(folder):
 def test_only_the_newest_steps_stay(folder):
     assert sorted(p.name for p in folder.glob("*.sha256")) == ["2.sha256", "3.sha256", "4.sha256"]
     assert sorted(p.name for p in folder.iterdir() if p.is_dir()) == ["2", "3", "4"]
+
+
+def test_no_save_waits_for_the_deletion_of_old_steps_or_fails_with_it(tmp_path, monkeypatch):
+    """Deletions begin when all saves are done, and are refused then."""
+    saved, said = threading.Event(), []
+
+    def refuse(path, *rest, **more):
+        assert saved.wait(60), "a save waits for this"
+        raise PermissionError(f"{path} is not ours")
+
+    with Checkpoints(tmp_path, keep=2, tell=said.append) as store:
+        monkeypatch.setattr(shutil, "rmtree", refuse)
+        for step in range(1, 6):
+            store.save(step, arrays(step))
+        saved.set()
+    (words,) = said
+    assert words.startswith(f"old checkpoints in {tmp_path} could not be deleted: ")
+    assert words.endswith("1 is not ours")
+    found = restore(tmp_path)
+    assert found.step == 5 and equal(found.arrays, arrays(5)) and found.damaged == ()
 
 
 def test_empty_folder_has_no_step(tmp_path):

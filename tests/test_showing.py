@@ -1,8 +1,10 @@
 """`codesign render`, `replay` and `landscape`: one grasp is simulated, a grid is complete."""
 
 import csv
+import errno
 import importlib
 import json
+import os
 import re
 import sys
 
@@ -14,7 +16,7 @@ from tiny_run import small_run  # noqa: F401
 from toy import TINY
 
 from codesign_jax import cli, codesign, runs, scene
-from codesign_jax.commands import calls
+from codesign_jax.commands import calls, status
 from codesign_jax.commands import landscape as command
 from codesign_jax.commands.case import Case
 from codesign_jax.engines import make_engine
@@ -123,6 +125,35 @@ def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
         assert cli.main([*arguments]) == 2, arguments
         assert words in capsys.readouterr().err
     assert not list(workplace.iterdir()), "nothing was written"
+
+
+def test_places_that_cannot_be_written_are_said_before_a_simulation(
+    run, workplace, simulated, capsys
+):
+    (workplace / "file").touch()
+    cases = {
+        ("render", *DESIGN, "--out"): "file/a.gif",
+        ("replay", *DESIGN, "--out"): "file/folder/a.html",
+        ("report", str(run), "--out"): "file/a.html",
+        ("evaluate", *DESIGN, "--render"): "file/a.png",
+        ("landscape", *DESIGN, "--out"): "file",
+        ("optimize", *DESIGN[:2], "--out"): "file/folder",
+    }
+    for arguments, place in cases.items():
+        assert cli.main([*arguments, place]) == 2, arguments
+        words = f"error: {arguments[-1]} {place} cannot be written: Not a directory"
+        assert words in capsys.readouterr().err
+    assert cli.main(["report", str(run), "--out", str(workplace)]) == 2
+    assert "cannot be written: it is a folder" in capsys.readouterr().err
+    assert simulated == [] and [p.name for p in workplace.iterdir()] == ["file"]
+
+
+def test_what_cannot_be_written_in_the_end_is_said_in_words(capsys):
+    def full() -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "grasp.gif")
+
+    assert status.of(full) == 1
+    assert capsys.readouterr().err == "error: grasp.gif: No space left on device\n"
 
 
 def test_landscape_has_every_point(run, monkeypatch, capsys):

@@ -1,8 +1,10 @@
 """What the commands share: designs, notes and JAX's compilation cache."""
 
 import math
+import tempfile
 from collections.abc import Mapping, Sequence
 from itertools import chain
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +21,7 @@ from codesign_jax.scene.schema import SceneError
 __all__ = [
     "SceneFlags",
     "check_engine",
+    "check_place",
     "load_scene",
     "mesh_notes",
     "parse_design",
@@ -89,6 +92,32 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
     if problems:
         raise SceneError(problems)
     return np.clip(space.from_units(np.array(list(values.values()))), space.low, space.high)
+
+
+def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
+    """Checks that something can be written to a path, before anything is simulated for it.
+
+    A file without a name is made where the path's missing folders would be, and leaves no trace.
+
+    Args:
+      flag: Flag that chose the path, for the message.
+      path: A file that will be written.
+      folder: Whether the path is a folder that will be filled instead.
+
+    Raises:
+      SceneError: If the path cannot be written.
+    """
+    place = path.absolute() if folder else path.absolute().parent
+    try:
+        if not folder and path.is_dir():
+            raise IsADirectoryError(0, "it is a folder")
+        while not place.exists():
+            place = place.parent
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        problem = f"{flag} {path} cannot be written: {error.strerror} ({place})"
+        raise SceneError([problem]) from error
 
 
 def check_engine(name: str) -> None:

@@ -67,6 +67,8 @@ def _check(options: "Evaluate", engine: str) -> None:
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], engine)
     if problems:
         raise SceneError(problems)
+    if options.render:
+        common.check_place("--render", options.render)
 
 
 def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:

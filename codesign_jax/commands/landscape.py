@@ -80,7 +80,7 @@ def _folder(options: "Options", case: Case) -> Path:
     """Where the files go: to the run, if it is the run's scene that is simulated.
 
     Raises:
-      SceneError: If it is a file.
+      SceneError: If the folder cannot be written.
     """
     own = options.run_folder
     folder = Path("landscape")
@@ -88,8 +88,7 @@ def _folder(options: "Options", case: Case) -> Path:
         folder = own
     if options.out is not None:
         folder = options.out
-    if folder.exists() and not folder.is_dir():
-        raise SceneError([f"--out {folder} is a file"])
+    common.check_place("--out", folder, folder=True)
     return folder
 
 

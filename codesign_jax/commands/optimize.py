@@ -39,6 +39,7 @@ def main(options: "Optimize") -> int:
     # Everything that speaks against the runs, before anything that takes time.
     plan = runs.prepare(scene, settings)
     folders = {seed: _folder(options, scene, settings, seed) for seed in chosen}
+    common.check_place("--out", options.out or next(iter(folders.values())), folder=True)
     for seed, folder in folders.items():
         asked = dataclasses.replace(settings, seed=seed)
         runs.check_folder(folder, scene, asked, fresh=options.fresh)

@@ -38,6 +38,7 @@ def _check(options: "Render") -> None:
     problem = schema.range_problem("--size", options.size, "pixels", 16, 4096)
     if problems or problem:
         raise SceneError([*problems, *([problem] if problem else [])])
+    common.check_place("--out", options.out)
 
 
 def _draw(asked: grasp.Asked, options: "Render", console: Console) -> None:

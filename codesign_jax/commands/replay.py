@@ -28,11 +28,13 @@ def main(options: "Replay") -> int:
         options.run_folder = options.path
     if options.out is not None and options.out.suffix != ".html":
         raise SceneError([f"--out {options.out} must end in .html"])
+    path = options.out or _default(options.run_folder)
+    common.check_place("--out", path)
     asked = grasp.find(options)
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder is not None:
         failure.show_list(options.run_folder)
-    path = _write(asked, options.out or _default(options.run_folder), console)
+    _write(asked, path, console)
     console.print(f"replay: {path} (for any browser, offline)", markup=False)
     if options.open:
         webbrowser.open(path.resolve().as_uri())

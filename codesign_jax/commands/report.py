@@ -36,13 +36,15 @@ def main(options: "Report") -> int:
     except ImportError as error:
         message = f"a report needs {error.name}: pip install 'codesign-jax[report]'"
         raise SceneError([message]) from error
+    path = options.out or options.folder / "report.html"
+    common.check_place("--out", path)
     record = choice.read_record(options.folder)
     chosen = choice.choose(scene, record)
     provenance = read_provenance(options.folder)
     run = page.Run(options.folder, scene, settings, record, chosen, provenance)
     console = Console(highlight=False, soft_wrap=True)
     shown = None if options.no_replay else _best_grasp(scene, settings, record, name, console)
-    path = page.write(run, shown, options.out or options.folder / "report.html")
+    page.write(run, shown, path)
     size = path.stat().st_size / 1e6
     console.print(f"report: {path} ({size:.1f} MB, for any browser, offline)", markup=False)
     return 0

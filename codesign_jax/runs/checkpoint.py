@@ -10,7 +10,8 @@ cut short.  The newest step whose digests match is used.
 
 import hashlib
 import shutil
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,21 +40,27 @@ class Restored(NamedTuple):
 class Checkpoints:
     """Numbered steps of one run in a folder; use as a context manager."""
 
-    def __init__(self, folder: Path, *, keep: int = 3):
+    def __init__(self, folder: Path, *, keep: int = 3, tell: Callable[[str], None] = warnings.warn):
         """Opens the folder, and makes it if it is missing.
 
         Args:
           folder: Folder of the steps.
           keep: Newest steps to keep.
+          tell: Takes the words for old steps that could not be deleted, when the folder is closed.
         """
         import orbax.checkpoint as ocp
 
         self.folder = folder.resolve()  # orbax takes absolute paths only
         # Synchronous: an episode counts as saved when the command says so.
+        # Old steps are deleted meanwhile: some file systems take a tenth of a second for one, and
+        # thirty runs in one batch would wait for thirty.
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
+            max_to_keep=keep,
+            enable_async_checkpointing=False,
+            enable_background_delete=True,
+            cleanup_tmp_directories=True,
         )
-        self._args = ocp.args
+        self._args, self._tell = ocp.args, tell
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def __enter__(self) -> "Checkpoints":
@@ -61,8 +68,11 @@ class Checkpoints:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Closes orbax's manager."""
-        self._manager.close()
+        """Closes orbax's manager, which waits until old steps are deleted."""
+        try:
+            self._manager.close()
+        except OSError as error:  # what is kept is there, so that no run fails for it
+            self._tell(f"old checkpoints in {self.folder} could not be deleted: {error}")
 
     def save(self, step: int, arrays: Arrays) -> None:
         """Writes a step; it becomes visible at once and as a whole, or not at all.

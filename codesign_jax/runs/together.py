@@ -110,10 +110,10 @@ def _group(
             own = with_seed(plan, seed)
             how = folder, own.scene, own.settings, command
             run, notes = stack.enter_context(open_run(*how, fresh=fresh))
-            store = stack.enter_context(Checkpoints(run.checkpoints))
             voice = (
                 progress.one(f"seed {seed}") if isinstance(progress, GroupProgress) else progress
             )
+            store = stack.enter_context(Checkpoints(run.checkpoints, tell=voice.message))
             for note in notes:
                 voice.message(note)
             loops[seed] = Loop(own, run, store, voice)

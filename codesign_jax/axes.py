@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import Constants, Scene
@@ -54,6 +55,24 @@ def refuse_constants(constants: Constants, count: int, axis: str) -> None:
             raise SceneError(
                 [f"constants{key} has {np.shape(value)[0]} values, one a {axis}: there are {count}"]
             )
+
+
+def refuse_draws(key: Any, count: int) -> None:
+    """Refuses what no trials can be drawn from.
+
+    Args:
+      key: Should be one typed random key of JAX.
+      count: Number of trials.
+
+    Raises:
+      SceneError: If it is no key, or not one; or if that is no number of trials.
+    """
+    if not isinstance(count, int | np.integer) or count < 1:
+        raise SceneError([f"num_trials = {count} must be a whole number, at least 1"])
+    shape, kind = jnp.shape(key), jnp.result_type(key)
+    if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
+        words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
+        raise SceneError([words])
 
 
 def _problems(what: str, batch: Any, one: Any, axis: str) -> list[str]:

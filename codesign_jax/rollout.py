@@ -58,7 +58,11 @@ def sample_trials(
 
     Returns:
       Trials with leading axis (trial,).
+
+    Raises:
+      SceneError: If the key is none, there is no trial, or the constants do not fit.
     """
+    axes.refuse_draws(key, num_trials)
     constants = numbers(scene, constants)
     axes.refuse_constants(constants, num_trials, "trial")
     return _draw(num_trials, len(scene.objects.object), key, constants.objects.noise)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy import tiny
 
-from codesign_jax import codesign, rollout
+from codesign_jax import codesign, make_engine, rollout
 from codesign_jax.scene import SceneError
 
 SCENE, SPACE, ENGINE = tiny()
@@ -26,6 +26,11 @@ def simulate(params, trials, **more):
 def evaluate(population, constants=None):
     made = codesign.make_evaluate(SCENE, ENGINE, SPACE, 2)
     return made(jnp.asarray(population), jax.random.key(0), constants)
+
+
+def draw(key, count):
+    """Trials, as a program that JAX traces draws them."""
+    return jax.eval_shape(lambda k: rollout.sample_trials(SCENE, k, count), key)
 
 
 def episode(mask):
@@ -55,6 +60,27 @@ CASES = {
     "another hand's": (
         lambda: simulate(batch(HAND, 2)._replace(length=np.ones((2, 3))), batch(TRIAL, 2)),
         r"params.length has shape \(2, 3\), not \(world, 2\)",
+    ),
+    "a number for a key": (
+        lambda: draw(0, 3),
+        r"key must be one typed key from jax.random.key, got shape \(\) of int32",
+    ),
+    "a key of the older kind": (
+        lambda: draw(jax.random.PRNGKey(0), 3),
+        r"got shape \(2,\) of uint32",
+    ),
+    "several keys": (
+        lambda: draw(jax.random.split(jax.random.key(0), 3), 3),
+        r"one typed key from jax.random.key, got shape \(3,\) of key",
+    ),
+    "half a trial": (lambda: draw(jax.random.key(0), 2.5), "num_trials = 2.5 must be"),
+    "a scene's name for a scene": (
+        lambda: make_engine("structured", "paper"),  # type: ignore[arg-type]
+        r"scene is 'paper', not a Scene; scene.load\('paper'\) reads it",
+    ),
+    "no trial": (
+        lambda: draw(jax.random.key(0), 0),
+        "num_trials = 0 must be a whole number, at least 1",
     ),
     "particles": (
         lambda: rollout.evaluate(SCENE, ENGINE, HAND, batch(TRIAL, 3)),

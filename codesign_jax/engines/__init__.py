@@ -23,8 +23,9 @@ def make_engine(name: str, scene: Scene) -> Engine:
       scene: The scene.
 
     Raises:
-      SceneError: If there is no such engine, or it does not do what the scene asks for: effects,
-        meshes, or a [solver] table that it does not read, see `solver_problems`.
+      SceneError: If there is no such engine, if the scene is none, or if the engine does not do
+        what it asks for: effects, meshes, or a [solver] table that the engine does not read, see
+        `solver_problems`.
 
     >>> from codesign_jax import make_engine, scene
     >>> grasping = scene.load("paper")
@@ -34,6 +35,9 @@ def make_engine(name: str, scene: Scene) -> Engine:
     Traceback (most recent call last):
     codesign_jax.scene.schema.SceneError: engine 'mojoco' unknown; did you mean 'mujoco'?
     """
+    if not isinstance(scene, Scene):
+        words = f"scene is {scene!r}, not a Scene; scene.load({scene!r}) reads it"
+        raise schema.SceneError([words])
     if name == "mjx":
         from codesign_jax.engines.mjx import MjxEngine
 

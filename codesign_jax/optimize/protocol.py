@@ -132,8 +132,8 @@ def check_start(
         ValueError: If the shape of the seed particle or the number of particles is wrong, or the
             seed particle lies far outside the box.
     """
-    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-        raise TypeError(f"key must be a typed key from jax.random.key, got {key.dtype}")
+    if not jnp.issubdtype(kind := jnp.result_type(key), jax.dtypes.prng_key):
+        raise TypeError(f"key must be a typed key from jax.random.key, got {kind}")
     seed_particle = jnp.asarray(seed_particle, float)
     if seed_particle.shape != jnp.shape(space.low):
         raise ValueError(f"{seed_particle.shape=}, expected {jnp.shape(space.low)}")

@@ -58,14 +58,14 @@ def refuse_constants(constants: Constants, count: int, axis: str) -> None:
 
 
 def refuse_draws(key: Any, count: int) -> None:
-    """Refuses what no trials can be drawn from.
+    """Refuses arguments of `rollout.sample_trials` from which no trials can be drawn.
 
     Args:
-      key: Should be one typed random key of JAX.
-      count: Number of trials.
+      key: What should be one typed key of JAX.
+      count: What should be a number of trials.
 
     Raises:
-      SceneError: If it is no key, or not one; or if that is no number of trials.
+      SceneError: If `key` is anything but one typed key, or `count` is no whole number or below 1.
     """
     if not isinstance(count, int | np.integer) or count < 1:
         raise SceneError([f"num_trials = {count} must be a whole number, at least 1"])

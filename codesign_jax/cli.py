@@ -73,9 +73,9 @@ class Optimize:
     """Devices that share the batch; default: every GPU of this host. Results do not depend on
     it."""
     chunk: Count = None
-    """Most grasps that a device simulates in one call; default: 16384. A run is never cut. Larger
-    calls are faster on a GPU that has memory for them (docs/performance.md). Results do not depend
-    on it."""
+    """Most grasps that a device simulates in one call; default: 16384. An episode of one
+    run is never cut. Larger calls are faster on a GPU that has memory for them
+    (docs/performance.md). Results do not depend on it."""
     distributed: Text = None
     """With --seeds, one process on each of several hosts, which share the seeds: auto under SLURM
     or MPI, or ADDRESS:PORT,PROCESSES,INDEX. The folder must be one that all see."""

@@ -60,7 +60,8 @@ def sample_trials(
       Trials with leading axis (trial,).
 
     Raises:
-      SceneError: If the key is none, there is no trial, or the constants do not fit.
+      SceneError: If `key` is not one typed key, `num_trials` is no whole number or below 1, or the
+        constants do not fit the scene or the trials.
     """
     axes.refuse_draws(key, num_trials)
     constants = numbers(scene, constants)

@@ -75,7 +75,7 @@ def test_runs_on_two_devices_are_those_of_one_run_on_one(tmp_path):
 def test_shares_of_joined_runs_are_those_of_one_run(tmp_path, monkeypatch):
     """By the kernel, on one device that stands for two: the middle run of three is cut.
 
-    Then in calls of one run each, as --chunk has no room for two.
+    Then two runs in calls of one run each: --chunk has room for 39 grasps, and a run has 20.
     """
     shares, call = [], Batch._call
 
@@ -90,12 +90,16 @@ def test_shares_of_joined_runs_are_those_of_one_run(tmp_path, monkeypatch):
     first, second = shares[:2]
     assert first == second + 1 and (first + second) % 3 == 0
     shares.clear()
-    single = ["--seeds", "1,2", "--chunk", "39", "--out", str(tmp_path / "single")]
-    assert cli.main([*RUN, *single]) == 0
+    assert cli.main([*RUN, "--seed", "1", "--out", str(tmp_path / "one")]) == 0
+    assert 3 * shares[0] == first + second
+    assert stored(tmp_path / "many" / "seed-1") == stored(tmp_path / "one")
+    assert stored(tmp_path / "many" / "seed-2") != stored(tmp_path / "one")
+    shares.clear()
+    calls = ["--seeds", "1,2", "--chunk", "39", "--out", str(tmp_path / "calls")]
+    assert cli.main([*RUN, *calls]) == 0
     assert {3 * share for share in shares} == {first + second}
     for seed in ("seed-1", "seed-2"):
-        assert stored(tmp_path / "many" / seed) == stored(tmp_path / "single" / seed)
-    assert stored(tmp_path / "many" / "seed-2") != stored(tmp_path / "single" / "seed-1")
+        assert stored(tmp_path / "many" / seed) == stored(tmp_path / "calls" / seed)
 
 
 def test_devices_that_there_are_not_and_calls_without_grasps(tmp_path, capsys):

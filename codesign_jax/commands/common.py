@@ -27,6 +27,7 @@ __all__ = [
     "parse_design",
     "preflight_notes",
     "solver_problems",
+    "trials",
     "use_compilation_cache",
     "verdict",
 ]
@@ -97,7 +98,8 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
 def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
     """Checks that something can be written to a path, before anything is simulated for it.
 
-    A file without a name is made where the path's missing folders would be, and leaves no trace.
+    A temporary file is made and removed in the path's folder, or in the nearest folder above it
+    that exists; missing folders are not made.
 
     Args:
       flag: Flag that chose the path, for the message.
@@ -110,7 +112,7 @@ def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
     place = path.absolute() if folder else path.absolute().parent
     try:
         if not folder and path.is_dir():
-            raise IsADirectoryError(0, "it is a folder")
+            raise SceneError([f"{flag} {path} cannot be written: it is a folder"])
         while not place.exists():
             place = place.parent
         with tempfile.TemporaryFile(dir=place):

@@ -50,9 +50,11 @@ def main(options: "Optimize") -> int:
         return 0
     if options.jobs is not None:
         return _jobs(options, scene, folders)
-    how = {"devices": options.devices, "chunk": options.chunk}
-    found = runs.optimize(plan, folders, sys.argv, fresh=options.fresh, **how)
-    _record_rate(plan, found, options.devices)
+    devices, chunk = options.devices, options.chunk
+    found = runs.optimize(
+        plan, folders, sys.argv, fresh=options.fresh, devices=devices, chunk=chunk
+    )
+    _record_rate(plan, found, devices)
     results: dict[int, RunResult | None] = {}
     for seed, result in found.runs.items():
         results[seed] = result if isinstance(result, RunResult) else None
@@ -177,9 +179,10 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     available = jax.local_device_count() if options.jobs is None else options.devices or 1
     if options.devices is not None and not 1 <= options.devices <= available:
         problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
-    counts = [("--reference-trials", options.reference_trials, 0, 100_000)]
-    counts += [("--chunk", options.chunk, 1, 10_000_000)]
-    for name, count, low, high in counts:
+    for name, count, low, high in (
+        ("--reference-trials", options.reference_trials, 0, 100_000),
+        ("--chunk", options.chunk, 1, 10_000_000),
+    ):
         problem = None if count is None else schema.range_problem(name, count, "", low, high)
         problems += [problem] if problem else []
     problems += runs.check(settings, scene.hand if scene else None)

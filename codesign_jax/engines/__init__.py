@@ -23,9 +23,9 @@ def make_engine(name: str, scene: Scene) -> Engine:
       scene: The scene.
 
     Raises:
-      SceneError: If there is no such engine, if the scene is none, or if the engine does not do
-        what it asks for: effects, meshes, or a [solver] table that the engine does not read, see
-        `solver_problems`.
+      SceneError: If there is no such engine, if `scene` is not a `Scene`, or if the engine does not
+        do what the scene asks for: effects, meshes, or a [solver] table that the engine does not
+        read, see `solver_problems`.
 
     >>> from codesign_jax import make_engine, scene
     >>> grasping = scene.load("paper")

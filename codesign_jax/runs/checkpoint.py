@@ -46,14 +46,15 @@ class Checkpoints:
         Args:
           folder: Folder of the steps.
           keep: Newest steps to keep.
-          tell: Takes the words for old steps that could not be deleted, when the folder is closed.
+          tell: Called when the folder is closed, with a message, if a step could not be deleted;
+            from then on orbax deletes none.
         """
         import orbax.checkpoint as ocp
 
         self.folder = folder.resolve()  # orbax takes absolute paths only
         # Synchronous: an episode counts as saved when the command says so.
-        # Old steps are deleted meanwhile: some file systems take a tenth of a second for one, and
-        # thirty runs in one batch would wait for thirty.
+        # A thread of orbax's deletes old steps: on a slow file system a step may take a tenth of a
+        # second, and a batch of thirty runs, which are saved in turn, would wait for thirty.
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
             enable_async_checkpointing=False,
@@ -71,7 +72,7 @@ class Checkpoints:
         """Closes orbax's manager, which waits until old steps are deleted."""
         try:
             self._manager.close()
-        except OSError as error:  # what is kept is there, so that no run fails for it
+        except OSError as error:  # the newest steps are saved all the same
             self._tell(f"old checkpoints in {self.folder} could not be deleted: {error}")
 
     def save(self, step: int, arrays: Arrays) -> None:

@@ -295,7 +295,10 @@ def main(arguments: list[str] | None = None) -> int:
         prog="codesign",
         description="Co-design of soft hand morphology and control.",
     )
-    return status.of(command.run)
+    code = status.of(command.run)
+    if arguments is None and code == status.INTERRUPTED:
+        status.leave(code)
+    return code
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ def outcome(scene: Scene, trace: Trace, initial: jax.Array | int = 0) -> Outcome
     c = c_max (t_end - t_lost) / (t_end - t_0), where t_lost is the first time in [t_0, t_end) at
     which the object is `lost_distance` or more from the hand centre; 0 if it is kept.  A trial is
     decided once it is lost: what happens later neither fails it nor needs simulating.  A failed
-    trial says nothing about the grasp and shows c_max; `particle_cost` decides what it counts.
+    trial is neither kept nor lost and shows c_max; `particle_cost` decides what it counts.
 
     Args:
       scene: The scene; of `Scene.with_constants` if its numbers are traced.
@@ -66,11 +66,25 @@ def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
       Costs without the trial axis.
     """
     good = ~failed(trials.status)
-    if scene.cost.failure == "worst":
+    if _failures_count(scene):
         return jnp.where(good, trials.cost, scene.cost.maximum).mean(-1)
     count = good.sum(-1)
     mean = jnp.where(good, trials.cost, 0.0).sum(-1) / jnp.maximum(count, 1)
     return jnp.where(count > 0, mean, scene.cost.maximum)
+
+
+def counts(scene: Scene, status: Any) -> Any:
+    """Which trials `particle_cost` averages, bool; failed ones where the scene's rule is "worst".
+
+    Args:
+      scene: The scene.
+      status: Bits of `Status`, int or integer array of any shape.
+    """
+    return ~failed(status) | _failures_count(scene)
+
+
+def _failures_count(scene: Scene) -> bool:
+    return scene.cost.failure == "worst"
 
 
 def shown(trace: Trace, trajectory: bool | None) -> Trace:

@@ -18,8 +18,9 @@ import jax
 class Status(enum.IntFlag):
     """What went wrong in a world, as bits; OK is zero.
 
-    Every bit but those of `WARNINGS` makes the trial a failed one, which says nothing about the
-    grasp; see `failed`.
+    Every bit but those of `WARNINGS` makes the trial a failed one, which counts neither as kept nor
+    as lost; see `failed`. All of these but STUCK are faults of the simulation; STUCK is the hand's
+    grip, which does not let go.
 
     Attributes:
       NONFINITE: A number of the state was not finite.
@@ -50,6 +51,18 @@ class Status(enum.IntFlag):
 
 WARNINGS = Status.SOLVER_CAP
 """Bits that do not make a trial a failed one."""
+
+MEANINGS = {
+    Status.NONFINITE: "a number of the state was not finite",
+    Status.SPEED: "a velocity beyond the scene's limit",
+    Status.PENETRATION: "the object fell through the table",
+    Status.SOLVER_CAP: "a warning only: the contact solver stopped at its cap of iterations",
+    Status.CONTACT_OVERFLOW: "more contacts than the engine has room for",
+    Status.INVALID_START: "bodies deep inside one another before the first step",
+    Status.STUCK: "the hand did not let go: the released object neither left it nor rests on the "
+    "table",
+}
+"""What the bits of `Status` mean, in words for readers of reports."""
 
 
 _FAILURES = sum(bit for bit in Status if bit not in WARNINGS)

@@ -9,11 +9,10 @@ from typing import Protocol
 
 import numpy as np
 
-from codesign_jax import codesign, engines, types
+from codesign_jax import engines
 from codesign_jax import scene as scenes
 from codesign_jax.commands import preflight
 from codesign_jax.files import use_compilation_cache
-from codesign_jax.report import statistics
 from codesign_jax.scene import Scene, keypaths, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import SceneError
@@ -27,9 +26,7 @@ __all__ = [
     "parse_design",
     "preflight_notes",
     "solver_problems",
-    "trials",
     "use_compilation_cache",
-    "verdict",
 ]
 
 
@@ -189,33 +186,6 @@ def preflight_notes(
     if report.refusals:
         raise SceneError(report.refusals)
     return [f"warning: {text}" for text in report.warnings] + report.notes
-
-
-def trials(count: int) -> str:
-    """A number of trials in words."""
-    return f"{count} trial" if count == 1 else f"{count} trials"
-
-
-def verdict(mean: float, cost: np.ndarray, status: np.ndarray) -> str:
-    """Says how a design did, with how sure that is.
-
-    Args:
-      mean: Its mean cost by the scene's rule for failed trials.
-      cost: Costs of its trials, shape (trial,).
-      status: Bits of `Status` of its trials, shape (trial,).
-    """
-    limit = codesign.SUCCESS_COST
-    side = "below" if mean < limit else "not below"
-    text = f"mean cost {mean:.4f} over {trials(cost.size)}, {side} the limit of success, {limit}"
-    counted = ~types.failed(status)
-    if not counted.any():
-        return f"{text}; every trial failed, which says nothing about the grasp"
-    kept, total = int((cost[counted] < limit).sum()), int(counted.sum())
-    share = statistics.wilson(kept, total)
-    return (
-        f"{text}; {kept} of {total} trials kept the object: the design keeps it in "
-        f"{100 * share.low:.0f} to {100 * share.high:.0f} % of grasps (95 % interval)"
-    )
 
 
 def _number(text: str) -> float | None:

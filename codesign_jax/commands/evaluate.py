@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, rollout, runs, types
-from codesign_jax.commands import common, estimate
+from codesign_jax import codesign, engines, rollout, runs
+from codesign_jax.commands import common, estimate, verdicts
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.estimate import Part
-from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import rates
+from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import SceneError
 
@@ -38,7 +38,7 @@ def main(options: "Evaluate") -> int:
     if options.run_folder:
         console.print(f"best final design of {options.run_folder}", markup=False)
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
-    for note in [*notes, *common.mesh_notes(case.scene)]:
+    for note in [*_untried(case, options), *notes, *common.mesh_notes(case.scene)]:
         console.print(note, markup=False)
     if options.dry_run:
         _dry_run(case, options, console)
@@ -87,20 +87,26 @@ def _evaluate(case: Case, engine: engines.Engine, options: "Evaluate", console: 
     """Simulates the trials and prints the costs of each object."""
     evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
     population = jnp.asarray(case.design, jnp.float32)[None]
-    outcomes = jax.tree.map(np.asarray, evaluate(population, jax.random.key(options.seed)))
+    found = interruptible(evaluate, population, jax.random.key(options.seed))
+    outcomes = jax.tree.map(np.asarray, found)
+    one = jax.tree.map(lambda v: v[0], outcomes)
     names = [shape.name for shape in case.scene.objects.object]
-    for k, name in enumerate(names):
-        cost, status = outcomes.cost[0, k :: len(names)], outcomes.status[0, k :: len(names)]
-        if not cost.size:
-            continue
-        lost = np.isfinite(outcomes.lost_time[0, k :: len(names)]).sum()
-        counts = runs.status_counts(status)
-        console.print(
-            f"{name:>12}: mean cost {cost.mean():.3f} over {common.trials(cost.size)}, "
-            f"{lost} lost, {types.failed(status).sum()} failed" + (f" ({counts})" if counts else "")
-        )
-    total = float(particle_cost(case.scene, outcomes)[0])
-    console.print(f"{'all':>12}: {common.verdict(total, outcomes.cost[0], outcomes.status[0])}")
+    for k, name in enumerate(names[: options.trials]):
+        own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
+        console.print(f"{name:>12}: {verdicts.of_object(case.scene, own)}", markup=False)
+    console.print(f"{'all':>12}: {verdicts.verdict(case.scene, one)}", markup=False)
+
+
+def _untried(case: Case, options: "Evaluate") -> list[str]:
+    """Says which objects fewer trials than objects leave out."""
+    names = [shape.name for shape in case.scene.objects.object]
+    left = names[options.trials :]
+    if not left:
+        return []
+    return [
+        f"warning: --trials {options.trials} tries {options.trials} of {len(names)} objects, and "
+        f"not {', '.join(left)}; --trials {len(names)} tries each once"
+    ]
 
 
 def _render(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:

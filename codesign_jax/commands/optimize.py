@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, optimize, runs
-from codesign_jax.commands import common, estimate, hosts, jobs, reference, seeds
+from codesign_jax.commands import common, estimate, hosts, jobs, reference, seeds, verdicts
 from codesign_jax.commands.estimate import Part
 from codesign_jax.runs import Plan, RunResult, Settings, rates
 from codesign_jax.runs.scene_files import scene_texts
@@ -257,7 +257,7 @@ def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:
         best = int(cost.argmin())
         console.print(f"best final particle: {runs.describe(plan.space, particles[best])}")
         trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.trials)
-        console.print(f"its test: {common.verdict(float(cost[best]), trials.cost, trials.status)}")
+        console.print(f"its test: {verdicts.verdict(plan.scene, trials)}")
         again = f"codesign evaluate --run {folder} --trials 150 --accuracy reference"
         console.print(
             f"chosen as the best of {cost.size} by these trials; for more new ones: {again}",

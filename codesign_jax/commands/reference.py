@@ -13,11 +13,10 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines
-from codesign_jax.commands import common
+from codesign_jax.commands import verdicts
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.estimate import Part
 from codesign_jax.commands.flags import Subject
-from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Settings, outcomes, rates
 from codesign_jax.scene import Scene, with_accuracy
@@ -73,19 +72,35 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
     Returns:
       Outcomes of the trials, shape (trial,).
     """
-    case = find_case(Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY))
-    key = outcomes.key(case.scene, case.engine, case.design[None], trials, settings.seed)
+    case, key = _case(folder, settings, trials)
     found = outcomes.load(folder / FILE, key)
     if found is None:
         found = _simulate(case, settings, trials)
         outcomes.save(folder / FILE, found, key)
     size = case.scene.discretization
-    verdict = common.verdict(float(particle_cost(case.scene, found)), found.cost, found.status)
+    verdict = verdicts.verdict(case.scene, found)
     console.print(
         f"on {trials} fresh trials at accuracy {ACCURACY} ({1e3 * size.timestep:g} ms, "
         f"{size.links} links): {verdict}"
     )
     return found
+
+
+def stored(folder: Path, settings: Settings) -> Outcome | None:
+    """Outcomes that `test` kept in a run folder, shape (trial,); None if not of its design today.
+
+    Args:
+      folder: Run folder with a finished episode.
+      settings: The run's settings.
+    """
+    trials = outcomes.count(folder / FILE)
+    return outcomes.load(folder / FILE, _case(folder, settings, trials)[1]) if trials else None
+
+
+def _case(folder: Path, settings: Settings, trials: int) -> tuple[Case, str]:
+    """The design to test and the digest of what determines its outcomes."""
+    case = find_case(Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY))
+    return case, outcomes.key(case.scene, case.engine, case.design[None], trials, settings.seed)
 
 
 def _simulate(case: Case, settings: Settings, trials: int) -> Outcome:

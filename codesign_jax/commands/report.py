@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from rich.console import Console
 
 from codesign_jax import runs
-from codesign_jax.commands import common
+from codesign_jax.commands import common, reference
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.directory import read_provenance
@@ -33,6 +33,7 @@ def main(options: "Report") -> int:
     common.check_engine(name)
     try:
         from codesign_jax.report import page
+        from codesign_jax.report.of_run import Run
     except ImportError as error:
         message = f"a report needs {error.name}: pip install 'codesign-jax[report]'"
         raise SceneError([message]) from error
@@ -41,7 +42,8 @@ def main(options: "Report") -> int:
     record = choice.read_record(options.folder)
     chosen = choice.choose(scene, record)
     provenance = read_provenance(options.folder)
-    run = page.Run(options.folder, scene, settings, record, chosen, provenance)
+    found = reference.stored(options.folder, settings)
+    run = Run(options.folder, scene, settings, record, chosen, provenance, found)
     console = Console(highlight=False, soft_wrap=True)
     shown = None if options.no_replay else _best_grasp(scene, settings, record, name, console)
     page.write(run, shown, path)

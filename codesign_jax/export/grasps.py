@@ -1,7 +1,7 @@
 """Grasps as files: a model of each, its controls, and the player that needs MuJoCo alone."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,9 +50,7 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
     scene, trial = plain.single_object(scene, trial)
     wide = _wide(params), _wide(trial)
     start, controls = _float64(_start, scene, *wide), schedule(scene, params, trial)
-    spec = model.build_spec(scene, *wide, visual=True)
-    skinned = scene.effects.surface == "hull"
-    shares = skin.add(scene, spec, wide[0]) if skinned else plain.NONE
+    spec, shares = _spec(scene, *wide)
     limits = verdict.bounds(scene)
     spec.add_numeric(name="hand_centre", data=model.layout(scene).centre_weights)
     spec.add_numeric(name="lost", data=[limits.lost_distance, limits.start, limits.end])
@@ -74,6 +72,19 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
         states,
         _judge(scene, distance, states, compiled.nq),
     )
+
+
+def world(scene: Scene, params: Params, trial: Trial) -> mujoco.MjModel:
+    """The model of one world as `Grasp.binary` is, without key frames; arguments as of `grasp`."""
+    scene, trial = plain.single_object(scene, trial)
+    return plain.engine_model(scene, *_spec(scene, _wide(params), _wide(trial)))
+
+
+def _spec(scene: Scene, params: Params, trial: Trial) -> tuple[mujoco.MjSpec, Mapping[str, float]]:
+    """Spec of a scene with one object, and the shares of its points; see `skin.add`."""
+    spec = model.build_spec(scene, params, trial, visual=True)
+    skinned = scene.effects.surface == "hull"
+    return spec, skin.add(scene, spec, params) if skinned else plain.NONE
 
 
 def schedule(scene: Scene, params: Params, trial: Trial) -> np.ndarray:

@@ -1,69 +1,20 @@
 """The report of a run: one HTML file that needs no network, see `write`."""
 
 import datetime
-import html
 import json
 import shlex
-from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from codesign_jax import codesign, files, types
-from codesign_jax.report import charts, landscape, viewer
+from codesign_jax.report import charts, chosen, landscape, markup, viewer
 from codesign_jax.report.animation import Replay
-from codesign_jax.report.statistics import wilson
-from codesign_jax.runs import Settings, choice, tables
-from codesign_jax.runs.choice import Chosen, Grasp
-from codesign_jax.runs.record import History, Record
+from codesign_jax.report.of_run import Run
+from codesign_jax.runs import choice, tables
+from codesign_jax.runs.choice import Grasp
 from codesign_jax.runs.scene_files import NAMES
-from codesign_jax.scene import Scene
-from codesign_jax.scene.parameters import DesignSpace, design_space
-from codesign_jax.types import Status
-
-MEANINGS = {
-    Status.NONFINITE: "a number of the state was not finite",
-    Status.SPEED: "a velocity beyond the scene's limit",
-    Status.PENETRATION: "the object fell through the table",
-    Status.SOLVER_CAP: "a warning only: the contact solver stopped at its cap of iterations",
-    Status.CONTACT_OVERFLOW: "more contacts than the engine has room for",
-    Status.INVALID_START: "bodies deep inside one another before the first step",
-    Status.STUCK: "the released object neither left the hand nor rests on the table",
-}
-"""What the bits of `Status` mean, for readers of a report."""
-
-
-class Run(NamedTuple):
-    """A run to report on.
-
-    Attributes:
-      folder: Its folder.
-      scene: Its scene.
-      settings: Its settings.
-      record: Its episodes, at least one.
-      chosen: The design it found.
-      provenance: Content of its provenance.json.
-    """
-
-    folder: Path
-    scene: Scene
-    settings: Settings
-    record: Record
-    chosen: Chosen
-    provenance: dict[str, Any]
-
-    @property
-    def space(self) -> DesignSpace:
-        """The design space."""
-        return design_space(self.scene.hand, self.settings.preset)
-
-    @property
-    def history(self) -> History:
-        """Reports of the finished episodes."""
-        h, done = self.record.history, self.record.done
-        trials = types.Outcome(*(v[:done] for v in h.trials))
-        return History(h.population[:done], trials, *(v[:done] for v in h[2:]))
+from codesign_jax.types import MEANINGS
 
 
 def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
@@ -79,11 +30,11 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
     """
     sections = [
         _summary(run),
-        _design(run),
+        chosen.design(run),
         _grasp(run, grasp),
-        _section(
+        markup.section(
             "Cost",
-            _paragraph(_cost_note(run)),
+            markup.paragraph(_cost_note(run)),
             charts.html(charts.cost_evolution(run.history), "cost"),
         ),
         _parameters(run),
@@ -93,46 +44,11 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
     ]
     title = f"Co-design run {run.folder.resolve().name}"
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes")
-    head = f"<h1>{_text(title)}</h1>\n<p class='note'>codesign-jax, report of {now}</p>\n"
+    head = f"<h1>{markup.text(title)}</h1>\n<p class='note'>codesign-jax, report of {now}</p>\n"
     with files.atomically(path) as part:
         body = head + "\n".join(sections)
         part.write_text(viewer.page(title, body, charts.library()), encoding="utf-8")
     return path
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value))
-
-
-def _paragraph(text: str, kind: str = "", command: Sequence[str] = ()) -> str:
-    """A paragraph that may end with a command of `codesign`."""
-    code = f"<code>{_text(shlex.join(['codesign', *command]))}</code>" if command else ""
-    return f"<p class='{kind}'>{_text(text)}{code}</p>" if text else ""
-
-
-def _section(title: str, *parts: str) -> str:
-    return f"<h2>{_text(title)}</h2>\n" + "\n".join(parts)
-
-
-def _table(
-    head: Sequence[str], rows: Iterable[Sequence[object]], numbers: Sequence[int] = ()
-) -> str:
-    """An HTML table; cells that are `_Html` stay as they are, columns in numbers stand right."""
-
-    def cell(tag: str, k: int, value: object) -> str:
-        kind = " class='number'" if k in numbers else ""
-        text = value if isinstance(value, _Html) else _text(value)
-        return f"<{tag}{kind}>{text}</{tag}>"
-
-    def line(tag: str, values: Sequence[object]) -> str:
-        return "<tr>" + "".join(cell(tag, k, v) for k, v in enumerate(values)) + "</tr>"
-
-    top = line("th", head) if head else ""
-    return "<table>" + top + "".join(line("td", row) for row in rows) + "</table>"
-
-
-class _Html(str):
-    """Text that is HTML already."""
 
 
 def _summary(run: Run) -> str:
@@ -154,7 +70,7 @@ def _summary(run: Run) -> str:
         ("converged", _converged(run)),
         ("final particles", _solved(run)),
     ]
-    return _section("Summary", _table((), rows))
+    return markup.section("Summary", markup.table((), rows))
 
 
 def _converged(run: Run) -> str:
@@ -177,60 +93,6 @@ def _solved(run: Run) -> str:
     )
 
 
-def _share(kept: int, total: int) -> str:
-    """A share of successes with its interval, in words."""
-    if not total:
-        return "no trial that counts"
-    share = wilson(kept, total)
-    return (
-        f"{kept} of {total}: {100 * share.value:.0f} %, 95 % interval "
-        f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
-    )
-
-
-def _design(run: Run) -> str:
-    chosen, space = run.chosen, run.space
-    values, low, high = (
-        space.in_units(np.asarray(v)) for v in (chosen.design, space.low, space.high)
-    )
-    rows = []
-    for k, name in enumerate(space.names):
-        at = 100 * float((values[k] - low[k]) / (high[k] - low[k]))
-        bar = _Html(f"<div class='scale'><i style='left:{min(max(at, 0), 100):.1f}%'></i></div>")
-        domain = "morphology" if space.is_morphology[k] else "control"
-        number = (f"{v:.4g}" for v in (values[k], low[k], high[k]))
-        rows.append((name, *number, space.units[k], domain, bar))
-    head = ("parameter", "value", "lowest", "highest", "unit", "domain", "within its range")
-    kept = (np.asarray(chosen.trials.cost) < codesign.SUCCESS_COST) & ~types.failed(
-        np.asarray(chosen.trials.status)
-    )
-    counted = ~types.failed(np.asarray(chosen.trials.status))
-    source = "the final test" if chosen.tested else "its last episode; there was no final test"
-    success = f"Kept the object in {_share(int(kept.sum()), int(counted.sum()))}"
-    note = (
-        f"Particle {chosen.particle}, mean cost {chosen.cost:.4f} in {counted.size} trials of "
-        f"{source}. It was chosen as the best by these very trials, which flatters it. New trials "
-        "at the reference accuracy: "
-    )
-    again = ["evaluate", "--run", str(run.folder), "--trials", "150", "--accuracy", "reference"]
-    parts = [_paragraph(success, "key"), _paragraph(note, "note", again)]
-    parts += [_by_object(run, kept, counted), _table(head, rows, (1, 2, 3))]
-    return _section("Chosen design", *parts)
-
-
-def _by_object(run: Run, kept: np.ndarray, counted: np.ndarray) -> str:
-    """Success for each object; every batch of trials takes turns between the objects."""
-    names = [shape.name for shape in run.scene.objects.object]
-    index = np.arange(counted.size) % run.settings.trials % len(names)
-    rows = []
-    for k, name in enumerate(names):
-        own = index == k
-        if own.any():
-            share = _share(int(kept[own].sum()), int(counted[own].sum()))
-            rows.append((name, share, int((~counted[own]).sum())))
-    return _table(("object", "kept", "failed trials"), rows, (2,))
-
-
 def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
     if grasp is None:
         return ""
@@ -248,8 +110,8 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
             "The two differ: contact is chaotic, and a batch of another size or another machine "
             "rounds differently."
         )
-        parts = [_paragraph(text, "warning"), *parts]
-    return _section("Best grasp", _paragraph(note), *parts)
+        parts = [markup.paragraph(text, "warning"), *parts]
+    return markup.section("Best grasp", markup.paragraph(note), *parts)
 
 
 def _cost_note(run: Run) -> str:
@@ -266,7 +128,7 @@ def _parameters(run: Run) -> str:
         "A band that stays wide says that selection did not narrow the parameter."
     )
     figure = charts.parameters(run.history, run.space, run.chosen.design)
-    return _section("Parameters", _paragraph(note), charts.html(figure, "parameters"))
+    return markup.section("Parameters", markup.paragraph(note), charts.html(figure, "parameters"))
 
 
 def _landscape(run: Run) -> str:
@@ -289,8 +151,8 @@ def _landscape(run: Run) -> str:
             around = "the chosen design" if own else tables.describe(space, found.design)
             words = f"In grey {grey} The other parameters are those of {around}."
             figure = charts.landscape_figure(found)
-    section = _paragraph(words, "", command), charts.html(figure, "landscape")
-    return _section("Landscape", *section)
+    section = markup.paragraph(words, "", command), charts.html(figure, "landscape")
+    return markup.section("Landscape", *section)
 
 
 def _failures(run: Run) -> str:
@@ -307,10 +169,10 @@ def _failures(run: Run) -> str:
         (b.name, f"{n:,}", f"{100 * n / total:.2f} %", MEANINGS[b]) for b, n in counts.items() if n
     ]
     if not rows:
-        return _section("Failures by cause", _paragraph(note))
-    table = _table(("status", "trials", "share", "meaning"), rows, (1, 2))
+        return markup.section("Failures by cause", markup.paragraph(note))
+    table = markup.table(("status", "trials", "share", "meaning"), rows, (1, 2))
     figure = charts.html(charts.failures(status), "failures")
-    return _section("Failures by cause", _paragraph(note), table, figure)
+    return markup.section("Failures by cause", markup.paragraph(note), table, figure)
 
 
 def _provenance(run: Run) -> str:
@@ -327,7 +189,7 @@ def _provenance(run: Run) -> str:
     found = {path.name: path.read_text(encoding="utf-8") for path in texts if path.exists()}
     found["provenance.json"] = json.dumps(p, indent=2)
     details = [
-        f"<details><summary>{_text(name)}</summary><pre>{_text(text)}</pre></details>"
+        f"<details><summary>{markup.text(name)}</summary><pre>{markup.text(text)}</pre></details>"
         for name, text in found.items()
     ]
-    return _section("Provenance", _table((), rows), *details)
+    return markup.section("Provenance", markup.table((), rows), *details)

@@ -19,7 +19,7 @@ from codesign_jax.runs.loop import (
 )
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, check, make_settings
-from codesign_jax.runs.tables import describe, status_counts, status_names
+from codesign_jax.runs.tables import describe, failure_counts, status_names, warning_counts
 from codesign_jax.runs.together import Results, optimize
 
 __all__ = [
@@ -33,12 +33,13 @@ __all__ = [
     "check",
     "check_folder",
     "describe",
+    "failure_counts",
     "load_record",
     "make_settings",
     "optimize",
     "prepare",
     "read_run",
-    "status_counts",
     "status_names",
+    "warning_counts",
     "with_seed",
 ]

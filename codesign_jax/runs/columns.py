@@ -37,7 +37,7 @@ class Table:
 
 _EPISODE = "number of the episode, from 1, as on the console"
 _PARTICLE = "index of the particle, from 0"
-_FAILED = "trials that failed: they say nothing about the grasp (see `status`)"
+_FAILED = "trials that failed, which count neither as kept nor as lost (see `status`)"
 
 TABLES = {
     "episodes.csv": Table(

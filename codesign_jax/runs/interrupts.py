@@ -13,6 +13,34 @@ import jax
 T = TypeVar("T")
 
 
+def interruptible(function: Callable[..., T], *arguments: Any) -> T:
+    """Calls a function of JAX and waits for its arrays; Ctrl-C ends the wait at once.
+
+    The function goes on in a thread of its own until the process ends: what may be interrupted must
+    have nothing to save.
+
+    Args:
+      function: Returns a tree of arrays.
+      *arguments: Its arguments.
+
+    Raises:
+      KeyboardInterrupt: If SIGINT came.
+    """
+    future: concurrent.futures.Future[T] = concurrent.futures.Future()
+
+    def work() -> None:
+        try:
+            future.set_result(jax.block_until_ready(function(*arguments)))
+        except BaseException as error:  # the caller is to meet it, whatever it is
+            future.set_exception(error)
+
+    # Not of a pool: the interpreter waits for the threads of pools before it ends.
+    threading.Thread(target=work, daemon=True).start()
+    while not future.done():
+        concurrent.futures.wait([future], timeout=0.2)
+    return future.result()
+
+
 class Stopped(Exception):
     """The user asked to stop, and nothing is left to save.
 

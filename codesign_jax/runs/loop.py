@@ -263,7 +263,8 @@ class Loop:
             mean=float(history.cost[e].mean()),
             best=float(history.cost[e].min()),
             failed=int(types.failed(status).sum()),
-            causes=tables.status_counts(status),
+            causes=tables.failure_counts(status),
+            warnings=tables.warning_counts(status),
             grasps=status.size,
             seconds=seconds,
         )
@@ -300,7 +301,7 @@ def _final_test(plan: Plan, record: Record) -> FinalTest | None:
 def _all_failed(status: np.ndarray, folder: Path) -> None:
     advice = [text for bit, text in _ADVICE.items() if (status & bit).any()]
     raise AllFailed(
-        f"every one of {status.size} trials failed ({tables.status_counts(status)}); see "
+        f"every one of {status.size} trials failed ({tables.failure_counts(status)}); see "
         f"trials.csv and codesign replay {folder}. " + " ".join(advice)
     )
 

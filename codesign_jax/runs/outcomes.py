@@ -42,3 +42,12 @@ def load(path: Path, key: str) -> Outcome | None:
             return Outcome(**{name: stored[name] for name in Outcome._fields})
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
         return None
+
+
+def count(path: Path) -> int:
+    """Number of trials of the outcomes in a file, whatever their key; 0 if there are none."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return stored["cost"].size
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        return 0

@@ -60,6 +60,7 @@ class Progress:
         grasps: int,
         seconds: float,
         causes: str = "",
+        warnings: str = "",
     ) -> str:
         """Reports a finished episode and returns the line.
 
@@ -70,10 +71,12 @@ class Progress:
           failed: Failed worlds among the episode's grasps.
           grasps: Grasps of the episode.
           seconds: Wall time of the episode.
-          causes: Counts of the status bits, such as "SPEED 1, SOLVER_CAP 3".
+          causes: How often each cause of failure occurs, such as "SPEED 1, STUCK 3".
+          warnings: How often each warning occurs, such as "SOLVER_CAP 3".
         """
         pace = self._pace(done, grasps, seconds)
         reasons = f" ({causes})" if causes else ""
+        reasons += f"  warnings: {warnings}" if warnings else ""
         count = f"{done:>{len(str(self.total))}}/{self.total}"
         line = (
             f"episode {count}  mean {mean:.3f}  best {best:.3f}  failed {failed}/{grasps}"

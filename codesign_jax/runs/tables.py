@@ -16,7 +16,7 @@ from codesign_jax.runs.columns import TABLES
 from codesign_jax.runs.record import History
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import Status
+from codesign_jax.types import WARNINGS, Status
 
 TESTS = "tests.csv"
 
@@ -79,9 +79,18 @@ def status_names(status: int) -> str:
     return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
 
 
-def status_counts(status: np.ndarray) -> str:
-    """How often each status bit is set, e.g. "SPEED 1, SOLVER_CAP 3"; empty if none is."""
-    counts = {bit.name: int(((status & bit) != 0).sum()) for bit in Status if bit}
+def failure_counts(status: np.ndarray) -> str:
+    """How often each cause of failure occurs, e.g. "SPEED 1, STUCK 3"; empty if none does."""
+    return _counts(status, [bit for bit in Status if bit not in WARNINGS])
+
+
+def warning_counts(status: np.ndarray) -> str:
+    """How often each warning occurs, which does not fail a trial, e.g. "SOLVER_CAP 3"."""
+    return _counts(status, [*WARNINGS])
+
+
+def _counts(status: np.ndarray, bits: Iterable[Status]) -> str:
+    counts = {bit.name: int(((status & bit) != 0).sum()) for bit in bits}
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
 
 

@@ -42,7 +42,7 @@ def folder(tmp_path):
 
 
 def restore(folder):
-    with Checkpoints(folder) as store:
+    with Checkpoints(folder, read_only=True) as store:
         return store.restore()
 
 
@@ -162,6 +162,10 @@ def test_full_disk_is_said_and_older_steps_stay(folder):
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     found = restore(folder)
     assert found.step == 4 and equal(found.arrays, arrays(4))
+    # What is left of step 5 is deleted by who may write, and not by who reads only.
+    assert [path for path in folder.iterdir() if path.name.startswith("5.")]
+    with Checkpoints(folder):
+        assert not [path for path in folder.iterdir() if path.name.startswith("5.")]
 
 
 def test_only_one_module_imports_orbax():

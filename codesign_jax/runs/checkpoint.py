@@ -19,6 +19,9 @@ import numpy as np
 
 from codesign_jax import files
 
+_TEMPORARY = ".orbax-checkpoint-tmp"
+"""Mark in the name of a step that orbax is writing."""
+
 Arrays = dict[str, Any]
 """Nested dictionaries of NumPy arrays; orbax stores none of size zero."""
 
@@ -38,9 +41,19 @@ class Restored(NamedTuple):
 
 
 class Checkpoints:
-    """Numbered steps of one run in a folder; use as a context manager."""
+    """Numbered steps of one run in a folder; use as a context manager.
 
-    def __init__(self, folder: Path, *, keep: int = 3, tell: Callable[[str], None] = warnings.warn):
+    One process at a time may have a folder open, but for those that open it read-only.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        keep: int = 3,
+        tell: Callable[[str], None] = warnings.warn,
+        read_only: bool = False,
+    ):
         """Opens the folder, and makes it if it is missing.
 
         Args:
@@ -48,6 +61,8 @@ class Checkpoints:
           keep: Newest steps to keep.
           tell: Called when the folder is closed, with a message, if a step could not be deleted;
             from then on orbax deletes none.
+          read_only: Opens a folder that exists and changes nothing in it, not even what a process
+            that was killed left of a step: another process may be saving that step now.
         """
         import orbax.checkpoint as ocp
 
@@ -55,12 +70,15 @@ class Checkpoints:
         # Synchronous: an episode counts as saved when the command says so.
         # A thread of orbax's deletes old steps: on a slow file system a step may take a tenth of a
         # second, and a batch of thirty runs, which are saved in turn, would wait for thirty.
+        writing = {"max_to_keep": keep, "enable_background_delete": True}
+        reading = {"create": False}  # orbax's own read_only warns that the folder is read-only
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep,
-            enable_async_checkpointing=False,
-            enable_background_delete=True,
-            cleanup_tmp_directories=True,
+            enable_async_checkpointing=False, **(reading if read_only else writing)
         )
+        if not read_only:
+            # Not by orbax, which begins a thread for it and does not wait for that when it closes.
+            for left in self.folder.glob(f"*{_TEMPORARY}*"):
+                shutil.rmtree(left)
         self._args, self._tell = ocp.args, tell
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 

@@ -289,7 +289,7 @@ def load_record(folder: Path) -> Record | None:
     """Reads the newest good checkpoint of a run folder; None if it has none."""
     if not (folder / "checkpoints").is_dir():
         return None
-    with Checkpoints(folder / "checkpoints") as store:
+    with Checkpoints(folder / "checkpoints", read_only=True) as store:
         found = store.restore()
     return records.from_arrays(found.arrays) if found.step is not None else None
 

@@ -56,7 +56,8 @@ class Optimize:
     episodes: Count = None
     """Episodes; the paper's 64 in 2d, 128 otherwise."""
     test_trials: Count = None
-    """Further trials that test each final particle; the paper's 36 in 2d, 72 otherwise; 0: none."""
+    """Further trials that test each final particle, in whole rounds of --trials; the paper's 36 in
+    2d, 72 otherwise; 0: none."""
     reference_trials: Count = None
     """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine
     structured; 0: none."""
@@ -238,7 +239,7 @@ class Scenes:
     """List scenes and their effects: on, off, or unsupported by an engine."""
 
     name: Annotated[
-        str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help_behavior_hint="")
+        str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]", help_behavior_hint="")
     ] = None
     """Scene: a built-in name or a .toml file; default: all built-in ones."""
     engine: Text = None
@@ -261,7 +262,7 @@ class Replay(Shown):
     """
 
     path: Annotated[
-        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="PATH", help_behavior_hint="")
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PATH]", help_behavior_hint="")
     ] = None
     """A run folder (as --run), or a file of its failures/."""
     out: File = None
@@ -289,13 +290,17 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
       arguments: Arguments without the program's name; default: those of the process.
     """
-    command = tyro.cli(
-        COMMANDS,  # type: ignore[arg-type]
-        args=arguments,
-        prog="codesign",
-        description="Co-design of soft hand morphology and control.",
-    )
-    code = status.of(command.run)
+
+    def run() -> int:
+        command = tyro.cli(
+            COMMANDS,  # type: ignore[arg-type]
+            args=arguments,
+            prog="codesign",
+            description="Co-design of soft hand morphology and control.",
+        )
+        return command.run()
+
+    code = status.of(run)
     if arguments is None and code == status.INTERRUPTED:
         status.leave(code)
     return code

@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,14 +21,15 @@ import numpy as np
 import pytest
 from toy import TINY
 
-from codesign_jax import cli, codesign, runs
+from codesign_jax import cli, codesign, runs, scene
 from codesign_jax.batch import Batch
-from codesign_jax.commands import common, jobs, preflight, reference
+from codesign_jax.commands import jobs, preflight, reference, status, verdicts
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import choice, columns
 from codesign_jax.runs.checkpoint import Checkpoints, digest
 from codesign_jax.runs.record import to_arrays
-from codesign_jax.types import Status
+from codesign_jax.scene import effects
+from codesign_jax.types import Outcome, Status
 
 EPISODES = 14  # enough that a signal after the third finds the run on its way
 RUN = [
@@ -334,7 +336,10 @@ WRONG = {
     ),
     "wrong type of a value": (
         ["--set", "discretization.links=3.5", "gravity='low'"],
-        ["discretization.links = 3.5 must be of type int", "gravity = 'low' must be of type float"],
+        [
+            "discretization.links = 3.5 must be a whole number in [1, 200]",
+            "gravity = 'low' must be a number in [0, 100] m/s^2",
+        ],
     ),
     "not a number": (["--set", "gravity=nan"], ["gravity = nan is outside [0, 100] m/s^2"]),
     "key of a value": (["--set", "name.x=1"], ["name = 'paper' is no table: it has no key 'x'"]),
@@ -344,6 +349,10 @@ WRONG = {
             "hand.section.width = 18 is outside [0.005, 0.1] m",
             "objects.nois is not a known key; did you mean 'objects.noise'?",
         ],
+    ),
+    "parameters of no jobs": (
+        ["--job-set", "slurm_partition=gpu", "cpus_per_task"],
+        ["--job-set needs --jobs", "--job-set 'cpus_per_task' must be KEY=VALUE"],
     ),
     "seeds that are none": (["--seeds", "0-"], ["--seeds '0-' must be seeds such as 0-9 or 1,3,5"]),
     "seeds backwards": (["--seeds", "9-0"], ["must be seeds such as"]),
@@ -398,7 +407,7 @@ def test_wrong_hand_file_reports_every_problem(tmp_path, workplace, capsys):
     assert "bad.toml.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018?" in error
     assert "bad.toml.material.densty is not a known key; did you mean 'density'?" in error
     assert "bad.toml.material.density is missing (unit kg/m^3)" in error
-    assert "bad.toml.finger[1].azimuth = 'back' must be of type float" in error
+    assert "bad.toml.finger[1].azimuth = 'back' must be a number in [-360, 360] deg" in error
     assert list(workplace.iterdir()) == []
 
 
@@ -472,12 +481,78 @@ def test_evaluate_judges_a_run_on_other_objects_and_settings(finished, tmp_path,
 
 def test_a_verdict_comes_with_its_interval():
     """Wilson's interval of n out of n begins at n / (n + 1.96^2): three of three says little."""
-    ok = np.zeros(3, int)
-    assert "keeps it in 44 to 100 % of grasps" in common.verdict(0.0, np.zeros(3), ok)
-    some = common.verdict(0.5, np.array([0.0, 0.0, 1.5]), np.array([0, 0, 0]))
+    tiny = scene.load(TINY)
+    kept = verdicts.verdict(tiny, trials_of([0.0] * 3, [0] * 3))
+    assert "mean cost 0.0000 over 3 trials" in kept and "44 to 100 % of grasps" in kept
+    some = verdicts.verdict(tiny, trials_of([0.0, 0.0, 1.5], [0, 0, Status.SOLVER_CAP]))
     assert "not below the limit" in some and "2 of 3 trials kept" in some
-    broken = common.verdict(3.0, np.zeros(3), ok + int(Status.NONFINITE))
-    assert "every trial failed" in broken and "%" not in broken
+    broken = verdicts.verdict(tiny, trials_of([3.0] * 3, [Status.NONFINITE] * 3))
+    assert "every trial failed (NONFINITE 3)" in broken and "%" not in broken
+
+
+@pytest.mark.parametrize(
+    ("rule", "mean", "over", "share"),
+    [
+        ("exclude", "0.500", "2 trials, 1 lost (1 more failed, left out: STUCK 1)", "1 of 2"),
+        ("worst", "1.333", "3 trials, 1 lost (1 of them failed, counted as 3: STUCK 1)", "1 of 3"),
+    ],
+)
+def test_rows_and_verdict_follow_the_rule_for_failed_trials(rule, mean, over, share):
+    """Costs 0, 1 and a failed trial: 1/2 without it, (0 + 1 + 3) / 3 with it as the worst."""
+    tiny = scene.load(TINY, overrides={"cost.failure": rule})
+    found = trials_of([0.0, 1.0, 3.0], [0, Status.SOLVER_CAP, Status.STUCK], lost=[1])
+    row, verdict = verdicts.of_object(tiny, found), verdicts.verdict(tiny, found)
+    assert row == f"mean cost {mean} over {over}; warnings: SOLVER_CAP 1"
+    assert f"mean cost {mean}" in verdict and f"{share} trials kept" in verdict
+    alone = verdicts.of_object(tiny, trials_of([3.0], [Status.STUCK]))
+    assert alone.startswith("no mean cost (1 more failed" if rule == "exclude" else "mean cost 3.0")
+
+
+def trials_of(cost, status, lost=()):
+    """Outcomes of trials; the indices in `lost` lost their objects at 1 s."""
+    times = np.where(np.isin(np.arange(len(cost)), lost), 1.0, np.inf)
+    return Outcome(np.array(cost), np.array(status, int), times, np.full(len(cost), -1))
+
+
+def test_a_narrow_console_breaks_no_name(monkeypatch, capsys):
+    """Names of effects are what a scene file says."""
+    monkeypatch.setenv("COLUMNS", "80")
+    assert command("scenes", "paper") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(len(line) for line in lines) <= 80
+    assert {line.split()[0] for line in lines if line.split()} >= {*effects.EFFECTS}
+
+
+def test_evaluate_says_which_objects_it_leaves_out(capsys):
+    design = ["--scene", TINY, "--objects", "paper", "--dry-run"]
+    assert command("evaluate", *design, "--trials", "1") == 0
+    words = "--trials 1 tries 1 of 3 objects, and not cylinder, sphere; --trials 3 tries each once"
+    assert words in capsys.readouterr().out
+    assert command("evaluate", *design, "--trials", "3") == 0
+    assert "tries" not in capsys.readouterr().out
+
+
+def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys):
+    """A simulation may hold the process for minutes: what waits for it must not."""
+    going, left = threading.Event(), []
+
+    def simulate(*arguments):
+        going.set()
+        threading.Event().wait(30)
+
+    def press():
+        going.wait(30)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(codesign, "make_evaluate", lambda *arguments: simulate)
+    monkeypatch.setattr(status, "leave", left.append)
+    arguments = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--trials", "1"]
+    monkeypatch.setattr(sys, "argv", ["codesign", *arguments])
+    threading.Thread(target=press).start()
+    start = time.monotonic()
+    assert cli.main() == 130 and left == [130]
+    assert time.monotonic() - start < 20  # of the 30 that the simulation goes on
+    assert capsys.readouterr().err == "stopped\n"
 
 
 @pytest.mark.parametrize(
@@ -508,8 +583,32 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
     assert chosen.trials.cost.shape == ((6,) if optimizer == "particle-filter" else (4,))
     before = snapshot(grown)
     assert command(*run, "--episodes", "4", "--out", grown) == 2
-    assert "a run can be extended, not shortened" in capsys.readouterr().err
-    assert snapshot(grown) == before
+    error = capsys.readouterr().err
+    assert "can be extended, but not shortened; leave out --episodes" in error
+    assert "--fresh" not in error and snapshot(grown) == before
+    # Without --episodes the command goes on with the run, whatever it was extended to.
+    assert command(*without(run, "--episodes"), "--out", grown) == 0
+    assert "all 5 episodes are done" in capsys.readouterr().out
+    assert_same_run(grown, long)
+
+
+def without(arguments, flag):
+    """The arguments without a flag and its values."""
+    given = [k for k, argument in enumerate(arguments) if argument == flag]
+    return [a for k, a in enumerate(arguments) if k not in given and k - 1 not in given]
+
+
+def test_runs_of_different_lengths_need_episodes(compared, tmp_path, capsys):
+    both = shutil.copytree(compared[0], tmp_path / "both")
+    path = both / "seed-3" / "provenance.json"
+    content = json.loads(path.read_text())
+    content["settings"]["episodes"] = 7
+    path.write_text(json.dumps(content))
+    before = snapshot(both)
+    assert command(*without(TWO, "--episodes"), "--out", both) == 2
+    error = capsys.readouterr().err
+    assert "seed-2 has 2 episodes and" in error and "seed-3 7: say by --episodes" in error
+    assert snapshot(both) == before
 
 
 BASE = [a for a in RUN if a not in ("--seed", "3")]
@@ -684,6 +783,7 @@ def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsy
         (["--design", "length=long"], "length = 'long' must be a number in mm"),
         (["--design", "length=nan"], "must be a number in mm"),
         (["--design", "length"], "must be a number in mm"),
+        (["--design", "length=90", "arm_z=5", "length=95"], "more than once: 90, 95"),
         (["--trials", "0"], "--trials = 0 is outside"),
         (["--engine", "c"], "--engine"),
         (["--set", "solver.iterations=50"], "set newton.iterations, which limits the solver"),

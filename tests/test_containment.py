@@ -1,5 +1,6 @@
 """Status bits, frozen worlds and their neighbours, saved failures and their replay."""
 
+import re
 from functools import partial
 
 import jax
@@ -8,9 +9,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import cli, cost, model, rollout, runs, start
+from codesign_jax import cli, cost, model, rollout, runs, scene, start
+from codesign_jax.commands import failure
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.export import grasps
+from codesign_jax.scene import parameters
 from codesign_jax.types import Status, Trace, failed
 from tests.small import (
     batch_inputs,
@@ -302,6 +306,29 @@ def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
     assert (folder / "replay.html").exists()
 
 
+def test_the_end_of_a_stuck_world_has_its_hull_and_its_controls_in_mujoco():
+    """The hull is in MuJoCo C as points, and no step of a world that is STUCK was bad."""
+    from toy import TINY
+
+    hull = scene.load(TINY, overrides={"effects.surface": "hull"})
+    space = parameters.design_space(hull.hand, "2d")
+    trial = jax.tree.map(np.asarray, rollout.nominal_trial(hull, 0))
+    design = space.default().astype(np.float32)
+    params = jax.tree.map(np.asarray, space.params(design))
+    data = mujoco.MjData(grasps.world(hull, params, trial))
+    mujoco.mj_kinematics(data.model, data)
+    data.qpos[-7:-4] = data.xpos[model.layout(hull).bodies[0, 1]]  # the object in a finger's place
+    state = np.concatenate([data.qpos, data.qvel])
+    world = runs.failures.Failure(design, trial, state, int(Status.STUCK), -1, (1, 0, 0))
+    controls = grasps.schedule(hull, params, trial)[:, 1:]
+    data = failure._last_state(hull, space, world)
+    np.testing.assert_array_equal(data.ctrl, controls[-1])
+    assert re.match(r"contacts: \d+ of hand and object, ", failure._contacts(data))
+    assert (controls[4] != controls[-1]).any()
+    early = failure._last_state(hull, space, world._replace(bad_step=5))
+    np.testing.assert_array_equal(early.ctrl, controls[4])
+
+
 def test_what_is_no_failed_world_is_refused(failing_run, tmp_path, capsys):
     folder, _ = failing_run
     other = folder / "failures" / "no.npz"
@@ -327,4 +354,5 @@ def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
 
 def test_the_progress_line_counts_by_cause():
     status = np.array([[0, Status.SPEED, 8], [Status.SPEED | 8, Status.STUCK, 0]])
-    assert runs.status_counts(status) == "SPEED 2, SOLVER_CAP 2, STUCK 1"
+    assert runs.failure_counts(status) == "SPEED 2, STUCK 1"
+    assert runs.warning_counts(status) == "SOLVER_CAP 2"

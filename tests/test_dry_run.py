@@ -32,6 +32,13 @@ def dry_run(capsys, command, *arguments):
     return capsys.readouterr().out
 
 
+def test_optimize_says_that_the_test_has_whole_rounds(workplace, capsys):
+    sizes = ["--trials", 4, "--test-trials"]
+    words = "final test: 8 trials of each particle, in whole rounds of 4"
+    assert words in dry_run(capsys, "optimize", *sizes, 6)
+    assert "final test" not in dry_run(capsys, "optimize", *sizes, 8)
+
+
 def test_optimize_counts_the_test_at_reference(workplace, capsys):
     """Its grasps are of another program, of 20 times as many steps and more links."""
     output = dry_run(capsys, "optimize", "--reference-trials", 70)

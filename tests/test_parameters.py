@@ -70,6 +70,16 @@ def test_other_units_than_si_are_refused_in_words(name, value, expected):
         parameters.refuse_unit_slips(full)
 
 
+def test_designs_of_another_length_are_refused_by_the_conversion_of_units():
+    """A single number would stand for every parameter: a length for the arm's height."""
+    space = parameters.design_space(HAND, "2d")
+    for convert in (space.from_units, space.in_units):
+        assert convert([[95.0, 30.0]] * 3).shape == (3, 2)
+        for design in (95.0, [95.0], [95.0, 30.0, 1.0], np.ones((2, 3))):
+            with pytest.raises(schema.SceneError, match=r"designs have shape .*: length, arm_z"):
+                convert(design)
+
+
 def test_pressures_that_may_be_kilopascals_are_hinted_at():
     """141 Pa is in the range, which begins at 0, and moves nothing."""
     design = FULL.default()

@@ -13,10 +13,11 @@ from scipy import stats
 from tiny_run import small_run  # noqa: F401
 
 from codesign_jax import cli, runs
+from codesign_jax.commands import reference
 from codesign_jax.report import landscape
-from codesign_jax.runs import choice
+from codesign_jax.runs import choice, outcomes
 from codesign_jax.scene.schema import SceneError
-from codesign_jax.types import failed
+from codesign_jax.types import Outcome, Status, failed
 
 pytest.importorskip("plotly", reason="the extra 'report' is not installed")
 
@@ -99,6 +100,23 @@ def test_unfinished_run_reports_its_finished_episodes(run, tmp_path, capsys):
     assert "2 of 3 episodes" in page and "not tested" in page
     assert "startReplay(document" not in page
     assert f"report: {tmp_path / 'r.html'}" in capsys.readouterr().out
+
+
+def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
+    """Those of the run's design; not those of the design before the run was extended."""
+    copy = shutil.copytree(run, tmp_path / "run")
+    settings, trials = runs.read_run(copy)[1], 5
+    cost, status = np.array([0.0, 0.0, 0.0, 2.0, 3.0]), np.array([0, 0, 0, 0, int(Status.STUCK)])
+    found = Outcome(cost, status, np.full(trials, np.inf), np.full(trials, -1))
+    for design, words in (("own", True), ("other", False)):
+        case, key = reference._case(copy, settings, trials)
+        other = outcomes.key(case.scene, case.engine, case.design[None] + 1, trials, settings.seed)
+        outcomes.save(copy / reference.FILE, found, key if design == "own" else other)
+        page = tmp_path / f"{design}.html"
+        assert cli.main(["report", str(copy), "--no-replay", "--out", str(page)]) == 0
+        low, high = stats.binomtest(3, 4).proportion_ci(0.95, method="wilson")
+        share = f"3 of 4: 75 %, 95 % interval {100 * low:.0f} to {100 * high:.0f} % (1 more failed)"
+        assert (share in page.read_text(encoding="utf-8")) == words
 
 
 @pytest.mark.parametrize("moved", [False, True])

@@ -146,12 +146,16 @@ def test_missing_table(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("width = 0.024", 'width = "20 mm"', "section.width = '20 mm' must be of type float"),
-        ("width = 0.024", "width = true", "section.width = True must be of type float"),
-        ("width = 0.024", "width = [0.02]", "section.width = [0.02] must be of type float"),
+        (
+            "width = 0.024",
+            'width = "20 mm"',
+            "section.width = '20 mm' must be a number in [0.005, 0.1] m",
+        ),
+        ("width = 0.024", "width = true", "section.width = True must be a number"),
+        ("width = 0.024", "width = [0.02]", "section.width = [0.02] must be a number"),
         ('domain = "morphology"', 'domain = "shape"', "domain = 'shape' is not valid; "),
         ("[section]", "[[section]]", "hands.toml.section must be a table, not list"),
-        ("tied = true", "tied = 1", "preset[0].free[0].tied = 1 must be of type bool"),
+        ("tied = true", "tied = 1", "preset[0].free[0].tied = 1 must be true or false"),
     ],
 )
 def test_wrong_type(tmp_path, old, new, expected):
@@ -162,7 +166,7 @@ def test_wrong_type(tmp_path, old, new, expected):
 def test_an_integer_is_a_number_but_a_number_is_not_an_integer():
     assert scene.load("paper", overrides={"cost": {"maximum": 3}}).cost.maximum == 3.0
     (problem,) = scene_problems(discretization={"links": 10.0})
-    assert "discretization.links = 10.0 must be of type int" in problem
+    assert "discretization.links = 10.0 must be a whole number in [1, 200]" in problem
 
 
 @pytest.mark.parametrize(
@@ -184,6 +188,17 @@ def test_eighteen_for_a_width_of_0_018_m(tmp_path):
         "hands.toml.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? "
         "(mm given where m is expected)"
     )
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "low", "high"),
+    [
+        (30.0, "mm", 0.0, 10.0),  # nobody gives micrometres
+        (0.1, "s", 1e-5, 0.05),  # nor a tenth of a millisecond for 0.0001 s
+    ],
+)
+def test_no_slip_is_guessed_that_nobody_makes(value, unit, low, high):
+    assert schema.unit_slip(value, unit, low, high) is None
 
 
 def test_numbers_without_a_unit_have_no_slip_of_units():

@@ -16,7 +16,7 @@ from tiny_run import small_run  # noqa: F401
 from toy import TINY
 
 from codesign_jax import cli, codesign, runs, scene
-from codesign_jax.commands import calls, status
+from codesign_jax.commands import calls, failure, replay, status
 from codesign_jax.commands import landscape as command
 from codesign_jax.commands.case import Case
 from codesign_jax.engines import make_engine
@@ -89,6 +89,16 @@ def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys)
     parts = json.loads(data)["parts"]
     assert [p["name"] for p in parts] == ["finger 0", "finger 1", "palm", "object"]
     assert not re.search(r"(src|href)\s*=\s*[\"']", page), "nothing is loaded from elsewhere"
+
+
+def test_failed_worlds_are_listed_where_no_grasp_was_asked_for(run, tmp_path, monkeypatch):
+    listed = []
+    monkeypatch.setattr(failure, "show_list", listed.append)
+    monkeypatch.setattr(replay, "_write", lambda *arguments: None)
+    own = ["replay", str(run), "--out", str(tmp_path / "r.html")]
+    for more in (["--trial", "0"], ["--episode", "1"], ["--object", "sphere"]):
+        assert cli.main([*own, *more]) == 0 and not listed
+    assert cli.main(own) == 0 and listed == [run]
 
 
 def test_replay_of_a_design_goes_here_unless_told(workplace, simulated):

@@ -2,6 +2,7 @@
 
 import math
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -66,15 +67,20 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
       The design [SI units], shape (parameter,).
 
     Raises:
-      SceneError: With every unknown name, value that is not a number and value out of range.
+      SceneError: With every unknown name, name given twice, value that is not a number and value
+        out of range.
     """
     values = dict(zip(space.names, space.in_units(space.default()), strict=True))
     lows = dict(zip(space.names, space.in_units(np.array(space.low)), strict=True))
     highs = dict(zip(space.names, space.in_units(np.array(space.high)), strict=True))
     units = dict(zip(space.names, space.units, strict=True))
-    problems = []
-    for pair in pairs:
-        name, _, text = pair.partition("=")
+    given = [pair.partition("=")[::2] for pair in pairs]
+    problems = [
+        f"--design {name!r} is given more than once: {', '.join(v for n, v in given if n == name)}"
+        for name, count in Counter(name for name, _ in given).items()
+        if count > 1
+    ]
+    for name, text in given:
         if name not in values:
             problems.append(f"--design {name!r} is not a parameter; {schema.nearest(name, values)}")
             continue

@@ -2,9 +2,9 @@
 
 import dataclasses
 import functools
+import shlex
 import signal
 import sys
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,12 +12,12 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, optimize, runs
-from codesign_jax.commands import common, estimate, hosts, jobs, reference, seeds, verdicts
+from codesign_jax import codesign, runs
+from codesign_jax.commands import asked, common, estimate, hosts, jobs, reference, seeds, verdicts
 from codesign_jax.commands.estimate import Part
 from codesign_jax.runs import Plan, RunResult, Settings, rates
 from codesign_jax.runs.scene_files import scene_texts
-from codesign_jax.scene import Scene, schema
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import SceneError
 
@@ -34,15 +34,15 @@ def main(options: "Optimize") -> int:
     common.use_compilation_cache()
     if options.distributed is not None:
         return _distributed(options)
-    scene, settings = resolve(options)
-    chosen = [settings.seed] if options.seeds is None else seeds.parse(options.seeds)
+    scene, settings = asked.resolve(options)
+    chosen = asked.seeds_of(options)
     # Everything that speaks against the runs, before anything that takes time.
     plan = runs.prepare(scene, settings)
-    folders = {seed: _folder(options, scene, settings, seed) for seed in chosen}
+    folders = {seed: asked.folder(options, scene, settings, seed) for seed in chosen}
     common.check_place("--out", options.out or next(iter(folders.values())), folder=True)
     for seed, folder in folders.items():
-        asked = dataclasses.replace(settings, seed=seed)
-        runs.check_folder(folder, scene, asked, fresh=options.fresh)
+        own = dataclasses.replace(settings, seed=seed)
+        runs.check_folder(folder, scene, own, fresh=options.fresh)
     notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
@@ -90,9 +90,9 @@ def _distributed(options: "Optimize") -> int:
 
 def _compare_all(options: "Optimize") -> int:
     """Compares the runs of all hosts; returns the exit status."""
-    scene, settings = resolve(options)
-    chosen = seeds.parse(options.seeds or "")
-    folders = {seed: _folder(options, scene, settings, seed) for seed in chosen}
+    scene, settings = asked.resolve(options)
+    chosen = asked.seeds_of(options)
+    folders = {seed: asked.folder(options, scene, settings, seed) for seed in chosen}
     results = {seed: jobs.read(scene, folder) for seed, folder in folders.items()}
     _compare(results, folders, Console(highlight=False, soft_wrap=True))
     return int(any(result is None for result in results.values()))
@@ -145,62 +145,6 @@ def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
     return int(any(result is None for result in results.values()))
 
 
-def resolve(options: "Optimize") -> tuple[Scene, Settings]:
-    """Reads the scene and fills the settings.
-
-    Raises:
-      SceneError: With the problems of both.
-    """
-    problems, scene = [], None
-    try:
-        problems += common.solver_problems(
-            [*chain.from_iterable(options.overrides)], options.engine or engines.DEFAULT
-        )
-        scene = common.load_scene(options)
-    except SceneError as error:
-        problems += error.problems
-    settings = runs.make_settings(
-        options.preset,
-        options.schedule,
-        options.first,
-        options.engine or engines.DEFAULT,
-        options.seed,
-        particles=options.particles,
-        trials=options.trials,
-        episodes=options.episodes,
-        test_trials=options.test_trials,
-        optimizer=options.optimizer,
-    )
-    if options.seeds is not None and options.seed != 0:
-        problems.append("--seed and --seeds exclude each other")
-    if options.jobs is not None and (options.seeds is None or options.jobs < 1):
-        problems.append("--jobs needs --seeds and at least one run at a time")
-    # Jobs have the devices of their own hosts, and check there.
-    available = jax.local_device_count() if options.jobs is None else options.devices or 1
-    if options.devices is not None and not 1 <= options.devices <= available:
-        problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
-    for name, count, low, high in (
-        ("--reference-trials", options.reference_trials, 0, 100_000),
-        ("--chunk", options.chunk, 1, 10_000_000),
-    ):
-        problem = None if count is None else schema.range_problem(name, count, "", low, high)
-        problems += [problem] if problem else []
-    problems += runs.check(settings, scene.hand if scene else None)
-    if problems or scene is None:
-        raise SceneError(problems)
-    return scene, settings
-
-
-def _folder(options: "Optimize", scene: Scene, settings: Settings, seed: int) -> Path:
-    """Folder of one run: --out, with a folder inside for each of --seeds."""
-    if options.out is not None:
-        return options.out if options.seeds is None else options.out / f"seed-{seed}"
-    names = [scene.hand.name, settings.preset, settings.schedule, str(seed)]
-    if settings.optimizer != optimize.DEFAULT:
-        names.insert(3, settings.optimizer)
-    return Path("runs") / "-".join(names)
-
-
 def _preflight(scene: Scene, settings: Settings) -> list[str]:
     """Checks the ends of the design space, as every particle lies between them.
 
@@ -225,6 +169,9 @@ def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") 
     space = design_space(scene.hand, settings.preset)
     batch = settings.particles * settings.trials
     print(f"grasps: {settings.grasps} and at least {batch} to find the seed")
+    if settings.test_trials % settings.trials:
+        tested = settings.test_rounds * settings.trials
+        print(f"final test: {tested} trials of each particle, in whole rounds of {settings.trials}")
     if count > 1:
         how = f"{options.jobs} at a time" if options.jobs else "in one batch"
         print(f"runs: {count}, {how}; grasps and disk are those of each")
@@ -258,14 +205,15 @@ def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:
         console.print(f"best final particle: {runs.describe(plan.space, particles[best])}")
         trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.trials)
         console.print(f"its test: {verdicts.verdict(plan.scene, trials)}")
-        again = f"codesign evaluate --run {folder} --trials 150 --accuracy reference"
+        flags = ["--run", str(folder), "--trials", "150", "--accuracy", reference.ACCURACY]
+        again = shlex.join(["codesign", "evaluate", *flags])
         console.print(
             f"chosen as the best of {cost.size} by these trials; for more new ones: {again}",
             markup=False,
         )
     _figures(plan, result, folder, console)
     console.print(f"results: {folder}", markup=False)
-    console.print(f"to look at: codesign report {folder}", markup=False)
+    console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}", markup=False)
 
 
 def _figures(plan: Plan, result: RunResult, folder: Path, console: Console) -> None:

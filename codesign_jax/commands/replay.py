@@ -32,7 +32,8 @@ def main(options: "Replay") -> int:
     common.check_place("--out", path)
     asked = grasp.find(options)
     console = Console(highlight=False, soft_wrap=True)
-    if options.run_folder is not None:
+    places = options.episode, options.particle, options.trial, options.object
+    if options.run_folder is not None and places == (None,) * 4:
         failure.show_list(options.run_folder)
     _write(asked, path, console)
     console.print(f"replay: {path} (for any browser, offline)", markup=False)

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from codesign_jax import scene as scenes
 from codesign_jax.scene import effects, library, schema
@@ -34,8 +34,10 @@ def main(options: "Scenes") -> int:
 
 def _table(scene: scenes.Scene, engines: tuple[str, ...]) -> Table:
     """Effects of a scene, a row each, with a column for each engine."""
-    table = Table("effect", *engines, "meaning", box=box.SIMPLE)
+    # A narrow console breaks between words, never inside a name that a scene file may have.
+    states = [Column(engine, min_width=len("unsupported")) for engine in engines]
+    table = Table(Column("effect", no_wrap=True), *states, "meaning", box=box.SIMPLE)
     for name, effect in effects.EFFECTS.items():
-        states = [effects.state(scene.effects, name, engine) for engine in engines]
-        table.add_row(name, *states, effect.meaning)
+        found = [effects.state(scene.effects, name, engine) for engine in engines]
+        table.add_row(name, *found, effect.meaning)
     return table

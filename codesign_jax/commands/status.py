@@ -15,14 +15,21 @@ def of(run: Callable[[], int]) -> int:
 
     Wrong input, files that can no longer be written or read, and Ctrl-C are said on stderr.
     """
-    from codesign_jax.scene.schema import SceneError
-
     try:
         return run()
-    except SceneError as error:
+    except ValueError as error:
+        from codesign_jax.scene.schema import SceneError
+
+        if not isinstance(error, SceneError):
+            raise
         for problem in error.problems:
             print(f"error: {problem}", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        # Who read the output, such as `head`, has enough. The interpreter would complain when it
+        # flushes what is left: Python's documentation, library "signal", note on SIGPIPE.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except OSError as error:
         if error.filename is None:
             raise

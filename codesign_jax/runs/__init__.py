@@ -8,7 +8,7 @@ The numerical modules know nothing of files; this package knows nothing of physi
 (10, 6, 64, 4200)
 """
 
-from codesign_jax.runs.directory import check_folder, read_run
+from codesign_jax.runs.directory import check_folder, episodes_of, read_run
 from codesign_jax.runs.loop import (
     AllFailed,
     Plan,
@@ -33,6 +33,7 @@ __all__ = [
     "check",
     "check_folder",
     "describe",
+    "episodes_of",
     "failure_counts",
     "load_record",
     "make_settings",

@@ -12,7 +12,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,24 @@ def read_run(
     return scene, Settings(**stored["settings"])
 
 
+def episodes_of(paths: Iterable[Path]) -> int | None:
+    """Episodes that the runs in folders are to have; None if no folder has a run.
+
+    Raises:
+      SceneError: If they are to have different numbers, or a run cannot be read.
+    """
+    found = [path for path in paths if (path / PROVENANCE).exists()]
+    numbers = {path: read_provenance(path)["settings"]["episodes"] for path in found}
+    if len(set(numbers.values())) > 1:
+        least, most = (f(numbers, key=lambda path: numbers[path]) for f in (min, max))
+        problem = (
+            f"{least} has {numbers[least]} episodes and {most} {numbers[most]}: say by --episodes "
+            "how many all are to have"
+        )
+        raise SceneError([problem])
+    return next(iter(numbers.values()), None)
+
+
 def read_provenance(path: Path) -> dict[str, Any]:
     """Reads provenance.json of a run folder.
 
@@ -230,11 +248,11 @@ def _write_provenance(path: Path, content: dict[str, Any]) -> None:
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
     """Refuses to resume another run, and says what differs."""
-    problems = []
+    problems, extension = [], []
     for name, value in dataclasses.asdict(settings).items():
         before = stored["settings"].get(name)
         if name == "episodes":
-            problems += _extension_problems(scene, settings, before)
+            extension = _extension_problems(scene, settings, before)
         elif before != value:
             problems.append(f"{name}: the run has {before!r}, asked for is {value!r}")
     if scenes.load(path / "scene.toml") != scene:
@@ -244,22 +262,23 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
             problems += list(diff)
     if problems:
         head = f"--out {path} holds another run; choose another folder, or --fresh to delete it"
-        raise SceneError([head, *(p.rstrip() for p in problems)])
+        raise SceneError([head, *(p.rstrip() for p in problems + extension)])
+    if extension:
+        hint = "leave out --episodes to go on with it, or choose another folder"
+        raise SceneError([f"--out {path}: {problem}; {hint}" for problem in extension])
 
 
 def _extension_problems(scene: Scene, settings: Settings, before: int) -> list[str]:
     """Why a run cannot have another number of episodes than it had."""
     asked = settings.episodes
+    both = f"the run has {before} episodes, asked for are {asked}"
     if asked < before:
-        return [
-            f"episodes: the run has {before}, asked for is {asked}: "
-            "a run can be extended, not shortened"
-        ]
+        return [f"{both}, and a run can be extended, but not shortened"]
     masks = [masks_of(scene, dataclasses.replace(settings, episodes=n)) for n in (before, asked)]
     if (masks[0] != masks[1][:before]).any():
         return [
-            f"episodes: the run has {before}, asked for is {asked}: schedule "
-            f"{settings.schedule} divides its episodes and would have switched at others"
+            f"{both}, and schedule {settings.schedule} divides its episodes: it would have "
+            "switched at others"
         ]
     return []
 

@@ -25,7 +25,8 @@ class Settings:
       trials: Trials of a particle in an episode.
       episodes: Episodes.
       seed: Root of all random draws.
-      test_trials: Further trials in which the final particles are tested; 0 for no test.
+      test_trials: Further trials in which the final particles are tested, in whole rounds of
+        `trials`; 0 for no test.
       optimizer: One of `optimize.NAMES`.
     """
 

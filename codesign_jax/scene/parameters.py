@@ -151,12 +151,25 @@ class DesignSpace:
         first = [self.source.index(j) for j in range(self.num_parameters)]
         return np.clip(base[first], self.low, self.high)
 
-    def in_units(self, design: np.ndarray) -> np.ndarray:
-        """Converts design vectors from SI to the hand file's units, shape (..., parameter)."""
+    def in_units(self, design: np.typing.ArrayLike) -> np.ndarray:
+        """Converts design vectors from SI to the hand file's units, shape (..., parameter).
+
+        Raises:
+          SceneError: If the last axis is not that of the parameters.
+        """
+        self._refuse_shape(design, "..., ")
         return np.asarray(design) / np.asarray(self.scale)
 
-    def from_units(self, design: np.ndarray) -> np.ndarray:
-        """Converts design vectors from the hand file's units to SI, shape (..., parameter)."""
+    def from_units(self, design: np.typing.ArrayLike) -> np.ndarray:
+        """Converts design vectors from the hand file's units to SI, shape (..., parameter).
+
+        A design outside of the space's bounds is converted as well: it may be simulated, though no
+        optimiser proposes it.
+
+        Raises:
+          SceneError: If the last axis is not that of the parameters.
+        """
+        self._refuse_shape(design, "..., ")
         return np.asarray(design, float) * np.asarray(self.scale)
 
 

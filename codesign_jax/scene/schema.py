@@ -24,6 +24,8 @@ _ANGLES = {
 _PREFIXES = {-6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 _SLIPS = (-3, 3, -6, 6)
 """Powers of ten between units that people mix up, tried in this order."""
+_SMALLER = (1e-3, 1e-6)
+"""Factors from a smaller unit to the right one."""
 _UNIT = re.compile(r"(µ|m|k|M)?(m|s|g|N|Pa|Hz)(?![A-Za-z])(.*)")
 _COMMON = {"Mg/m^3": "g/cm^3"}
 """What a unit is usually called."""
@@ -101,7 +103,8 @@ def nearest(name: str, names: typing.Iterable[str]) -> str:
 def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, str] | None:
     """The factor between units, and what was mixed up, that would bring a value into its range.
 
-    None for a value in its range, and for a number without a unit.
+    None for a value in its range, for a number without a unit, and where a guess would be far from
+    what people write: micrometres for millimetres, or a tenth of a millisecond for seconds.
 
     >>> unit_slip(18.0, "m", 0.005, 0.1)
     (0.001, 'mm given where m is expected')
@@ -110,7 +113,15 @@ def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, 
     """
     if low <= value <= high or value == 0 or not math.isfinite(value):
         return None
-    return next(((f, why) for f, why in _slips(unit) if low <= value * f <= high), None)
+    return next(
+        (
+            (f, why)
+            for f, why in _slips(unit)
+            # In a unit a thousand times smaller than the right one, numbers are large.
+            if low <= value * f <= high and (abs(value) >= 1 or f not in _SMALLER)
+        ),
+        None,
+    )
 
 
 def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
@@ -124,7 +135,7 @@ def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
     own = next(power for power, name in _PREFIXES.items() if name == (prefix or ""))
     for power in _SLIPS:
         other = _PREFIXES.get(own + power)
-        if other is not None:
+        if other is not None and other != "µ":
             name = f"{other}{base}{rest}"
             yield 10.0**power, f"{_COMMON.get(name, name)} given where {unit} is expected"
 
@@ -274,7 +285,7 @@ def _value(hint: Any, value: Any, path: str, field: dataclasses.Field, problems:
 def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems: list[str]) -> Any:
     accepted = (int, float) if hint is float else hint
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
-        problems.append(f"{path} = {value!r} must be of type {hint.__name__}")
+        problems.append(f"{path} = {value!r} must be {_kind(hint, field)}")
         return None
     options = field.metadata.get("options")
     if options and value not in options:
@@ -284,3 +295,17 @@ def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems
         if problem:
             problems.append(problem)
     return float(value) if hint is float else value
+
+
+def _kind(hint: type, field: dataclasses.Field) -> str:
+    """What a value is to be, in words."""
+    if hint is bool:
+        return "true or false"
+    if hint is str:
+        options = field.metadata.get("options")
+        return f"one of {', '.join(options)}" if options else "text"
+    words = "a whole number" if hint is int else "a number"
+    if "low" in field.metadata:
+        limits = _range(field)
+        words = f"{words} in [{limits.low:g}, {limits.high:g}] {limits.unit}".rstrip()
+    return words

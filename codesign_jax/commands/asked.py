@@ -1,0 +1,110 @@
+"""What a command line of `codesign optimize` asks for: scene, settings, seeds and folders."""
+
+import dataclasses
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+
+from codesign_jax import engines, optimize, runs
+from codesign_jax.commands import common, jobs, seeds
+from codesign_jax.runs import Settings
+from codesign_jax.scene import Scene, schema
+from codesign_jax.scene.schema import SceneError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Optimize
+
+
+def resolve(options: "Optimize") -> tuple[Scene, Settings]:
+    """Reads the scene and fills the settings.
+
+    Raises:
+      SceneError: With the problems of both.
+    """
+    problems, scene = [], None
+    try:
+        problems += common.solver_problems(
+            [*chain.from_iterable(options.overrides)], options.engine or engines.DEFAULT
+        )
+        scene = common.load_scene(options)
+    except SceneError as error:
+        problems += error.problems
+    settings = runs.make_settings(
+        options.preset,
+        options.schedule,
+        options.first,
+        options.engine or engines.DEFAULT,
+        options.seed,
+        particles=options.particles,
+        trials=options.trials,
+        episodes=options.episodes,
+        test_trials=options.test_trials,
+        optimizer=options.optimizer,
+    )
+    if scene is not None and options.episodes is None and not options.fresh:
+        try:
+            settings = _as_the_runs(options, scene, settings)
+        except SceneError as error:
+            problems += error.problems
+    problems += _flag_problems(options)
+    problems += runs.check(settings, scene.hand if scene else None)
+    if problems or scene is None:
+        raise SceneError(problems)
+    return scene, settings
+
+
+def _flag_problems(options: "Optimize") -> list[str]:
+    """What is wrong with flags that are no settings of a run."""
+    problems = []
+    if options.seeds is not None and options.seed != 0:
+        problems.append("--seed and --seeds exclude each other")
+    if options.jobs is not None and (options.seeds is None or options.jobs < 1):
+        problems.append("--jobs needs --seeds and at least one run at a time")
+    if options.job_set and options.jobs is None:
+        problems.append("--job-set needs --jobs: its parameters are those of jobs")
+    try:
+        jobs.parameters([*chain.from_iterable(options.job_set)])
+    except SceneError as error:
+        problems += error.problems
+    # Jobs have the devices of their own hosts, and check there.
+    available = jax.local_device_count() if options.jobs is None else options.devices or 1
+    if options.devices is not None and not 1 <= options.devices <= available:
+        problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
+    for name, count, low, high in (
+        ("--reference-trials", options.reference_trials, 0, 100_000),
+        ("--chunk", options.chunk, 1, 10_000_000),
+    ):
+        problem = None if count is None else schema.range_problem(name, count, "", low, high)
+        problems += [problem] if problem else []
+    return problems
+
+
+def _as_the_runs(options: "Optimize", scene: Scene, settings: Settings) -> Settings:
+    """Settings with the episodes of the runs that are there: these may have been extended.
+
+    Raises:
+      SceneError: If the runs differ in them.
+    """
+    folders = [folder(options, scene, settings, seed) for seed in seeds_of(options)]
+    return dataclasses.replace(settings, episodes=runs.episodes_of(folders) or settings.episodes)
+
+
+def seeds_of(options: "Optimize") -> list[int]:
+    """Seeds of the runs.
+
+    Raises:
+      SceneError: If --seeds is no list of them.
+    """
+    return [options.seed] if options.seeds is None else seeds.parse(options.seeds)
+
+
+def folder(options: "Optimize", scene: Scene, settings: Settings, seed: int) -> Path:
+    """Folder of one run: --out, with a folder inside for each of --seeds."""
+    if options.out is not None:
+        return options.out if options.seeds is None else options.out / f"seed-{seed}"
+    names = [scene.hand.name, settings.preset, settings.schedule, str(seed)]
+    if settings.optimizer != optimize.DEFAULT:
+        names.insert(3, settings.optimizer)
+    return Path("runs") / "-".join(names)

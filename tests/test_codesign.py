@@ -221,7 +221,7 @@ def test_convergence_episode(means, expected):
     assert codesign.convergence_episode(means) == expected
 
 
-@pytest.mark.slow  # quick: whole runs by the command line, bit for bit (test_cli)
+@pytest.mark.slow  # quick: whole runs by the command line, bit for bit (test_resume)
 def test_episode_on_real_physics_is_repeatable():
     the_scene, space, _ = tiny()
     optimizer = codesign.make_filter(space)

@@ -13,8 +13,8 @@ def design(run: Run) -> str:
     """The design's parameters within their ranges, and its success in all and by object."""
     chosen, trials = run.chosen, run.chosen.trials
     kept, counted = _kept(run, trials)
-    source = "the final test" if chosen.tested else "its last episode; there was no final test"
-    success = f"Kept the object in {_share(int(kept.sum()), int(counted.sum()))}"
+    source = "the final test" if chosen.tested else "its last episode (there was no final test)"
+    success = f"In {source} it kept the object in {_share(int(kept.sum()), int(counted.sum()))}."
     note = (
         f"Particle {chosen.particle}, mean cost {chosen.cost:.4f} over {counted.sum()} of "
         f"{counted.size} trials of {source}. It was chosen as the best by these very trials, which "
@@ -45,8 +45,8 @@ def _reference(run: Run) -> str:
     left = counted.size - int(counted.sum())
     failed = f" ({left} more failed)" if left else ""
     return (
-        "On fresh trials at the reference accuracy, by which it was not chosen, kept the object in "
-        f"{_share(int(kept.sum()), int(counted.sum()))}{failed}"
+        "In fresh trials at the reference accuracy, which had no part in the choice, it kept the "
+        f"object in {_share(int(kept.sum()), int(counted.sum()))}{failed}."
     )
 
 

@@ -1,0 +1,116 @@
+"""`codesign evaluate`: rows and verdict of a design, of its own or of a run."""
+
+import numpy as np
+import pytest
+from command_runs import command, finished_run, own_workplace  # noqa: F401
+from toy import TINY
+
+from codesign_jax import scene
+from codesign_jax.commands import verdicts
+from codesign_jax.types import Outcome, Status
+
+
+def test_evaluate_prints_costs_of_each_object(capsys):
+    design = ["length=100", "arm_z=-20"]  # by the default engine, the only such evaluation here
+    assert command("evaluate", "--scene", TINY, "--design", *design, "--trials", "3") == 0
+    output = capsys.readouterr().out
+    assert "design: length=100 mm arm_z=-20 mm" in output
+    assert "sphere: mean cost" in output and "over 3 trials" in output and "success" in output
+
+
+def test_evaluate_takes_the_best_of_a_run(finished, capsys):
+    rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
+    best = min(rows, key=lambda row: float(row[1]))
+    assert command("evaluate", "--run", finished, "--trials", "1") == 0
+    output = capsys.readouterr().out
+    assert f"length={float(best[-2]):.4g} mm" in output
+    assert "over 1 trial" in output and "% of grasps (95 % interval)" in output
+
+
+def test_evaluate_judges_a_run_on_other_objects_and_settings(finished, tmp_path, capsys):
+    box = TINY.parent / "box.toml"
+    changes = ["--objects", box, "--accuracy", "fast", "--set", "objects.object.box.mass=0.2"]
+    again = tmp_path / "again.gif"
+    assert command("evaluate", "--run", finished, *changes, "--trials", "3") == 0
+    output = capsys.readouterr().out
+    assert "best final design of" in output and "box: mean cost" in output
+    assert "sphere" not in output and not again.exists()
+    wrong = ["--accuracy", "fats", "--set", "hand.sectoin.width=1"]
+    assert command("evaluate", "--run", finished, *wrong) == 2
+    error = capsys.readouterr().err
+    assert "did you mean 'fast'?" in error and "did you mean 'hand.section'?" in error
+
+
+def test_a_verdict_comes_with_its_interval():
+    """Wilson's interval of n out of n begins at n / (n + 1.96^2): three of three says little."""
+    tiny = scene.load(TINY)
+    kept = verdicts.verdict(tiny, trials_of([0.0] * 3, [0] * 3))
+    assert "mean cost 0.0000 over 3 trials" in kept and "44 to 100 % of grasps" in kept
+    some = verdicts.verdict(tiny, trials_of([0.0, 0.0, 1.5], [0, 0, Status.SOLVER_CAP]))
+    assert "not below the limit" in some and "2 of 3 trials kept" in some
+    broken = verdicts.verdict(tiny, trials_of([3.0] * 3, [Status.NONFINITE] * 3))
+    assert "every trial failed (NONFINITE 3)" in broken and "%" not in broken
+
+
+@pytest.mark.parametrize(
+    ("rule", "mean", "over", "share"),
+    [
+        ("exclude", "0.500", "2 trials, 1 lost (1 more failed, left out: STUCK 1)", "1 of 2"),
+        ("worst", "1.333", "3 trials, 1 lost (1 of them failed, counted as 3: STUCK 1)", "1 of 3"),
+    ],
+)
+def test_rows_and_verdict_follow_the_rule_for_failed_trials(rule, mean, over, share):
+    """Costs 0, 1 and a failed trial: 1/2 without it, (0 + 1 + 3) / 3 with it as the worst."""
+    tiny = scene.load(TINY, overrides={"cost.failure": rule})
+    found = trials_of([0.0, 1.0, 3.0], [0, Status.SOLVER_CAP, Status.STUCK], lost=[1])
+    row, verdict = verdicts.of_object(tiny, found), verdicts.verdict(tiny, found)
+    assert row == f"mean cost {mean} over {over}; warnings: SOLVER_CAP 1"
+    assert f"mean cost {mean}" in verdict and f"{share} trials kept" in verdict
+    alone = verdicts.of_object(tiny, trials_of([3.0], [Status.STUCK]))
+    assert alone.startswith("no mean cost (1 more failed" if rule == "exclude" else "mean cost 3.0")
+
+
+def trials_of(cost, status, lost=()):
+    """Outcomes of trials; the indices in `lost` lost their objects at 1 s."""
+    times = np.where(np.isin(np.arange(len(cost)), lost), 1.0, np.inf)
+    return Outcome(np.array(cost), np.array(status, int), times, np.full(len(cost), -1))
+
+
+def test_evaluate_says_which_objects_it_leaves_out(capsys):
+    design = ["--scene", TINY, "--objects", "paper", "--dry-run"]
+    assert command("evaluate", *design, "--trials", "1") == 0
+    words = "--trials 1 tries 1 of 3 objects, and not cylinder, sphere; --trials 3 tries each once"
+    assert words in capsys.readouterr().out
+    assert command("evaluate", *design, "--trials", "3") == 0
+    assert "tries" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--design", "lenght=100"], "'lenght' is not a parameter; did you mean 'length'?"),
+        (["--design", "length=0.148"], "did you mean 148?"),
+        (["--design", "length=1480"], "length = 1480.0 is outside [10, 180] mm"),
+        (["--design", "length=long"], "length = 'long' must be a number in mm"),
+        (["--design", "length=nan"], "must be a number in mm"),
+        (["--design", "length"], "must be a number in mm"),
+        (["--design", "length=90", "arm_z=5", "length=95"], "more than once: 90, 95"),
+        (["--trials", "0"], "--trials = 0 is outside"),
+        (["--engine", "c"], "--engine"),
+        (["--set", "solver.iterations=50"], "set newton.iterations, which limits the solver"),
+        (["--render", "grasp.mp4"], "must end in .gif"),
+        (["--run", "nowhere"], "nowhere is not a run folder"),
+        (["--run", "nowhere", "--design", "length=100"], "own; leave out --design"),
+        (["--run", "nowhere", "--hand", "tripod3", "--preset", "23d"], "out --hand and --preset"),
+    ],
+)
+def test_evaluate_refuses_wrong_input(arguments, part, workplace, capsys):
+    assert command("evaluate", *arguments) == 2
+    assert part in capsys.readouterr().err
+    assert list(workplace.iterdir()) == []
+
+
+def test_bounds_themselves_are_designs(capsys):
+    space_low = ["length=10", "arm_z=-50"]
+    engine = ["--engine", "mujoco", "--trials", "1"]
+    assert command("evaluate", "--scene", TINY, "--design", *space_low, *engine) == 0

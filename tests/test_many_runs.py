@@ -1,0 +1,199 @@
+"""Many runs of one command: in one batch, as jobs, on several hosts, with the same bits."""
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from command_runs import (
+    RUN,
+    assert_same_run,
+    command,
+    launch,
+    own_workplace,  # noqa: F401
+    snapshot,
+    stored,
+    without,
+)
+
+from codesign_jax import runs
+from codesign_jax.batch import Batch
+from codesign_jax.commands import jobs
+from codesign_jax.runs.checkpoint import Checkpoints
+
+BASE = [a for a in RUN if a not in ("--seed", "3")]
+
+
+TWO = [*BASE, "--episodes", "2", "--seeds", "2-3"]
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """Folder of two seeds in one batch, and what was printed."""
+    folder, text = tmp_path_factory.mktemp("compared") / "both", io.StringIO()
+    with contextlib.redirect_stdout(text):
+        assert command(*TWO, "--out", folder) == 0
+    return folder, text.getvalue()
+
+
+def test_runs_of_different_lengths_need_episodes(compared, tmp_path, capsys):
+    both = shutil.copytree(compared[0], tmp_path / "both")
+    path = both / "seed-3" / "provenance.json"
+    content = json.loads(path.read_text())
+    content["settings"]["episodes"] = 7
+    path.write_text(json.dumps(content))
+    before = snapshot(both)
+    assert command(*without(TWO, "--episodes"), "--out", both) == 2
+    error = capsys.readouterr().err
+    assert "seed-2 has 2 episodes and" in error and "seed-3 7: say by --episodes" in error
+    assert snapshot(both) == before
+
+
+def test_seeds_are_compared(compared):
+    both, output = compared
+    assert output.count("compiled in") == 1 and "  2 runs  mean" in output
+    assert stored(both / "seed-2") != stored(both / "seed-3")
+    table = output.split("best test cost")[1]
+    rows = [line.split() for line in table.splitlines()]
+    assert [row[0] for row in rows if row[-1:] == ["particles"]] == ["2", "3"]
+    assert "of 2 runs have a particle below the limit of success" in table
+    assert "% of such runs (95 % interval)" in table
+    _, *rows = (both / "seeds.csv").read_text().splitlines()
+    assert rows[0].startswith("2,1,") and rows[1].startswith("3,1,")
+
+
+class Here:
+    """In the place of submitit's executor: runs each job in this process as it is submitted."""
+
+    cluster, folder = "here", "none"
+
+    def submit(self, function, *arguments):
+        code = function(*arguments)
+        there = SimpleNamespace(exists=lambda: True)
+        return SimpleNamespace(
+            done=lambda: True,
+            exception=lambda: None,
+            result=lambda: code,
+            paths=SimpleNamespace(result_pickle=there, stderr=Path("none")),
+        )
+
+
+def assert_jobs_are_the_batch(compared, out, *more):
+    both, _ = compared
+    assert command(*TWO, "--jobs", "2", *more, "--out", out) == 0
+    assert (out / "seeds.csv").read_bytes() == (both / "seeds.csv").read_bytes()
+    for seed in ("seed-2", "seed-3"):
+        assert stored(out / seed) == stored(both / seed)
+
+
+def test_jobs_have_the_bits_of_a_batch(compared, tmp_path, monkeypatch, capsys):
+    """Each a run by itself, here within this process; the next test has processes, other SLURM."""
+    monkeypatch.setattr(jobs, "executor", lambda options, folder: Here())
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    assert_jobs_are_the_batch(compared, tmp_path / "jobs")
+    assert "2 runs, 2 at a time, on here" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_jobs_are_processes_where_there_is_no_slurm(compared, tmp_path):
+    local = ("--job-set", "cluster=local", "timeout_min=5")
+    assert_jobs_are_the_batch(compared, tmp_path / "jobs", *local)
+
+
+def test_wrong_jobs_are_refused(tmp_path, capsys):
+    assert command(*BASE, "--episodes", "2", "--jobs", "2") == 2
+    assert "--jobs needs --seeds" in capsys.readouterr().err
+    run = [*TWO, "--jobs", "2", "--job-set", "cluster=local"]
+    for wrong, words in (("timeout_min", "must be KEY=VALUE"), ("memory=3", "memory")):
+        assert command(*run, wrong, "--out", tmp_path / "no") == 2
+        assert words in capsys.readouterr().err
+
+
+def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch, capsys):
+    """A signal, a disk that is full for one of them, and runs that are at other episodes."""
+    run = [*BASE, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]
+    assert command(*RUN, "--episodes", "1", "--out", tmp_path / "runs" / "seed-3") == 0
+    save, simulate = Checkpoints.save, Batch.begin
+
+    def interrupted(batch, requests):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return simulate(batch, requests)
+
+    def full(store, step, arrays):
+        if store.folder.parent.name == "seed-5" and step == 2:
+            raise OSError("no space left")
+        save(store, step, arrays)
+
+    monkeypatch.setattr(Batch, "begin", interrupted)
+    assert command(*run) == 128 + signal.SIGTERM
+    monkeypatch.setattr(Batch, "begin", simulate)
+    assert "seed 3: extended from 1 to 3 episodes" in capsys.readouterr().out
+    first = runs.load_record(tmp_path / "runs" / "seed-3")
+    assert first is not None and first.done == 2
+    monkeypatch.setattr(Checkpoints, "save", full)
+    assert command(*run) == 1
+    output = capsys.readouterr()
+    assert "error: seed 5: no space left" in output.err
+    assert "resuming episode 3/3" in output.out and "of 2 runs have a particle" in output.out
+    monkeypatch.setattr(Checkpoints, "save", save)
+    assert command(*run) == 0
+    assert "of 3 runs have a particle" in capsys.readouterr().out
+    events, fetch, report = [], runs.loop.fetch, runs.loop.records.report
+
+    def noted_fetch(tree):
+        events.append("fetch")
+        return fetch(tree)
+
+    def noted_report(history, episode, info):
+        events.append(f"report {episode + 1}")
+        report(history, episode, info)
+
+    def noted_save(store, step, arrays):
+        events.append(f"save {step}")
+        save(store, step, arrays)
+
+    def noted_simulation(batch, requests):
+        events.append("begin")
+        return simulate(batch, requests)
+
+    monkeypatch.setattr(runs.loop, "fetch", noted_fetch)
+    monkeypatch.setattr(runs.loop.records, "report", noted_report)
+    monkeypatch.setattr(Checkpoints, "save", noted_save)
+    monkeypatch.setattr(Batch, "begin", noted_simulation)
+    for seed in ("3", "5"):
+        alone = [*BASE, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
+        assert command(*alone) == 0
+        assert_same_run(tmp_path / "runs" / f"seed-{seed}", tmp_path / f"alone-{seed}")
+    # An episode is read from the devices before the next one begins, and then reported and saved;
+    # the last one before the test begins.
+    start, after = events.index("save 0"), ["begin", "fetch", "begin", "report 1", "save 1"]
+    after += ["fetch", "begin", "report 2", "save 2", "fetch", "report 3", "save 3", "begin"]
+    assert events[start + 1 : start + 14] == after
+
+
+@pytest.mark.slow
+def test_hosts_share_the_seeds(tmp_path, capsys):
+    """Two processes of JAX's distributed runtime on this host: the runs are those of one."""
+    run = [*BASE, "--episodes", "2", "--seeds", "3-5"]
+    assert command(*run, "--out", tmp_path / "one") == 0
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    hosts = [
+        launch(*run, "--out", tmp_path / "two", "--distributed", f"{address},2,{k}") for k in (0, 1)
+    ]
+    outputs = [host.communicate()[0] for host in hosts]
+    assert [host.returncode for host in hosts] == [0, 0], outputs
+    for seed in ("seed-3", "seed-4", "seed-5"):
+        assert stored(tmp_path / "two" / seed) == stored(tmp_path / "one" / seed)
+    tables = [(tmp_path / name / "seeds.csv").read_bytes() for name in ("one", "two")]
+    assert tables[0] == tables[1]
+    assert "of 3 runs have a particle" in outputs[0]
+    assert "seed 4: final test" not in outputs[0] and "of 3 runs" not in outputs[1]

@@ -1,0 +1,278 @@
+"""A run and its folder: it resumes and extends bit for bit, whatever ended it."""
+
+import dataclasses
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from command_runs import (  # noqa: F401
+    EPISODES,
+    RESULTS,
+    RUN,
+    assert_same_run,
+    command,
+    finished_run,
+    launch,
+    own_workplace,
+    snapshot,
+    stored,
+    wait_for,
+    without,
+)
+from toy import TINY
+
+from codesign_jax import codesign, runs
+from codesign_jax.commands import reference
+from codesign_jax.runs import choice, columns
+from codesign_jax.runs.checkpoint import Checkpoints
+
+
+def test_run_folder_is_complete(finished):
+    names = {p.name for p in finished.iterdir()}
+    assert names >= {*RESULTS, "scene.toml", "hand.toml", "objects.toml", "provenance.json"}
+    assert names >= {"checkpoints", "events.log", "figures"}
+    assert names <= {*columns.FILES, *columns.TABLES, ".lock"}, "a file that docs/files.md lacks"
+    assert not list(finished.rglob("*.tmp"))
+    provenance = json.loads((finished / "provenance.json").read_text())
+    assert provenance["settings"]["seed"] == 3
+    assert set(provenance["environment"]["versions"]) >= {"jax", "mujoco", "codesign-jax"}
+    assert len((finished / "episodes.csv").read_text().splitlines()) == EPISODES + 1
+
+
+def test_another_hand_compiles_nothing(finished, tmp_path):
+    """Neither a run nor an evaluation, once a hand of the same structure was simulated."""
+    text = (TINY.parent / "pinch.toml").read_text()
+    softer = text.replace("56e3", "53e3").replace("density = 1070.0", "density = 1100.0")
+    (tmp_path / "softer.toml").write_text(softer)
+    run = [*RUN, "--episodes", "2", "--out", tmp_path / "run"]
+    evaluate = ["evaluate", "--scene", TINY, "--engine", "mujoco", "--trials", "1"]
+    assert command(*evaluate) == 0
+    compiled = []
+
+    def listen(event, seconds, **details):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(details)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for arguments in (run, evaluate):
+            assert command(*arguments, "--hand", tmp_path / "softer.toml") == 0
+        assert not compiled
+        # What the count would have seen of any other program.
+        jax.jit(lambda x: x + len(compiled))(np.ones(3))
+        assert compiled
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert stored(tmp_path / "run") != stored(finished)
+
+
+def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    left = folder / "trials.csv.4711.tmp"  # of a process that was killed while it wrote
+    left.write_text("half")
+    assert command(*RUN, "--out", folder) == 0
+    assert not left.exists()
+    assert f"all {EPISODES} episodes are done" in capsys.readouterr().out
+    assert_same_run(folder, finished)
+
+
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [
+        (signal.SIGKILL, -signal.SIGKILL),
+        # Within this process: test_runs_of_a_batch_stop_fail_and_go_on_by_themselves.
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+    ],
+)
+def test_interrupted_run_resumes_bit_for_bit(number, status, finished, tmp_path, capsys):
+    folder = tmp_path / "run"
+    process = launch(*RUN, "--out", folder)
+    wait_for(folder / "events.log", "episode  3/", process)
+    process.send_signal(number)
+    output, _ = process.communicate()
+    assert process.returncode == status, output
+    done = runs.load_record(folder)
+    assert done is not None and 3 <= done.done < EPISODES, "it was to stop on the way"
+    assert command(*RUN, "--out", folder) == 0
+    assert f"resuming episode {done.done + 1}/{EPISODES}" in capsys.readouterr().out
+    assert_same_run(folder, finished)
+
+
+@pytest.mark.slow
+def test_run_killed_again_and_again_resumes_bit_for_bit(tmp_path):
+    run, folder, kills = [*RUN, "--episodes", "40"], tmp_path / "run", 0
+    assert command(*run, "--out", tmp_path / "whole") == 0
+    while True:
+        process = launch(*run, "--out", folder)
+        before = len(list((folder / "checkpoints").glob("*.sha256"))) if folder.exists() else 0
+        try:
+            # Any moment of start, compile, seed, episode or save, a little later each time.
+            process.wait(timeout=2.0 + 0.37 * kills)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            kills += 1
+        process.communicate()
+        if process.returncode == 0:
+            break
+        assert process.returncode == -signal.SIGKILL, before
+    assert kills > 5
+    assert_same_run(folder, tmp_path / "whole")
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate"])
+def test_damaged_checkpoint_is_said_and_the_older_one_used(damage, finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    newest = EPISODES + 1  # the final test
+    largest = max(
+        (folder / "checkpoints" / str(newest)).rglob("d/*"), key=lambda p: p.stat().st_size
+    )
+    content = bytearray(largest.read_bytes())
+    content[len(content) // 2] ^= 1
+    largest.write_bytes(content if damage == "flip" else content[: len(content) // 2])
+    assert command(*RUN, "--out", folder) == 0
+    assert f"checkpoint {newest} is lost" in capsys.readouterr().out
+    assert f"checkpoint {newest} is lost" in (folder / "events.log").read_text()
+    assert_same_run(folder, finished)
+
+
+def test_losing_every_checkpoint_starts_anew(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    for path in (folder / "checkpoints").glob("*.sha256"):
+        path.unlink()
+    assert command(*RUN, "--out", folder) == 0
+    assert capsys.readouterr().out.count("is lost") == 3
+    assert_same_run(folder, finished)
+
+
+def test_resume_with_another_scene_is_refused_with_a_diff(finished, capsys):
+    before = snapshot(finished)
+    assert command(*RUN, "--out", finished, "--set", "gravity=9.7") == 2
+    error = capsys.readouterr().err
+    assert "-gravity = 9.81  # m/s^2" in error and "+gravity = 9.7  # m/s^2" in error
+    assert snapshot(finished) == before
+
+
+def test_resume_with_other_settings_is_refused(finished, capsys):
+    before = snapshot(finished)
+    assert command(*RUN, "--out", finished, "--particles", "5", "--schedule", "switch-2") == 2
+    error = capsys.readouterr().err
+    assert "particles: the run has 4, asked for is 5" in error
+    assert "schedule: the run has 'concurrent', asked for is 'switch-2'" in error
+    assert snapshot(finished) == before
+
+
+def test_other_versions_resume_and_say_so(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    path = folder / "provenance.json"
+    path.write_text(path.read_text().replace('"mujoco": "', '"mujoco": "0.'))
+    assert command(*RUN, "--out", folder) == 0
+    assert "not bitwise comparable" in capsys.readouterr().out
+
+
+def test_second_process_on_a_folder_is_refused(finished, capsys):
+    before = snapshot(finished)
+    with (finished / ".lock").open("r+") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert command(*RUN, "--out", finished) == 2
+    assert f"is in use by process {os.getpid()}" in capsys.readouterr().err
+    assert snapshot(finished) == before
+
+
+def test_folder_with_other_files_is_refused(workplace, capsys):
+    (workplace / "thesis.tex").write_text("years of work")
+    assert command(*RUN, "--out", workplace, "--fresh") == 2
+    assert "thesis.tex" in capsys.readouterr().err
+    assert [p.name for p in workplace.iterdir()] == ["thesis.tex"]
+
+
+def test_fresh_starts_anew(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    few = [*RUN, "--episodes", "2", "--test-trials", "0", "--out", folder]
+    assert command(*few) == 2, "other settings need --fresh"
+    assert command(*few, "--fresh") == 0
+    assert "episode 1/2" in capsys.readouterr().out
+    assert len((folder / "episodes.csv").read_text().splitlines()) == 3
+    assert not (folder / "tests.csv").exists()
+
+
+def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, monkeypatch, capsys):
+    """Here shortened to a few coarse steps, as everything else of the run is."""
+    folder = shutil.copytree(finished, tmp_path / "run")
+    assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("on 2 fresh"))
+    assert "accuracy reference (1 ms, 20 links): mean cost" in line and "95 % interval" in line
+
+    def never(*arguments):
+        raise AssertionError("simulated again")
+
+    with monkeypatch.context() as patch:  # kept in the run folder
+        patch.setattr(codesign, "make_evaluate", never)
+        assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
+        assert line in capsys.readouterr().out.splitlines()
+        with pytest.raises(AssertionError, match="simulated again"):
+            command(*RUN, "--reference-trials", "3", "--out", folder)
+    settings = runs.read_run(folder)[1]
+    assert reference.number_of_trials(None, settings) == 0  # MuJoCo C would take minutes
+    quick = dataclasses.replace(settings, engine="structured")
+    assert reference.number_of_trials(None, quick) == 24
+    assert reference.number_of_trials(None, dataclasses.replace(quick, test_trials=0)) == 0
+
+
+@pytest.mark.parametrize(
+    "optimizer", ["particle-filter", pytest.param("cma-es", marks=pytest.mark.slow)]
+)
+def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
+    run = [*RUN, "--optimizer", optimizer]
+    long, grown = tmp_path / "long", tmp_path / "grown"
+    assert command(*run, "--episodes", "5", "--out", long) == 0
+    assert command(*run, "--episodes", "3", "--out", grown) == 0
+    if optimizer == "particle-filter":  # as runs from before there were others
+        provenance = json.loads((grown / "provenance.json").read_text())
+        del provenance["settings"]["optimizer"]
+        (grown / "provenance.json").write_text(json.dumps(provenance))
+    assert command(*run, "--episodes", "5", "--out", grown) == 0
+    assert "extended from 3 to 5 episodes" in capsys.readouterr().out
+    assert_same_run(grown, long)
+    provenance = json.loads((grown / "provenance.json").read_text())
+    assert provenance["settings"]["episodes"] == 5
+    ((step, command_line),) = [(e, e.pop("command")) for e in provenance["extended"]]
+    assert (step["from"], step["to"]) == (3, 5) and command_line
+    # The design that was found, wherever in the run, and one grasp of it.
+    scene, record = runs.read_run(grown)[0], choice.read_record(grown)
+    chosen, grasp = choice.choose(scene, record), choice.find_grasp(scene, record)
+    np.testing.assert_array_equal(grasp.design, chosen.design)
+    assert grasp.place[:2] == (chosen.episode + 1, chosen.row)
+    # Four trials of the test; the last episode's two are the particle filter's only.
+    assert chosen.trials.cost.shape == ((6,) if optimizer == "particle-filter" else (4,))
+    before = snapshot(grown)
+    assert command(*run, "--episodes", "4", "--out", grown) == 2
+    error = capsys.readouterr().err
+    assert "can be extended, but not shortened; leave out --episodes" in error
+    assert "--fresh" not in error and snapshot(grown) == before
+    # Without --episodes the command goes on with the run, whatever it was extended to.
+    assert command(*without(run, "--episodes"), "--out", grown) == 0
+    assert "all 5 episodes are done" in capsys.readouterr().out
+    assert_same_run(grown, long)
+
+
+def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsys):
+    switching = [*RUN, "--schedule", "switch-1", "--out", tmp_path / "run", "--test-trials", "0"]
+    assert command(*switching, "--episodes", "2") == 0
+    assert command(*switching, "--episodes", "4") == 2
+    assert "switch-1 divides its episodes" in capsys.readouterr().err
+
+
+def test_checkpoints_are_written_every_episode(finished):
+    with Checkpoints(Path(finished) / "checkpoints") as store:
+        found = store.restore()
+    assert found.step == EPISODES + 1 and "test" in found.arrays
+    kept = sorted(int(p.stem) for p in (finished / "checkpoints").glob("*.sha256"))
+    assert kept == [EPISODES - 1, EPISODES, EPISODES + 1]

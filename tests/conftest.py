@@ -39,11 +39,11 @@ def pytest_configure(config):
 # Files of more than ten seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other.
 LONG = """
-test_many_runs test_compose test_resume test_effects test_engines test_kernel test_containment test_mesh_grasps
-test_calibration test_constants test_codesign test_planted_contacts test_winners test_docs
-test_experiments test_accuracy test_hard_cases test_rollout test_model test_particle_filter
-test_grasp test_batch test_export_sheet test_report test_showing test_effects_physics
-test_optimizers test_parquet test_accuracy_report
+test_many_runs test_compose test_resume test_effects test_engines test_kernel test_containment
+test_mesh_grasps test_calibration test_constants test_codesign test_planted_contacts test_winners
+test_docs test_experiments test_accuracy test_hard_cases test_rollout test_model
+test_particle_filter test_grasp test_batch test_export_sheet test_report test_showing
+test_effects_physics test_optimizers test_parquet test_accuracy_report
 """.split()
 
 

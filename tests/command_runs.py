@@ -1,12 +1,9 @@
 """Runs by the command line for tests: the command, its run, and comparisons of run folders."""
 
-import fcntl
 import os
-import shutil
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 from toy import TINY
@@ -77,15 +74,10 @@ def stored(folder):
 
 @pytest.fixture(scope="module", name="finished")
 def finished_run(tmp_path_factory):
-    """A run that nothing interrupted, made once for all processes of the session."""
-    kept = Path(os.environ["CODESIGN_TESTS_FOLDER"]) / "finished-run"
-    with kept.with_suffix(".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (kept / "done").exists():
-            shutil.rmtree(kept, ignore_errors=True)
-            assert command(*RUN, "--out", kept / "run") == 0
-            (kept / "done").touch()
-    return Path(shutil.copytree(kept / "run", tmp_path_factory.mktemp("finished") / "run"))
+    """A run that nothing interrupted; copy it to change it."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    assert command(*RUN, "--out", folder) == 0
+    return folder
 
 
 def assert_same_run(folder, finished):

@@ -161,11 +161,16 @@ def test_resume_with_another_scene_is_refused_with_a_diff(finished, capsys):
 
 
 def test_resume_with_other_settings_is_refused(finished, capsys):
+    path = finished / "provenance.json"  # as of a run that the command began
+    content = json.loads(path.read_text())
+    content["started"]["command"] = ["/usr/bin/codesign", *RUN, "--out", "my runs"]
+    path.write_text(json.dumps(content))
     before = snapshot(finished)
     assert command(*RUN, "--out", finished, "--particles", "5", "--schedule", "switch-2") == 2
     error = capsys.readouterr().err
     assert "particles: the run has 4, asked for is 5" in error
-    assert "schedule: the run has 'concurrent', asked for is 'switch-2'" in error
+    assert "--schedule: the run has concurrent, asked for is switch-2" in error
+    assert "goes on by its own command: codesign optimize --scene" in error and "'my runs'" in error
     assert snapshot(finished) == before
 
 

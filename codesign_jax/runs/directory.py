@@ -11,6 +11,7 @@ import fcntl
 import json
 import os
 import re
+import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -26,6 +27,8 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
 
 _LOCK = ".lock"
+_MOST_LINES = 16
+"""Lines of a file's differences that an error shows."""
 PROVENANCE = "provenance.json"
 """File that makes a folder a run."""
 _OURS = {*FILES, *TABLES, _LOCK}
@@ -254,18 +257,35 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
         if name == "episodes":
             extension = _extension_problems(scene, settings, before)
         elif before != value:
-            problems.append(f"{name}: the run has {before!r}, asked for is {value!r}")
+            flag = name.replace("_", "-")
+            problems.append(f"--{flag}: the run has {before}, asked for is {value}")
     if scenes.load(path / "scene.toml") != scene:
         for name, text in scene_files.scene_texts(scene).items():
             old = (path / name).read_text(encoding="utf-8").splitlines()
             diff = difflib.unified_diff(old, text.splitlines(), f"run/{name}", f"asked/{name}", n=0)
-            problems += list(diff)
+            problems += _beginning([*diff])
     if problems:
         head = f"--out {path} holds another run; choose another folder, or --fresh to delete it"
-        raise SceneError([head, *(p.rstrip() for p in problems + extension)])
+        shown = [head, *_own_command(stored), *(p.rstrip() for p in problems + extension)]
+        raise SceneError(shown)
     if extension:
         hint = "leave out --episodes to go on with it, or choose another folder"
         raise SceneError([f"--out {path}: {problem}; {hint}" for problem in extension])
+
+
+def _own_command(stored: dict[str, Any]) -> list[str]:
+    """By which command a run goes on, in words; nothing if it was begun from Python."""
+    last = [stored.get("started", {}), *stored.get("resumed", [])][-1]
+    program, *arguments = last.get("command", [""])
+    if Path(program).name not in ("codesign", "cli.py"):
+        return []
+    return [f"the run in it goes on by its own command: {shlex.join(['codesign', *arguments])}"]
+
+
+def _beginning(lines: list[str]) -> list[str]:
+    """The first lines of many, and how many more there are."""
+    rest = len(lines) - _MOST_LINES
+    return lines if rest <= 0 else [*lines[:_MOST_LINES], f"and {rest} lines more"]
 
 
 def _extension_problems(scene: Scene, settings: Settings, before: int) -> list[str]:

@@ -73,6 +73,8 @@ def load(path: Path) -> Failure:
     Raises:
       SceneError: If the file is not one.
     """
+    if not path.exists():
+        raise SceneError([f"{path}: there is no such file or folder"])
     try:
         with np.load(path, allow_pickle=False) as stored:
             values = {k: stored[k] for k in stored.files}
@@ -82,4 +84,5 @@ def load(path: Path) -> Failure:
         status, bad_step = int(values["status"]), int(values["bad_step"])
         return Failure(values["design"], trial, values["state"], status, bad_step, place)  # type: ignore[arg-type]
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise SceneError([f"{path} is not a failed world of a run: {error}"]) from error
+        problem = f"{path} is not a failed world of a run, which are .npz files in its {FOLDER}/"
+        raise SceneError([problem]) from error

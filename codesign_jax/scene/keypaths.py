@@ -122,16 +122,14 @@ def _apply(
     if isinstance(place, list):
         index = _index(place, key)
         if index is None:
-            problems.append(
-                f"{names[0]} has no entry {key!r}; {schema.nearest(key, _names(place))}"
-            )
+            problems.append(f"{given} has no entry {key!r}; {schema.nearest(key, _names(place))}")
             return
         # The schema names an entry by its index, other checks by its name.
         names, key = tuple(n + form for n in names for form in (f"[{index}]", f" {key}")), index
     elif isinstance(place, dict):
         names = tuple(f"{name}.{key}" for name in names)
     else:
-        problems.append(f"{names[0]} = {place!r} is no table: it has no key {key!r}")
+        problems.append(f"{given} = {place!r} is no table: it has no key {key!r}")
         return
     given += f"[{path[0]}]" if path[0].isdecimal() else "." * bool(given) + path[0]
     if not rest or (isinstance(place, dict) and key not in place):
@@ -146,9 +144,9 @@ def _apply(
 
 
 def _names(entries: list) -> list[str]:
-    """What the entries of a list may be called: their names, and their indices."""
+    """What the entries of a list are called: their names, or their indices without names."""
     names = [str(e["name"]) for e in entries if isinstance(e, dict) and "name" in e]
-    return names + [str(i) for i in range(len(entries))]
+    return names or [str(i) for i in range(len(entries))]
 
 
 def _index(entries: list, key: str) -> int | None:

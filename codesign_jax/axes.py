@@ -1,5 +1,6 @@
 """Axes of what is simulated: arrays without them are refused in words, also while JAX traces."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -36,6 +37,40 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
             problems = [f"params have {counts[0]} {axes[0]}s and trials {counts[1]}"]
     if problems:
         raise SceneError(problems)
+
+
+def refuse_other(scene: Any, engine: Any) -> None:
+    """Refuses a scene that is not one that the engine was made for.
+
+    Args:
+      scene: What should be a scene.
+      engine: What should be an engine. Those of one's own without an attribute `scene` take all.
+
+    Raises:
+      SceneError: If `scene` is none, or its structure is not that of the engine's scene: the engine
+        would simulate its own.
+    """
+    if not isinstance(scene, Scene):
+        raise SceneError([f"scene is a {type(scene).__name__}, not a Scene; scene.load reads one"])
+    own = getattr(engine, "scene", None)
+    if own is None or own.structure == scene.structure:
+        return
+    keys = _differences(dataclasses.asdict(own.structure), dataclasses.asdict(scene.structure), "")
+    some = ", ".join(keys[:3]) + (", ..." if len(keys) > 3 else "")
+    raise SceneError(
+        [
+            f"engine {engine.name} was made for a scene of another structure (other: {some}); "
+            f"make_engine({engine.name!r}, scene) makes one for this scene"
+        ]
+    )
+
+
+def _differences(one: Any, other: Any, path: str) -> list[str]:
+    """Key paths in which two scenes as nested dictionaries differ."""
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        below = (_differences(one[k], other[k], f"{path}.{k}" if path else k) for k in one)
+        return [key for keys in below for key in keys]
+    return [] if repr(one) == repr(other) else [path]
 
 
 def refuse_constants(constants: Constants, count: int, axis: str) -> None:

@@ -151,10 +151,12 @@ def simulate(
       Outcome and trace with leading axis (world,).
 
     Raises:
-      SceneError: If an array lacks an axis, if the constants do not fit the scene or lie outside
-        their ranges, or if a parameter is out of its range by a factor between units, such as
-        millimetres given for metres; of traced ones no values are known.
+      SceneError: If the engine was made for a scene of another structure, if an array lacks an
+        axis, if the constants do not fit the scene or lie outside their ranges, or if a parameter
+        is out of its range by a factor between units, such as millimetres given for metres; of
+        traced ones no values are known.
     """
+    axes.refuse_other(scene, engine)
     constants = numbers(scene, constants)
     axes.refuse(scene, params, trials, ("world", "world"))
     axes.refuse_constants(constants, len(trials.yaw), "world")
@@ -233,7 +235,10 @@ def _by_own(
     """Outcome of one world with a cost of one's own."""
     if ctrl is None:
         raise ValueError("a cost of one's own needs the controls")
-    value = jnp.asarray(own(scene, trace, ctrl))
+    returned = own(scene, trace, ctrl)
+    if returned is None:
+        raise ValueError("a cost is one number for each world, not None: does it return one?")
+    value = jnp.asarray(returned)
     if value.shape:
         raise ValueError(f"a cost is one number for each world, not an array {value.shape}")
     value = jnp.where(failed(result.status), scene.cost.maximum, value)

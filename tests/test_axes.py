@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import tiny
+from toy import TINY, tiny
 
-from codesign_jax import codesign, make_engine, rollout
+from codesign_jax import codesign, make_engine, rollout, scene
 from codesign_jax.scene import SceneError
 
 SCENE, SPACE, ENGINE = tiny()
@@ -38,8 +38,18 @@ def episode(mask):
     return codesign.make_episode(SCENE, ENGINE, SPACE, OPTIMIZER, 2)(state, mask)
 
 
+FINER = scene.load(TINY, overrides={"discretization.links": 4, "effects.twist": True})
 LONG = SCENE.constants()._replace(gravity=np.full(5, 9.81))
 CASES = {
+    "an engine of another scene": (
+        lambda: rollout.simulate(FINER, ENGINE, batch(HAND, 1), batch(TRIAL, 1)),
+        r"engine toy was made for a scene of another structure \(other: effects.twist, "
+        r"discretization.links\); make_engine\('toy', scene\) makes one",
+    ),
+    "scene and engine exchanged": (
+        lambda: rollout.simulate(ENGINE, SCENE, batch(HAND, 1), batch(TRIAL, 1)),
+        "scene is a ToyEngine, not a Scene",
+    ),
     "one hand": (
         lambda: simulate(HAND, batch(TRIAL, 3)),
         r"params have no axis \(world,\); of one, jax.tree.map\(lambda v: v\[None\], params\)",
@@ -131,3 +141,10 @@ def test_it_is_said_while_tracing():
         jax.jit(lambda p, t: simulate(p, t))(HAND, batch(TRIAL, 3))
     with pytest.raises(SceneError, match="designs have shape"):
         jax.jit(SPACE.expand)(np.ones(3))
+
+
+def test_a_population_may_be_a_list():
+    listed = codesign.make_evaluate(SCENE, ENGINE, SPACE, 2)(
+        [[float(v) for v in SPACE.default()]], jax.random.key(0)
+    )
+    np.testing.assert_array_equal(listed.cost, evaluate(SPACE.default()[None]).cost)

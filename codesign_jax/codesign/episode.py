@@ -74,7 +74,7 @@ def make_evaluate(
     ) -> Outcome:
         space.refuse_population(population)
         space.refuse_unit_slips(population)
-        return program(population, key, constants)
+        return program(jnp.asarray(population), key, constants)
 
     return evaluate
 

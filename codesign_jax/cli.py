@@ -1,6 +1,7 @@
 """The `codesign` command: its flags.  Nothing heavy is imported before they are parsed."""
 
 import dataclasses
+import importlib.metadata
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -292,11 +293,13 @@ def main(arguments: list[str] | None = None) -> int:
     """
 
     def run() -> int:
+        if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+            return _version()
         command = tyro.cli(
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,
             prog="codesign",
-            description="Co-design of soft hand morphology and control.",
+            description="Co-design of soft hand morphology and control. (codesign --version: its version)",
         )
         return command.run()
 
@@ -304,6 +307,15 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments is None and code == status.INTERRUPTED:
         status.leave(code)
     return code
+
+
+def _version() -> int:
+    """Prints the version of the installed package."""
+    try:
+        print(f"codesign-jax {importlib.metadata.version('codesign-jax')}")
+    except importlib.metadata.PackageNotFoundError:
+        print("codesign-jax, not installed: run from its sources")
+    return 0
 
 
 if __name__ == "__main__":

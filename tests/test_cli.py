@@ -6,6 +6,8 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
+from pathlib import Path
 
 import pytest
 from command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
@@ -170,6 +172,12 @@ def test_conflicts_are_told_before_the_preflight(finished, monkeypatch, capsys):
     for arguments in ([*RUN, *hull], ["evaluate", "--scene", TINY, "--engine", "mujoco", *hull]):
         assert command(*arguments) == 2
         assert "not supported by engine mujoco" in capsys.readouterr().err
+
+
+def test_version(capsys):
+    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())
+    assert command("--version") == 0
+    assert capsys.readouterr().out == f"codesign-jax {project['project']['version']}\n"
 
 
 def test_a_narrow_console_breaks_no_name(monkeypatch, capsys):

@@ -299,7 +299,7 @@ def main(arguments: list[str] | None = None) -> int:
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,
             prog="codesign",
-            description="Co-design of soft hand morphology and control. (codesign --version: its version)",
+            description="Co-design of soft hand morphology and control; --version says which.",
         )
         return command.run()
 

@@ -5,6 +5,7 @@ only interface: a run is read back from its folder, and the same command resumes
 finish.
 """
 
+import contextlib
 import dataclasses
 import os
 import signal
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 FOLDER = "jobs"
 """Folder of submitit's files and logs, beside the run folders."""
+CONTROLLERS = "controllers.log"
+"""File there with what submitit's own processes complain about."""
 POLL_SECONDS = 0.5
 MINUTES = 7 * 24 * 60
 """Time limit of a local process where none is given; submitit's own is five minutes."""
@@ -186,7 +189,9 @@ class Processes:
         """Seed and job of each run that has ended since, and a word if it left no result."""
         while self._waiting and len(self._running) < self._most:
             seed = next(iter(self._waiting))
-            self._running[seed] = self._made.submit(*self._waiting.pop(seed))
+            # submitit's controller of a job tells every Ctrl-C with a traceback.
+            with _errors_to(Path(self._made.folder) / CONTROLLERS):
+                self._running[seed] = self._made.submit(*self._waiting.pop(seed))
         for seed in [s for s, job in self._running.items() if job.done()]:
             job = self._running.pop(seed)
             yield seed, job, "" if job.paths.result_pickle.exists() else "killed"
@@ -196,6 +201,20 @@ class Processes:
         self._waiting = {}
         for job in self._running.values():
             job.cancel()
+
+
+@contextlib.contextmanager
+def _errors_to(path: Path) -> Iterator[None]:
+    """Lets processes that are started meanwhile write their errors to the end of a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    own = os.dup(2)
+    with path.open("ab") as file:
+        os.dup2(file.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(own, 2)
+        os.close(own)
 
 
 def why(job: Any, state: str) -> str:

@@ -83,6 +83,19 @@ def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
     assert_same_run(folder, finished)
 
 
+@pytest.mark.parametrize("left_out", ["tests.csv", "the last rows", "trials.csv"])
+def test_a_run_killed_before_its_last_rows_writes_them(left_out, finished, tmp_path):
+    """All checkpoints are there, and the process ended between the last one and the tables."""
+    folder = shutil.copytree(finished, tmp_path / "run")
+    if left_out == "the last rows":
+        text = (folder / "trials.csv").read_text()
+        (folder / "trials.csv").write_text(text[:-30])
+    else:
+        (folder / left_out).unlink()
+    assert command(*RUN, "--out", folder) == 0
+    assert_same_run(folder, finished)
+
+
 @pytest.mark.parametrize(
     ("number", "status"),
     [

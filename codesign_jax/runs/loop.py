@@ -125,9 +125,9 @@ class Loop:
           AllFailed: If every trial of an episode failed.
           OSError: If an episode cannot be saved; earlier ones stay intact.
         """
-        record, settings, signum = self._restore(), self.plan.settings, 0
+        record, signum = self._restore(), 0
         try:
-            if record is None or record.done < settings.episodes or not self._tested(record):
+            if record is None or not self._ended(record):
                 if record is None:
                     record = yield from self._seed()
                 self._write_tables(record, 0)
@@ -157,6 +157,11 @@ class Loop:
 
     def _tested(self, record: Record) -> bool:
         return record.test is not None or self.plan.settings.test_trials == 0
+
+    def _ended(self, record: Record) -> bool:
+        """Whether nothing of the run is left to do, the tables included."""
+        done = record.done >= self.plan.settings.episodes and self._tested(record)
+        return done and tables.complete(self.run_directory.path, record)
 
     def _restore(self) -> Record | None:
         found = self.store.restore()

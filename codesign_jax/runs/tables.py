@@ -13,7 +13,7 @@ import numpy as np
 from codesign_jax import files, types
 from codesign_jax.codesign import FinalTest
 from codesign_jax.runs.columns import TABLES
-from codesign_jax.runs.record import History
+from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import WARNINGS, Status
@@ -66,6 +66,25 @@ def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: F
         for i, design in enumerate(_designs(space, particles))
     )
     _write(folder / TESTS, TABLES[TESTS].head(design_columns(space)), rows, 0)
+
+
+def complete(folder: Path, record: Record) -> bool:
+    """Whether the files have all that a run has so far.
+
+    A process that was killed between a checkpoint and the rows that belong to it leaves them
+    without these.  Rows of trials are written after those of episodes and particles.
+
+    Args:
+      folder: The run folder.
+      record: The run.
+    """
+    trials = record.history.trials.cost.shape[1:]
+    try:
+        rows = (folder / "trials.csv").read_bytes().count(b"\n") - 1
+    except FileNotFoundError:
+        return False
+    tested = record.test is None or (folder / TESTS).exists()
+    return tested and rows == record.done * trials[0] * trials[1]
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:

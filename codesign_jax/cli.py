@@ -15,8 +15,8 @@ from codesign_jax.commands.flags import (
     Flag,
     JobParameters,
     Overrides,
+    RunOrDesign,
     Shown,
-    Subject,
     Text,
 )
 
@@ -97,7 +97,7 @@ class Optimize:
 
 
 @dataclasses.dataclass
-class Evaluate(Subject):
+class Evaluate(RunOrDesign):
     """Evaluate one design: costs of each object, how sure they are, an animation if asked for."""
 
     trials: int = 6
@@ -117,7 +117,7 @@ class Evaluate(Subject):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Export(Subject):
+class Export(RunOrDesign):
     """Export a design: MuJoCo models with a player, commands, parts to cast, a build sheet.
 
     The folder is there once all of it is done. docs/export.md has every file.
@@ -162,7 +162,7 @@ class Export(Subject):
 
 
 @dataclasses.dataclass
-class Landscape(Subject):
+class Landscape(RunOrDesign):
     """Draw the mean cost over a grid of two parameters: a figure, a table and arrays.
 
     With --run the files go to the run folder, and its report shows them.
@@ -192,7 +192,7 @@ class Landscape(Subject):
 
 
 @dataclasses.dataclass
-class Render(Shown):
+class Render(Shown, RunOrDesign):
     """Draw one grasp, of a design or of a run: an animation (.gif) or a film strip (.png)."""
 
     out: Path = Path("grasp.gif")

@@ -23,6 +23,9 @@ def test_evaluate_takes_the_best_of_a_run(finished, capsys):
     best = min(rows, key=lambda row: float(row[1]))
     assert command("evaluate", "--run", finished, "--trials", "1") == 0
     output = capsys.readouterr().out
+    assert command("evaluate", finished, "--trials", "1") == 0  # as report and replay take it
+    assert capsys.readouterr().out == output
+    assert command("evaluate", finished, "--run", finished) == 2
     assert f"length={float(best[-2]):.4g} mm" in output
     assert "over 1 trial" in output and "% of grasps (95 % interval)" in output
 
@@ -99,7 +102,7 @@ def test_evaluate_says_which_objects_it_leaves_out(capsys):
         (["--engine", "c"], "--engine"),
         (["--set", "solver.iterations=50"], "set newton.iterations, which limits the solver"),
         (["--render", "grasp.mp4"], "must end in .gif"),
-        (["--run", "nowhere"], "nowhere is not a run folder"),
+        (["--run", "nowhere"], "nowhere is not a run folder: there is no such folder"),
         (["--run", "nowhere", "--design", "length=100"], "own; leave out --design"),
         (["--run", "nowhere", "--hand", "tripod3", "--preset", "23d"], "out --hand and --preset"),
     ],

@@ -70,6 +70,26 @@ class Subject:
 
 
 @dataclasses.dataclass
+class RunOrDesign(Subject):
+    """As `Subject`, where the run may also come first, as in `codesign report RUN`."""
+
+    first: Annotated[
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]", help_behavior_hint="")
+    ] = None
+    """A run folder (as --run)."""
+
+    def __post_init__(self) -> None:
+        """Takes the run that comes first.
+
+        Raises:
+          ValueError: If --run names one as well.
+        """
+        if self.first is not None and self.run_folder is not None:
+            raise ValueError(f"{self.first} and --run {self.run_folder}: give one of them")
+        self.run_folder = self.first or self.run_folder
+
+
+@dataclasses.dataclass
 class Shown(Subject):
     """Which one grasp to show."""
 

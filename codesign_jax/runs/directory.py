@@ -172,7 +172,8 @@ def read_provenance(path: Path) -> dict[str, Any]:
         # Runs from before a setting was there have its default.
         stored["settings"] = dataclasses.asdict(Settings(**stored["settings"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        problem = f"{path} is not a run folder: {PROVENANCE} cannot be read"
+        why = f"{PROVENANCE} cannot be read" if path.exists() else "there is no such folder"
+        problem = f"{path} is not a run folder: {why}"
         raise SceneError([problem + _runs_inside(path)]) from error
     return stored
 

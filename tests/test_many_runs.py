@@ -1,6 +1,7 @@
 """Many runs of one command: in one batch, as jobs, on several hosts, with the same bits."""
 
 import contextlib
+import csv
 import io
 import json
 import os
@@ -11,6 +12,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from command_runs import (
     RUN,
@@ -22,11 +24,13 @@ from command_runs import (
     stored,
     without,
 )
+from toy import TINY
 
-from codesign_jax import runs
+from codesign_jax import codesign, runs, scene
 from codesign_jax.batch import Batch
-from codesign_jax.commands import jobs
+from codesign_jax.commands import jobs, seeds
 from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.types import Outcome, Status
 
 BASE = [a for a in RUN if a not in ("--seed", "3")]
 
@@ -65,8 +69,30 @@ def test_seeds_are_compared(compared):
     assert [row[0] for row in rows if row[-1:] == ["particles"]] == ["2", "3"]
     assert "of 2 runs have a particle below the limit of success" in table
     assert "% of such runs (95 % interval)" in table
-    _, *rows = (both / "seeds.csv").read_text().splitlines()
-    assert rows[0].startswith("2,1,") and rows[1].startswith("3,1,")
+    with (both / "seeds.csv").open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    assert [(row["seed"], row["finished"], row["run"]) for row in rows] == [
+        ("2", "1", "seed-2"),
+        ("3", "1", "seed-3"),
+    ]
+    for row in rows:
+        with (both / row["run"] / "tests.csv").open(newline="") as file:
+            best = min(csv.DictReader(file), key=lambda r: float(r["test_cost"]))
+        assert row["best_test_cost"] == best["test_cost"] and row["trials"] == best["trials"]
+        assert int(row["counted_trials"]) == int(best["trials"]) - int(best["failed_trials"])
+
+
+def test_failed_trials_are_no_trials_that_a_run_lost():
+    """One kept, one lost and one failed: kept in one of two, as the verdict has it."""
+    tiny = scene.load(TINY)
+    status = np.array([[0, 0, Status.STUCK]])
+    lost = np.array([[np.inf, 1.0, np.inf]])
+    test = codesign.summarize_test(
+        tiny, Outcome(np.array([[0.0, 1.0, 3.0]]), status, lost, np.full((1, 3), -1))
+    )
+    record = SimpleNamespace(history=SimpleNamespace(cost=np.ones((1, 1))))
+    row = seeds._row(tiny, runs.RunResult(record, test, 0))
+    assert row == ("no", "0.5000", "1 of 2 trials", "0 of 1 particles")
 
 
 class Here:

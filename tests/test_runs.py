@@ -183,6 +183,7 @@ def test_every_file_and_column_is_described_on_the_reference_page(run, tmp_path)
         designs = {f"{table.designs}{d}" for d in tables.design_columns(space)}
         own = {*read(tmp_path / name)[0]} - designs
         assert own and all(f"| `{column}` | " in section for column in own)
+    assert all(f"## {name}\n" in page for name in columns.MORE)
 
 
 def test_tables_by_episode_equal_tables_at_once(run, tmp_path):

@@ -66,7 +66,7 @@ def main(options: "Optimize") -> int:
     console = Console(highlight=False, soft_wrap=True)
     _tell(options, plan, results, folders, console)
     if options.seeds is not None:
-        _compare(results, folders, console)
+        _compare(scene, results, folders, console)
     return int(any(result is None for result in results.values()))
 
 
@@ -94,16 +94,16 @@ def _compare_all(options: "Optimize") -> int:
     chosen = asked.seeds_of(options)
     folders = {seed: asked.folder(options, scene, settings, seed) for seed in chosen}
     results = {seed: jobs.read(scene, folder) for seed, folder in folders.items()}
-    _compare(results, folders, Console(highlight=False, soft_wrap=True))
+    _compare(scene, results, folders, Console(highlight=False, soft_wrap=True))
     return int(any(result is None for result in results.values()))
 
 
 def _compare(
-    results: dict[int, RunResult | None], folders: dict[int, Path], console: Console
+    scene: Scene, results: dict[int, RunResult | None], folders: dict[int, Path], console: Console
 ) -> None:
     """Compares runs on the console and in seeds.csv."""
-    seeds.compare(results, console)
-    console.print(f"table: {seeds.write_table(results, folders)}", markup=False)
+    seeds.compare(scene, results, console)
+    console.print(f"table: {seeds.write_table(scene, results, folders)}", markup=False)
 
 
 def _tell(
@@ -141,7 +141,7 @@ def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
         results = jobs.run(options, scene, folders, console)
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
-    _compare(results, folders, console)
+    _compare(scene, results, folders, console)
     return int(any(result is None for result in results.values()))
 
 

@@ -9,9 +9,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import codesign, files
+from codesign_jax import codesign, cost, files
 from codesign_jax.report import statistics
-from codesign_jax.runs import RunResult
+from codesign_jax.runs import RunResult, columns
+from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
 
 MOST = 1000
@@ -36,10 +37,11 @@ def parse(text: str) -> list[int]:
     return sorted(found)
 
 
-def compare(results: dict[int, RunResult | None], console: Console) -> None:
+def compare(scene: Scene, results: dict[int, RunResult | None], console: Console) -> None:
     """Prints a row for each run and the share of successful ones.
 
     Args:
+      scene: Scene of the runs.
       results: Each run by its seed; None for one that could not finish.
       console: Where to print.
     """
@@ -47,7 +49,7 @@ def compare(results: dict[int, RunResult | None], console: Console) -> None:
     table = Table(*head, box=box.SIMPLE)
     solved = []
     for seed, result in results.items():
-        table.add_row(str(seed), *_row(result))
+        table.add_row(str(seed), *_row(scene, result))
         if result is not None and result.test is not None:
             solved.append(bool(np.asarray(result.test.success).any()))
     console.print(table)
@@ -60,62 +62,55 @@ def compare(results: dict[int, RunResult | None], console: Console) -> None:
         )
 
 
-COLUMNS = (
-    "seed",
-    "finished",
-    "converged_episode",
-    "best_test_cost",
-    "trials_kept",
-    "trials",
-    "successful_particles",
-    "particles",
-    "run",
-)
-"""Columns of seeds.csv; an episode from 1, empty where a run has none."""
-
-
-def write_table(results: dict[int, RunResult | None], folders: dict[int, Path]) -> Path:
-    """Writes seeds.csv beside the run folders: a row for each run, with `COLUMNS`.
+def write_table(
+    scene: Scene, results: dict[int, RunResult | None], folders: dict[int, Path]
+) -> Path:
+    """Writes seeds.csv beside the run folders: a row for each run; see `runs.columns.MORE`.
 
     Args:
+      scene: Scene of the runs.
       results: Each run by its seed; None for one that could not finish.
       folders: Run folder of each seed.
     """
-    path = next(iter(folders.values())).parent / "seeds.csv"
+    path = next(iter(folders.values())).parent / columns.SEEDS
     with files.atomically(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(COLUMNS)
+        writer.writerow([*columns.MORE[columns.SEEDS].columns])
         for seed, result in results.items():
-            writer.writerow([seed, int(result is not None), *_values(result), folders[seed].name])
+            writer.writerow(
+                [seed, int(result is not None), *_values(scene, result), folders[seed].name]
+            )
     return path
 
 
-def _values(result: RunResult | None) -> list[object]:
-    """Numbers of a run in the order of `COLUMNS`, without seed, finished and run."""
+def _values(scene: Scene, result: RunResult | None) -> list[object]:
+    """Numbers of a run in the order of the table, without seed, finished and run."""
     if result is None or result.record is None:
-        return [""] * 6
+        return [""] * 7
     episode = codesign.convergence_episode(result.record.history.cost.mean(1))
     first: list[object] = ["" if episode is None else episode + 1]
     if result.test is None:
-        return first + [""] * 5
-    cost, trials = np.asarray(result.test.cost), np.asarray(result.test.trials.cost)
-    best = int(cost.argmin())
-    kept = int((trials[best] < codesign.SUCCESS_COST).sum())
+        return first + [""] * 6
+    costs, trials = np.asarray(result.test.cost), np.asarray(result.test.trials.cost)
+    best = int(costs.argmin())
+    counted = cost.counts(scene, np.asarray(result.test.trials.status)[best])
+    kept = int((counted & (trials[best] < codesign.SUCCESS_COST)).sum())
     good = int(np.asarray(result.test.success).sum())
-    return [*first, f"{cost[best]:.9g}", kept, trials.shape[1], good, cost.size]
+    sizes = [kept, int(counted.sum()), trials.shape[1], good, costs.size]
+    return [*first, f"{costs[best]:.9g}", *sizes]
 
 
-def _row(result: RunResult | None) -> tuple[str, ...]:
+def _row(scene: Scene, result: RunResult | None) -> tuple[str, ...]:
     """Convergence, best particle's test cost and trials kept, and successful particles."""
     if result is None or result.record is None:
         return ("failed", "", "", "")
-    episode, cost, kept, trials, good, particles = _values(result)
+    episode, lowest, kept, counted, _, good, particles = _values(scene, result)
     converged = f"episode {episode}" if episode else "no"
-    if cost == "":
+    if lowest == "":
         return (converged, "", "", "")
     return (
         converged,
-        f"{float(str(cost)):.4f}",
-        f"{kept} of {trials} trials",
+        f"{float(str(lowest)):.4f}",
+        f"{kept} of {counted} trials",
         f"{good} of {particles} particles",
     )

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from codesign_jax import files
+from codesign_jax.runs import columns
 from codesign_jax.scene.schema import SceneError
 
 FILE = "landscape.npz"
-TABLE = "landscape.csv"
+TABLE = columns.LANDSCAPE
 
 
 class Landscape(NamedTuple):
@@ -53,7 +54,7 @@ def save(found: Landscape, folder: Path) -> list[Path]:
     ]
     with files.atomically(table) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*axes, "mean_cost", "kept_trials", "counted_trials", "trials"])
+        writer.writerow([*axes, *columns.MORE[TABLE].columns])
         for i, j in np.ndindex(*found.cost.shape):
             point = [f"{v:.9g}" for v in (found.first[i], found.second[j], found.cost[i, j])]
             counts = [found.kept[i, j], found.counted[i, j], found.trials]

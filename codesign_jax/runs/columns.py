@@ -5,7 +5,7 @@
 
 import dataclasses
 
-from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST
 from codesign_jax.types import WARNINGS, Status
 
 
@@ -104,6 +104,39 @@ TABLES = {
     ),
 }
 
+SEEDS, LANDSCAPE = "seeds.csv", "landscape.csv"
+
+MORE = {
+    SEEDS: Table(
+        "a run of `codesign optimize --seeds`, in the file beside the run folders",
+        {
+            "seed": "the run's seed",
+            "finished": "1 if the run ended without an error, else 0",
+            "converged_episode": "number of the episode, from 1, from which on the mean cost stays "
+            f"below {CONVERGED_COST:g}; empty if there is none",
+            "best_test_cost": "lowest test cost of its final particles; this and the next five "
+            "are empty without a final test",
+            "kept_trials": f"trials of that particle's test with a cost below {SUCCESS_COST}",
+            "counted_trials": "trials of that test that count by the scene's rule for failed ones",
+            "trials": "trials of that test",
+            "successful_particles": f"final particles with a test cost below {SUCCESS_COST}",
+            "particles": "final particles",
+            "run": "name of the run's folder",
+        },
+    ),
+    LANDSCAPE: Table(
+        "a point of the grid of `codesign landscape`; its first two columns are the two parameters "
+        "in the hand file's units, such as `length_mm` and `arm_z_mm`",
+        {
+            "mean_cost": "mean cost of its trials by the scene's rule for failed ones",
+            "kept_trials": f"trials that did not fail, with a cost below {SUCCESS_COST}",
+            "counted_trials": "trials that did not fail",
+            "trials": "trials; all points have the same ones",
+        },
+    ),
+}
+"""Tables that are not of a run alone."""
+
 FILES = {
     "scene.toml": "the scene as simulated, every value with its unit; it names the two files below",
     "hand.toml": "the hand",
@@ -117,8 +150,7 @@ FILES = {
     "figures": "pictures",
     "landscape.npz": "the cost over a grid of two parameters, of `codesign landscape --run`, as "
     "arrays (`codesign_jax.report.landscape.Landscape`)",
-    "landscape.csv": "the same, a row for a point: the two parameters with units, mean cost, "
-    "trials that kept the object, trials that did not fail, trials",
+    LANDSCAPE: "the same as a table, see below",
     "landscape.part.npz": "what is done of a landscape that was interrupted; the same command goes "
     "on",
     "reference.npz": "outcomes of the chosen design's fresh trials at accuracy `reference`, arrays "
@@ -147,7 +179,7 @@ def page() -> str:
     lines += ["| file | content |", "| --- | --- |"]
     lines += [f"| `{name}` | {text} |" for name, text in FILES.items()]
     lines += [f"| `{name}` | a row for {table.rows} |" for name, table in TABLES.items()]
-    for name, table in TABLES.items():
+    for name, table in (TABLES | MORE).items():
         lines += ["", f"## {name}", "", f"A row for {table.rows}.", ""]
         lines += ["| column | meaning |", "| --- | --- |"]
         lines += [f"| `{column}` | {text} |" for column, text in table.columns.items()]

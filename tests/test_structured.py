@@ -45,7 +45,7 @@ def setting(shape, **params):
     return scene, oracle, np.asarray(fields.start), batch, np.asarray(ctrl)
 
 
-@pytest.mark.parametrize("shape", ["sphere", "box", "cylinder"])
+@pytest.mark.parametrize("shape", small.SHAPES)
 def test_every_step_of_a_grasp_equals_mujocos(shape):
     """Converged accelerations along the kernel's own path, contacts included."""
     with jax.enable_x64(True):

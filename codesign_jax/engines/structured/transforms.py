@@ -4,9 +4,13 @@ Batching: a mapped axis is folded into the axis of the worlds, so that one kerne
 them whatever the nesting (`jax.custom_batching.custom_vmap`).
 
 Differentiation (`jax.custom_vjp`): the forward pass is the same kernel, which then stores the state
-before each step and the accelerations of the step.  The backward pass is one reverse scan over the
-steps.  Each step is repeated from its stored accelerations as plain JAX (`differentiable`) and
-pulled back by the implicit function theorem (`implicit`): one linear solve a step.
+before each step and the accelerations of the step.  The backward pass is a second kernel, which
+goes through the steps in reverse (`kernel.adjoint`).  The accelerations a of a step are where the
+gradient of its objective vanishes,
+  F(a, theta) = M a - tau - J' f(J a - aref) = 0,
+with theta all data of the step.  By the implicit function theorem a cotangent v of a gives theta
+the cotangent -lambda' dF/dtheta with H lambda = v, and H = dF/da is the symmetric matrix of a
+Newton step at a: one linear solve a step, however many iterations found a.
 
 The derivative is that of the trace as it was computed.  The trace of a decided world repeats its
 last state, and the cotangents of the repeated entries are added to that state's.  A step that
@@ -21,9 +25,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax import verdict
-from codesign_jax.engines.structured import coordinates, differentiable
-from codesign_jax.engines.structured.constants import WorldConstants, world_constants
-from codesign_jax.engines.structured.lanes import total
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Recorded
 from codesign_jax.model import ModelFields
 from codesign_jax.types import Trace
 
@@ -61,7 +64,6 @@ def rollout(
 
     Raises:
       NotImplementedError: If a derivative is differentiated again.
-      SceneError: If a derivative is asked for and the scene has none.
     """
     plain = folded(lambda f, c: engine.simulate(f, c, trajectory=trajectory)[0])
     recorded = _once(folded(partial(engine.simulate, trajectory=trajectory, states=True)))
@@ -72,7 +74,6 @@ def rollout(
         return plain(fields, ctrl)
 
     def forward(fields: ModelFields, ctrl: jax.Array):
-        differentiable.refuse(engine.scene)  # before the kernel, whose compile takes a while
         trace, path = recorded(fields, ctrl)
         return trace, (fields, ctrl, path, trace.speed)
 
@@ -137,83 +138,41 @@ def _adjoint(
       speed: Its largest velocities, as in `Trace`.
       cotangent: Cotangent of its trace, without the status.
     """
-    with jax.default_matmul_precision("highest"):
-        return _reverse_scan(engine, fields, ctrl, path, speed, cotangent)
+    program = AdjointProgram.here(engine.scene, engine.limits, ctrl.dtype, len(ctrl))
 
+    def inputs(fields: ModelFields, ctrl: jax.Array) -> tuple:
+        hand = world_constants(engine.scene, fields)
+        return program.inputs(hand, engine.reset(fields), ctrl)
 
-def _reverse_scan(
-    engine: "StructuredEngine",
-    fields: ModelFields,
-    ctrl: jax.Array,
-    path: Path,
-    speed: jax.Array,
-    cotangent: Trace,
-) -> tuple[ModelFields, jax.Array]:
-    scene, nq = engine.scene, path.qpos.shape[-1]
-    hand = world_constants(scene, fields)
-    _, rebuild = _numbers(hand)
-    bounds = verdict.Bounds(*(v[0] for v in hand.bounds))
-    numbers, pull_fields = jax.vjp(lambda f: _numbers(world_constants(scene, f))[0], fields)
-    assert cotangent.last is not None
-
-    def body(carry: tuple, t: jax.Array):
-        sums, qpos_bar, qvel_bar = carry
-        here, u, top, bar = jax.tree.map(
-            lambda x: jax.lax.dynamic_index_in_dim(x, t, 1, keepdims=False),
-            (path, ctrl, speed, cotangent._replace(last=None)),
-        )
-        moved = here.moved[:, None]
-        acc = jnp.where(moved, here.acc, 0.0)
-
-        def step(numbers: list, qpos: jax.Array, qvel: jax.Array, u: jax.Array):
-            state = coordinates.make(scene, qpos, qvel, acc)
-            new, centre = differentiable.step(scene, rebuild(numbers), state, u.T)
-            away = state.position - centre
-            distance = jnp.sqrt(total([away[i, 0] ** 2 for i in range(3)]))
-            entry = distance, state.position[2, 0], coordinates.speed(state)
-            return coordinates.qpos(new), coordinates.qvel(new), *entry
-
-        _, pull = jax.vjp(step, numbers, here.qpos, here.qvel, u)
-        # The entry after a failed step shows the speed of a state that was not kept.
-        shown = jnp.where(verdict.slow(bounds, top), bar.speed, 0.0)
-        after = jnp.where(moved, qpos_bar, 0.0), jnp.where(moved, qvel_bar, 0.0)
-        own, dq, dv, du = pull((*after, bar.distance, bar.height, shown))
-        own, (dq, dv, du) = _finite(own, moved.T), _finite((dq, dv, du), moved)
-        dq += jnp.where(moved, 0.0, qpos_bar)
-        dv += jnp.where(moved, 0.0, qvel_bar)
-        dq += bar.qpos if bar.qpos.shape[-1] else 0.0
-        return (jax.tree.map(jnp.add, sums, own), dq, dv), du
-
-    zero = jax.tree.map(jnp.zeros_like, numbers)
-    start = zero, cotangent.last[:, :nq], cotangent.last[:, nq:]
-    steps = jnp.arange(ctrl.shape[1])
-    (sums, start_bar, _), ctrl_bar = jax.lax.scan(body, start, steps, reverse=True)
-    (bar,) = pull_fields(sums)
-    bar = bar._replace(start=bar.start + start_bar)
+    tables, pull_inputs = jax.vjp(inputs, fields, ctrl)
+    count = path.moved.sum(1)
+    # The entry after a failed step shows the speed of a state that was not kept.
+    bounds = world_constants(engine.scene, fields).bounds
+    bounds = verdict.Bounds(*(v[0, :, None] for v in bounds))
+    shown = jnp.where(verdict.slow(bounds, speed), cotangent.speed, 0.0)
+    entries = (_gathered(count, x) for x in (cotangent.distance, cotangent.height, shown))
+    bars = Cotangents(*program.pack_end(cotangent.last), program.pack_shown(*entries))
+    if cotangent.qpos.shape[-1]:
+        bars = bars._replace(path=program.pack_path(_gathered(count, cotangent.qpos)))
+    taken = program.pack_shown(count[:, None].astype(ctrl.dtype))[:, 0]
+    recorded = Recorded(*program.pack_path(*path[:3]), taken)
+    fields_bar, ctrl_bar = pull_inputs(program.adjoint(tables, recorded, bars))
     # A world that never moved, such as one of fields that are not numbers, has no derivative.
-    bar = jax.tree.map(partial(_of_worlds, path.moved.any(1)), bar)
-    return bar, jnp.moveaxis(ctrl_bar, 0, 1)
+    return jax.tree.map(partial(_of_worlds, count > 0), (fields_bar, ctrl_bar))
 
 
-def _numbers(hand: WorldConstants) -> tuple[list[jax.Array], Callable]:
-    """The constants that have a derivative, and the function that puts such into the others' place.
+def _gathered(count: jax.Array, x: jax.Array) -> jax.Array:
+    """Cotangents of entries (world, time, ...), those of the entries that repeat in the first.
 
-    Lanes have two axes at least: what has fewer, such as the grids of meshes, belongs to the scene.
+    Args:
+      count: Number of steps that each world took: later entries show the state at its end.
+      x: The cotangents.
     """
-    leaves, structure = jax.tree.flatten(hand)
-    mine = [jnp.issubdtype(x.dtype, jnp.floating) and x.ndim > 1 for x in leaves]
-
-    def rebuild(numbers: list[jax.Array]) -> WorldConstants:
-        given = iter(numbers)
-        every = [next(given) if m else x for x, m in zip(leaves, mine, strict=True)]
-        return jax.tree.unflatten(structure, every)
-
-    return [x for x, m in zip(leaves, mine, strict=True) if m], rebuild
-
-
-def _finite(tree: Any, moved: jax.Array) -> Any:
-    """Cotangents; zero where one of a world that stands still is not a number."""
-    return jax.tree.map(lambda x: jnp.where(moved | jnp.isfinite(x), x, 0.0), tree)
+    tail = [1] * (x.ndim - 2)
+    step = jnp.arange(x.shape[1]).reshape(1, -1, *tail)
+    end = count.reshape(-1, 1, *tail)
+    rest = jnp.where(step >= end, x, 0.0).sum(1, keepdims=True)
+    return jnp.where(step < end, x, jnp.where(step == end, rest, 0.0))
 
 
 def _of_worlds(keep: jax.Array, x: jax.Array) -> jax.Array:

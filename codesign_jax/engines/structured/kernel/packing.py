@@ -123,6 +123,45 @@ class Packing(Tables):
             found[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
         return found
 
+    def pack_path(
+        self, qpos: jax.Array, qvel: jax.Array | None = None, acc: jax.Array | None = None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Inverse of `path`: rows (block, time, row, lane or world); zeros where nothing is.
+
+        Args:
+          qpos: Generalized positions, shape (world, time, nq), or their cotangents.
+          qvel: Generalized velocities, shape (world, time, nv); without them positions' rows only.
+          acc: Accelerations likewise.
+        """
+        joints, others, end = [], [], 6 + self.lay.dofs.size
+        worlds, steps, size = qpos.shape[0], qpos.shape[1], self.links * self.axes
+        for x in (qpos, qvel, acc):
+            if x is not None:
+                finger = x[:, :, 6:end].reshape(worlds, steps, self.num_fingers, size)
+                joints.append(jnp.swapaxes(finger, 2, 3))
+                others.append(jnp.concatenate([x[:, :, :6], x[:, :, end:]], 2))
+        wide = jnp.concatenate(joints, 2)
+        fill = [(0, 0)] * 3 + [(0, self.fingers - self.num_fingers)]
+        wide = self._blocks(jnp.pad(wide, fill))
+        return wide.reshape(*wide.shape[:3], self.size), self._blocks(jnp.concatenate(others, 2))
+
+    def pack_end(self, last: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Cotangents (world, nq + nv) of the last states as those of the state's tables."""
+        nq = 13 + self.lay.dofs.size
+        qpos, qvel = last[:, None, :nq], last[:, None, nq:]
+        wide, narrow = self.pack_path(qpos, qvel, jnp.zeros_like(qvel))
+        return wide[:, 0], narrow[:, 0]
+
+    def _blocks(self, array: jax.Array) -> jax.Array:
+        """(world, ...) to (block, ..., world of the block); zeros fill the last block."""
+        missing = -array.shape[0] % self.block
+        array = jnp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1))
+        return jnp.moveaxis(array.reshape(-1, self.block, *array.shape[1:]), 1, -1)
+
+    def pack_shown(self, *entries: jax.Array) -> jax.Array:
+        """Entries of the trace (world, time) as rows (block, time, entry, world)."""
+        return self._blocks(jnp.stack(entries, 2))
+
     def unpack_state(self, finger_state: jax.Array, world_state: jax.Array, worlds: int) -> State:
         """Inverse of `pack_state`."""
         wide = self.finger_state.unpack(finger_state, self.fingers, self.num_fingers, worlds)

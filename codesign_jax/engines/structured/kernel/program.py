@@ -162,16 +162,12 @@ class Program(Packing):
             angles, places = self.path_rows(states)
             shapes += [(blocks, steps, angles, self.size), (blocks, steps, places, self.block)]
 
-        def spec(shape: tuple[int, ...]) -> pl.BlockSpec:
-            own = shape[0] == blocks
-            return pl.BlockSpec((None, *shape[1:]), lambda i: (i * own, *[0] * (len(shape) - 1)))
-
         outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
         call = pl.pallas_call(
             partial(self._kernel, steps, trajectory, states),
             grid=(blocks,),
-            in_specs=[spec(x.shape) for x in inputs],
-            out_specs=[spec(s) for s in shapes],
+            in_specs=[block_spec(x.shape, blocks) for x in inputs],
+            out_specs=[block_spec(s, blocks) for s in shapes],
             out_shape=outputs,
             interpret=self.backend == "interpreter",
             name="grasp",
@@ -244,6 +240,12 @@ class Program(Packing):
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))
+
+
+def block_spec(shape: tuple[int, ...], blocks: int) -> pl.BlockSpec:
+    """A block's part of an array with a leading axis of blocks, or of one that all share."""
+    own = shape[0] == blocks
+    return pl.BlockSpec((None, *shape[1:]), lambda i: (i * own, *[0] * (len(shape) - 1)))
 
 
 def lanes_here(scene: Scene, dtype: Any, worlds: int | None = None) -> int:

@@ -19,36 +19,20 @@ failed passes no cotangent back.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax import verdict
+from codesign_jax.engines.structured import segments
 from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Recorded
+from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Path
 from codesign_jax.model import ModelFields
 from codesign_jax.types import Trace
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.engine import StructuredEngine
-
-
-class Path(NamedTuple):
-    """What the derivative of a rollout needs of every step.
-
-    Attributes:
-      qpos: Generalized positions before the step, shape (world, time, nq).
-      qvel: Generalized velocities before the step, shape (world, time, nv).
-      acc: Accelerations of the step in the order of qvel, the object's as in `kinematics.Acc`,
-        shape (world, time, nv).
-      moved: Whether the world took the step, bool, shape (world, time).
-    """
-
-    qpos: jax.Array
-    qvel: jax.Array
-    acc: jax.Array
-    moved: jax.Array
 
 
 def rollout(
@@ -65,9 +49,9 @@ def rollout(
     Raises:
       NotImplementedError: If a derivative is differentiated again.
     """
-    plain = folded(lambda f, c: engine.simulate(f, c, trajectory=trajectory)[0])
-    recorded = _once(folded(partial(engine.simulate, trajectory=trajectory, states=True)))
-    adjoint = _once(folded(partial(_adjoint, engine)))
+    plain = folded(partial(engine.simulate, trajectory=trajectory))
+    recorded = _once(folded(partial(engine.record, trajectory=trajectory)))
+    adjoint = _once(folded(partial(_adjoint, engine, trajectory)))
 
     @jax.custom_vjp
     def run(fields: ModelFields, ctrl: jax.Array) -> Trace:
@@ -122,6 +106,7 @@ def _once(function: Callable) -> Callable:
 
 def _adjoint(
     engine: "StructuredEngine",
+    trajectory: bool,
     fields: ModelFields,
     ctrl: jax.Array,
     path: Path,
@@ -132,45 +117,47 @@ def _adjoint(
 
     Args:
       engine: The engine.
+      trajectory: As in `Engine.rollout`.
       fields: Model fields of the rollout.
       ctrl: Its controls.
       path: Its steps.
       speed: Its largest velocities, as in `Trace`.
       cotangent: Cotangent of its trace, without the status.
     """
-    program = AdjointProgram.here(engine.scene, engine.limits, ctrl.dtype, len(ctrl))
+    scene = engine.scene
+    program = AdjointProgram.here(scene, engine.limits, ctrl.dtype, len(ctrl))
 
     def inputs(fields: ModelFields, ctrl: jax.Array) -> tuple:
-        hand = world_constants(engine.scene, fields)
-        return program.inputs(hand, engine.reset(fields), ctrl)
+        return program.inputs(world_constants(scene, fields), engine.reset(fields), ctrl)
 
     tables, pull_inputs = jax.vjp(inputs, fields, ctrl)
-    count = path.moved.sum(1)
+    taken = path.taken[:, 0, 0]
     # The entry after a failed step shows the speed of a state that was not kept.
-    bounds = world_constants(engine.scene, fields).bounds
+    bounds = world_constants(scene, fields).bounds
     bounds = verdict.Bounds(*(v[0, :, None] for v in bounds))
     shown = jnp.where(verdict.slow(bounds, speed), cotangent.speed, 0.0)
-    entries = (_gathered(count, x) for x in (cotangent.distance, cotangent.height, shown))
-    bars = Cotangents(*program.pack_end(cotangent.last), program.pack_shown(*entries))
-    if cotangent.qpos.shape[-1]:
-        bars = bars._replace(path=program.pack_path(_gathered(count, cotangent.qpos)))
-    taken = program.pack_shown(count[:, None].astype(ctrl.dtype))[:, 0]
-    recorded = Recorded(*program.pack_path(*path[:3]), taken)
-    fields_bar, ctrl_bar = pull_inputs(program.adjoint(tables, recorded, bars))
+    entries = [cotangent.distance, cotangent.height, shown]
+    assert cotangent.last is not None
+    trace = _gathered(taken, jnp.stack(entries, 2))[..., None]
+    bars = Cotangents(*program.rows_of_end(cotangent.last), trace)
+    if trajectory:
+        bars = bars._replace(path=program.rows_of(_gathered(taken, cotangent.qpos)))
+    path, bars = jax.tree.map(program.by_block, (path, bars))
+    found = segments.reverse(engine, program, tables, path, bars, trajectory=trajectory)
+    fields_bar, ctrl_bar = pull_inputs(program.sound(found, path.taken))
     # A world that never moved, such as one of fields that are not numbers, has no derivative.
-    return jax.tree.map(partial(_of_worlds, count > 0), (fields_bar, ctrl_bar))
+    return jax.tree.map(partial(_of_worlds, taken[:, 0] > 0), (fields_bar, ctrl_bar))
 
 
-def _gathered(count: jax.Array, x: jax.Array) -> jax.Array:
-    """Cotangents of entries (world, time, ...), those of the entries that repeat in the first.
+def _gathered(taken: jax.Array, x: jax.Array) -> jax.Array:
+    """Cotangents of entries (world, time, entry), those of entries that repeat in the first.
 
     Args:
-      count: Number of steps that each world took: later entries show the state at its end.
+      taken: Number of steps that each world took, shape (world, 1): later entries show the state
+        at its end.
       x: The cotangents.
     """
-    tail = [1] * (x.ndim - 2)
-    step = jnp.arange(x.shape[1]).reshape(1, -1, *tail)
-    end = count.reshape(-1, 1, *tail)
+    step, end = jnp.arange(x.shape[1])[:, None], taken[:, None]
     rest = jnp.where(step >= end, x, 0.0).sum(1, keepdims=True)
     return jnp.where(step < end, x, jnp.where(step == end, rest, 0.0))
 

@@ -123,44 +123,42 @@ class Packing(Tables):
             found[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
         return found
 
-    def pack_path(
-        self, qpos: jax.Array, qvel: jax.Array | None = None, acc: jax.Array | None = None
-    ) -> tuple[jax.Array, jax.Array]:
-        """Inverse of `path`: rows (block, time, row, lane or world); zeros where nothing is.
+    def rows_of(self, qpos: jax.Array, qvel: jax.Array | None = None) -> tuple:
+        """Rows (world, time, row, finger or 1) of coordinates, or of their cotangents; see `path`.
 
         Args:
-          qpos: Generalized positions, shape (world, time, nq), or their cotangents.
+          qpos: Generalized positions, shape (world, time, nq).
           qvel: Generalized velocities, shape (world, time, nv); without them positions' rows only.
-          acc: Accelerations likewise.
         """
         joints, others, end = [], [], 6 + self.lay.dofs.size
-        worlds, steps, size = qpos.shape[0], qpos.shape[1], self.links * self.axes
-        for x in (qpos, qvel, acc):
-            if x is not None:
-                finger = x[:, :, 6:end].reshape(worlds, steps, self.num_fingers, size)
-                joints.append(jnp.swapaxes(finger, 2, 3))
-                others.append(jnp.concatenate([x[:, :, :6], x[:, :, end:]], 2))
-        wide = jnp.concatenate(joints, 2)
+        for x in (qpos,) if qvel is None else (qpos, qvel):
+            finger = x[:, :, 6:end].reshape(*x.shape[:2], self.num_fingers, -1)
+            joints.append(jnp.swapaxes(finger, 2, 3))
+            others.append(jnp.concatenate([x[:, :, :6], x[:, :, end:]], 2))
         fill = [(0, 0)] * 3 + [(0, self.fingers - self.num_fingers)]
-        wide = self._blocks(jnp.pad(wide, fill))
-        return wide.reshape(*wide.shape[:3], self.size), self._blocks(jnp.concatenate(others, 2))
+        return jnp.pad(jnp.concatenate(joints, 2), fill), jnp.concatenate(others, 2)[..., None]
 
-    def pack_end(self, last: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Cotangents (world, nq + nv) of the last states as those of the state's tables."""
+    def rows_of_end(self, last: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """`rows_of` of cotangents (world, nq + nv) of the last state; none of accelerations."""
         nq = 13 + self.lay.dofs.size
-        qpos, qvel = last[:, None, :nq], last[:, None, nq:]
-        wide, narrow = self.pack_path(qpos, qvel, jnp.zeros_like(qvel))
-        return wide[:, 0], narrow[:, 0]
+        found = self.rows_of(last[:, None, :nq], last[:, None, nq:])
+        rows = self.path_rows(states=True)
+        return tuple(
+            jnp.pad(x, [(0, 0), (0, 0), (0, n - x.shape[2]), (0, 0)])
+            for x, n in zip(found, rows, strict=True)
+        )  # type: ignore[return-value]
 
-    def _blocks(self, array: jax.Array) -> jax.Array:
-        """(world, ...) to (block, ..., world of the block); zeros fill the last block."""
-        missing = -array.shape[0] % self.block
-        array = jnp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1))
-        return jnp.moveaxis(array.reshape(-1, self.block, *array.shape[1:]), 1, -1)
+    def by_world(self, rows: jax.Array, worlds: int) -> jax.Array:
+        """Rows (block, time, row, lane or world) as (world, time, row, finger or 1)."""
+        split = rows.reshape(*rows.shape[:3], -1, self.block)
+        return jnp.moveaxis(split, 4, 1).reshape(-1, *split.shape[1:4])[:worlds]
 
-    def pack_shown(self, *entries: jax.Array) -> jax.Array:
-        """Entries of the trace (world, time) as rows (block, time, entry, world)."""
-        return self._blocks(jnp.stack(entries, 2))
+    def by_block(self, rows: jax.Array) -> jax.Array:
+        """Inverse of `by_world`; zeros fill the last block."""
+        missing = -rows.shape[0] % self.block
+        rows = jnp.pad(rows, [(0, missing)] + [(0, 0)] * 3)
+        split = jnp.moveaxis(rows.reshape(-1, self.block, *rows.shape[1:]), 1, 4)
+        return split.reshape(*split.shape[:3], -1)
 
     def unpack_state(self, finger_state: jax.Array, world_state: jax.Array, worlds: int) -> State:
         """Inverse of `pack_state`."""

@@ -26,7 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import schema
-from codesign_jax.scene.hand import PARAMETERS, UNITS, Hand, Parameter, Preset, structure
+from codesign_jax.scene.hand import PARAMETERS, UNITS, Free, Hand, Parameter, Preset, structure
+from codesign_jax.scene.hand_tables import per_finger
 from codesign_jax.types import Params
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
@@ -146,7 +147,10 @@ class DesignSpace:
             )
 
     def default(self) -> np.ndarray:
-        """Returns the table's default design, shape (parameter,), inside the bounds [SI]."""
+        """Returns the table's default design, shape (parameter,), inside the bounds [SI].
+
+        A value that fingers share is the default of the first of them.
+        """
         base = _defaults(self.hand)
         first = [self.source.index(j) for j in range(self.num_parameters)]
         return np.clip(base[first], self.low, self.high)
@@ -223,7 +227,7 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
     Raises:
       SceneError: if the hand has no such preset.
     """
-    total = sum(_width(hand, p) for p in hand.parameter)
+    total = sum(hand.width(p) for p in hand.parameter)
     if preset in ("full", f"{total}d"):
         chosen = Preset(preset, ())
     else:
@@ -248,22 +252,23 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
     source = np.full(base.shape, -1)
     for name, value in preset.fixed.items():
         row = _row(hand, name)
-        base[offsets[name] : offsets[name] + _width(hand, row)] = value * UNITS[row.unit][1]
+        width, factor = hand.width(row), UNITS[row.unit][1]
+        base[offsets[name] : offsets[name] + width] = np.array(per_finger(value, width)) * factor
     free = {f.name: f for f in preset.free}
     columns: list[tuple[str, str, float, float, float, bool]] = []
     for row in hand.parameter:
         if not everything and row.name not in free:
             continue
-        spec, factor, width = free.get(row.name), UNITS[row.unit][1], _width(hand, row)
-        low = row.low if spec is None or spec.low is None else spec.low
-        high = row.high if spec is None or spec.high is None else spec.high
-        count = 1 if (spec is not None and spec.tied) or row.per == "hand" else width
+        spec = free.get(row.name, Free(row.name))
+        factor, width = UNITS[row.unit][1], hand.width(row)
+        low, high = spec.bounds(row, width)
+        count = 1 if spec.tied else width
         for k in range(width):
             source[offsets[row.name] + k] = len(columns) + (k if count > 1 else 0)
         for k in range(count):
             name = f"{row.name}[{k}]" if count > 1 else row.name
             morphology = row.domain == "morphology"
-            columns.append((name, row.unit, factor, low * factor, high * factor, morphology))
+            columns.append((name, row.unit, factor, low[k] * factor, high[k] * factor, morphology))
     names, units, scale, low, high, domain = zip(*columns, strict=True)
     return DesignSpace(
         _table_alone(hand),
@@ -328,21 +333,20 @@ def _table_alone(hand: Hand) -> Hand:
     )
 
 
-def _width(hand: Hand, row: Parameter) -> int:
-    return len(hand.finger) if row.per == "finger" else 1
-
-
 def _row(hand: Hand, name: str) -> Parameter:
     return next(p for p in hand.parameter if p.name == name)
 
 
 @functools.cache
 def _offsets(hand: Hand) -> dict[str, int]:
-    widths = [_width(hand, p) for p in hand.parameter]
+    widths = [hand.width(p) for p in hand.parameter]
     starts = np.concatenate([[0], np.cumsum(widths)])
     return {p.name: int(s) for p, s in zip(hand.parameter, starts[:-1], strict=True)}
 
 
 def _defaults(hand: Hand) -> np.ndarray:
-    values = [[p.default * UNITS[p.unit][1]] * _width(hand, p) for p in hand.parameter]
-    return np.concatenate(values).astype(float)
+    values = [
+        np.array(per_finger(p.default, hand.width(p)), float) * UNITS[p.unit][1]
+        for p in hand.parameter
+    ]
+    return np.concatenate(values)

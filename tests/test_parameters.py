@@ -191,3 +191,47 @@ def test_a_tied_pressure_obeys_the_thinnest_wall():
     design = jnp.asarray([0.007, 0.005, 0.002, 0.006, 150e3])
     np.testing.assert_allclose(space.project(design)[-1], 80e3, rtol=1e-5)
     assert space.project(design)[-1] < 80e3
+
+
+THUMB = hand.load("thumb4")
+
+
+def test_fingers_may_have_values_and_bounds_of_their_own():
+    """The file has [60, 60, 60, 40] to [180, 180, 180, 110] mm, default [100, 100, 100, 75]."""
+    space = parameters.design_space(THUMB)
+    low, high = space.in_units(np.array(space.low)), space.in_units(np.array(space.high))
+    np.testing.assert_allclose(low[:4], [60, 60, 60, 40])
+    np.testing.assert_allclose(high[:4], [180, 180, 180, 110])
+    np.testing.assert_allclose(space.in_units(space.default())[:4], [100, 100, 100, 75])
+    np.testing.assert_allclose(high[4:8], 25)  # a number is for all fingers
+    fixed = parameters.design_space(THUMB, "2d").params(jnp.asarray([0.8, 0.01]))
+    np.testing.assert_allclose(fixed.length, [0.1, 0.1, 0.1, 0.075], rtol=1e-6)
+    np.testing.assert_allclose(fixed.pressure, [110e3, 110e3, 110e3, 140e3], rtol=1e-6)
+    np.testing.assert_allclose(fixed.wall, 0.005, rtol=1e-6)
+
+
+def test_a_preset_narrows_single_fingers_and_tied_ones_share_the_bounds_of_all():
+    def of(*free):
+        return parameters.design_space(
+            dataclasses.replace(THUMB, preset=(hand.Preset("own", free),)), "own"
+        )
+
+    narrow = of(hand.Free("length", low=(70.0, 80.0, 90.0, 50.0), high=120.0))
+    np.testing.assert_allclose(narrow.in_units(narrow.low), [70, 80, 90, 50])
+    np.testing.assert_allclose(narrow.in_units(narrow.high), 120)
+    tied = of(hand.Free("length", tied=True))
+    assert tied.names == ("length",)
+    np.testing.assert_allclose(tied.in_units([tied.low, tied.high]), [[60], [110]])
+
+
+def test_fingers_that_are_given_one_by_one_are_those_that_share_a_number():
+    """Names, bounds and values are the same, whichever way a file states them."""
+    rows = (
+        dataclasses.replace(r, low=(r.low,) * 4, high=(r.high,) * 4, default=(r.default,) * 4)
+        if r.per == "finger"
+        else r
+        for r in HAND.parameter
+    )
+    one_by_one = parameters.design_space(dataclasses.replace(HAND, parameter=tuple(rows)))
+    assert dataclasses.replace(one_by_one, hand=FULL.hand) == FULL
+    np.testing.assert_array_equal(one_by_one.default(), FULL.default())

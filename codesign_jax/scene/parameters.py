@@ -19,21 +19,19 @@ codesign_jax.scene.schema.SceneError: length = 95.0 is outside [0.001, 1] m; did
 import dataclasses
 import functools
 import re
-import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import schema
-from codesign_jax.scene.hand import PARAMETERS, UNITS, Free, Hand, Parameter, Preset, structure
+from codesign_jax.scene import schema, unit_slips
+from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, structure
 from codesign_jax.scene.hand_tables import per_finger
 from codesign_jax.types import Params
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
 _STRICT = 1.0 - 1e-6
-_FAINT = 1000.0
-"""Pressure below which no finger moves visibly [Pa]: 1 kPa bends one of 100 mm by half a degree."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +44,8 @@ class DesignSpace:
       names: Names of the free parameters, e.g. "length[2]" or "length" where tied.
       units: Units in which the hand file states them.
       scale: Factor from that unit to SI, shape (parameter,).
-      low: Lower bounds [SI], shape (parameter,).
-      high: Upper bounds [SI], shape (parameter,).
+      bounds: Lower and upper bounds [SI], as tuples, which can be hashed; `low` and `high` are
+        arrays.
       is_morphology: True for morphology, False for control, shape (parameter,).
       base: Full vector with the fixed values and defaults [SI], shape (full,).
       source: For each full entry the design entry that fills it, or -1, shape (full,).
@@ -57,11 +55,20 @@ class DesignSpace:
     names: tuple[str, ...]
     units: tuple[str, ...]
     scale: tuple[float, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    bounds: tuple[tuple[float, ...], tuple[float, ...]]
     is_morphology: tuple[bool, ...]
     base: tuple[float, ...]
     source: tuple[int, ...]
+
+    @property
+    def low(self) -> np.ndarray:
+        """Lower bounds [SI], shape (parameter,)."""
+        return np.array(self.bounds[0])
+
+    @property
+    def high(self) -> np.ndarray:
+        """Upper bounds [SI], shape (parameter,)."""
+        return np.array(self.bounds[1])
 
     @property
     def num_parameters(self) -> int:
@@ -98,6 +105,28 @@ class DesignSpace:
         self.refuse_unit_slips(design)
         return _projected(self, jnp.asarray(design))
 
+    def sample(self, key: jax.Array, n: int, *, first: Any = 0) -> jax.Array:
+        """Draws legal designs: within the bounds, pressures under the limit of their walls.
+
+        Every parameter is uniform between its bounds and independent of the others, but for
+        pressures above their limit, which are lowered to it (`project`): such a finger has the
+        highest pressure that its wall allows. Design i draws from fold_in(key, i), so that more
+        designs do not change earlier ones, and any of them can be drawn without the others.
+
+        Args:
+          key: Typed key.
+          n: Number of designs.
+          first: Index of the first design; may be traced.
+
+        Returns:
+          Designs first to first + n - 1 [SI], shape (n, parameter).
+
+        Raises:
+          SceneError: If `key` is not one typed key, or `n` is no whole number or below 1.
+        """
+        _refuse_draws(key, n)
+        return _sampled(self, n, key, first)
+
     def refuse_unit_slips(self, designs: np.typing.ArrayLike) -> None:
         """Refuses designs that were given in other units than SI; see `from_units` for those.
 
@@ -118,10 +147,10 @@ class DesignSpace:
         rows = [name.split("[")[0] for name in self.names]
         found = []
         for name, row, column in zip(self.names, rows, columns, strict=True):
-            found += _slips(name, row, column)
+            found += unit_slips.slips(name, row, column)
         if found:
             raise schema.SceneError(found)
-        _hint_at_kilopascals(columns[[row == "pressure" for row in rows]])
+        unit_slips.hint_at_kilopascals(columns[[row == "pressure" for row in rows]])
 
     def refuse_population(self, population: np.typing.ArrayLike) -> None:
         """Refuses what are not designs of this space, shape (particle, parameter).
@@ -189,6 +218,36 @@ def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
         if j >= 0:
             design = design.at[j].min(caps[i])
     return design
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _sampled(space: DesignSpace, n: int, key: jax.Array, first: Any) -> jax.Array:
+    """`DesignSpace.sample`; one program a space and number."""
+    low, high = _representable(space)
+
+    def draw(i: jax.Array) -> jax.Array:
+        unit = jax.random.uniform(jax.random.fold_in(key, i), low.shape, low.dtype)
+        return _projected(space, jnp.minimum(low + (high - low) * unit, high))
+
+    return jax.vmap(draw)(first + jnp.arange(n))
+
+
+def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds as JAX's floats, none beyond the space's own by rounding."""
+    kind = np.dtype(jnp.result_type(float))
+    low, high = space.low.astype(kind), space.high.astype(kind)
+    low = np.where(low < space.low, np.nextafter(low, kind.type(np.inf)), low)
+    return low, np.where(high > space.high, np.nextafter(high, kind.type(-np.inf)), high)
+
+
+def _refuse_draws(key: Any, n: Any) -> None:
+    """Refuses what no designs can be drawn from."""
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
+        raise schema.SceneError([f"n = {n!r} designs must be a whole number, at least 1"])
+    shape, kind = jnp.shape(key), jnp.result_type(key)
+    if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
+        words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
+        raise schema.SceneError([words])
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -275,54 +334,11 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         names,
         units,
         scale,
-        low,
-        high,
+        (low, high),
         domain,
         tuple(base),
         tuple(source.tolist()),
     )
-
-
-def refuse_unit_slips(params: Params) -> None:
-    """Refuses parameters that were given in other units than SI and radians.
-
-    As `DesignSpace.refuse_unit_slips`, for parameters with any leading axes.
-
-    Raises:
-      SceneError: With every such number and its suggested value.
-    """
-    if any(isinstance(v, jax.core.Tracer) for v in params):
-        return
-    arm = [f"arm_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
-    values = {name: getattr(params, name) for name in Params._fields if name != "arm"}
-    values |= {name: np.asarray(params.arm)[..., i] for i, name in enumerate(arm)}
-    found = [slip for name, v in values.items() for slip in _slips(name, name, np.asarray(v))]
-    if found:
-        raise schema.SceneError(found)
-    _hint_at_kilopascals(np.asarray(params.pressure, float))
-
-
-def _hint_at_kilopascals(pressures: np.ndarray) -> None:
-    """Warns of pressures that are all nearly zero, which their range has: kPa, most likely."""
-    largest = float(np.abs(pressures).max(initial=0.0))
-    if 0 < largest < _FAINT:
-        warnings.warn(
-            f"the largest pressure is {largest:g} Pa, next to none; did you mean "
-            f"{1e3 * largest:g}? (kPa given where Pa is expected; Python takes SI units)",
-            stacklevel=3,
-        )
-
-
-def _slips(name: str, row: str, values: np.ndarray) -> list[str]:
-    """What is wrong with the first value, if any, that looks like one of another unit."""
-    kind = PARAMETERS[row]
-    slack = 1e-6 * abs(kind.high)  # a float32 of a bound
-    outside = values[(values < kind.low - slack) | (values > kind.high + slack)]
-    for value in outside.ravel()[:1]:
-        if schema.unit_slip(float(value), kind.unit, kind.low, kind.high):
-            problem = schema.range_problem(name, float(value), kind.unit, kind.low, kind.high)
-            return [f"{problem}; Python takes SI units and radians"]
-    return []
 
 
 def _table_alone(hand: Hand) -> Hand:

@@ -1,11 +1,13 @@
 """Batched simulation of soft hands and co-design of their morphology and control.
 
 The names below are the package's public list; each module has its own.  They are imported when they
-are first asked for, so that importing the package costs nothing and sets nothing.
+are first asked for, so that importing the package costs a millisecond and sets nothing.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+from codesign_jax import sources as _sources  # noqa: F401  # notes the state of the files first
 
 if TYPE_CHECKING:
     from codesign_jax import (

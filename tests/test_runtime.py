@@ -500,20 +500,3 @@ def test_what_is_not_used_goes(folder, monkeypatch):
     monkeypatch.setenv(cache.LIMIT, "much")
     with pytest.raises(ValueError, match="must be a number of bytes"):
         cache.kept("new", lambda: b"")
-
-
-def test_sources_are_part_of_the_key(tmp_path):
-    """Another line of code in any file but in those left out is another kernel."""
-    for name in ("a.py", "deep/b.py", "report/c.py"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(name)
-
-    def digest():
-        cache.sources.cache_clear()
-        return cache.sources(tmp_path, ("report",))
-
-    first = digest()
-    (tmp_path / "report" / "c.py").write_text("other")
-    assert digest() == first
-    (tmp_path / "deep" / "b.py").write_text("other")
-    assert digest() != first

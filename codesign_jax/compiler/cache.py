@@ -6,7 +6,6 @@ remote, nothing is.  The environment variable CODESIGN_KERNEL_CACHE_BYTES sets t
 """
 
 import contextlib
-import functools
 import hashlib
 import os
 import tempfile
@@ -21,22 +20,6 @@ _DEFAULT_LIMIT = 512 * 2**20
 _DIGEST = hashlib.sha256().digest_size
 _SUFFIX, _PART = ".kernel", ".part"
 _ABANDONED = 3600.0  # age of a file that its writer will not finish any more [s]
-
-
-@functools.cache
-def sources(root: Path, leave_out: tuple[str, ...] = ()) -> str:
-    """Digest of a package's Python code: what is kept belongs to the code that made it.
-
-    Args:
-      root: Its folder; read once a process, about a millisecond for 200 kB.
-      leave_out: Subfolders of which no kernel depends.
-    """
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        relative = path.relative_to(root)
-        if relative.parts[0] not in leave_out:
-            digest.update(f"{relative} {path.stat().st_size}\n".encode() + path.read_bytes())
-    return digest.hexdigest()
 
 
 def key(*parts: object) -> str:

@@ -1,0 +1,3 @@
+"""The table of docs/faults.md, from the counts."""
+def write(data, path):
+    pass

@@ -99,7 +99,8 @@ def stored(folder: Path, settings: Settings) -> Outcome | None:
 
 def _case(folder: Path, settings: Settings, trials: int) -> tuple[Case, str]:
     """The design to test and the digest of what determines its outcomes."""
-    case = find_case(Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY))
+    subject = Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY)
+    case = find_case(subject, tell=lambda text: None)  # the command says what is amiss
     return case, outcomes.key(case.scene, case.engine, case.design[None], trials, settings.seed)
 
 

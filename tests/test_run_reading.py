@@ -266,7 +266,7 @@ def test_changed_scene_files_are_refused_by_all_that_read_the_run(run, capsys):
     with pytest.raises(SceneError, match="objects.toml is missing"):
         runs.read_run(run)
     path.write_text(text)
-    assert runs.read_run(run)
+    runs.read_run(run)
 
 
 HOSTILE = {

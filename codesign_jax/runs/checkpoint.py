@@ -11,9 +11,11 @@ pass: neither is damaged, and only what is damaged may be deleted.
 """
 
 import errno
+import functools
 import hashlib
 import logging
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -94,7 +96,7 @@ class Checkpoints:
             for left in self.folder.glob(f"*{_TEMPORARY}*"):
                 remove(left)
         self._args, self._tell, self._run = ocp.args, tell, run
-        logging.getLogger("asyncio").addFilter(_is_not_orbax)
+        _silence()
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def __enter__(self) -> "Checkpoints":
@@ -121,18 +123,23 @@ class Checkpoints:
         labelled = arrays if self._run is None else arrays | {_LABEL: _label(self._run, step)}
         try:
             saved = self._manager.save(step, args=self._args.StandardSave(labelled))
+            if saved:
+                self._write_digests(step, labelled)
         except (OSError, ValueError) as error:  # the latter is how tensorstore says it
             raise _unsaved(self.folder / str(step), error) from error
         if not saved:
             raise OSError(f"checkpoint {step} was not written: {self.folder} holds a newer step")
-        lines = [f"# arrays {digest(labelled)}"]
+        self._forget_old_digests()
+
+    def _write_digests(self, step: int, arrays: Arrays) -> None:
+        """Writes the digests of a step, which make it whole."""
+        lines = [f"# arrays {digest(arrays)}"]
         for path in sorted((self.folder / str(step)).rglob("*")):
             if path.is_file():
                 name = path.relative_to(self.folder).as_posix()
                 lines.append(f"{_file_digest(path)}  {name}")
         with files.atomically(self._digests(step)) as part:
             part.write_text("\n".join(lines) + "\n")
-        self._forget_old_digests()
 
     def restore(self) -> Restored:
         """Reads the newest step whose digest matches; changes nothing on disk.
@@ -301,13 +308,29 @@ def _unsaved(place: Path, error: Exception) -> OSError:
     return OSError(f"checkpoint {place.name} could not be written to {place.parent}: {problem}")
 
 
-def _is_not_orbax(record: logging.LogRecord) -> bool:
-    """Whether a message of asyncio's is not about a task of orbax's that failed.
+@functools.cache
+def _silence() -> None:
+    """Keeps tracebacks of a failed save off the terminal: `Checkpoints.save` raises the error.
 
-    When a save fails, its other tasks are never asked how they ended, and asyncio prints a
-    traceback of each. The error itself has been raised.
+    Orbax logs it from each of its threads, asyncio from each task that nobody asked how it ended,
+    and tensorstore finds the tasks' event loop closed. Some come long after the save, so that this
+    is for the rest of the process.
     """
-    return not ("never retrieved" in record.getMessage() and "orbax" in record.getMessage())
+    before = sys.unraisablehook
+
+    def hook(event: Any) -> None:
+        if str(event.exc_value) != "Event loop is closed":
+            before(event)
+
+    sys.unraisablehook = hook
+    for name in ("absl", "asyncio"):
+        logging.getLogger(name).addFilter(_is_news)
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Whether a message is not of orbax's threads or tasks about an error that was raised."""
+    text = record.getMessage()
+    return "_SignalingThread" not in text and not ("never retrieved" in text and "orbax" in text)
 
 
 def _leaves(arrays: Arrays, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:

@@ -88,7 +88,7 @@ class Record:
     def failed_status(self) -> np.ndarray | None:
         """Status of the final test's or the last episode's trials where every one failed."""
         told = [] if self.test is None else [np.asarray(self.test.status)]
-        told += [self.history.trials.status[self.done - 1]] if self.done else []
+        told += [np.asarray(self.history.trials.status[self.done - 1])] if self.done else []
         return next((status for status in told if failed(status).all()), None)
 
     def last_outcomes(self) -> Outcome:

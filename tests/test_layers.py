@@ -14,6 +14,8 @@ ROOT = Path(__file__).parents[1]
 # What stands in a line may import lines before it, and its own folder.
 LAYERS = """
 sources files
+kept_programs archives
+caches
 types provenance compiler optimize
 scene
 axes model control verdict

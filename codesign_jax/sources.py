@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent
 UNRELATED = ("commands", "export", "optimize", "report", "runs")
 """Folders that no simulation depends on: they import engines, never the other way."""
-_UNTRACED = ("compiler", "sources")
+_UNTRACED = ("archives", "caches", "compiler", "files", "kept_programs", "memory_maps", "sources")
 """What is not traced: to replace a name there is to change the machinery and no physics."""
 
 _State = dict[str, tuple[int, ...]]

@@ -13,8 +13,8 @@ import numpy as np
 
 from codesign_jax import engines
 from codesign_jax import scene as scenes
+from codesign_jax.caches import use_compilation_cache
 from codesign_jax.commands import preflight
-from codesign_jax.files import use_compilation_cache
 from codesign_jax.scene import Scene, keypaths, library, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import SceneError

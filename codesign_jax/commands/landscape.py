@@ -25,7 +25,7 @@ from codesign_jax.types import Outcome, failed
 if TYPE_CHECKING:
     from codesign_jax.cli import Landscape as Options
 
-PART = "landscape.part.npz"
+PART = "landscape.part"
 """What is done of a landscape, until it is finished."""
 
 
@@ -186,6 +186,8 @@ def _simulate(
     engine = make_engine(case.engine, case.scene)
     simulate = Calls(trials, engine, size, part, designs)
     console.print(f"grasps: {grasps} in {-(-len(designs) // size)} calls")
+    if simulate.refused:
+        console.print(f"{part} {simulate.refused}: simulated again", markup=False)
     if simulate.found:
         done = simulate.found // size
         console.print(f"going on after {done} calls, from {part}", markup=False)

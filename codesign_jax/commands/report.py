@@ -46,9 +46,11 @@ def main(options: "Report") -> int:
     for note in notes:
         common.warn(note)
     provenance = read_provenance(options.folder)
-    found = reference.stored(options.folder, settings)
+    found, why = reference.stored(options.folder, settings)
     run = Run(options.folder, scene, settings, record, chosen, provenance, found, tuple(notes))
     console = Console(highlight=False, soft_wrap=True)
+    if why:
+        console.print(f"{options.folder / reference.FILE} {why}: left out", markup=False)
     shown = None if options.no_replay else _best_grasp(scene, settings, record, name, console)
     page.write(run, shown, path)
     size = path.stat().st_size / 1e6

@@ -47,7 +47,7 @@ def write_scene(scene: Scene, folder: Path) -> None:
     for i, shape in enumerate(scene.objects.object):
         if shape.mesh:
             (folder / MESHES).mkdir(exist_ok=True)
-            (folder / _mesh_name(shape, i)).write_bytes(shape.mesh.path.read_bytes())
+            (folder / _mesh_name(shape, i)).write_bytes(shape.mesh.content)
     again = scenes.load(folder / "scene.toml")
     # A scene with other constants is another kind of object than one that was read.
     if again != scene and scene_texts(again) != scene_texts(scene):
@@ -63,7 +63,7 @@ def _mesh_name(shape: Shape, index: int) -> str:
 def _document(table: dict[str, Any], units: dict[str, str]) -> str:
     """TOML of a table, with the units of its values as comments."""
     lines, place = [], ""
-    for line in tomli_w.dumps(table).splitlines():
+    for line in tomli_w.dumps(table).split("\n")[:-1]:  # texts may hold other ends of lines
         if header := re.fullmatch(r"\[+(.*?)\]+", line):
             place = header[1] + "."
         key, equals, _ = line.partition(" = ")

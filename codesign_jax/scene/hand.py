@@ -133,6 +133,9 @@ def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
         path = f"{where}.preset {preset.name}"
         if names.count(preset.name) > 1 or preset.name == "full":
             problems.append(f"{path}: the name is taken")
+        if len(preset.fixed) > schema.MOST_ENTRIES:
+            problems.append(f"{path}.fixed has {len(preset.fixed):,} keys")
+            continue
         for key, value in preset.fixed.items():
             if key not in table:
                 problems.append(
@@ -141,7 +144,8 @@ def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
                 continue
             p = table[key]
             if isinstance(value, bool) or not isinstance(value, (int, float)):
-                problems.append(f"{path}.fixed.{key} = {value!r} must be a number [{p.unit}]")
+                given = schema.shown(value)
+                problems.append(f"{path}.fixed.{key} = {given} must be a number [{p.unit}]")
                 continue
             problem = schema.range_problem(f"{path}.fixed.{key}", value, p.unit, p.low, p.high)
             if problem:

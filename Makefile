@@ -19,10 +19,10 @@ help:
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
 	@echo "make test-browser  the report in a headless Chromium"
-	@echo "make stability   the hard cases and their margins, docs/stability.md"
+	@echo "make stability   the hard cases and their margins, docs/notes/stability.md"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
-	@echo "make effects     what each effect costs and decides: docs/effects.md"
+	@echo "make effects     what each effect costs and decides: docs/notes/effects.md"
 	@echo "make accuracy    what accuracy costs in time: ACCURACY=docs/data/accuracy_cpu.json, SIZE=full"
 	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make format      ruff format          make clean       remove what make built"
@@ -47,7 +47,7 @@ test-gpu: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile --durations=10
 
-# All hard cases; their margins go to docs/stability.md. About half an hour on two cores.
+# All hard cases; their margins go to docs/notes/stability.md. About half an hour on two cores.
 stability: $(STAMP)
 	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
 

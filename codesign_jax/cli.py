@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from codesign_jax import caches
 from codesign_jax.commands import status
 from codesign_jax.commands.flags import (
     Count,
@@ -301,6 +302,10 @@ def main(arguments: list[str] | None = None) -> int:
             prog="codesign",
             description="Co-design of soft hand morphology and control; --version says which.",
         )
+        if wrong := caches.problems():
+            from codesign_jax.scene.schema import SceneError
+
+            raise SceneError(wrong)
         return command.run()
 
     code = status.of(run)

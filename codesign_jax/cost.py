@@ -115,7 +115,14 @@ def _refusing(name: str, problems: dict[str, str]) -> type:
     fields = {field: property(refuse(problem)) for field, problem in problems.items()}
     # What unpacks or indexes the trace reads all of it.
     every = refuse(next(iter(problems.values())))
-    return type(name, (Trace,), fields | {"__iter__": every, "__getitem__": every})
+
+    def at(trace: Any, scene: Scene, phase: str | None = None) -> Trace:
+        if "distance" in problems:
+            raise ValueError(problems["distance"])
+        return kind(*Trace(*tuple.__iter__(trace)).at(scene, phase))
+
+    kind = type(name, (Trace,), fields | {"__iter__": every, "__getitem__": every, "at": at})
+    return kind
 
 
 _QPOS = (

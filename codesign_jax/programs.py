@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import rollout
+from codesign_jax import memory_maps, rollout, sources
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
@@ -60,19 +60,26 @@ class Program:
 def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
     """Jits what `build` returns once for each structure, engine, design space and further argument.
 
+    Nothing is found again once the code is not what was imported, see `sources`.
+
     Args:
       build: Function (scene, engine, space, *arguments) that returns a function to jit, which reads
         numbers from its constants alone; the last argument is a cost of one's own or None.
     """
-    jitted = lambda *arguments: jax.jit(build(*arguments))  # noqa: E731
+
+    def jitted(*arguments: Any) -> Callable:
+        memory_maps.relieve()
+        return jax.jit(build(*arguments))
+
     kept = functools.lru_cache(maxsize=_KEPT)(jitted)
+    memory_maps.holds_programs(kept.cache_clear)
 
     @functools.wraps(build)
     def find(scene: Scene, engine: Engine, space: DesignSpace, *arguments: Any) -> Callable:
         if arguments[-1] is not None:
             # A cost of one's own may read names and whatever else is no number of the scene.
             return jitted(scene, engine, space, *arguments)
-        if not isinstance(engine, Hashable):
+        if not isinstance(engine, Hashable) or sources.digest() is None:
             return jitted(scene.structure, engine, space, *arguments)
         return kept(scene.structure, engine, space, *arguments)
 

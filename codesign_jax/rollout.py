@@ -24,7 +24,7 @@ import numpy as np
 from codesign_jax import axes, control, model
 from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
-from codesign_jax.scene import Constants, Scene, parameters, schema
+from codesign_jax.scene import Constants, Scene, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes, check
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Trace, Trial, failed
@@ -160,7 +160,7 @@ def simulate(
     constants = numbers(scene, constants)
     axes.refuse(scene, params, trials, ("world", "world"))
     axes.refuse_constants(constants, len(trials.yaw), "world")
-    parameters.refuse_unit_slips(params)
+    unit_slips.refuse(params)
     fields, ctrl, initial = prepare(scene, params, trials, constants)
     trace = engine.rollout(fields, ctrl, trajectory=bool(trajectory))
     judged = judge(scene, trace, ctrl, initial, constants, trajectory=trajectory, cost=cost)

@@ -127,6 +127,67 @@ def test_worlds_are_independent_under_vmap():
             np.testing.assert_array_equal(a, b[i])
 
 
+# --- a trace at the end of a phase ---------------------------------------------------------------
+
+
+def counted(worlds=()):
+    """A trace whose entries are their indices, and five times that in qpos."""
+    step = jnp.broadcast_to(jnp.arange(float(STEPS)), (*worlds, STEPS))
+    qpos = 5 * step[..., None] + jnp.arange(3)
+    return Trace(step, step, step, qpos, step.astype(int), qpos[..., 0, :])
+
+
+ENDS = {"approach": 199, "inflate": 349, "lift": 449, "disturb": 799, "ungrasp": 899, None: 799}
+
+
+@pytest.mark.parametrize("worlds", [(), (2,)])
+def test_a_trace_at_the_end_of_a_phase_is_its_last_step(worlds):
+    for phase, last in ENDS.items():
+        found = counted(worlds).at(SCENE, phase)
+        np.testing.assert_array_equal(found.distance, np.full(worlds, last))
+        np.testing.assert_array_equal(found.qpos, np.full((*worlds, 3), 5 * last) + np.arange(3))
+        assert found.status.shape == worlds and found.last is None
+
+
+def test_the_last_step_that_counts_is_that_of_the_cost():
+    """An object that is lost in it costs, and one step later does not."""
+    last = SCENE.last_step()
+    assert evaluate(trace(last)).cost > 0 and evaluate(trace(last + 1)).cost == 0
+
+
+def test_a_trace_at_a_phase_composes_with_transformations():
+    """Also where the phases' ends are traced numbers, one for each world."""
+    numbers = SCENE.constants()
+    ends = jnp.array([8.0, 7.5])  # s
+    shorter = numbers._replace(phases=numbers.phases._replace(disturb=ends))
+    axes = jax.tree.map(lambda v: 0 if jnp.ndim(v) else None, shorter)
+
+    def distance(trace, constants):
+        return trace.at(SCENE.with_constants(constants), "disturb").distance
+
+    found = jax.jit(jax.vmap(distance, (None, axes)))(counted(), shorter)
+    np.testing.assert_array_equal(found, [799, 749])
+    slope = jax.grad(distance)(counted()._replace(status=None), numbers).distance
+    np.testing.assert_array_equal(np.flatnonzero(slope), [799])
+    with pytest.raises(ValueError, match=r"phases differ between worlds: map .* jax\.vmap"):
+        counted((2,)).at(SCENE.with_constants(shorter), "disturb")
+
+
+def test_a_trace_without_the_phase_says_so():
+    brief = scene.load("paper_spheres", overrides={"effects": {"disturb": False, "ungrasp": False}})
+    assert list(brief.phase_ends) == ["approach", "inflate", "lift"]
+    held = jax.tree.map(lambda v: v[: brief.num_steps], counted())
+    assert held.at(brief).distance == held.at(brief, "lift").distance == 449
+    for the_scene, phase, words in (
+        (SCENE, "distrub", "phase 'distrub' unknown; did you mean 'disturb'"),
+        (SCENE, "shaking", "unknown; valid: approach, disturb, inflate, lift, ungrasp"),
+        (brief, "disturb", "has no phase 'disturb', as effects.disturb = false; its grasp ends"),
+        (brief, "lift", "the trace has 900 time steps, but a grasp of the scene 450"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            counted().at(the_scene, phase)
+
+
 # --- particles -----------------------------------------------------------------------------------
 
 

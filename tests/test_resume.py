@@ -156,13 +156,21 @@ def test_damaged_checkpoint_is_said_and_the_older_one_used(damage, finished, tmp
     assert_same_run(folder, finished)
 
 
-def test_losing_every_checkpoint_starts_anew(finished, tmp_path, capsys):
+@pytest.mark.parametrize("lost", ["*.sha256", "*"])
+def test_losing_every_checkpoint_is_refused_until_fresh(lost, finished, tmp_path, capsys):
+    """The tables are the last that is left of the results, and a start would replace them."""
     folder = shutil.copytree(finished, tmp_path / "run")
-    for path in (folder / "checkpoints").glob("*.sha256"):
-        path.unlink()
-    assert command(*RUN, "--out", folder) == 0
-    assert capsys.readouterr().out.count("is lost") == 3
-    assert_same_run(folder, finished)
+    for path in (folder / "checkpoints").glob(lost):
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+    before = {name: (folder / name).read_bytes() for name in RESULTS}
+    assert command(*RUN, "--out", folder) == 1
+    error = capsys.readouterr().err
+    assert f"while its tables have {EPISODES} episodes" in error and "--fresh" in error
+    assert before == {name: (folder / name).read_bytes() for name in RESULTS}
+    if lost == "*.sha256":
+        assert error.count(".sha256 is missing") == 3 and (folder / "checkpoints" / "14").is_dir()
+        assert command(*RUN, "--out", folder, "--fresh") == 0
+        assert_same_run(folder, finished)
 
 
 def test_resume_with_another_scene_is_refused_with_a_diff(finished, capsys):

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from codesign_jax import codesign, runs
-from codesign_jax.commands import slurm, status
+from codesign_jax.commands import common, slurm, status
 from codesign_jax.runs import RunResult
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
@@ -243,9 +243,13 @@ def _last_words(log: Path) -> str:
 
 
 def read(scene: Scene, folder: Path) -> RunResult | None:
-    """The run in a folder as it is; None if it has no checkpoint."""
-    record = runs.load_record(folder)
-    if record is None:
+    """The run in a folder as it is; None if it has no checkpoint, or every trial failed."""
+    try:
+        record = runs.load_record(folder, tell=common.warn)
+    except SceneError as error:
+        common.warn(str(error))
+        return None
+    if record is None or record.failed_status() is not None:
         return None
     test = None if record.test is None else codesign.summarize_test(scene, record.test)
     return RunResult(record, test, 0)

@@ -115,10 +115,7 @@ def _data(scene: Scene, grasp: Replay) -> dict[str, Any]:
 
 def phases(scene: Scene) -> list[tuple[str, float]]:
     """Names and end times [s] of the phases that a scene has, in order."""
-    p, e = scene.phases, scene.effects
-    found = [("approach", p.approach), ("inflate", p.inflate), ("lift", p.lift)]
-    found += [("disturb", p.disturb)] if e.disturb else []
-    return found + ([("release", p.ungrasp)] if e.ungrasp else [])
+    return [("release" if n == "ungrasp" else n, end) for n, end in scene.phase_ends.items()]
 
 
 def _part(part: bodies.Part) -> dict[str, Any]:

@@ -151,8 +151,7 @@ FILES = {
     "landscape.npz": "the cost over a grid of two parameters, of `codesign landscape --run`, as "
     "arrays (`codesign_jax.report.landscape.Landscape`)",
     LANDSCAPE: "the same as a table, see below",
-    "landscape.part.npz": "what is done of a landscape that was interrupted; the same command goes "
-    "on",
+    "landscape.part": "what is done of a landscape that was interrupted; the same command goes on",
     "reference.npz": "outcomes of the chosen design's fresh trials at accuracy `reference`, arrays "
     "of shape (trial,), and the digest of what determines them",
     "replay.html": "a grasp in 3D, of `codesign replay`: opens in any browser, without a network",

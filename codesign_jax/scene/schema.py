@@ -265,8 +265,11 @@ def _required(field: dataclasses.Field) -> bool:
 
 def _value(hint: Any, value: Any, path: str, field: dataclasses.Field, problems: list[str]) -> Any:
     """Checks one value against its type hint and its field's metadata."""
-    if isinstance(hint, types.UnionType):  # "X | None": TOML has no null, so a given value is an X
-        hint = next(a for a in typing.get_args(hint) if a is not type(None))
+    if isinstance(hint, types.UnionType):
+        # "X | None": TOML has no null, so a given value is an X. "X | tuple[X, ...]": one or many.
+        kinds = [a for a in typing.get_args(hint) if a is not type(None)]
+        many = [a for a in kinds if typing.get_origin(a) is tuple]
+        hint = many[0] if many and isinstance(value, list) else kinds[0]
     if typing.get_origin(hint) is tuple:
         if not isinstance(value, list):
             problems.append(f"{path} must be an array, not {type(value).__name__}")

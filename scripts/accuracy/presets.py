@@ -29,11 +29,17 @@ def presets_table(studies: dict[str, Study]) -> list[list[str]]:
     return rows
 
 
-def front_page(studies: dict[str, Study]) -> list[list[str]]:
-    """The presets in short, for a reader in a hurry: three errors and grasps a second."""
+WITHOUT = "without contact between fingers"
+"""What the study leaves out of the default scene."""
+
+
+def in_short(studies: dict[str, Study]) -> list[list[str]]:
+    """The presets for a user: three errors and grasps a second; the heads say what is left out."""
     full = next(iter(studies.values()))
     heads = [ERRORS[part][0] for part in JUDGED]
-    rows = [["preset", "setting", *heads, *(f"grasps/s, {name}" for name in studies)]]
+    heads[-1] += f", {WITHOUT}"
+    rates = (f"grasps/s in contact, {WITHOUT}, {name}" for name in studies)
+    rows = [["preset", "setting", *heads, *rates]]
     for name, setting in PRESETS.items():
         errors = [full.error(part, setting) for part in JUDGED]
         cells = ["–" if e is None else f"{e:.2g}" for e in errors]
@@ -82,9 +88,9 @@ def comment(name: str, studies: dict[str, Study]) -> str:
         if cost := study.cost("structured", setting):
             seconds, rate = cost_cells(cost)
             costs.append(f"{seconds} on {machine} ({rate} grasps/s)")
-    lines = [", ".join(words)]
+    lines = [", ".join(words) + f" ({WITHOUT})"]
     if costs:
-        lines.append("wall s / simulated s: " + ", ".join(costs))
+        lines.append("wall s / simulated s: " + ", ".join(costs) + f" ({WITHOUT})")
     return "".join(f"{_COMMENT}{line}\n" for line in lines)
 
 

@@ -1,15 +1,15 @@
 """Signed distance on a voxel grid, as fine as a bound on its interpolation error asks for."""
 
 import contextlib
+import hashlib
 import time
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
-from codesign_jax import files
+from codesign_jax import archives, caches, sources
 from codesign_jax.scene.meshes import surface as surfaces
 from codesign_jax.scene.meshes.surface import Surface
 
@@ -21,7 +21,7 @@ COARSEST = 0.0025
 MAX_NODES = 3_000_000  # 12 MB in float32
 _NEAR = 0.002  # how far from the surface "near the surface" goes [m]
 _WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
-_FORMAT = 1  # of the files in the cache; change it with anything that changes a grid
+_ENDING = ".npz"  # of the files in the cache
 
 
 class Grid(NamedTuple):
@@ -133,7 +133,11 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> G
       faces: As for `build`.
       bound: As for `build`.
     """
-    path = files.cache_folder() / "meshes" / f"{key}-{_FORMAT}.npz"
+    code = sources.of_files()
+    if code is None or not caches.enabled():
+        return build(vertices, faces, bound)
+    name = hashlib.sha256(f"{key} {code}".encode()).hexdigest()
+    path = caches.folder() / "meshes" / f"{name}{_ENDING}"
     stored = _read(path)
     if stored is not None:
         return stored
@@ -145,17 +149,21 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> G
 
 
 def _read(path: Path) -> Grid | None:
-    """A stored grid, or None; a damaged file (zip has checksums) counts as none."""
+    """A stored grid, or None; a damaged file counts as none."""
     try:
-        # NumPy leaves a damaged file open if it opens it itself.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            scalars = {k: float(file[k]) for k in ("cell", "error", "worst")}
-            return Grid(origin=file["origin"], values=file["values"], **scalars)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        stored = archives.load(path)
+        if str(stored["name"]) != path.name:  # another grid's file
+            return None
+        scalars = {k: float(stored[k]) for k in ("cell", "error", "worst")}
+        found = Grid(origin=stored["origin"], values=stored["values"], **scalars)
+    except (OSError, archives.ArchiveError, KeyError):
         return None
+    caches.used(path)
+    return found
 
 
 def _write(path: Path, grid: Grid) -> None:
     """Writes a grid to the cache; a full disk is no error."""
-    with contextlib.suppress(OSError), files.atomically(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, **grid._asdict())
+    with contextlib.suppress(OSError):
+        archives.save(path, {"name": path.name, **grid._asdict()}, compressed=True)
+        caches.evict(path.parent, _ENDING, caches.limit(caches.MESHES), path)

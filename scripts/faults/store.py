@@ -140,7 +140,12 @@ def gather(campaign: str, numbers: range, results: dict[int, Result], good: Any,
         for name, value in result.most.items():
             most[name] = max(value, most.get(name, value))
         if result.word not in good:
-            bad.append([number, result.word, result.detail[-2000:]])
+            bad.append([number, result.word, _short(result.detail)])
     return Part(
         campaign, numbers.start, numbers.stop, dict(counts), dict(tallies), most, bad, round(took, 2)
     )
+
+
+def _short(text: str) -> str:
+    """A text's beginning, which names the case, and its end, which has the error."""
+    return text if len(text) < 2500 else f"{text[:500]}\n[...]\n{text[-2000:]}"

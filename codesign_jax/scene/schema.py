@@ -353,7 +353,7 @@ def text_problem(path: str, text: str, *, lines: bool = False) -> str | None:
     """
     if len(text) > MOST_LETTERS:
         return f"{path} has {len(text):,} characters, more than {MOST_LETTERS:,}"
-    allowed = "\n\t" if lines else ""
+    allowed = "\n\r\t" if lines else ""
     for c in text:
         if unicodedata.category(c) in _CONTROL and c not in allowed:
             return f"{path} = {shown(text)} has a character that is no text, U+{ord(c):04X}"

@@ -2,7 +2,7 @@
 
 A program takes the scene's numbers (`Scene.constants`) and the optimiser as arguments, so
 that neither JAX nor XLA sees what hand, objects or bounds they come from: another file of the same
-structure traces and compiles nothing, and a new process finds the program in JAX's cache on disk.
+structure, whose preset fixes the same values, traces and compiles nothing, and a new process finds the program in JAX's cache on disk.
 """
 
 import functools
@@ -58,7 +58,7 @@ class Program:
 
 
 def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
-    """Jits what `build` returns once for each structure, engine, design space and further argument.
+    """Jits what `build` returns once for each structure, engine and further argument.
 
     Nothing is found again once the code is not what was imported, see `sources`.
 
@@ -80,7 +80,7 @@ def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
             # A cost of one's own may read names and whatever else is no number of the scene.
             return jitted(scene, engine, space, *arguments)
         if not isinstance(engine, Hashable) or sources.digest() is None:
-            return jitted(scene.structure, engine, space, *arguments)
-        return kept(scene.structure, engine, space, *arguments)
+            return jitted(scene.structure, engine, space.structure, *arguments)
+        return kept(scene.structure, engine, space.structure, *arguments)
 
     return find

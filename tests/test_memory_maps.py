@@ -30,7 +30,7 @@ def test_programs_go_when_many_maps_are_taken(monkeypatch):
     find = programs.shared(lambda *how: built.append(how) or (lambda v: v + 1))
 
     def get(number):
-        return find(scene, "engine", number, None)
+        return find(scene, "engine", types.SimpleNamespace(structure=number), None)
 
     full(monkeypatch, 0.29)
     first = get(0)

@@ -7,6 +7,7 @@ Linux, and a C compiler (`cc`, or the one in CC).
 
 import argparse
 import datetime
+import json
 import signal
 import sys
 from pathlib import Path

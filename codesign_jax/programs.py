@@ -44,18 +44,37 @@ class Program:
         Raises:
           SceneError: If the constants do not fit the scene, see `scene.constants.check`.
         """
-        return self._jitted(first, second, self._numbers(constants), *self._more)
+        return _again_if_stuck(
+            lambda: self._jitted(first, second, self._numbers(constants), *self._more)
+        )
 
     def compile(self, first: Any, second: Any) -> Callable[..., Any]:
         """Compiles the program ahead for arguments like these; a function to call it by."""
         numbers = self._numbers(None)
-        compiled = self._jitted.lower(first, second, numbers, *self._more).compile()
+        compiled = _again_if_stuck(
+            lambda: self._jitted.lower(first, second, numbers, *self._more).compile()
+        )
         return lambda first, second: compiled(first, second, numbers, *self._more)
 
     def _numbers(self, constants: Constants | None) -> Constants:
         numbers = rollout.numbers(self._scene, constants)
         # Python's floats would be traced apart from arrays.
         return jax.tree.map(lambda v: jnp.asarray(v, float), numbers)
+
+
+def _again_if_stuck(call: Callable[[], Any]) -> Any:
+    """Returns call(), if need be without what JAX had traced.
+
+    Ctrl-C at a bad moment of tracing leaves a mark in one of JAX's caches, which takes the next
+    call for a recursion.
+    """
+    try:
+        return call()
+    except RecursionError as error:
+        if "Recursively calling" not in str(error):
+            raise
+        jax.clear_caches()
+        return call()
 
 
 def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
@@ -85,3 +104,6 @@ def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
         return kept(scene.structure, engine, space.structure, *arguments)
 
     return find
+
+
+sources.note()  # what programs are traced from has been imported

@@ -73,7 +73,8 @@ def note() -> None:
 def replaced() -> list[str]:
     """Names of modules and classes that are not what they were when their module was noted.
 
-    A module is noted when the structured engine is imported, or when it is first seen here later.
+    A module is noted when `programs` or the structured engine is imported, else when it is first
+    seen here.
     The contents of containers are not looked at.
     """
     note()

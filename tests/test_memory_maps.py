@@ -52,6 +52,26 @@ def test_a_kernel_is_refused_before_the_limit(monkeypatch):
     jax.jit(lambda *v: kernels.run(*v, rounds=3))(*kernels.numbers(2))
 
 
+def test_what_ctrl_c_left_in_jax_is_forgotten(monkeypatch):
+    """The next call works; another recursion is an error as ever."""
+    cleared, scene = [], small.pinch("sphere", 2)
+    words = ["Recursively calling <weakref> multiply"]
+
+    def stuck(*_):
+        if words and not cleared:
+            raise RecursionError(words[0])
+        return 3
+
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
+    program = programs.Program(scene, stuck)
+    assert program(0, 0) == 3 and cleared == [1]
+    cleared.clear()
+    words[0] = "maximum recursion depth exceeded"
+    with pytest.raises(RecursionError, match="maximum"):
+        program(0, 0)
+    assert not cleared
+
+
 @pytest.mark.slow  # test_programs_go_when_many_maps_are_taken keeps the idea
 def test_many_structures_stay_below_a_limit(monkeypatch):
     """Twelve structures of 600 maps each under a limit that three exceed."""

@@ -28,7 +28,7 @@ from command_runs import (  # noqa: F401
 )
 from toy import TINY
 
-from codesign_jax import codesign, runs
+from codesign_jax import runs, sources
 from codesign_jax.commands import reference
 from codesign_jax.runs import choice, columns
 from codesign_jax.runs.checkpoint import Checkpoints
@@ -240,11 +240,17 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         raise AssertionError("simulated again")
 
     with monkeypatch.context() as patch:  # kept in the run folder
-        patch.setattr(codesign, "make_evaluate", never)
+        patch.setattr(reference, "_simulate", never)
         assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
         assert line in capsys.readouterr().out.splitlines()
         with pytest.raises(AssertionError, match="simulated again"):
             command(*RUN, "--reference-trials", "3", "--out", folder)
+        capsys.readouterr()
+        patch.setattr(sources, "digest", lambda: "other code")
+        with pytest.raises(AssertionError, match="simulated again"):
+            command(*RUN, "--reference-trials", "2", "--out", folder)
+        said = capsys.readouterr().out
+        assert "reference.npz is of another version of the code: simulated again" in said
     settings = runs.read_run(folder)[1]
     assert reference.number_of_trials(None, settings) == 0  # MuJoCo C would take minutes
     quick = dataclasses.replace(settings, engine="structured")

@@ -117,6 +117,15 @@ def test_sizes_of_mesh_files(tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "MOST_FACES", 11)
     (problem,) = refusals(load_mesh, path)
     assert "has 12 faces, more than 11" in problem
+    monkeypatch.undo()
+    monkeypatch.setattr(objects, "MOST_BYTES", path.stat().st_size)
+    entry = 'type = "mesh"; file = "large.stl"; friction = 0.8; mass = 0.1; name = '
+    assert len(objects.load(object_file(tmp_path, entry + '"a"')).object) == 1
+    (problem,) = refusals(objects.load, object_file(tmp_path, entry + '"a"', entry + '"b"'))
+    assert "the meshes have" in problem
+    monkeypatch.setattr(meshes.grid, "MAX_WORK", 1e5)
+    with pytest.raises(SceneError, match="12 faces are too many for a grid of"):
+        _ = load_mesh(path).grid
 
 
 def gltf(tmp_path, change=lambda tree: None):

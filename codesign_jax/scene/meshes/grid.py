@@ -17,6 +17,9 @@ from codesign_jax.scene.reach import LEAST
 # The error grows in proportion to the cell at edges and with its square elsewhere.
 COARSEST = 0.0025
 MAX_NODES = 3_000_000  # 12 MB in float32
+# Looking for a node's nearest faces takes longest where all are equally far, as in a ball's middle:
+# 36 s of processor time for a ball of 82,000 faces and 800,000 nodes.
+MAX_WORK = 3e10  # faces times nodes
 _LARGE = 300_000  # nodes; more take a second
 _NEAR = 0.002  # how far from the surface "near the surface" goes [m]
 _WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
@@ -55,7 +58,7 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = 
       reach: How far beyond the surface the grid goes [m]; see `codesign_jax.scene.reach`.
 
     Raises:
-      ValueError: if the grid would have more than `MAX_NODES` nodes, or the body is too thin.
+      ValueError: if the grid would have more than `MAX_NODES` nodes, or take more than `MAX_WORK`.
     """
     surface = surfaces.prepare(vertices, faces)
     points = near_surface(vertices, faces, 3000)
@@ -69,6 +72,11 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = 
                 f"a grid of {cell * 1e3:.2g} mm cells, which a voxel_error of {bound * 1e3:.3g} mm "
                 f"needs, has {shape.prod():,} nodes, more than {MAX_NODES:,}; it goes "
                 f"{reach * 1e3:g} mm beyond the surface, as far as the hand's contacts need"
+            )
+        if shape.prod() * len(faces) > MAX_WORK:
+            raise ValueError(
+                f"{len(faces):,} faces are too many for a grid of {shape.prod():,} nodes: "
+                "use fewer faces or a larger voxel_error"
             )
         if shape.prod() > _LARGE and _too_coarse(surface, points, exact, low, cell, bound):
             cell *= 0.9

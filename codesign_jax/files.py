@@ -26,12 +26,28 @@ def atomically(path: Path) -> Iterator[Path]:
     # Of this call alone: threads may write the same file, and so may hosts that share a disk.
     temporary = path.with_name(f"{path.name}.{secrets.randbits(64)}.tmp")
     try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        with naming(path):
+            yield temporary
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Gives an error of writing to a file, such as of a full disk, the file's name.
+
+    Args:
+      path: The file that the block writes.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 @contextlib.contextmanager

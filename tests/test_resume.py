@@ -30,7 +30,7 @@ from toy import TINY
 
 from codesign_jax import runs, sources
 from codesign_jax.commands import reference
-from codesign_jax.runs import choice, columns
+from codesign_jax.runs import choice, columns, manifest
 from codesign_jax.runs.checkpoint import Checkpoints
 
 
@@ -303,7 +303,8 @@ def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsy
 
 
 def test_checkpoints_are_written_every_episode(finished):
-    with Checkpoints(Path(finished) / "checkpoints") as store:
+    own = manifest.read_provenance(finished)["id"]
+    with Checkpoints(Path(finished) / "checkpoints", run=own, read_only=True) as store:
         found = store.restore()
     assert found.step == EPISODES + 1 and "test" in found.arrays
     kept = sorted(int(p.stem) for p in (finished / "checkpoints").glob("*.sha256"))

@@ -11,7 +11,9 @@ from command_runs import command, own_workplace, snapshot, stored  # noqa: F401
 from tiny_run import RUN, copied
 
 from codesign_jax import runs
-from codesign_jax.runs import checkpoint, choice, manifest, tables
+from codesign_jax.batch import Batch
+from codesign_jax.commands import status
+from codesign_jax.runs import checkpoint, choice, directory, manifest, tables
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.scene.schema import SceneError
 
@@ -331,3 +333,94 @@ def test_tables_are_mended_from_the_checkpoints(run, whole, capsys):
         assert (run / name).read_bytes() == (whole / name).read_bytes()
     assert command(*RUN, "--out", run) == 0
     assert "differed" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "a file: No space left on device; make"),
+        (OSError(errno.EIO, "Input/output error", "x.csv"), "x.csv: Input/output error; the disk"),
+        (runs.RunError("the run is lost"), "error: the run is lost"),
+        (
+            PermissionError(errno.EACCES, "Permission denied", b"a\xff"),
+            "a\\udcff: Permission denied",
+        ),
+    ],
+)
+def test_errors_of_the_disk_are_a_line_that_says_what_to_do(error, words, capsys):
+    def run():
+        raise error
+
+    assert status.of(run) == 1
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    if error.errno if isinstance(error, OSError) else False:
+        assert ("give the same command again" in said) == (error.errno != errno.EACCES)
+
+
+def test_a_bug_is_no_error_of_the_disk():
+    for bug in (RuntimeError("bug"), OSError("without a number")):
+        with pytest.raises(type(bug)):
+            status.of(lambda bug=bug: (_ for _ in ()).throw(bug))
+
+
+@pytest.mark.parametrize("name", ["report.html", "provenance.json"])
+def test_a_full_disk_names_the_file_that_could_not_be_written(name, run, monkeypatch, capsys):
+    """The write fails, not the opening: such errors have no name of their own."""
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    report = ["report", run, "--no-replay"]
+    assert command(*(report if name == "report.html" else [*RUN, "--out", run])) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {run / name}: No space left on device; make room, and give")
+    assert error.count("\n") == 1
+
+
+def test_a_run_that_cannot_be_saved_says_why(run, tmp_path, monkeypatch, capsys):
+    """Neither tensorstore's line of hundreds of characters, nor that the log is full as well."""
+    save, log = checkpoint.Checkpoints.save, directory.RunDirectory.log
+
+    def full(store, step, arrays):
+        text = "RESOURCE_EXHAUSTED: Failed writing: x" + "/x" * 300 + ": No space left on device"
+        monkeypatch.setattr(
+            store._manager, "save", lambda *a, **k: (_ for _ in ()).throw(ValueError(text))
+        )
+        save(store, step, arrays)
+
+    def full_log(folder, message):
+        if message.startswith("failed"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        log(folder, message)
+
+    monkeypatch.setattr(checkpoint.Checkpoints, "save", full)
+    monkeypatch.setattr(directory.RunDirectory, "log", full_log)
+    assert command(*RUN, "--out", tmp_path / "new") == 1
+    error = capsys.readouterr().err
+    place = tmp_path / "new" / "checkpoints"
+    assert error == (
+        f"error: {place}: checkpoint 0 could not be written: No space left on device; make room, "
+        "and give the same command again: what was saved is whole\n"
+    )
+
+
+def test_an_unexpected_error_keeps_its_traceback(run, monkeypatch, capsys):
+    """On the terminal and in events.log: it is a bug, or the device's."""
+
+    def broken(batch, requests):
+        raise RuntimeError("a bug of somebody's")
+
+    monkeypatch.setattr(Batch, "begin", broken)
+    assert command(*RUN, "--out", run, "--episodes", "4") == 1
+    error, log = capsys.readouterr().err, (run / "events.log").read_text()
+    for text in (error, log):
+        assert "Traceback (most recent call last)" in text and "in broken" in text
+    assert "error: RuntimeError: a bug of somebody's" in error
+
+
+def test_a_folder_whose_name_is_no_text_is_refused(tmp_path, capsys):
+    assert command(*RUN, "--out", os.fsdecode(bytes(tmp_path / "a") + b"\xff")) == 2
+    assert r"a\udcff" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["work"]  # as it was

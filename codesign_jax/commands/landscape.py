@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, runs
+from codesign_jax import codesign, files, runs
 from codesign_jax.commands import calls, common, estimate
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case, find_case
@@ -247,5 +247,7 @@ def _write(case: Case, found: Landscape, folder: Path, console: Console) -> None
     except ImportError:
         console.print("no figure: pip install 'codesign-jax[viz]'", markup=False)
         return
-    path = figures.landscape(found, folder / "figures" / "landscape.png")
+    path = folder / "figures" / "landscape.png"
+    with files.naming(path):
+        figures.landscape(found, path)
     console.print(f"figure: {path}", markup=False)

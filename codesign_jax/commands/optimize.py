@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, runs
+from codesign_jax import codesign, files, runs
 from codesign_jax.commands import (
     asked,
     common,
@@ -244,5 +244,6 @@ def _figures(plan: Plan, result: RunResult, folder: Path, console: Console) -> N
         return
     assert result.record is not None
     path = folder / "figures" / "cost_evolution.png"
-    figures.cost_evolution(result.record.history.cost, path)
+    with files.naming(path):
+        figures.cost_evolution(result.record.history.cost, path)
     console.print(f"figure: {path}", markup=False)

@@ -211,6 +211,8 @@ class Checkpoints:
           RunError: If the digests are another step's.
         """
         path = self._digests(step)
+        if path.exists() and not path.is_file():
+            return "", f"{path.name} is no file"
         try:
             lines = path.read_bytes().decode().splitlines()
             expected = lines[0].removeprefix("# arrays ")

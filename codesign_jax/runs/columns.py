@@ -142,9 +142,10 @@ FILES = {
     "hand.toml": "the hand",
     "objects.toml": "the objects",
     "meshes": "mesh files of the objects, if there are any",
-    "provenance.json": "settings, command lines of start, resumptions and extensions, versions of "
-    "code and packages, machine",
-    "checkpoints": "state after each of the last episodes, with SHA-256 digests",
+    "provenance.json": "the run's identity, settings, command lines of start, resumptions and "
+    "extensions, versions of code and packages, machine, SHA-256 digests of the scene's files",
+    "checkpoints": "state after each of the last episodes, with SHA-256 digests and the run's "
+    "identity",
     "events.log": "what happened when, with the wall time of each episode",
     "failures": "worlds that failed, at most ten an episode, for `codesign replay`",
     "figures": "pictures",

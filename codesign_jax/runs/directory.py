@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from codesign_jax import files
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment
 from codesign_jax.runs import belongings, manifest, scene_files
@@ -43,7 +44,8 @@ class RunDirectory:
     def log(self, message: str) -> None:
         """Appends a line with the time to events.log."""
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        with (self.path / "events.log").open("a", encoding="utf-8") as file:
+        path = self.path / "events.log"
+        with files.naming(path), path.open("a", encoding="utf-8") as file:
             file.write(f"{now} {message}\n")
 
 

@@ -74,8 +74,9 @@ def read_provenance(path: Path) -> dict[str, Any]:
     """
     file = path / PROVENANCE
     try:
-        if file.stat().st_size > _MOST_BYTES:
-            raise SceneError([f"{file} is damaged: it is larger than any run's"])
+        size = file.stat().st_size
+        if not file.is_file() or size > _MOST_BYTES:
+            raise _damaged(file, "it is no file" if size <= _MOST_BYTES else f"it has {size} bytes")
         text = file.read_text(encoding="utf-8")
     except OSError as error:
         if isinstance(error, FileNotFoundError | NotADirectoryError):
@@ -118,11 +119,7 @@ def changed_files(path: Path, stored: Mapping[str, Any]) -> list[str]:
     noted = stored.get("files", {})
     found = []
     for name, digest in noted.items():
-        try:
-            same = sha256((path / name).read_bytes()).hexdigest() == digest
-        except OSError:
-            same = False
-        found += [] if same else [name]
+        found += [] if _digest(path / name) == digest else [name]
     if not found or not set(found) <= set(scene_files.NAMES):
         return found
     try:
@@ -162,6 +159,14 @@ def _damaged(file: Path, why: str) -> SceneError:
     return SceneError(
         [f"{file} is damaged: {why}. Put it back from a copy, or choose another folder"]
     )
+
+
+def _digest(path: Path) -> str:
+    """A file's digest; nothing where there is no file that can be read."""
+    try:
+        return sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+    except OSError:
+        return ""
 
 
 def _exists(path: Path) -> bool:

@@ -45,7 +45,8 @@ def write_episodes(
         if start == 0:
             _replace(folder / name, _text([head, *rows]))
         else:
-            with (folder / name).open("a", newline="", encoding="utf-8") as file:
+            path = folder / name
+            with files.naming(path), path.open("a", newline="", encoding="utf-8") as file:
                 file.write(_text(rows))
 
 
@@ -197,7 +198,4 @@ def _replace(path: Path, text: str) -> None:
 
 def _content(path: Path) -> bytes | None:
     """A file's bytes; None if there is none."""
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        return None
+    return path.read_bytes() if path.is_file() else None

@@ -1,4 +1,4 @@
-"""Damage of a run folder beside its checkpoints: tables, scene files, provenance, permissions, strangers' files."""
+"""Damage of a run folder beside its checkpoints, and folders that are no run's."""
 
 import json
 import os

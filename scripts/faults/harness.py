@@ -51,6 +51,7 @@ class Worker:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
+                start_new_session=True,  # Ctrl-C at the terminal is not for it
                 env=inherited | own | shim.environment(library) | environment,
             )
         self.cases, self._rest = 0, b""
@@ -197,6 +198,9 @@ class Harness:
         self._said = time.monotonic()
         now = self._store.summary(campaign.name)
         words = ", ".join(f"{count} {word}" for word, count in now["counts"].items())
-        bad = "".join(f"\n  BROKEN {number}: {word}: {d[:200]} [...] {d[-300:]}" for number, word, d in part.bad)
+        bad = "".join(
+            f"\n  BROKEN {number}: {word}: {d[:200]} [...] {d[-300:]}"
+            for number, word, d in part.bad
+        )
         span = f"{part.first}" if part.stop == part.first + 1 else f"{part.first}-{part.stop - 1}"
         self._tell(f"{campaign.name} {span} ({part.seconds:.1f} s); in all {words}{bad}")

@@ -52,7 +52,7 @@ class Forked:
         self._zygote, self.pid, self._log = zygote, pid, log
 
     def send(self, number: int) -> None:
-        """Sends a signal; nothing happens if the process has ended, whose number is still its own."""
+        """Sends a signal; nothing happens if it has ended: its number is its own until `wait`."""
         os.kill(self.pid, number)
 
     def wait(self, limit: float) -> int | None:

@@ -1,4 +1,4 @@
-"""The harness of `make faults`: its store goes on, its comparison can fail, its faults do happen."""
+"""The harness of `make faults`: its store goes on, its comparison can fail, its faults happen."""
 
 import errno
 import json
@@ -23,7 +23,7 @@ def part(campaign, first, stop, **counts):
 
 
 def test_a_store_goes_on_after_a_kill_at_any_byte(tmp_path):
-    """Whatever the last write left, what was finished before is there and nothing is counted twice."""
+    """What was finished before the last write is there, and nothing is counted twice."""
     whole = Store(tmp_path / "whole")
     whole.start({"commit": "c"})
     for first in (0, 10, 20):

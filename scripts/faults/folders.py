@@ -29,6 +29,13 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
     return found
 
 
+def changes(before: dict[str, bytes | None], run: Path) -> list[str]:
+    """Names of what was changed, deleted or added below a folder; a new empty folder is nothing."""
+    after = snapshot(run)
+    names = {n for n in {*before, *after} if before.get(n) != after.get(n)}
+    return sorted(names | set(before) - set(after))
+
+
 def refused(said: Said) -> bool:
     """Whether a command said that it does not do it, in words."""
     return said.code in (1, 2) and "error: " in said.text and not said.traceback
@@ -39,10 +46,8 @@ def _ended(bench: Bench, said: Said, run: Path, before: dict, what: str) -> Resu
     if said.traceback:
         return Result("traceback", f"{what}: {said.text}")
     if refused(said):
-        changed = [n for n, v in snapshot(run).items() if before.get(n, b"") != v]
-        lost = sorted(set(before) - set(snapshot(run)))
-        if changed or lost:
-            return Result("lost", f"{what}: {lost} {changed}: {said.text}")
+        if changed := changes(before, run):
+            return Result("lost", f"{what}: {changed}: {said.text}")
         return Result("refused")
     result = judged(said, run, finished.place(bench, KIND))
     return result._replace(detail=f"{what}: {result.detail}")
@@ -96,7 +101,7 @@ def scenes(bench: Bench, number: int) -> Result:
         if said.traceback:
             return Result("traceback", f"{what}: {said.text}")
         if refused(said):
-            return Result("refused" if snapshot(run) == before else "lost", f"{what}: {said.text}")
+            return Result("lost" if changes(before, run) else "refused", f"{what}: {said.text}")
         same = _same_scene(run, finished.place(bench, KIND))
         return Result("same scene" if same else "silent", f"{what}: {said.text}")
 
@@ -154,7 +159,7 @@ def provenance(bench: Bench, number: int) -> Result:
         what = f"{way}, {_READERS[command]}"
         if _READERS[command] == "optimize" or said.code:
             return _ended(bench, said, run, before, what)
-        return Result("lost" if snapshot(run) != before else "harmless", f"{what}: {said.text}")
+        return Result("lost" if changes(before, run) else "harmless", f"{what}: {said.text}")
 
 
 def _begun(bench: Bench, run: Path) -> Path:
@@ -239,7 +244,7 @@ def whose(bench: Bench, number: int) -> Result:
         if said.traceback:
             return Result("traceback", f"{what}: {said.text}")
         if refused(said):
-            return Result("refused" if snapshot(run) == before else "lost", f"{what}: {said.text}")
+            return Result("lost" if changes(before, run) else "refused", f"{what}: {said.text}")
         return Result("silent", f"{what}: {said.text}")
 
 

@@ -14,16 +14,19 @@ from codesign_jax.scene import Scene, keypaths
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import SceneError
 
+PRESET = "2d"
+"""Design space where none is named."""
+
 
 class Options(Protocol):
     """Flags that say which design; `cli.Evaluate` has their meaning."""
 
     design: tuple[tuple[str, ...], ...]
     run_folder: Path | None
-    preset: str
+    preset: str | None
     hand: str | None
     objects: str | None
-    scene: str
+    scene: str | None
     accuracy: str | None
     overrides: tuple[tuple[str, ...], ...]
     engine: str | None
@@ -60,7 +63,7 @@ def find_case(options: Options, *, tell: Tell = common.warn) -> Case:
 
 def _from_flags(options: Options) -> Case:
     scene = common.load_scene(options)
-    space = design_space(scene.hand, options.preset)
+    space = design_space(scene.hand, options.preset or PRESET)
     design = common.parse_design(space, [*chain.from_iterable(options.design)])
     return Case(scene, space, design, options.engine or engines.DEFAULT)
 
@@ -70,9 +73,8 @@ def _from_run(options: Options, tell: Tell) -> Case:
 
     Objects, accuracy and single values may differ from the run's.
     """
-    own = {"--design": bool(options.design), "--hand": options.hand is not None}
-    own |= {"--scene": options.scene != "paper", "--preset": options.preset != "2d"}
-    given = [flag for flag, is_given in own.items() if is_given]
+    own = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
+    given = ["--design"] * bool(options.design) + [f for f, v in own.items() if v is not None]
     if given:
         flags = " and ".join(given)
         raise SceneError([f"--run brings design, hand and scene of its own; leave out {flags}"])

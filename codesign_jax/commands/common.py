@@ -34,10 +34,14 @@ __all__ = [
 ]
 
 
+SCENE = "paper"
+"""Scene where none is named."""
+
+
 class SceneFlags(Protocol):
     """Flags that say which scene; `flags.Subject` has their meaning."""
 
-    scene: str
+    scene: str | None
     hand: str | None
     objects: str | None
     accuracy: str | None
@@ -51,7 +55,7 @@ def load_scene(options: SceneFlags) -> Scene:
       SceneError: If a file or a value is wrong.
     """
     return scenes.load(
-        options.scene,
+        options.scene or SCENE,
         hand_name=options.hand,
         object_set=options.objects,
         accuracy=options.accuracy,

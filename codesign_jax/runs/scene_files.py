@@ -39,7 +39,7 @@ def contents(scene: Scene) -> dict[str, bytes]:
     found = {name: text.encode() for name, text in scene_texts(scene).items()}
     for i, shape in enumerate(scene.objects.object):
         if shape.mesh:
-            found[_mesh_name(shape, i)] = shape.mesh.path.read_bytes()
+            found[_mesh_name(shape, i)] = shape.mesh.content
     return found
 
 
@@ -72,7 +72,7 @@ def _mesh_name(shape: Shape, index: int) -> str:
 def _document(table: dict[str, Any], units: dict[str, str]) -> str:
     """TOML of a table, with the units of its values as comments."""
     lines, place = [], ""
-    for line in tomli_w.dumps(table).splitlines():
+    for line in tomli_w.dumps(table).split("\n")[:-1]:  # texts may hold other ends of lines
         if header := re.fullmatch(r"\[+(.*?)\]+", line):
             place = header[1] + "."
         key, equals, _ = line.partition(" = ")

@@ -13,7 +13,7 @@ from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.transforms import Path
 from codesign_jax.model import ModelFields
-from codesign_jax.scene import Scene, effects
+from codesign_jax.scene import Scene, effects, reach
 from codesign_jax.types import Status, Trace
 
 FAR = 1e30
@@ -64,11 +64,13 @@ class StructuredEngine(Equal):
 
         Raises:
           KernelUnavailable: If kernels cannot run on this device.
-          SceneError: If a mesh's distance cannot be put on a grid.
+          SceneError: If a mesh's distance cannot be put on a grid, or was read for a hand with
+            smaller contact spheres.
         """
         effects.refuse(scene.effects, self.name)
         if (reason := available(jax.default_backend())) is not None:
             raise _unavailable(reason)
+        reach.refuse(scene.objects, reach.contact_radius(scene.hand))
         mesh.tables(scene)
         self.scene = scene
         newton = scene.newton

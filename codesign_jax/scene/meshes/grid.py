@@ -12,13 +12,12 @@ import trimesh
 from codesign_jax import archives, caches, sources
 from codesign_jax.scene.meshes import surface as surfaces
 from codesign_jax.scene.meshes.surface import Surface
+from codesign_jax.scene.reach import LEAST
 
-# Contact spheres have radii of up to 12.5 mm (fingers of 25 mm height): no farther from the surface
-# does any contact begin.  The rest is for objects that the size noise shrinks.
-PAD = 0.014
 # The error grows in proportion to the cell at edges and with its square elsewhere.
 COARSEST = 0.0025
 MAX_NODES = 3_000_000  # 12 MB in float32
+_LARGE = 300_000  # nodes; more take a second
 _NEAR = 0.002  # how far from the surface "near the surface" goes [m]
 _WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
 _ENDING = ".npz"  # of the files in the cache
@@ -42,7 +41,7 @@ class Grid(NamedTuple):
     worst: float
 
 
-def build(vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
+def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = LEAST) -> Grid:
     """Builds the coarsest grid whose error near the surface stays under a bound.
 
     The error is measured, not derived: trilinear interpolation against the exact distance at random
@@ -53,22 +52,27 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
       vertices: Positions in the body's frame [m], shape (vertex, 3).
       faces: Vertex indices, shape (face, 3).
       bound: Largest error [m].
+      reach: How far beyond the surface the grid goes [m]; see `codesign_jax.scene.reach`.
 
     Raises:
-      ValueError: if the grid would have more than `MAX_NODES` nodes.
+      ValueError: if the grid would have more than `MAX_NODES` nodes, or the body is too thin.
     """
     surface = surfaces.prepare(vertices, faces)
     points = near_surface(vertices, faces, 3000)
     exact = surfaces.signed_distance(surface, points)
-    low, extent = vertices.min(0) - PAD, np.ptp(vertices, axis=0) + 2 * PAD
+    low, extent = vertices.min(0) - reach, np.ptp(vertices, axis=0) + 2 * reach
     cell = _cell(surface, points, exact, low, bound)
     while True:
         shape = np.ceil(extent / cell).astype(int) + 1
         if shape.prod() > MAX_NODES:
             raise ValueError(
                 f"a grid of {cell * 1e3:.2g} mm cells, which a voxel_error of {bound * 1e3:.3g} mm "
-                f"needs, has {shape.prod():,} nodes, more than {MAX_NODES:,}"
+                f"needs, has {shape.prod():,} nodes, more than {MAX_NODES:,}; it goes "
+                f"{reach * 1e3:g} mm beyond the surface, as far as the hand's contacts need"
             )
+        if shape.prod() > _LARGE and _too_coarse(surface, points, exact, low, cell, bound):
+            cell *= 0.9
+            continue
         values = surfaces.signed_distance(surface, _nodes(low, cell, shape), proven=False)
         grid = Grid(low, cell, values.astype(np.float32).reshape(shape), 0.0, 0.0)
         error = np.abs(interpolate(grid, points) - exact)
@@ -108,15 +112,33 @@ def _cell(
     """Cell that meets the bound, tried at a few points without building the grid."""
     points, exact, cell = points[::4], exact[::4], COARSEST
     while True:
-        base = low + np.floor((points - low) / cell) * cell
-        offsets = np.array(list(np.ndindex(2, 2, 2))) * cell
-        corners = (base[:, None] + offsets).reshape(-1, 3)
-        values = surfaces.signed_distance(surface, corners, proven=False).reshape(-1, 8)
-        error = np.abs(_blend(values, (points - base) / cell) - exact)
-        worst = np.quantile(error, 0.99)
+        worst = np.quantile(_errors(surface, points, exact, low, cell), 0.99)
         if worst <= bound or cell < 2e-4:
             return cell
         cell *= max(0.5, min(0.95, bound / worst))
+
+
+def _too_coarse(
+    surface: Surface,
+    points: np.ndarray,
+    exact: np.ndarray,
+    low: np.ndarray,
+    cell: float,
+    bound: float,
+) -> bool:
+    """Whether a grid that was built would clearly not meet the bound, float32 or not."""
+    return bool(np.quantile(_errors(surface, points, exact, low, cell), 0.99) > 1.001 * bound)
+
+
+def _errors(
+    surface: Surface, points: np.ndarray, exact: np.ndarray, low: np.ndarray, cell: float
+) -> np.ndarray:
+    """Errors of interpolation at points of a grid that begins at `low`, without building it."""
+    base = low + np.floor((points - low) / cell) * cell
+    offsets = np.array(list(np.ndindex(2, 2, 2))) * cell
+    corners = (base[:, None] + offsets).reshape(-1, 3)
+    values = surfaces.signed_distance(surface, corners, proven=False).reshape(-1, 8)
+    return np.abs(_blend(values, (points - base) / cell) - exact)
 
 
 def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
@@ -124,7 +146,9 @@ def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
-def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
+def cached(
+    key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = LEAST
+) -> Grid:
     """As `build`, but what took longer than a tenth of a second is kept on disk.
 
     Args:
@@ -132,6 +156,7 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> G
       vertices: As for `build`.
       faces: As for `build`.
       bound: As for `build`.
+      reach: As for `build`.
     """
     code = sources.of_files()
     if code is None or not caches.enabled():
@@ -142,7 +167,7 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> G
     if stored is not None:
         return stored
     start = time.perf_counter()
-    grid = build(vertices, faces, bound)
+    grid = build(vertices, faces, bound, reach)
     if time.perf_counter() - start > _WORTH_KEEPING:
         _write(path, grid)
     return grid

@@ -163,7 +163,7 @@ def simulate(
     axes.refuse_constants(constants, len(trials.yaw), "world")
     unit_slips.refuse(params)
     if not isinstance(params.height, jax.core.Tracer):
-        reach.refuse(scene.objects, float(np.max(params.height)) / 2)
+        reach.refuse(scene.objects, float(np.asarray(params.height).max()) / 2)
     fields, ctrl, initial = prepare(scene, params, trials, constants)
     trace = engine.rollout(fields, ctrl, trajectory=bool(trajectory))
     judged = judge(scene, trace, ctrl, initial, trials, constants, trajectory=trajectory, cost=cost)

@@ -112,6 +112,7 @@ def test_evaluate_says_which_objects_it_leaves_out(capsys):
         (["--run", "nowhere"], "nowhere is not a run folder: there is no such folder"),
         (["--run", "nowhere", "--design", "length=100"], "own; leave out --design"),
         (["--run", "nowhere", "--hand", "tripod3", "--preset", "23d"], "out --hand and --preset"),
+        (["--run", "nowhere", "--scene", "paper"], "leave out --scene"),
     ],
 )
 def test_evaluate_refuses_wrong_input(arguments, part, workplace, capsys):

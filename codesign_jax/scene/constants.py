@@ -45,7 +45,7 @@ def check(scene: Scene, constants: Constants) -> None:
         raise schema.SceneError(problems)
     radius, noise = constants.hand.palm.contact_radius, constants.objects.noise.size
     if not any(isinstance(v, jax.core.Tracer) for v in (radius, noise)):
-        reach.refuse(scene.objects, float(np.max(radius)), float(np.max(noise)))
+        reach.refuse(scene.objects, float(np.asarray(radius).max()), float(np.asarray(noise).max()))
 
 
 def _paths(tree: Any) -> Iterator[tuple[str, Any]]:

@@ -1,5 +1,6 @@
 """Finds and reads the TOML files of hands, objects, scenes and presets of accuracy."""
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +18,8 @@ _FOLDERS = {
 }
 MOST_BYTES = 1 << 18
 """Largest file that is read; those that come with the package have 4 kB."""
+_LONG_KEY = re.compile(r"""(?<![\w-])[\w-]++(?:\s*+\.\s*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')){100}""")
+"""A dotted key for whose parts the parser needs time that grows with the square of their number."""
 DEEPEST = 12
 """Most tables and arrays inside of one another; a preset's fixed value has three."""
 
@@ -93,6 +96,8 @@ def parse(text: str) -> dict[str, Any]:
       ValueError: If it is no TOML, or has a whole number of thousands of digits.
       RecursionError: If tables and arrays are nested too deep.
     """
+    if _LONG_KEY.search(text):
+        raise RecursionError
     # Line ends as a text file's: tomllib refuses a lone carriage return.
     table = tomllib.loads(text.replace("\r\n", "\n").replace("\r", "\n"))
     if too_deep(table):

@@ -55,7 +55,7 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = 
       reach: How far beyond the surface the grid goes [m]; see `codesign_jax.scene.reach`.
 
     Raises:
-      ValueError: if the grid would have more than `MAX_NODES` nodes, or the body is too thin.
+      ValueError: if the grid would have more than `MAX_NODES` nodes.
     """
     surface = surfaces.prepare(vertices, faces)
     points = near_surface(vertices, faces, 3000)

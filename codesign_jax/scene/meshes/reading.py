@@ -7,6 +7,7 @@ that this one names, and no picture.
 import hashlib
 import io
 import json
+import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,9 @@ import trimesh
 
 from codesign_jax.scene import library
 from codesign_jax.scene.schema import SceneError, shown
+
+# What trimesh logs, tracebacks of what it tried first among it, is no message for a terminal.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 FORMATS = ("glb", "gltf", "obj", "off", "ply", "stl")
 """Formats whose files hold all of a mesh, and are no archives."""

@@ -1,6 +1,7 @@
 """Runs campaigns in worker processes, each under a time limit, and stores what they count."""
 
 import contextlib
+import fcntl
 import json
 import os
 import queue
@@ -114,6 +115,16 @@ class Harness:
           counts: Cases of each.
           workers: Processes at a time.
         """
+        with (self._folder.parent / "lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise SystemExit(
+                    f"{self._folder.parent} is in use: another --work, please"
+                ) from None
+            self._run(campaigns, counts, workers)
+
+    def _run(self, campaigns: list[Campaign], counts: dict[str, int], workers: int) -> None:
         self._prepare()
         for campaign in campaigns:
             for numbers in self._store.left(campaign.name, counts[campaign.name], campaign.size):

@@ -15,6 +15,9 @@ def tried(bench: Bench, number: int, *, kind: str) -> Result:
 
     folder = bench.scratch_folders / kind
     folder.mkdir(exist_ok=True)
+    for left in folder.iterdir():
+        if left.is_file():  # to write over it would wait for the disk
+            left.unlink()
     word, _, detail = fuzz.CASES[kind](number, folder).partition(": ")
     return Result(word, detail)
 

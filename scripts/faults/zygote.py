@@ -39,7 +39,7 @@ def obey_permissions() -> None:
         library.prctl(_CAPBSET_DROP, capability, 0, 0, 0)  # or the next program has it again
     library.capget(ctypes.byref(header), data)
     keep = ~((1 << _DAC_OVERRIDE) | (1 << _DAC_READ_SEARCH)) & 0xFFFFFFFF
-    for name, _ in Data._fields_:
+    for name in ("effective", "permitted", "inherited"):
         setattr(data[0], name, getattr(data[0], name) & keep)
     library.capset(ctypes.byref(header), data)
 

@@ -1,4 +1,4 @@
-"""What cases work with: scratch folders, the command in this process and in others, finished runs."""
+"""What cases work with: scratch folders, and the command in this process and in others."""
 
 import contextlib
 import gc

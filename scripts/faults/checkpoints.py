@@ -40,8 +40,11 @@ def files(run: Path, step: int) -> list[Path]:
 
 
 def _damaged(bench: Bench, number: int, run: Path) -> tuple[str, bool] | None:
-    """A copy of the finished run whose newest checkpoint is damaged: what was done, and whether
-    anything differs; None if there is no file of this number."""
+    """Copies the finished run and damages its newest checkpoint.
+
+    Returns:
+      What was done, and whether a reader finds anything else; None if there is no such file.
+    """
     finished.copy(bench, KIND, run)
     newest, before = steps(run)[:2]
     mine, older = files(run, newest), files(run, before)

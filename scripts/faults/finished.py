@@ -79,8 +79,8 @@ def code_digest() -> str:
 def differences(run: Path, finished: Path) -> list[str]:
     """What of a run's results is not bit for bit that of an uninterrupted run, by name.
 
-    Tables and scene files by their bytes, checkpoints and outcomes at reference by their arrays. A file that only one of
-    them has is a difference, and so is a temporary file that was left.
+    Tables and scene files by their bytes, checkpoints and outcomes at reference by their arrays. A
+    file that only one of them has is a difference, and so is a temporary file that was left.
     """
     from codesign_jax import runs
     from codesign_jax.runs.checkpoint import digest
@@ -118,7 +118,8 @@ def _steps(run: Path) -> dict[str, str]:
     with ocp.StandardCheckpointer() as reader:
         for path in (run / "checkpoints").glob("*.sha256"):
             try:
-                arrays = dict(reader.restore((run / "checkpoints" / path.stem / "default").resolve()))
+                place = (run / "checkpoints" / path.stem / "default").resolve()
+                arrays = dict(reader.restore(place))
                 arrays.pop("run", None)
                 found[path.stem] = digest(arrays)
             except Exception as error:  # whatever orbax meets there

@@ -1,6 +1,7 @@
 """Runs campaigns in worker processes, each under a time limit, and stores what they count."""
 
 import contextlib
+import fcntl
 import json
 import os
 import queue
@@ -51,6 +52,7 @@ class Worker:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
+                start_new_session=True,  # Ctrl-C at the terminal is not for it
                 env=inherited | own | shim.environment(library) | environment,
             )
         self.cases, self._rest = 0, b""
@@ -113,6 +115,16 @@ class Harness:
           counts: Cases of each.
           workers: Processes at a time.
         """
+        with (self._folder.parent / "lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise SystemExit(
+                    f"{self._folder.parent} is in use: another --work, please"
+                ) from None
+            self._run(campaigns, counts, workers)
+
+    def _run(self, campaigns: list[Campaign], counts: dict[str, int], workers: int) -> None:
         self._prepare()
         for campaign in campaigns:
             for numbers in self._store.left(campaign.name, counts[campaign.name], campaign.size):
@@ -197,6 +209,9 @@ class Harness:
         self._said = time.monotonic()
         now = self._store.summary(campaign.name)
         words = ", ".join(f"{count} {word}" for word, count in now["counts"].items())
-        bad = "".join(f"\n  BROKEN {number}: {word}: {d[:200]} [...] {d[-300:]}" for number, word, d in part.bad)
+        bad = "".join(
+            f"\n  BROKEN {number}: {word}: {d[:200]} [...] {d[-300:]}"
+            for number, word, d in part.bad
+        )
         span = f"{part.first}" if part.stop == part.first + 1 else f"{part.first}-{part.stop - 1}"
         self._tell(f"{campaign.name} {span} ({part.seconds:.1f} s); in all {words}{bad}")

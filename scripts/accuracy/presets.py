@@ -53,12 +53,12 @@ def in_short(studies: dict[str, Study]) -> list[list[str]]:
 
 def _flips(study: Study, setting: Setting) -> float | None:
     """Share of late verdicts that differ from the finest mesh; None if not measured."""
-    pair = [study.grasps.get((s, False, "late")) for s in (setting, FINEST_MESH)]
-    if pair[0] is None or pair[1] is None:
+    mine, finest = (study.grasps.get((s, False, "late")) for s in (setting, FINEST_MESH))
+    if mine is None or finest is None:
         return None
-    trials = min(cost.shape[1] for cost in pair)
-    kept = [cost[:, :trials] < SUCCESS_COST for cost in pair]  # a trial that failed is not kept
-    return float((kept[0] != kept[1]).mean())
+    trials = min(mine.shape[1], finest.shape[1])
+    kept, right = (cost[:, :trials] < SUCCESS_COST for cost in (mine, finest))  # failed: not kept
+    return float((kept != right).mean())
 
 
 def standing(study: Study) -> list[list[str]]:

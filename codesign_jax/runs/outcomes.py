@@ -36,7 +36,7 @@ def save(path: Path, outcomes: Outcome, key: str) -> None:
 def load(path: Path, key: str) -> Outcome | None:
     """Reads outcomes; None if there are none, of another key, or the file is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             if str(stored["key"]) != key:
                 return None
             return Outcome(**{name: stored[name] for name in Outcome._fields})
@@ -47,7 +47,7 @@ def load(path: Path, key: str) -> Outcome | None:
 def count(path: Path) -> int:
     """Number of trials of the outcomes in a file, whatever their key; 0 if there are none."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return stored["cost"].size
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
         return 0

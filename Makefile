@@ -12,7 +12,7 @@ CHECKED := codesign_jax scripts tests notebooks
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs test test-browser test-gpu test-slow stability notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo docs test test-browser test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
@@ -20,6 +20,7 @@ help:
 	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
 	@echo "make test-browser  the report in a headless Chromium"
 	@echo "make stability   the hard cases and their margins, docs/notes/stability.md"
+	@echo "make faults      kills, full disks, damage, hostile input, counted: docs/faults.md"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
 	@echo "make effects     what each effect costs and decides: docs/notes/effects.md"
@@ -50,6 +51,11 @@ test-slow: $(STAMP)
 # All hard cases; their margins go to docs/notes/stability.md. About half an hour on two cores.
 stability: $(STAMP)
 	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
+
+# Needs Linux and a C compiler; goes on where it stopped. FAULTS is its folder.
+FAULTS ?= runs/faults
+faults: $(STAMP)
+	nice -n 5 $(BIN)/python -m scripts.faults --store $(FAULTS)/store.jsonl --work $(FAULTS)/work --page $(ARGS)
 
 notebooks: $(STAMP)
 	$(BIN)/python -m scripts.run_notebooks

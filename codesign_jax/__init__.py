@@ -26,8 +26,8 @@ if TYPE_CHECKING:
         scene,
         types,
     )
+    from codesign_jax.caches import use_compilation_cache
     from codesign_jax.engines import make_engine
-    from codesign_jax.files import use_compilation_cache
     from codesign_jax.scene import SceneError, constants, hand, objects, parameters
     from codesign_jax.types import Params, Status, Trace, Trial
 
@@ -42,7 +42,7 @@ _HOME = {
     "Status": "codesign_jax.types",
     "Trace": "codesign_jax.types",
     "Trial": "codesign_jax.types",
-    "use_compilation_cache": "codesign_jax.files",
+    "use_compilation_cache": "codesign_jax.caches",
 }
 """Where the names are that are not modules of this folder."""
 

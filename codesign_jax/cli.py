@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from codesign_jax.commands import status
+from codesign_jax import caches
+from codesign_jax.commands import flags, status
 from codesign_jax.commands.flags import (
     Count,
     File,
@@ -334,17 +335,26 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
       arguments: Arguments without the program's name; default: those of the process.
     """
+    given = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
-        if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        if given == ["--version"]:
             return _version()
+        refuse(flags.text_problems(given))
         command = tyro.cli(
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,
             prog="codesign",
             description="Co-design of soft hand morphology and control; --version says which.",
         )
+        refuse(caches.problems() + flags.path_problems(command))
         return command.run()
+
+    def refuse(problems: list[str]) -> None:
+        if problems:
+            from codesign_jax.scene.schema import SceneError
+
+            raise SceneError(problems)
 
     code = status.of(run)
     if arguments is None and code == status.INTERRUPTED:

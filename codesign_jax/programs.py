@@ -1,8 +1,9 @@
 """Jitted programs that every scene of one structure shares within a process.
 
-A program takes the scene's numbers (`Scene.constants`) and the optimiser as arguments, so
-that neither JAX nor XLA sees what hand, objects or bounds they come from: another file of the same
-structure traces and compiles nothing, and a new process finds the program in JAX's cache on disk.
+A program takes the scene's numbers (`Scene.constants`) and the optimiser as arguments, so that
+neither JAX nor XLA sees what hand, objects or bounds they come from.  Another file of the same
+structure, whose preset fixes the same values, traces and compiles nothing, and a new process finds
+the program in JAX's cache on disk.
 """
 
 import functools
@@ -12,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import rollout, sources
+from codesign_jax import memory_maps, rollout, sources
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
@@ -43,12 +44,16 @@ class Program:
         Raises:
           SceneError: If the constants do not fit the scene, see `scene.constants.check`.
         """
-        return self._jitted(first, second, self._numbers(constants), *self._more)
+        return _again_if_stuck(
+            lambda: self._jitted(first, second, self._numbers(constants), *self._more)
+        )
 
     def compile(self, first: Any, second: Any) -> Callable[..., Any]:
         """Compiles the program ahead for arguments like these; a function to call it by."""
         numbers = self._numbers(None)
-        compiled = self._jitted.lower(first, second, numbers, *self._more).compile()
+        compiled = _again_if_stuck(
+            lambda: self._jitted.lower(first, second, numbers, *self._more).compile()
+        )
         return lambda first, second: compiled(first, second, numbers, *self._more)
 
     def _numbers(self, constants: Constants | None) -> Constants:
@@ -57,8 +62,23 @@ class Program:
         return jax.tree.map(lambda v: jnp.asarray(v, float), numbers)
 
 
+def _again_if_stuck(call: Callable[[], Any]) -> Any:
+    """Returns call(), if need be without what JAX had traced.
+
+    Ctrl-C at a bad moment of tracing leaves a mark in one of JAX's caches, which takes the next
+    call for a recursion.
+    """
+    try:
+        return call()
+    except RecursionError as error:
+        if "Recursively calling" not in str(error):
+            raise
+        jax.clear_caches()
+        return call()
+
+
 def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
-    """Jits what `build` returns once for each structure, engine, design space and further argument.
+    """Jits what `build` returns once for each structure, engine and further argument.
 
     Nothing is found again once the code is not what was imported, see `sources`.
 
@@ -66,8 +86,13 @@ def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
       build: Function (scene, engine, space, *arguments) that returns a function to jit, which reads
         numbers from its constants alone; the last argument is a cost of one's own or None.
     """
-    jitted = lambda *arguments: jax.jit(build(*arguments))  # noqa: E731
+
+    def jitted(*arguments: Any) -> Callable:
+        memory_maps.relieve()
+        return jax.jit(build(*arguments))
+
     kept = functools.lru_cache(maxsize=_KEPT)(jitted)
+    memory_maps.holds_programs(kept.cache_clear)
 
     @functools.wraps(build)
     def find(scene: Scene, engine: Engine, space: DesignSpace, *arguments: Any) -> Callable:
@@ -75,7 +100,10 @@ def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
             # A cost of one's own may read names and whatever else is no number of the scene.
             return jitted(scene, engine, space, *arguments)
         if not isinstance(engine, Hashable) or sources.digest() is None:
-            return jitted(scene.structure, engine, space, *arguments)
-        return kept(scene.structure, engine, space, *arguments)
+            return jitted(scene.structure, engine, space.structure, *arguments)
+        return kept(scene.structure, engine, space.structure, *arguments)
 
     return find
+
+
+sources.note()  # what programs are traced from has been imported

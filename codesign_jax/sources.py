@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent
 UNRELATED = ("commands", "export", "optimize", "report", "runs")
 """Folders that no simulation depends on: they import engines, never the other way."""
-_UNTRACED = ("compiler", "sources")
+_UNTRACED = ("archives", "caches", "compiler", "files", "kept_programs", "memory_maps", "sources")
 """What is not traced: to replace a name there is to change the machinery and no physics."""
 
 _State = dict[str, tuple[int, ...]]
@@ -48,9 +48,14 @@ _defined: dict[str, dict[str, object]] = {}
 def digest() -> str | None:
     """Digest of the code that this process runs, or None if that is not known.
 
-    It is the same in every process that imported the same code, and costs two milliseconds.
+    It is the same in every process that imported the same code, and costs three milliseconds.
     """
-    if replaced() or not _imported or _now() != _imported:
+    return None if replaced() else of_files()
+
+
+def of_files() -> str | None:
+    """As `digest`, for what is not traced: names that were replaced do not matter."""
+    if not _imported or _now() != _imported:
         return None
     found = _read()
     return found if _now() == _imported else None  # edited while it was read
@@ -68,7 +73,8 @@ def note() -> None:
 def replaced() -> list[str]:
     """Names of modules and classes that are not what they were when their module was noted.
 
-    A module is noted when the structured engine is imported, or when it is first seen here later.
+    A module is noted when `programs` or the structured engine is imported, else when it is first
+    seen here.
     The contents of containers are not looked at.
     """
     note()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from codesign_jax import cost, scene
+from codesign_jax import cost, rollout, scene
 from codesign_jax.types import Outcome, Status, Trace
 from tests import small
 
@@ -15,6 +15,7 @@ SCENE = scene.load("paper_spheres")
 STEPS, LOST = SCENE.num_steps, SCENE.cost.lost_distance
 repeatable = settings(max_examples=50, deadline=None, derandomize=True)
 evaluate = jax.jit(lambda trace: cost.outcome(SCENE, trace))
+judge = jax.jit(lambda trace, trial: cost.outcome(SCENE, trace, 0, trial))
 
 
 def trace(lost_from=None, until=STEPS, **changes):
@@ -108,6 +109,19 @@ def test_a_stuck_object_fails_the_trial():
     without = scene.load("paper_spheres", overrides={"effects": {"ungrasp": False}})
     held = jax.tree.map(lambda v: v[: without.num_steps], trace())
     assert cost.outcome(without, held).status == Status.OK
+
+
+def test_whether_an_object_rests_is_told_by_its_own_size():
+    """A sphere of 30 mm that is held at 40 mm is stuck; a cuboid may stand there on a corner."""
+    held = trace(distance={STEPS - 1: 0.05}, height={STEPS - 1: 0.04})
+    for name, size, status in (
+        ("sphere", 1.0, Status.STUCK),
+        ("sphere", 1.4, Status.OK),  # this trial's has 42 mm
+        ("cuboid", 1.0, Status.OK),
+        ("cuboid", 0.7, Status.STUCK),  # 36 mm from its centre to a corner
+    ):
+        trial = rollout.nominal_trial(SCENE, name)._replace(size=jnp.float32(size))
+        assert judge(held, trial).status == status, (name, size)
 
 
 @repeatable

@@ -44,6 +44,13 @@ def test_evaluate_judges_a_run_on_other_objects_and_settings(finished, tmp_path,
     assert "did you mean 'fast'?" in error and "did you mean 'hand.section'?" in error
 
 
+def test_an_evaluation_without_an_answer_is_no_success(finished, capsys):
+    """Every trial fails, so that nothing is known of the design."""
+    broken = ["--trials", "1", "--set", "limits.speed=1"]
+    assert command("evaluate", "--run", finished, *broken) == 1
+    assert "every trial failed (SPEED 1)" in capsys.readouterr().out
+
+
 def test_a_verdict_comes_with_its_interval():
     """Wilson's interval of n out of n begins at n / (n + 1.96^2): three of three says little."""
     tiny = scene.load(TINY)
@@ -105,6 +112,7 @@ def test_evaluate_says_which_objects_it_leaves_out(capsys):
         (["--run", "nowhere"], "nowhere is not a run folder: there is no such folder"),
         (["--run", "nowhere", "--design", "length=100"], "own; leave out --design"),
         (["--run", "nowhere", "--hand", "tripod3", "--preset", "23d"], "out --hand and --preset"),
+        (["--run", "nowhere", "--scene", "paper"], "leave out --scene"),
     ],
 )
 def test_evaluate_refuses_wrong_input(arguments, part, workplace, capsys):

@@ -13,7 +13,9 @@ ROOT = Path(__file__).parents[1]
 
 # What stands in a line may import lines before it, and its own folder.
 LAYERS = """
-sources files
+sources files memory_maps
+kept_programs archives
+caches
 types provenance compiler optimize
 scene
 axes model control verdict

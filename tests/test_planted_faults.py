@@ -23,7 +23,7 @@ from tests.planted import Fault, planted, simulate
 STEPS = 8
 
 # Stages of the kernel: functions that it evaluates lane by lane.
-PALM, LINK = "Step._palm.<locals>.compute", "_link"
+PALM, LINK = "Step._palm.<locals>.compute", "link_forces"
 JAR = "BoundContacts.begin.<locals>.jar"
 RESPONSE = "BoundContacts._push.<locals>.response"
 RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
@@ -134,8 +134,8 @@ FAULTS = {
     "contacts of the iteration before": Fault(
         {"tree_add_scaled": lambda f, alpha, value, change: value}
     ),
-    "angles after explicit Euler": Fault({"_turned": explicit}, "position"),
-    "spin in the wrong frame": Fault({"_moved": spin_in_world_axes}),
+    "angles after explicit Euler": Fault({"turned": explicit}, "position"),
+    "spin in the wrong frame": Fault({"moved": spin_in_world_axes}),
     # wrong weight
     "links a tenth too heavy": Fault(link(mass=lambda m: 1.1 * m)),
     "a whole weight for half segments": Fault(

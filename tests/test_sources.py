@@ -126,13 +126,13 @@ def test_nothing_traced_is_found_once_the_code_is_not_known(monkeypatch):
     """A function's key does not have the functions that it calls."""
     scene, built = types.SimpleNamespace(structure="s"), []
     find = programs.shared(lambda *how: built.append(how) or (lambda v: v))
-    first = find(scene, "engine", "space", None)
-    assert find(scene, "engine", "space", None) is first
+    first = find(scene, "engine", scene, None)
+    assert find(scene, "engine", scene, None) is first
     lanewise.of_code("a")
     lanewise._program.cache_clear()
     keep = lanewise._program.cache_info
     monkeypatch.setattr(sources, "digest", lambda: None)
-    assert find(scene, "engine", "space", None) is not first and len(built) == 2
+    assert find(scene, "engine", scene, None) is not first and len(built) == 2
 
     half = lanewise.lanes([np.float32(3)], (), wide=False)
     jax.make_jaxpr(lambda: lanewise.lanewise(lambda v: v * 2, half).lane)()

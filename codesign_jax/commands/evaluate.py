@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, rollout, runs
+from codesign_jax import codesign, engines, rollout, runs, types
 from codesign_jax.commands import common, estimate, verdicts
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.estimate import Part
@@ -43,10 +43,10 @@ def main(options: "Evaluate") -> int:
     if options.dry_run:
         _dry_run(case, options, console)
         return 0
-    _evaluate(case, engine, options, console)
+    one = _evaluate(case, engine, options, console)
     if options.render:
         _render(case, engine, options, console)
-    return 0
+    return int(types.failed(one.status).all())  # no trial says anything of the design
 
 
 def _check(options: "Evaluate", engine: str) -> None:
@@ -83,8 +83,10 @@ def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
     console.print(estimate.text(parts), markup=False)
 
 
-def _evaluate(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
-    """Simulates the trials and prints the costs of each object."""
+def _evaluate(
+    case: Case, engine: engines.Engine, options: "Evaluate", console: Console
+) -> types.Outcome:
+    """Simulates the trials and prints the costs of each object; outcomes (trial,)."""
     evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
     population = jnp.asarray(case.design, jnp.float32)[None]
     found = interruptible(evaluate, population, jax.random.key(options.seed))
@@ -95,6 +97,7 @@ def _evaluate(case: Case, engine: engines.Engine, options: "Evaluate", console: 
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
         console.print(f"{name:>12}: {verdicts.of_object(case.scene, own)}", markup=False)
     console.print(f"{'all':>12}: {verdicts.verdict(case.scene, one)}", markup=False)
+    return one
 
 
 def _untried(case: Case, options: "Evaluate") -> list[str]:

@@ -5,6 +5,7 @@ import functools
 import shlex
 import signal
 import sys
+import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +13,18 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, runs
-from codesign_jax.commands import asked, common, estimate, hosts, jobs, reference, seeds, verdicts
+from codesign_jax import codesign, files, runs
+from codesign_jax.commands import (
+    asked,
+    common,
+    estimate,
+    hosts,
+    jobs,
+    reference,
+    seeds,
+    status,
+    verdicts,
+)
 from codesign_jax.commands.estimate import Part
 from codesign_jax.runs import Plan, RunResult, Settings, rates
 from codesign_jax.runs.scene_files import scene_texts
@@ -40,9 +51,12 @@ def main(options: "Optimize") -> int:
     plan = runs.prepare(scene, settings)
     folders = {seed: asked.folder(options, scene, settings, seed) for seed in chosen}
     common.check_place("--out", options.out or next(iter(folders.values())), folder=True)
+    sources = common.source_files(options)
     for seed, folder in folders.items():
         own = dataclasses.replace(settings, seed=seed)
-        runs.check_folder(folder, scene, own, fresh=options.fresh)
+        runs.check_folder(folder, scene, own, fresh=options.fresh, sources=sources)
+    if options.seeds is not None:
+        seeds.check_table(folders)
     notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
@@ -51,16 +65,14 @@ def main(options: "Optimize") -> int:
     if options.jobs is not None:
         return _jobs(options, scene, folders)
     devices, chunk = options.devices, options.chunk
-    found = runs.optimize(
-        plan, folders, sys.argv, fresh=options.fresh, devices=devices, chunk=chunk
-    )
+    opened = {"fresh": options.fresh, "sources": sources}
+    found = runs.optimize(plan, folders, sys.argv, **opened, devices=devices, chunk=chunk)
     _record_rate(plan, found, devices)
     results: dict[int, RunResult | None] = {}
     for seed, result in found.runs.items():
         results[seed] = result if isinstance(result, RunResult) else None
         if isinstance(result, Exception):
-            name = "" if options.seeds is None else f"seed {seed}: "
-            print(f"error: {name}{result}", file=sys.stderr)
+            _tell_error("" if options.seeds is None else f"seed {seed}: ", result)
     if found.signum:
         return 128 + found.signum
     console = Console(highlight=False, soft_wrap=True)
@@ -68,6 +80,14 @@ def main(options: "Optimize") -> int:
     if options.seeds is not None:
         _compare(scene, results, folders, console)
     return int(any(result is None for result in results.values()))
+
+
+def _tell_error(name: str, error: Exception) -> None:
+    """Says how a run failed, with the traceback of what nobody expected."""
+    if not isinstance(error, runs.FAILURES):
+        traceback.print_exception(error)
+        name += f"{type(error).__name__}: "
+    print(f"error: {name}{status.words(error)}", file=sys.stderr)
 
 
 def _distributed(options: "Optimize") -> int:
@@ -82,10 +102,10 @@ def _distributed(options: "Optimize") -> int:
         problems.append("--dry-run knows one host: leave out --distributed to have its estimate")
     if problems:
         raise SceneError(problems)
-    status, here = hosts.run(options)
-    if here.index or status == 2 or status >= 128:
-        return status
-    return hosts.in_a_process(functools.partial(_compare_all, options)) or status
+    code, here = hosts.run(options)
+    if here.index or code == 2 or code >= 128:
+        return code
+    return hosts.in_a_process(functools.partial(_compare_all, options)) or code
 
 
 def _compare_all(options: "Optimize") -> int:
@@ -224,5 +244,6 @@ def _figures(plan: Plan, result: RunResult, folder: Path, console: Console) -> N
         return
     assert result.record is not None
     path = folder / "figures" / "cost_evolution.png"
-    figures.cost_evolution(result.record.history.cost, path)
+    with files.naming(path):
+        figures.cost_evolution(result.record.history.cost, path)
     console.print(f"figure: {path}", markup=False)

@@ -73,8 +73,10 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
       Outcomes of the trials, shape (trial,).
     """
     case, key = _case(folder, settings, trials)
-    found = outcomes.load(folder / FILE, key)
+    found, why = outcomes.load(folder / FILE, key)
     if found is None:
+        if why:
+            console.print(f"{folder / FILE} {why}: simulated again", markup=False)
         found = _simulate(case, settings, trials)
         outcomes.save(folder / FILE, found, key)
     size = case.scene.discretization
@@ -86,20 +88,24 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
     return found
 
 
-def stored(folder: Path, settings: Settings) -> Outcome | None:
-    """Outcomes that `test` kept in a run folder, shape (trial,); None if not of its design today.
+def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
+    """Outcomes that `test` kept in a run folder, shape (trial,), if they are of its design today.
 
     Args:
       folder: Run folder with a finished episode.
       settings: The run's settings.
+
+    Returns:
+      The outcomes or None, and why there are none; see `runs.outcomes.load`.
     """
     trials = outcomes.count(folder / FILE)
-    return outcomes.load(folder / FILE, _case(folder, settings, trials)[1]) if trials else None
+    return outcomes.load(folder / FILE, _case(folder, settings, trials)[1])
 
 
 def _case(folder: Path, settings: Settings, trials: int) -> tuple[Case, str]:
     """The design to test and the digest of what determines its outcomes."""
-    case = find_case(Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY))
+    subject = Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY)
+    case = find_case(subject, tell=lambda text: None)  # the command says what is amiss
     return case, outcomes.key(case.scene, case.engine, case.design[None], trials, settings.seed)
 
 

@@ -62,6 +62,27 @@ def compare(scene: Scene, results: dict[int, RunResult | None], console: Console
         )
 
 
+def check_table(folders: dict[int, Path]) -> None:
+    """Refuses to replace a file of the table's name that is none of these tables.
+
+    Args:
+      folders: Run folder of each seed.
+
+    Raises:
+      SceneError: If there is one.
+    """
+    path = next(iter(folders.values())).parent / columns.SEEDS
+    head = ",".join(columns.MORE[columns.SEEDS].columns)
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        ours = file.read(len(head)) == head.encode()
+    if not ours:
+        raise SceneError(
+            [f"{path} is no table of runs, and would be replaced: choose another --out"]
+        )
+
+
 def write_table(
     scene: Scene, results: dict[int, RunResult | None], folders: dict[int, Path]
 ) -> Path:

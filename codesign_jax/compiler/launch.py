@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import sources
+from codesign_jax import memory_maps, sources
 from codesign_jax.compiler import ffi
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.compiler.layout import INPUT, OUTPUT, SCRATCH, Array, Layout
@@ -105,11 +105,11 @@ def launch(
       The results, None in the place of scratch memory.
 
     Raises:
-      KernelUnavailable: If kernels cannot run here.
+      KernelUnavailable: If kernels cannot run here, or no longer, see `memory_maps`.
       NotImplementedError: If the kernel does something that the compiler has no instruction for.
       ValueError: If an array's leading axis is not that of the others.
     """
-    if reason := available(kernel.backend):
+    if reason := available(kernel.backend) or memory_maps.problem():
         raise KernelUnavailable(reason)
     if kernel.backend == "cpu":
         from codesign_jax.compiler import cpu as device

@@ -70,7 +70,7 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
         plain.engine_model(scene, spec, shares),
         controls,
         states,
-        _judge(scene, distance, states, compiled.nq),
+        _judge(scene, distance, states, compiled.nq, trial),
     )
 
 
@@ -137,12 +137,14 @@ def _add_keys(scene: Scene, spec: mujoco.MjSpec, controls: np.ndarray, states: n
         )
 
 
-def _judge(scene: Scene, distance: np.ndarray, states: np.ndarray, nq: int) -> Outcome:
+def _judge(
+    scene: Scene, distance: np.ndarray, states: np.ndarray, nq: int, trial: Trial
+) -> Outcome:
     """Outcome of one's own simulation by the scene's rule."""
     speed = np.abs(states[:, nq:]).max(1)
     trace = Trace(distance, states[:, nq - 5], speed, states[:, :0])
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _outcome(scene, trace))
+        return jax.tree.map(np.asarray, _outcome(scene, trace, 0, trial))
 
 
 _outcome = jax.jit(outcome, static_argnums=0)

@@ -23,6 +23,7 @@ class Run(NamedTuple):
       provenance: Content of its provenance.json.
       reference: Outcomes of the design's fresh trials at the end of the run, every array of shape
         (trial,); None without them.
+      notes: What is amiss with the run, in sentences.
     """
 
     folder: Path
@@ -32,6 +33,7 @@ class Run(NamedTuple):
     chosen: Chosen
     provenance: dict[str, Any]
     reference: types.Outcome | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def space(self) -> DesignSpace:

@@ -29,6 +29,7 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
       The path.
     """
     sections = [
+        *(markup.paragraph(f"Warning: {note}.", "warning") for note in run.notes),
         _summary(run),
         chosen.design(run),
         _grasp(run, grasp),

@@ -171,17 +171,17 @@ FILES = {
     "hand.toml": "the hand",
     "objects.toml": "the objects",
     "meshes": "mesh files of the objects, if there are any",
-    "provenance.json": "settings, command lines of start, resumptions and extensions, versions of "
-    "code and packages, machine",
-    "checkpoints": "state after each of the last episodes, with SHA-256 digests",
+    "provenance.json": "the run's identity, settings, command lines of start, resumptions and "
+    "extensions, versions of code and packages, machine, SHA-256 digests of the scene's files",
+    "checkpoints": "state after each of the last episodes, with SHA-256 digests and the run's "
+    "identity",
     "events.log": "what happened when, with the wall time of each episode",
     "failures": "worlds that failed, at most ten an episode, for `codesign replay`",
     "figures": "pictures",
     "landscape.npz": "the cost over a grid of two parameters, of `codesign landscape --run`, as "
     "arrays (`codesign_jax.report.landscape.Landscape`)",
     LANDSCAPE: "the same as a table, see below",
-    "landscape.part.npz": "what is done of a landscape that was interrupted; the same command goes "
-    "on",
+    "landscape.part": "what is done of a landscape that was interrupted; the same command goes on",
     "reference.npz": "outcomes of the chosen design's fresh trials at accuracy `reference`, arrays "
     "of shape (trial,), and the digest of what determines them",
     "replay.html": "a grasp in 3D, of `codesign replay`: opens in any browser, without a network",

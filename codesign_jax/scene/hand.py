@@ -168,6 +168,9 @@ def _check_presets(
         path = f"{where}.preset {preset.name}"
         if names.count(preset.name) > 1 or preset.name == "full":
             problems.append(f"{path}: the name is taken")
+        if len(preset.fixed) > schema.MOST_ENTRIES:
+            problems.append(f"{path}.fixed has {len(preset.fixed):,} keys")
+            continue
         for key, value in preset.fixed.items():
             if key not in table:
                 problems.append(
@@ -193,7 +196,7 @@ def _check_fixed(path: str, value: Any, row: Parameter, hand: Hand, problems: li
         if isinstance(number, bool) or not isinstance(number, int | float):
             given = list(value) if isinstance(value, tuple) else value
             many = ", or one for each finger" if row.per == "finger" else ""
-            problems.append(f"{path} = {given!r} must be a number [{row.unit}]{many}")
+            problems.append(f"{path} = {schema.shown(given)} must be a number [{row.unit}]{many}")
             return
     if _fits(path, value, row, hand, problems):
         for finger, (number, low, high) in _by_finger(value, row.low, row.high):

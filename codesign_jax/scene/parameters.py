@@ -75,6 +75,22 @@ class DesignSpace:
         """Number of free parameters."""
         return len(self.names)
 
+    @functools.cached_property
+    def structure(self) -> "DesignSpace":
+        """The space without numbers that no program reads, so that others share its programs.
+
+        Values of fixed parameters and the pressure limit stay: programs have them as constants.
+        """
+        zeros, place = (0.0,) * self.num_parameters, zip(self.base, self.source, strict=True)
+        rows = (dataclasses.replace(p, low=0.0, high=0.0, default=0.0) for p in self.hand.parameter)
+        return dataclasses.replace(
+            self,
+            hand=dataclasses.replace(self.hand, parameter=tuple(rows)),
+            scale=zeros,
+            bounds=(zeros, zeros),
+            base=tuple(0.0 if source >= 0 else value for value, source in place),
+        )
+
     def expand(self, design: jax.Array) -> jax.Array:
         """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,).
 

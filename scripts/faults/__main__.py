@@ -1,13 +1,16 @@
-"""Runs the commands through faults and counts what happens: python -m scripts.faults [--only NAME ...].
+"""Runs the commands through faults and counts what happens.
 
-Every finished case is kept in one file: the same command goes on where the last one stopped, however it was
-stopped, and more --cases go on from there. Exits with 1 if a promise was broken in any case of the file.
-Linux, and a C compiler (`cc`, or the one in CC).
+python -m scripts.faults                                  # all campaigns
+python -m scripts.faults --only toml --cases toml=1000000
+python -m scripts.faults --page                           # and write docs/faults.md
+
+Every finished case is kept in one file: the same command goes on where the last one stopped,
+however it was stopped, and more --cases go on from there. Exits with 1 if a promise was broken in
+any case of the file. It needs Linux and a C compiler (`cc`, or the one in CC).
 """
 
 import argparse
 import datetime
-import json
 import signal
 import sys
 from pathlib import Path

@@ -79,9 +79,8 @@ def code_digest() -> str:
 def differences(run: Path, finished: Path) -> list[str]:
     """What of a run's results is not bit for bit that of an uninterrupted run, by name.
 
-    Tables and scene files by their bytes, checkpoints by the digests of their arrays, the newest of
-    them read and digested again, outcomes at reference by their arrays. A file that only one of
-    them has is a difference, and so is a temporary file that was left.
+    Tables and scene files by their bytes, checkpoints and outcomes at reference by their arrays. A
+    file that only one of them has is a difference, and so is a temporary file that was left.
     """
     from codesign_jax import runs
     from codesign_jax.runs.checkpoint import digest
@@ -91,13 +90,11 @@ def differences(run: Path, finished: Path) -> list[str]:
     for name in (*TABLES, *SOURCES):
         if not _same_bytes(run / name, finished / name):
             found.append(name)
-    if _array_digests(run) != _array_digests(finished):
-        found.append("checkpoints")
-    else:
-        records = [runs.load_record(folder) for folder in (run, finished)]
-        digests = [record and digest(to_arrays(record)) for record in records]
-        if digests[0] is None or digests[0] != digests[1]:
-            found.append("the newest checkpoint")
+    found += [f"checkpoint {n}" for n in _unequal(_steps(run), _steps(finished))]
+    records = [runs.load_record(folder) for folder in (run, finished)]
+    digests = [record and digest(to_arrays(record)) for record in records]
+    if digests[0] is None or digests[0] != digests[1]:
+        found.append("the record")
     if _reference(run) != _reference(finished):
         found.append("reference.npz")
     left = [p.name for p in run.rglob("*") if p.name.endswith((".tmp", ".part"))]
@@ -111,13 +108,27 @@ def _same_bytes(a: Path, b: Path) -> bool:
     return a.read_bytes() == b.read_bytes()
 
 
-def _array_digests(run: Path) -> dict[str, str]:
-    """The first line of each step's file of digests, which is that of its arrays."""
+def _steps(run: Path) -> dict[str, str]:
+    """Digest of the arrays of each checkpoint, but for those that say whose it is."""
+    import orbax.checkpoint as ocp
+
+    from codesign_jax.runs.checkpoint import digest
+
     found = {}
-    for path in (run / "checkpoints").glob("*.sha256"):
-        lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
-        found[path.name] = next((x for x in lines if x.startswith("# arrays")), "none")
+    with ocp.StandardCheckpointer() as reader:
+        for path in (run / "checkpoints").glob("*.sha256"):
+            try:
+                place = (run / "checkpoints" / path.stem / "default").resolve()
+                arrays = dict(reader.restore(place))
+                arrays.pop("run", None)
+                found[path.stem] = digest(arrays)
+            except Exception as error:  # whatever orbax meets there
+                found[path.stem] = repr(error)
     return found
+
+
+def _unequal(a: dict[str, str], b: dict[str, str]) -> list[str]:
+    return sorted(name for name in {*a, *b} if a.get(name) != b.get(name))
 
 
 def _reference(run: Path) -> dict[str, bytes] | None:

@@ -1,6 +1,7 @@
 """Runs campaigns in worker processes, each under a time limit, and stores what they count."""
 
 import contextlib
+import fcntl
 import json
 import os
 import queue
@@ -16,11 +17,12 @@ from typing import Any
 
 from scripts.faults import finished, shim
 from scripts.faults.campaigns import Campaign
-from scripts.faults.store import Result, Store, gather
+from scripts.faults.store import Part, Result, Store, gather
 
 _PREPARING = 1800.0
 """Time to make the finished runs with cold caches on a busy machine [s]."""
 _ENDING = 20.0
+_SILENCE = 10.0
 MOST_CASES = 400
 """Cases after which a worker is replaced, as its memory grows with what faults leave in it."""
 
@@ -50,6 +52,7 @@ class Worker:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
+                start_new_session=True,  # Ctrl-C at the terminal is not for it
                 env=inherited | own | shim.environment(library) | environment,
             )
         self.cases, self._rest = 0, b""
@@ -102,7 +105,7 @@ class Harness:
         self._folder = work.absolute() / finished.code_digest()[:12]
         self._library = shim.build(work)
         self._left: queue.Queue[tuple[Campaign, range]] = queue.Queue()
-        self.stop = threading.Event()
+        self.stop, self._said = threading.Event(), 0.0
 
     def run(self, campaigns: list[Campaign], counts: dict[str, int], workers: int) -> None:
         """Runs what is left of the campaigns; `stop` ends it after the parts that have begun.
@@ -112,6 +115,16 @@ class Harness:
           counts: Cases of each.
           workers: Processes at a time.
         """
+        with (self._folder.parent / "lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise SystemExit(
+                    f"{self._folder.parent} is in use: another --work, please"
+                ) from None
+            self._run(campaigns, counts, workers)
+
+    def _run(self, campaigns: list[Campaign], counts: dict[str, int], workers: int) -> None:
         self._prepare()
         for campaign in campaigns:
             for numbers in self._store.left(campaign.name, counts[campaign.name], campaign.size):
@@ -189,9 +202,16 @@ class Harness:
             self._say(campaign, part)
         return alive
 
-    def _say(self, campaign: Campaign, part: Any) -> None:
+    def _say(self, campaign: Campaign, part: Part) -> None:
+        """Tells of a part that broke a promise, and every few seconds of how far it is."""
+        if not part.bad and time.monotonic() - self._said < _SILENCE:
+            return
+        self._said = time.monotonic()
         now = self._store.summary(campaign.name)
         words = ", ".join(f"{count} {word}" for word, count in now["counts"].items())
-        bad = "".join(f"\n  BROKEN {number}: {word}: {d[-400:]}" for number, word, d in part.bad)
+        bad = "".join(
+            f"\n  BROKEN {number}: {word}: {d[:200]} [...] {d[-300:]}"
+            for number, word, d in part.bad
+        )
         span = f"{part.first}" if part.stop == part.first + 1 else f"{part.first}-{part.stop - 1}"
         self._tell(f"{campaign.name} {span} ({part.seconds:.1f} s); in all {words}{bad}")

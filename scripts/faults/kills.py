@@ -1,4 +1,4 @@
-"""Processes that end at any moment, and files that cannot be written: what was saved goes on bit for bit."""
+"""Processes that end at any moment, and files that cannot be written: runs go on bit for bit."""
 
 import random
 import signal

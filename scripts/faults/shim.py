@@ -1,4 +1,4 @@
-"""The preloaded library that counts file operations and lets one of them fail: shim.c, compiled by `cc`."""
+"""The preloaded library that counts file operations and lets one fail: shim.c, compiled by `cc`."""
 
 import ctypes
 import enum

@@ -1,4 +1,4 @@
-"""Results of cases in one file that a kill at any moment cannot spoil: a line for each finished part."""
+"""Results of cases in one file that no kill spoils: a line for each finished part."""
 
 import json
 import os
@@ -121,7 +121,9 @@ class Store:
             os.fsync(file.fileno())
 
 
-def gather(campaign: str, numbers: range, results: dict[int, Result], good: Any, took: float) -> Part:
+def gather(
+    campaign: str, numbers: range, results: dict[int, Result], good: Any, took: float
+) -> Part:
     """Makes the part of finished cases.
 
     Args:
@@ -140,7 +142,19 @@ def gather(campaign: str, numbers: range, results: dict[int, Result], good: Any,
         for name, value in result.most.items():
             most[name] = max(value, most.get(name, value))
         if result.word not in good:
-            bad.append([number, result.word, result.detail[-2000:]])
+            bad.append([number, result.word, _short(result.detail)])
     return Part(
-        campaign, numbers.start, numbers.stop, dict(counts), dict(tallies), most, bad, round(took, 2)
+        campaign,
+        numbers.start,
+        numbers.stop,
+        dict(counts),
+        dict(tallies),
+        most,
+        bad,
+        round(took, 2),
     )
+
+
+def _short(text: str) -> str:
+    """A text's beginning, which names the case, and its end, which has the error."""
+    return text if len(text) < 2500 else f"{text[:500]}\n[...]\n{text[-2000:]}"

@@ -39,7 +39,7 @@ def obey_permissions() -> None:
         library.prctl(_CAPBSET_DROP, capability, 0, 0, 0)  # or the next program has it again
     library.capget(ctypes.byref(header), data)
     keep = ~((1 << _DAC_OVERRIDE) | (1 << _DAC_READ_SEARCH)) & 0xFFFFFFFF
-    for name, _ in Data._fields_:
+    for name in ("effective", "permitted", "inherited"):
         setattr(data[0], name, getattr(data[0], name) & keep)
     library.capset(ctypes.byref(header), data)
 
@@ -52,7 +52,7 @@ class Forked:
         self._zygote, self.pid, self._log = zygote, pid, log
 
     def send(self, number: int) -> None:
-        """Sends a signal; nothing happens if the process has ended, whose number is still its own."""
+        """Sends a signal; nothing happens if it has ended: its number is its own until `wait`."""
         os.kill(self.pid, number)
 
     def wait(self, limit: float) -> int | None:

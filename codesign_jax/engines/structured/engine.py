@@ -10,10 +10,10 @@ from codesign_jax.engines.base import Equal, Staged
 from codesign_jax.engines.structured import coordinates, mesh, transforms
 from codesign_jax.engines.structured.constants import WorldConstants, world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
+from codesign_jax.engines.structured.kernel.adjoint import Path, recorded
 from codesign_jax.engines.structured.kinematics import Acc, State
-from codesign_jax.engines.structured.transforms import Path
 from codesign_jax.model import ModelFields
-from codesign_jax.scene import Scene, effects
+from codesign_jax.scene import Scene, effects, reach
 from codesign_jax.types import Status, Trace
 
 FAR = 1e30
@@ -52,6 +52,8 @@ class StructuredEngine(Equal):
         iterations: int | None = None,
         evaluations: int | None = None,
         tolerance: float | None = None,
+        segment: int | None = None,
+        truncate: bool = False,
     ):
         """Prepares the engine.
 
@@ -61,16 +63,27 @@ class StructuredEngine(Equal):
             `scene.Newton`.
           evaluations: Largest number of line-search evaluations of an iteration.
           tolerance: Relative Newton decrement below which a world needs no further iteration.
+          segment: Steps of a segment, for derivatives: only the states at the segments' starts are
+            stored, and the steps between them simulated once more, with the same bits. By default
+            the states of all steps are stored.
+          truncate: Whether no cotangent of a state passes from a segment to the one before it.
 
         Raises:
+          ValueError: If a segment has no step, or there is none to truncate.
           KernelUnavailable: If kernels cannot run on this device.
-          SceneError: If a mesh's distance cannot be put on a grid.
+          SceneError: If a mesh's distance cannot be put on a grid, or was read for a hand with
+            smaller contact spheres.
         """
         effects.refuse(scene.effects, self.name)
         if (reason := available(jax.default_backend())) is not None:
             raise _unavailable(reason)
+        reach.refuse(scene.objects, reach.contact_radius(scene.hand))
+        if segment is not None and segment < 1:
+            raise ValueError(f"segment = {segment}: a segment has one time step at least")
+        if truncate and segment is None:
+            raise ValueError("truncate = True needs segment, the number of steps of a segment")
         mesh.tables(scene)
-        self.scene = scene
+        self.scene, self.segment, self.truncate = scene, segment, truncate
         newton = scene.newton
         self.limits = Limits(
             newton.iterations if iterations is None else iterations,
@@ -79,7 +92,7 @@ class StructuredEngine(Equal):
         )
 
     def _key(self) -> tuple:
-        return self.scene.structure, self.limits
+        return self.scene.structure, self.limits, self.segment, self.truncate
 
     def reset(self, fields: ModelFields) -> State:
         """Start states of a batch, fields with leading axis (world,)."""
@@ -136,36 +149,31 @@ class StructuredEngine(Equal):
         """See `Engine.rollout`; what JAX's transformations make of it stands in `transforms`."""
         return transforms.rollout(self, fields, ctrl, trajectory=trajectory)
 
-    def simulate(
-        self,
-        fields: ModelFields,
-        ctrl: jax.Array,
-        *,
-        trajectory: bool = False,
-        states: bool = False,
-    ) -> tuple[Trace, Path | None]:
-        """The rollout itself, in one kernel.
-
-        Args:
-          fields: As in `Engine.rollout`.
-          ctrl: As in `Engine.rollout`.
-          trajectory: As in `Engine.rollout`.
-          states: Whether to return every step's state and accelerations.
-
-        Returns:
-          The trace, and what a derivative reads of it if states are asked for, else None.
+    def simulate(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
+        """The rollout itself, in one kernel; arguments as in `Engine.rollout`.
 
         Raises:
           KernelUnavailable: If the kernel cannot be compiled for this device, or called there.
         """
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
         hand, start = world_constants(self.scene, fields), self.reset(fields)
-        record = {"trajectory": trajectory, "states": states}
-        found, end = self._run(program, hand, start, ctrl, **record)
-        trace = self._trace(found, end, trajectory)
-        if not states:
-            return trace, None
-        return trace, Path(found["qpos"], found["qvel"], found["acc"], found["moved"] > 0)
+        found, end = self._run(program, hand, start, ctrl, trajectory=trajectory)
+        return self._trace(found, end, trajectory)
+
+    def record(
+        self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
+    ) -> tuple[Trace, Path]:
+        """`simulate`, and what a derivative reads of it."""
+        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
+        inputs = program.inputs(world_constants(self.scene, fields), self.reset(fields), ctrl)
+        try:
+            out = program.execute(inputs, trajectory=trajectory, states=self.segment or 1)
+        except KernelUnavailable as error:
+            raise _unavailable(str(error)) from error
+        found, end = program.outputs(out, len(ctrl), trajectory=trajectory)
+        taken = program.by_block(found["moved"].sum(1)[:, None, None, None])
+        path = jax.tree.map(lambda x: program.by_world(x, len(ctrl)), recorded(out, taken))
+        return self._trace(found, end, trajectory), path
 
     def block_lanes(self, worlds: int) -> int:
         """See `base.block_lanes`: a GPU with few worlds is faster with narrow blocks."""

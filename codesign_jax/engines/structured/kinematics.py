@@ -111,7 +111,7 @@ def kinematics(
     """Computes the kinematics of all bodies."""
     place = _place(state)
     palm, wrist_axes, palm_vel, palm_bias = run(_wrist, place, state.wrist, state.wrist_vel)
-    frame, origin = run(_mount, place, palm, hand.mount, hand.base)
+    frame, origin = run(mounted, place, palm, hand.mount, hand.base)
     vel, bias = palm_vel, palm_bias
     trig = run(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
 
@@ -147,7 +147,7 @@ def straight(hand: WorldConstants, state: State) -> Kinematics:
     """Places of all bodies with straight fingers: no loop along the links, and nothing else."""
     place = _place(state)
     palm = _palm_columns(state.wrist)
-    frame, base = _mount(place, palm, hand.mount, hand.base)
+    frame, base = mounted(place, palm, hand.mount, hand.base)
     origin = base[:, None] + frame[0][:, None] * jnp.cumsum(hand.offset, axis=0)
     link = jnp.broadcast_to(frame[:, :, None], (3, *origin.shape))
     columns = rotation_columns(state.quat)
@@ -184,7 +184,8 @@ def _palm_columns(wrist: jax.Array) -> jax.Array:
     return jnp.stack(jnp.broadcast_arrays(*frame))
 
 
-def _mount(place: jax.Array, palm: jax.Array, mount: jax.Array, base: jax.Array):
+def mounted(place: jax.Array, palm: jax.Array, mount: jax.Array, base: jax.Array):
+    """Columns and origin of a finger's base from the palm's."""
     frame = turn_columns(palm, mount)
     return frame, place + apply_columns(palm, base)
 

@@ -4,9 +4,13 @@ Batching: a mapped axis is folded into the axis of the worlds, so that one kerne
 them whatever the nesting (`jax.custom_batching.custom_vmap`).
 
 Differentiation (`jax.custom_vjp`): the forward pass is the same kernel, which then stores the state
-before each step and the accelerations of the step.  The backward pass is one reverse scan over the
-steps.  Each step is repeated from its stored accelerations as plain JAX (`differentiable`) and
-pulled back by the implicit function theorem (`implicit`): one linear solve a step.
+before each step and the accelerations of the step.  The backward pass is a second kernel, which
+goes through the steps in reverse (`kernel.adjoint`).  The accelerations a of a step are where the
+gradient of its objective vanishes,
+  F(a, theta) = M a - tau - J' f(J a - aref) = 0,
+with theta all data of the step.  By the implicit function theorem a cotangent v of a gives theta
+the cotangent -lambda' dF/dtheta with H lambda = v, and H = dF/da is the symmetric matrix of a
+Newton step at a: one linear solve a step, however many iterations found a.
 
 The derivative is that of the trace as it was computed.  The trace of a decided world repeats its
 last state, and the cotangents of the repeated entries are added to that state's.  A step that
@@ -15,37 +19,20 @@ failed passes no cotangent back.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax import verdict
-from codesign_jax.engines.structured import coordinates, differentiable
-from codesign_jax.engines.structured.constants import WorldConstants, world_constants
-from codesign_jax.engines.structured.lanes import total
+from codesign_jax.engines.structured import segments
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Path
 from codesign_jax.model import ModelFields
 from codesign_jax.types import Trace
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.engine import StructuredEngine
-
-
-class Path(NamedTuple):
-    """What the derivative of a rollout needs of every step.
-
-    Attributes:
-      qpos: Generalized positions before the step, shape (world, time, nq).
-      qvel: Generalized velocities before the step, shape (world, time, nv).
-      acc: Accelerations of the step in the order of qvel, the object's as in `kinematics.Acc`,
-        shape (world, time, nv).
-      moved: Whether the world took the step, bool, shape (world, time).
-    """
-
-    qpos: jax.Array
-    qvel: jax.Array
-    acc: jax.Array
-    moved: jax.Array
 
 
 def rollout(
@@ -61,18 +48,16 @@ def rollout(
 
     Raises:
       NotImplementedError: If a derivative is differentiated again.
-      SceneError: If a derivative is asked for and the scene has none.
     """
-    plain = folded(lambda f, c: engine.simulate(f, c, trajectory=trajectory)[0])
-    recorded = _once(folded(partial(engine.simulate, trajectory=trajectory, states=True)))
-    adjoint = _once(folded(partial(_adjoint, engine)))
+    plain = folded(partial(engine.simulate, trajectory=trajectory))
+    recorded = _once(folded(partial(engine.record, trajectory=trajectory)))
+    adjoint = _once(folded(partial(_adjoint, engine, trajectory)))
 
     @jax.custom_vjp
     def run(fields: ModelFields, ctrl: jax.Array) -> Trace:
         return plain(fields, ctrl)
 
     def forward(fields: ModelFields, ctrl: jax.Array):
-        differentiable.refuse(engine.scene)  # before the kernel, whose compile takes a while
         trace, path = recorded(fields, ctrl)
         return trace, (fields, ctrl, path, trace.speed)
 
@@ -121,6 +106,7 @@ def _once(function: Callable) -> Callable:
 
 def _adjoint(
     engine: "StructuredEngine",
+    trajectory: bool,
     fields: ModelFields,
     ctrl: jax.Array,
     path: Path,
@@ -131,89 +117,49 @@ def _adjoint(
 
     Args:
       engine: The engine.
+      trajectory: As in `Engine.rollout`.
       fields: Model fields of the rollout.
       ctrl: Its controls.
       path: Its steps.
       speed: Its largest velocities, as in `Trace`.
       cotangent: Cotangent of its trace, without the status.
     """
-    with jax.default_matmul_precision("highest"):
-        return _reverse_scan(engine, fields, ctrl, path, speed, cotangent)
+    scene = engine.scene
+    program = AdjointProgram.here(scene, engine.limits, ctrl.dtype, len(ctrl))
 
+    def inputs(fields: ModelFields, ctrl: jax.Array) -> tuple:
+        return program.inputs(world_constants(scene, fields), engine.reset(fields), ctrl)
 
-def _reverse_scan(
-    engine: "StructuredEngine",
-    fields: ModelFields,
-    ctrl: jax.Array,
-    path: Path,
-    speed: jax.Array,
-    cotangent: Trace,
-) -> tuple[ModelFields, jax.Array]:
-    scene, nq = engine.scene, path.qpos.shape[-1]
-    hand = world_constants(scene, fields)
-    _, rebuild = _numbers(hand)
-    bounds = verdict.Bounds(*(v[0] for v in hand.bounds))
-    numbers, pull_fields = jax.vjp(lambda f: _numbers(world_constants(scene, f))[0], fields)
+    tables, pull_inputs = jax.vjp(inputs, fields, ctrl)
+    taken = path.taken[:, 0, 0]
+    # The entry after a failed step shows the speed of a state that was not kept.
+    bounds = world_constants(scene, fields).bounds
+    bounds = verdict.Bounds(*(v[0, :, None] for v in bounds))
+    shown = jnp.where(verdict.slow(bounds, speed), cotangent.speed, 0.0)
+    entries = [cotangent.distance, cotangent.height, shown]
     assert cotangent.last is not None
-
-    def body(carry: tuple, t: jax.Array):
-        sums, qpos_bar, qvel_bar = carry
-        here, u, top, bar = jax.tree.map(
-            lambda x: jax.lax.dynamic_index_in_dim(x, t, 1, keepdims=False),
-            (path, ctrl, speed, cotangent._replace(last=None)),
-        )
-        moved = here.moved[:, None]
-        acc = jnp.where(moved, here.acc, 0.0)
-
-        def step(numbers: list, qpos: jax.Array, qvel: jax.Array, u: jax.Array):
-            state = coordinates.make(scene, qpos, qvel, acc)
-            new, centre = differentiable.step(scene, rebuild(numbers), state, u.T)
-            away = state.position - centre
-            distance = jnp.sqrt(total([away[i, 0] ** 2 for i in range(3)]))
-            entry = distance, state.position[2, 0], coordinates.speed(state)
-            return coordinates.qpos(new), coordinates.qvel(new), *entry
-
-        _, pull = jax.vjp(step, numbers, here.qpos, here.qvel, u)
-        # The entry after a failed step shows the speed of a state that was not kept.
-        shown = jnp.where(verdict.slow(bounds, top), bar.speed, 0.0)
-        after = jnp.where(moved, qpos_bar, 0.0), jnp.where(moved, qvel_bar, 0.0)
-        own, dq, dv, du = pull((*after, bar.distance, bar.height, shown))
-        own, (dq, dv, du) = _finite(own, moved.T), _finite((dq, dv, du), moved)
-        dq += jnp.where(moved, 0.0, qpos_bar)
-        dv += jnp.where(moved, 0.0, qvel_bar)
-        dq += bar.qpos if bar.qpos.shape[-1] else 0.0
-        return (jax.tree.map(jnp.add, sums, own), dq, dv), du
-
-    zero = jax.tree.map(jnp.zeros_like, numbers)
-    start = zero, cotangent.last[:, :nq], cotangent.last[:, nq:]
-    steps = jnp.arange(ctrl.shape[1])
-    (sums, start_bar, _), ctrl_bar = jax.lax.scan(body, start, steps, reverse=True)
-    (bar,) = pull_fields(sums)
-    bar = bar._replace(start=bar.start + start_bar)
+    trace = _gathered(taken, jnp.stack(entries, 2))[..., None]
+    bars = Cotangents(*program.rows_of_end(cotangent.last), trace)
+    if trajectory:
+        bars = bars._replace(path=program.rows_of(_gathered(taken, cotangent.qpos)))
+    path, bars = jax.tree.map(program.by_block, (path, bars))
+    found = segments.reverse(engine, program, tables, path, bars, trajectory=trajectory)
+    fields_bar, ctrl_bar = pull_inputs(program.sound(found, path.taken))
     # A world that never moved, such as one of fields that are not numbers, has no derivative.
-    bar = jax.tree.map(partial(_of_worlds, path.moved.any(1)), bar)
-    return bar, jnp.moveaxis(ctrl_bar, 0, 1)
+    return jax.tree.map(partial(_of_worlds, taken[:, 0] > 0), (fields_bar, ctrl_bar))
 
 
-def _numbers(hand: WorldConstants) -> tuple[list[jax.Array], Callable]:
-    """The constants that have a derivative, and the function that puts such into the others' place.
+def _gathered(taken: jax.Array, x: jax.Array) -> jax.Array:
+    """Cotangents of entries (world, time, entry), those of entries that repeat in the first.
 
-    Lanes have two axes at least: what has fewer, such as the grids of meshes, belongs to the scene.
+    Args:
+      taken: Number of steps that each world took, shape (world, 1): later entries show the state
+        at its end.
+      x: The cotangents.
     """
-    leaves, structure = jax.tree.flatten(hand)
-    mine = [jnp.issubdtype(x.dtype, jnp.floating) and x.ndim > 1 for x in leaves]
-
-    def rebuild(numbers: list[jax.Array]) -> WorldConstants:
-        given = iter(numbers)
-        every = [next(given) if m else x for x, m in zip(leaves, mine, strict=True)]
-        return jax.tree.unflatten(structure, every)
-
-    return [x for x, m in zip(leaves, mine, strict=True) if m], rebuild
-
-
-def _finite(tree: Any, moved: jax.Array) -> Any:
-    """Cotangents; zero where one of a world that stands still is not a number."""
-    return jax.tree.map(lambda x: jnp.where(moved | jnp.isfinite(x), x, 0.0), tree)
+    step, end = jnp.arange(x.shape[1])[:, None], taken[:, None]
+    rest = jnp.where(step >= end, x, 0.0).sum(1, keepdims=True)
+    return jnp.where(step < end, x, jnp.where(step == end, rest, 0.0))
 
 
 def _of_worlds(keep: jax.Array, x: jax.Array) -> jax.Array:

@@ -36,6 +36,12 @@ CONE = {
 }
 
 
+def cone_of(friction: str, numbers: Any) -> Cone:
+    """The cone of a friction model from its numbers, in the order of `CONE`."""
+    found: dict[str, Any] = dict.fromkeys(Cone._fields)
+    return Cone(**found | {name: numbers[i] for i, name in enumerate(CONE[friction])})
+
+
 def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
     """Lanes of zeros of a finger each, like an array over the lanes."""
     count = 1
@@ -81,9 +87,8 @@ class ContactSet:
 
     def cone(self, read: Callable[[str], Lanes]) -> Cone:
         """Contact parameters, lanes of a world each; `read` as in `bind`."""
-        numbers, names = read(f"cone.{which_cone(self.name)}"), CONE[self.scene.effects.friction]
-        found: dict[str, Any] = dict.fromkeys(Cone._fields)
-        return Cone(**found | {name: numbers[i] for i, name in enumerate(names)})
+        numbers = read(f"cone.{which_cone(self.name)}")
+        return cone_of(self.scene.effects.friction, numbers)
 
     @staticmethod
     def contacts(place: tuple, cone: Cone) -> Contacts:

@@ -53,9 +53,18 @@ class Eliminated(NamedTuple):
 class Coupling:
     """Corrects a Newton step for the contacts between fingers."""
 
-    def __init__(self, problem: Problem, pairs: BoundPairs, done: Eliminated):
-        """Takes an iteration's elimination."""
+    def __init__(
+        self,
+        problem: Problem,
+        pairs: BoundPairs,
+        done: Eliminated,
+        *,
+        tolerance: float = TOLERANCE,
+        iterations: int = ITERATIONS,
+    ):
+        """Takes an elimination, the squared error at which to end, and most iterations."""
         self.problem, self.pairs, self.done = problem, pairs, done
+        self.tolerance, self.iterations = tolerance, iterations
         self.block, self.links = problem.block, problem.links
 
     def correct(self, step: Iterate, idle: jax.Array) -> Iterate:
@@ -73,11 +82,11 @@ class Coupling:
         start = (jnp.int32(0), *self._products(), one, none, work)
 
         def misses(size: jax.Array, work: jax.Array) -> jax.Array:
-            return size > TOLERANCE * jnp.abs(work)
+            return size > self.tolerance * jnp.abs(work)
 
         def going(carry: tuple) -> jax.Array:
             count, size, *_, work = carry
-            return (count < ITERATIONS) & anywhere(misses(size, work))
+            return (count < self.iterations) & anywhere(misses(size, work))
 
         def body(carry: tuple) -> tuple:
             count, size, bent, last, length, work = carry

@@ -11,6 +11,7 @@ from codesign_jax.engines.structured.kernel import hull
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, direct, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
 from codesign_jax.engines.structured.kernel.memory import choose, full, loop, upper
+from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanes import contract, dot, total
@@ -56,7 +57,7 @@ class Elimination:
         """
         problem = self.problem
         if problem.pairs:
-            problem.pairs.update_constraints(alpha)
+            self.between_fingers(problem.pairs, alpha)
 
         def eliminate(node, body, motion, smooth, tau, axes, armature, acc, pushes, terms, pairs):
             link = make_body(*body)
@@ -74,9 +75,10 @@ class Elimination:
 
         def step(i: Any, carry: tuple) -> tuple:
             node, work = carry
-            acc, motion = problem.move("acc", i, alpha), problem.move("motion", i, alpha)
-            pushes = {c.set.name: c.push(i, alpha) for c in problem.fingers}
-            smooth, tau, axes, armature = problem.read("smooth", "tau", "axes", "armature", item=i)
+            acc, motion = self.accelerations(i, alpha)
+            pushes = {c.set.name: self.push(c, i, alpha) for c in problem.fingers}
+            smooth, tau = self.smooth(i)
+            axes, armature = problem.read("axes", "armature", item=i)
             node = node._replace(p=full(node.p), q=full(node.q))
             rows = [self.row(c, i, axes, alpha) for c in problem.skin]
             terms = add_terms([r.terms for r in rows]) if rows else None
@@ -101,6 +103,26 @@ class Elimination:
         node = self.block.sum(node)
         return node._replace(p=full(node.p), q=full(node.q)), work
 
+    # What is on the right side: here the forces that an iterate leaves unbalanced
+
+    def accelerations(self, i: Any, alpha: Lanes) -> list[Lanes]:
+        """Accelerations of a joint and of the link behind it."""
+        return [self.problem.move(name, i, alpha) for name in ("acc", "motion")]
+
+    def smooth(self, i: Any) -> list[Lanes]:
+        """Smooth forces on a link and on the joint before it."""
+        return self.problem.read("smooth", "tau", item=i)
+
+    def push(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+        """Inertia and wrench of an item's contacts, see `BoundContacts.push`."""
+        return contacts.push(item, alpha)
+
+    def between_fingers(self, pairs: BoundPairs, alpha: Lanes) -> None:
+        """Prepares contacts between fingers, see `BoundPairs.update_constraints`."""
+        pairs.update_constraints(alpha)
+
+    # Rows of the hull
+
     def row(self, slots: BoundSlots, row: Any, axes: Lanes | None, alpha: Lanes) -> "Row":
         """What a row of the hull adds to the elimination, see `hull.row_terms`.
 
@@ -116,7 +138,7 @@ class Elimination:
         used = slots.used(row) > 0
 
         def compute() -> list[Lanes]:
-            inertia, wrench = slots.push(row, alpha)
+            inertia, wrench = self.push(slots, row, alpha)
             if axes is None:
                 return [*empty[:4], upper(inertia[:6, :6]), wrench[:6]]
             terms, matrix, force = lanewise(hull.row_terms, axes, inertia, wrench)
@@ -143,7 +165,7 @@ class Elimination:
         for c in self.problem.slots:
 
             def add(i: Any, carry: tuple, c: BoundContacts = c) -> tuple:
-                matrix, wrench = c.push(i, alpha)
+                matrix, wrench = self.push(c, i, alpha)
                 return lanewise(
                     lambda a, b: jax.tree.map(jnp.add, a, b), carry, (upper(matrix), wrench)
                 )

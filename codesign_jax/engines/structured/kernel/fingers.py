@@ -107,7 +107,7 @@ class Search:
                     one, other = lanewise(sections.between, mine, theirs)
                     rows = tuple(jax.lax.div(v, jnp.asarray(self.p.k, v.dtype)) + 1 for v in (j, i))
                     moves = self._moves(rows, pairing)
-                    self._enter(row, which, owner, (one, other), rows, moves)
+                    self._enter(row, which, owner, (one, other), rows, moves, (j, i))
 
                 any_of(which, enter)
 
@@ -235,6 +235,7 @@ class Search:
         ends: tuple,
         rows: tuple,
         moves: list[tuple[Lanes, Lanes]],
+        spheres: tuple = (0, 0),
     ) -> None:
         """Gives contacts a slot; places on either side, the sides' rows, and how they move."""
         pairs, contacts = self.pairs, self.pairs.set.contacts
@@ -256,6 +257,8 @@ class Search:
         numbers = [v.astype(self.like.dtype) for v in rows]
         side = jnp.where(owner, self.like + numbers[0], self.like + numbers[1])
         alike = {"row": lanes([side], (1, 1), wide=True), "step": none}
+        if pairs.set.remembers:
+            alike |= pairs.remembered({"owner": owner, "sphere": jnp.where(owner, *spheres)})
         pairs.enter(row, which, owner, kept[0], kept[1], alike)
 
 

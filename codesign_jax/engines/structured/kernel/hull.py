@@ -121,9 +121,9 @@ class Skin:
             which = which & (self.step.block.finger < self.step.p.num_fingers)
 
         def store() -> None:
-            lever = lanewise(lambda w, i, c, x: w * (i + c - x), weight, image, where, point)
-            contact = where, normal, gap, lever, share
-            kept = slots.begin(contact, *moves[name])
+            arm = lanewise(lambda *places: lever(*places), weight, image, where, point)
+            kept = slots.begin((where, normal, gap, arm, share), *moves[name])
+            kept |= slots.remembered({"vertex": item})
             slots.add(row, which, kept, self.step.block.lane)
 
         any_of(which, store)
@@ -162,6 +162,11 @@ def placed(vertex, joint, before, after):
     image = apply_columns(after, local)
     point = joint + (1.0 - weight) * apply_columns(before, local) + weight * image
     return point[:, None], image[:, None], weight[None], share[None, None]
+
+
+def lever(weight, image, where, point):
+    """Lever of a vertex's contact: how far it is from the joint that it follows in part."""
+    return weight * (image + where - point)
 
 
 def row_terms(

@@ -26,14 +26,14 @@ def advance(step: "Step", state: dict, at: dict, now: Iterate, goes_on: Any, spe
       Largest velocity after the step, and whether the world has moved, shapes (1, world).
     """
     p, h = step.p, step.p.scene.discretization.timestep
-    new = lanewise(partial(_moved, h), state, at["columns"], now.wrist, now.object_motion)
+    new = lanewise(partial(moved, h), state, at["columns"], now.wrist, now.object_motion)
     size = lanewise(_largest, new)
 
     def link(i: Any, largest: Lanes) -> Lanes:
         q, rate, acc = (
             p.finger_state.read(step.finger_state, n, i) for n in ("finger", "finger_vel", "acc")
         )
-        rate, q, top = lanewise(partial(_turned, h), q, rate, acc)
+        rate, q, top = lanewise(partial(turned, h), q, rate, acc)
         p.scratch.write(step.scratch, "new_finger", q, i)
         p.scratch.write(step.scratch, "new_finger_vel", rate, i)
         return lanewise(_worse, largest, top)
@@ -60,10 +60,10 @@ def advance(step: "Step", state: dict, at: dict, now: Iterate, goes_on: Any, spe
     return jnp.where(goes_on, largest, speed), good
 
 
-def _moved(h: float, state: dict, columns, wrist, obj) -> dict:
+def moved(h: float, state: dict, columns, wrist, obj) -> dict:
     """Wrist and object after the step."""
     names = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
-    # The fingers' joints are moved link by link, see `_turned`.
+    # The fingers' joints are moved link by link, see `turned`.
     old = State(finger=0.0, finger_vel=0.0, acc=None, **{n: state[n] for n in names})  # type: ignore[arg-type]
     new = integrate(old, columns, kin.Acc(wrist, 0.0, obj), h)  # type: ignore[arg-type]
     return {n: getattr(new, n) for n in names}
@@ -85,7 +85,8 @@ def _largest(new: dict):
     return jnp.where(place == place, top, place)
 
 
-def _turned(h: float, q, rate, acc):
+def turned(h: float, q, rate, acc):
+    """A joint after the step: velocities, angles, and the largest velocity."""
     rate = rate + h * acc
     q = q + h * rate
     top = jnp.abs(rate[0])

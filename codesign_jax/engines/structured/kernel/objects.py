@@ -148,10 +148,7 @@ def _for_both(
     plain = choose(anywhere(~mine), primitive, like, size)
     other = choose(anywhere(mine if near is None else near & mine), meshed, like, size)
 
-    def pick(mine: jax.Array, mesh: Any, primitive: Any) -> Any:
-        return jax.tree.map(partial(jnp.where, mine), mesh, primitive)
-
-    return lanewise(pick, thing.mesh.meshed, other, plain)
+    return lanewise(_pick, thing.mesh.meshed, other, plain)
 
 
 def signed_distance(scene: Scene, thing: WorldObject, local: Lanes) -> tuple[Lanes, Lanes]:
@@ -172,6 +169,59 @@ def signed_distance(scene: Scene, thing: WorldObject, local: Lanes) -> tuple[Lan
 
     none = lanewise(lambda p: (jnp.zeros_like(p[0]), jnp.zeros_like(p)), local)
     return _for_both(scene, thing, primitive, meshed, none)
+
+
+def distance_of(scene: Scene, local: jax.Array, at: dict, still: dict) -> tuple:
+    """`signed_distance` as a function of arrays that has a derivative.
+
+    Args:
+      scene: The scene.
+      local: Points (3, ...) in the object's frame.
+      at: Sizes of the object, and origin, cell and factor of a mesh's grid, by name.
+      still: Index of the object and, with meshes, first value and nodes of the grid, whether the
+        object is a mesh, and the distances at the corners of the points' cells, see `cell_values`.
+    """
+    found, shape = None, still["object_id"].astype(jnp.int32)
+    if len(collision.mesh_indices(scene)) < len(scene.objects.object):
+        found = collision.primitive_distance(scene, at["object_size"], shape, local)
+    if "meshed" in still:
+        grid = GridLanes(**{k: (at | still)[f"grid_{k}"] for k in GridLanes._fields})
+        new = mesh.interpolate(grid, mesh.locate(grid, local), still["values"])
+        found = new if found is None else _pick(still["meshed"], new, found)
+    assert found is not None
+    return found
+
+
+def cell_values(thing: WorldObject, local: Lanes) -> Lanes:
+    """Distances at the corners of the grid cells in which points (3, ...) lie, shape (8, ...)."""
+    assert thing.mesh is not None
+    grid = thing.mesh.grid
+    index = lanewise(lambda g, p: mesh.corners(g, mesh.locate(g, p)), grid, local)
+    return _gather(thing.mesh.values, index, local.dtype)
+
+
+def points_of(scene: Scene, at: dict, still: dict) -> jax.Array:
+    """`table_points` as a function of arrays that has a derivative.
+
+    Args:
+      scene: The scene.
+      at: Columns, sizes and, of meshes, factor of the object, by name.
+      still: As in `distance_of`; of meshes the points themselves, in the object's frame, and the
+        factor that they have.
+    """
+    found, shape, columns = None, still["object_id"].astype(jnp.int32), at["columns"][:, :, 0]
+    if len(collision.mesh_indices(scene)) < len(scene.objects.object):
+        found = collision.primitive_points(scene, at["object_size"][:, 0], shape, columns)
+    if "meshed" in still:
+        support = still["support"] * (at["grid_factor"] / still["factor"])
+        new = mesh.turned(columns, support)
+        found = new if found is None else _pick(still["meshed"], new, found)
+    assert found is not None
+    return found
+
+
+def _pick(mine: jax.Array, one: Any, other: Any) -> Any:
+    return jax.tree.map(partial(jnp.where, mine), one, other)
 
 
 def _gather(ref: Any, index: Lanes, dtype: Any) -> Lanes:

@@ -123,6 +123,43 @@ class Packing(Tables):
             found[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
         return found
 
+    def rows_of(self, qpos: jax.Array, qvel: jax.Array | None = None) -> tuple:
+        """Rows (world, time, row, finger or 1) of coordinates, or of their cotangents; see `path`.
+
+        Args:
+          qpos: Generalized positions, shape (world, time, nq).
+          qvel: Generalized velocities, shape (world, time, nv); without them positions' rows only.
+        """
+        joints, others, end = [], [], 6 + self.lay.dofs.size
+        for x in (qpos,) if qvel is None else (qpos, qvel):
+            finger = x[:, :, 6:end].reshape(*x.shape[:2], self.num_fingers, -1)
+            joints.append(jnp.swapaxes(finger, 2, 3))
+            others.append(jnp.concatenate([x[:, :, :6], x[:, :, end:]], 2))
+        fill = [(0, 0)] * 3 + [(0, self.fingers - self.num_fingers)]
+        return jnp.pad(jnp.concatenate(joints, 2), fill), jnp.concatenate(others, 2)[..., None]
+
+    def rows_of_end(self, last: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """`rows_of` of cotangents (world, nq + nv) of the last state; none of accelerations."""
+        nq = 13 + self.lay.dofs.size
+        found = self.rows_of(last[:, None, :nq], last[:, None, nq:])
+        rows = self.path_rows(states=True)
+        return tuple(
+            jnp.pad(x, [(0, 0), (0, 0), (0, n - x.shape[2]), (0, 0)])
+            for x, n in zip(found, rows, strict=True)
+        )  # type: ignore[return-value]
+
+    def by_world(self, rows: jax.Array, worlds: int) -> jax.Array:
+        """Rows (block, time, row, lane or world) as (world, time, row, finger or 1)."""
+        split = rows.reshape(*rows.shape[:3], -1, self.block)
+        return jnp.moveaxis(split, 4, 1).reshape(-1, *split.shape[1:4])[:worlds]
+
+    def by_block(self, rows: jax.Array) -> jax.Array:
+        """Inverse of `by_world`; zeros fill the last block."""
+        missing = -rows.shape[0] % self.block
+        rows = jnp.pad(rows, [(0, missing)] + [(0, 0)] * 3)
+        split = jnp.moveaxis(rows.reshape(-1, self.block, *rows.shape[1:]), 1, 4)
+        return split.reshape(*split.shape[:3], -1)
+
     def unpack_state(self, finger_state: jax.Array, world_state: jax.Array, worlds: int) -> State:
         """Inverse of `pack_state`."""
         wide = self.finger_state.unpack(finger_state, self.fingers, self.num_fingers, worlds)

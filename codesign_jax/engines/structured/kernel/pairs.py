@@ -39,7 +39,14 @@ class PairSet(HullSet):
     """Contacts between fingers; a row is a pairing of all fingers."""
 
     def __init__(
-        self, scene: Scene, block: tuple[int, int], links: int, slots: int, *, gathers: bool
+        self,
+        scene: Scene,
+        block: tuple[int, int],
+        links: int,
+        slots: int,
+        *,
+        gathers: bool,
+        remembers: tuple[str, ...] = (),
     ):
         """Prepares the set.
 
@@ -49,10 +56,11 @@ class PairSet(HullSet):
           links: Moving links of a finger.
           slots: Slots of a pairing, on each lane.
           gathers: Whether lanes read rows of their own as fast as a common one: on GPUs.
+          remembers: As in `SlotSet`.
         """
         fingers, worlds = block
         how = "finger_finger", fingers - 1, slots, fingers * worlds
-        super().__init__(scene, *how, gathers=gathers)
+        super().__init__(scene, *how, gathers=gathers, remembers=remembers)
         self.block, self.links = block, links
         self.skin = scene.effects.surface == "hull"
         if not self.skin:

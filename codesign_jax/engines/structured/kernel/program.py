@@ -97,14 +97,14 @@ class Program(Packing):
         return self.outputs(out, ctrl.shape[0], trajectory=trajectory, states=states)
 
     def execute(
-        self, inputs: tuple, *, trajectory: bool = False, states: bool = False
+        self, inputs: tuple, *, trajectory: bool = False, states: int = 0
     ) -> list[jax.Array | None]:
         """Runs the blocks, which do not depend on each other; None in the place of scratch memory.
 
         Args:
           inputs: See `inputs`.
           trajectory: As in `simulate`.
-          states: As in `simulate`.
+          states: Steps from one recorded state to the next, beginning with the first; 0 for none.
         """
         call, outputs = self._call(inputs, trajectory, states)
         if self.backend == "interpreter":
@@ -124,7 +124,7 @@ class Program(Packing):
         trace = trace.reshape(-1, trace.shape[2], len(self.trace))[:worlds]
         found = {name: trace[..., k] for k, name in enumerate(self.trace)}
         if trajectory or states:
-            found |= {k: v[:worlds] for k, v in self.path(out[4], out[5], states).items()}
+            found |= {k: v[:worlds] for k, v in self.path(out[4], out[5], states=states).items()}
         last = self.unpack_state(out[0], out[1], worlds)
         if states:
             # A row holds the acceleration of the step before it, the solver's warm start.
@@ -143,7 +143,7 @@ class Program(Packing):
         return inputs if hand.mesh is None else (*inputs, hand.mesh.values[None])
 
     def _call(
-        self, inputs: tuple, trajectory: bool, states: bool
+        self, inputs: tuple, trajectory: bool, states: int
     ) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
         """The kernel of arguments as a function of them, and its outputs."""
         blocks, steps, dtype = inputs[0].shape[0], inputs[4].shape[1], inputs[4].dtype
@@ -153,27 +153,23 @@ class Program(Packing):
             (blocks, self.scratch.rows, self.size),
             (blocks, steps, len(self.trace), self.block),
         ]
-        if trajectory or states:
-            angles, places = self.path_rows(states)
-            shapes += [(blocks, steps, angles, self.size), (blocks, steps, places, self.block)]
-
-        def spec(shape: tuple[int, ...]) -> pl.BlockSpec:
-            own = shape[0] == blocks
-            return pl.BlockSpec((None, *shape[1:]), lambda i: (i * own, *[0] * (len(shape) - 1)))
+        for stride, whole in _records(trajectory, states):
+            (angles, places), count = self.path_rows(whole), -(-steps // stride)
+            shapes += [(blocks, count, angles, self.size), (blocks, count, places, self.block)]
 
         outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
         call = pl.pallas_call(
             partial(self._kernel, steps, trajectory, states),
             grid=(blocks,),
-            in_specs=[spec(x.shape) for x in inputs],
-            out_specs=[spec(s) for s in shapes],
+            in_specs=[block_spec(x.shape, blocks) for x in inputs],
+            out_specs=[block_spec(s, blocks) for s in shapes],
             out_shape=outputs,
             interpret=self.backend == "interpreter",
             name="grasp",
         )
         return call, outputs
 
-    def _kernel(self, steps: int, to_end: bool, states: bool, *refs: Any) -> None:
+    def _kernel(self, steps: int, to_end: bool, states: int, *refs: Any) -> None:
         (
             hand,
             world,
@@ -203,11 +199,19 @@ class Program(Packing):
         bounds = bounds._replace(start=start, end=end)
         alive = self.world.read(world, "alive", 0, own).lane
 
+        def store(place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
+            angles, places = self.path_rows(whole)
+            _copy(finger_state, fingers, angles, at=(place,))
+            _copy(world_state, worlds, places, own, at=(place,))
+
         def record(t: jax.Array) -> None:
-            if path:
-                angles, places = self.path_rows(states)
-                _copy(finger_state, path[0], angles, at=(t,))
-                _copy(world_state, path[1], places, own, at=(t,))
+            for k, (stride, whole) in enumerate(_records(to_end, states)):
+                target = path[2 * k : 2 * k + 2]
+                if stride == 1:
+                    store(t, whole, *target)
+                else:
+                    put = partial(store, jax.lax.div(t, stride), whole, *target)
+                    jax.lax.cond(jax.lax.rem(t, stride) == 0, put, lambda: None)
 
         def body(carry: tuple) -> tuple:
             t, alive, speed = carry
@@ -239,6 +243,18 @@ class Program(Packing):
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))
+
+
+def _records(trajectory: bool, states: int) -> list[tuple[int, bool]]:
+    """What is recorded: every how many steps, and whether whole states or positions."""
+    found = [(1, states == 1)] if trajectory or states == 1 else []
+    return found + ([(states, True)] if states > 1 else [])
+
+
+def block_spec(shape: tuple[int, ...], blocks: int) -> pl.BlockSpec:
+    """A block's part of an array with a leading axis of blocks, or of one that all share."""
+    own = shape[0] == blocks
+    return pl.BlockSpec((None, *shape[1:]), lambda i: (i * own, *[0] * (len(shape) - 1)))
 
 
 def lanes_here(scene: Scene, dtype: Any, worlds: int | None = None) -> int:

@@ -141,9 +141,11 @@ def pressure(sums: jax.Array) -> tuple[tuple, tuple]:
     some = force > 0
     whole = jnp.where(some, force, 1.0)
     # Vertices that push in different directions cancel in part: the resultant's length.
-    size = jnp.sqrt(dot(normal, normal))
-    pushes = some & (size > 0)
-    normal = jnp.where(pushes, normal / jnp.where(pushes, size, 1.0), 0.0)
+    square = dot(normal, normal)
+    pushes = some & (square > 0)
+    # The root of a number above zero: that of zero has no slope.
+    size = jnp.sqrt(jnp.where(pushes, square, 1.0))
+    normal = jnp.where(pushes, normal / size, 0.0)
     gap = jnp.where(pushes, -size / jnp.where(some, share, 1.0), 1.0)[None, None]
     point, lever, behind = ((sums[k : k + 3] / whole)[:, None] for k in (5, 8, 11))
     normal, share = normal[:, None], share[None, None]

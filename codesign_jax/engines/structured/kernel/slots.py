@@ -30,7 +30,17 @@ def hull_slots(scene: Scene) -> int:
 class SlotSet(ContactSet):
     """Contacts of one pair of bodies in slots, one contact each, several to a row."""
 
-    def __init__(self, scene: Scene, name: str, rows: int, slots: int, size: int, *, gathers: bool):
+    def __init__(
+        self,
+        scene: Scene,
+        name: str,
+        rows: int,
+        slots: int,
+        size: int,
+        *,
+        gathers: bool,
+        remembers: tuple[str, ...] = (),
+    ):
         """Prepares the set.
 
         Args:
@@ -41,9 +51,10 @@ class SlotSet(ContactSet):
             gather, one more item of the set is what they read in slots that are not theirs.
           size: Lanes of a block.
           gathers: Whether lanes read items of their own as fast as a common one: on GPUs.
+          remembers: Numbers that are kept of each slot beside its contact, see `remembered`.
         """
         super().__init__(scene, name, rows * (slots + 1) + int(gathers), 1, size)
-        self.rows, self.slots, self.gathers = rows, slots, gathers
+        self.rows, self.slots, self.gathers, self.remembers = rows, slots, gathers, remembers
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """The set's part of the scratch table."""
@@ -51,7 +62,8 @@ class SlotSet(ContactSet):
 
     def fields(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """What is kept of each slot."""
-        more = {f"{self.name}.{field}": (self.count, (n, 1)) for field, n in self.more.items()}
+        fields = self.more | dict.fromkeys(self.remembers, 1)
+        more = {f"{self.name}.{field}": (self.count, (n, 1)) for field, n in fields.items()}
         return super().groups() | more
 
     more: dict[str, int] = {}
@@ -166,6 +178,15 @@ class BoundSlots(BoundContacts):
         self._counts = before.masked(busy)
         yield
         self._counts = before
+
+    def remembered(self, numbers: dict[str, Any]) -> dict[str, Lanes]:
+        """Fields of the numbers, the same or different on the lanes, that the set remembers."""
+        none = jnp.zeros((self.set.size,), self.ref.dtype)
+        return {
+            name: lanes([none + jnp.asarray(number).astype(none.dtype)], (1, 1), wide=True)
+            for name, number in numbers.items()
+            if name in self.set.remembers
+        }
 
     def overflow(self) -> jax.Array:
         """One for lanes that had too few slots in any row, else zero, shape (lane,)."""

@@ -42,6 +42,20 @@ if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.program import Program
 
 
+PALM_CONSTANTS = (
+    "palm_mass",
+    "palm_centre",
+    "palm_inertia",
+    "wrist_damping",
+    "wrist_armature",
+    "object_mass",
+    "object_inertia",
+    "wrist_stiffness",
+    "gravity",
+)
+"""Constants of the worlds that `palm_and_object` takes, in its order; some scenes lack the last."""
+
+
 class Step:
     """One time step of a block."""
 
@@ -123,46 +137,22 @@ class Step:
 
     def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
         """Kinematics, inertia and smooth forces of palm, wrist and object."""
-        names = ("palm_mass", "palm_centre", "palm_inertia", "wrist_damping", "wrist_armature")
-        constants = self.constants(*names, "object_mass", "object_inertia")
-        constants += [self.constant("wrist_stiffness") if self.p.scene.effects.wrist else None]
-        constants += [self.gravity()]
-        wrist, h = self.p.scene.effects.wrist, self.p.scene.discretization.timestep
+        names = self.p.world.groups
+        constants = [self.constant(n) if n in names else None for n in PALM_CONSTANTS]
+        timestep = self.p.scene.discretization.timestep
 
-        def compute(state, arm, mass, centre, tensor, damping, armature, obj, principal, k, g):
-            s = State(**{k: state.get(k) for k in State._fields})
-            place = kin._place(s)
-            frame, axes, vel, bias = kin._wrist(place, s.wrist, s.wrist_vel)
-            columns, object_vel = kin._object(s)
-            turned = inertia.turned_tensor(frame, tensor)
-            palm = Body(mass, place + apply_columns(frame, centre), turned)
-            thing = Centred(obj, inertia.principal_tensor(columns, principal))
-            spring = -damping * state["wrist_vel"]
-            if k is not None:
-                spring = k * (arm - state["wrist"]) + spring
-            acc = state["acc_wrist"], state["acc_object"]
-            if not wrist:
-                acc = rigid_arm(arm, state["wrist"], state["wrist_vel"], h), acc[1]
-            return {
-                "place": place,
-                "frame": frame,
-                "vel": vel,
-                "bias": bias,
-                "columns": columns,
-                "object_vel": object_vel,
-                "now": Iterate(acc[0], palm_motion(acc[0], axes), acc[1]),
-                "palm": Palm(
-                    palm,
-                    thing,
-                    palm.smooth_force(vel, bias, g),
-                    thing.smooth_force(object_vel, g),
-                    spring,
-                    armature,
-                    axes,
-                ),
-            }
+        def compute(state: dict, arm: jax.Array, *constants: Any) -> dict[str, Any]:
+            return palm_and_object(timestep, state, arm, *constants)
 
         return lanewise(compute, state, arm, *constants)
+
+    def keep(self, i: Any, chain: tuple) -> None:
+        """Called with origin, frame, velocity, bias and motion of the link before each joint.
+
+        Args:
+          i: The joint; the number of links for the last link.
+          chain: What the forward pass carries from link to link.
+        """
 
     def _forward(self, state: dict, at: dict, pressure: Lanes, m: Memory, thing: WorldObject):
         """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
@@ -175,7 +165,7 @@ class Step:
         mount, base, share, stub = (
             p.hand.read(self.hand, n) for n in ("mount", "base", "share", "stub_centre")
         )
-        frame, origin = lanewise(kin._mount, at["place"], at["frame"], mount, base)
+        frame, origin = lanewise(kin.mounted, at["place"], at["frame"], mount, base)
         weight = lanewise(
             lambda x, f, s, share: share * (x + apply_columns(f, s)),
             at["place"], at["frame"], stub, share,
@@ -194,6 +184,7 @@ class Step:
 
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, motion, middle = carry
+            self.keep(i, carry[:5])
             before = Side(frame, motion, vel)
             names = ("offset", "mass", "centre", "inertia", "stiffness", "damping")
             constants = [p.hand.read(self.hand, n, i) for n in names]
@@ -206,7 +197,7 @@ class Step:
                 for n in ("finger", "finger_vel", "acc")
             ]
             out = lanewise(
-                partial(_link, self.p.lay.axes),
+                partial(link_forces, self.p.lay.axes),
                 (origin, frame, vel, bias, motion),
                 constants,
                 joint,
@@ -226,7 +217,8 @@ class Step:
             return (*carry, middle)
 
         start = (origin, frame, vel, bias, motion, weight)
-        origin, frame, vel, _, motion, middle = loop(p.links, link, start, p.size)
+        origin, frame, vel, bias, motion, middle = loop(p.links, link, start, p.size)
+        self.keep(p.links, (origin, frame, vel, bias, motion))
         if skin:
             tip = Side(frame, motion, vel)
             skin.row(p.links, origin, tip, tip)
@@ -249,8 +241,65 @@ class Step:
         return lanewise(sphere_on_table, height, centre, radius)
 
 
-def _link(names: tuple[str, ...], parent, constants, joint, forces):
-    """A link's kinematics, inertia and forces."""
+def palm_and_object(
+    timestep: float, state: dict, arm, mass, centre, tensor, damping, armature, obj, principal, k, g
+) -> dict[str, Any]:
+    """Geometry, motion, inertia and smooth forces of palm, wrist and object.
+
+    Args:
+      timestep: Time step [s].
+      state: The state by name.
+      arm: Commands of the arm frame, shape (6, ...).
+      mass: The first of `PALM_CONSTANTS`; the others follow in their order.
+      centre: See there, and so on.
+      tensor: Inertia tensor.
+      damping: Of the wrist.
+      armature: Of the wrist.
+      obj: Mass of the object.
+      principal: Its principal inertia.
+      k: Stiffness of the wrist; None for a rigid arm, whose accelerations follow from the commands.
+      g: Magnitude of gravity; None without the effect.
+    """
+    s = State(**{k: state.get(k) for k in State._fields})
+    place = kin._place(s)
+    frame, axes, vel, bias = kin._wrist(place, s.wrist, s.wrist_vel)
+    columns, object_vel = kin._object(s)
+    turned = inertia.turned_tensor(frame, tensor)
+    palm = Body(mass, place + apply_columns(frame, centre), turned)
+    thing = Centred(obj, inertia.principal_tensor(columns, principal))
+    spring = -damping * state["wrist_vel"]
+    if k is not None:
+        spring = k * (arm - state["wrist"]) + spring
+    acc = state["acc_wrist"], state["acc_object"]
+    if k is None:
+        acc = rigid_arm(arm, state["wrist"], state["wrist_vel"], timestep), acc[1]
+    now = Iterate(acc[0], palm_motion(acc[0], axes), acc[1])
+    smooth = palm.smooth_force(vel, bias, g), thing.smooth_force(object_vel, g)
+    return {
+        "place": place,
+        "frame": frame,
+        "vel": vel,
+        "bias": bias,
+        "columns": columns,
+        "object_vel": object_vel,
+        "now": now,
+        "palm": Palm(palm, thing, *smooth, spring, armature, axes),
+    }
+
+
+def link_forces(names: tuple[str, ...], parent: tuple, constants: Any, joint: Any, forces: Any):
+    """A link's kinematics, inertia and forces.
+
+    Args:
+      names: Names of a joint's axes.
+      parent: Origin, frame, velocity, bias and motion of the link before it.
+      constants: Offset, mass, centre, inertia, stiffness and damping.
+      joint: Angles, velocities and accelerations of the joint before it.
+      forces: Gain and pressure of the chamber, the section or None, gravity or None.
+
+    Returns:
+      Origin, frame, velocity, bias and motion of the link, and what the solver needs, by name.
+    """
     gain, pressure, section, gravity = forces
     origin, frame, vel, bias, motion = parent
     offset, mass, centre, principal, stiffness, damping = constants

@@ -29,6 +29,9 @@ class Tables:
       hand: Rows of the hand's table; likewise `world`, `finger_state`, `world_state`, `scratch`.
     """
 
+    remembers: dict[str, tuple[str, ...]] = {"hull": (), "pairs": ()}
+    """Further numbers of the slots of the hull and of contacts between fingers."""
+
     def __init__(self, scene: Scene, *, backend: str, width: int):
         """Lays out the memory, see `Program`."""
         self.backend = backend
@@ -57,8 +60,8 @@ class Tables:
             sets += [self._skin(name) for name in on if on[name]]
         if e.finger_finger and self.num_fingers > 1:
             block, slots = (self.fingers, self.block), pair_slots(self.scene)
-            gathers = self.backend in GATHERING
-            sets.append(PairSet(self.scene, block, self.links, slots, gathers=gathers))
+            how = {"gathers": self.backend in GATHERING, "remembers": self.remembers["pairs"]}
+            sets.append(PairSet(self.scene, block, self.links, slots, **how))
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
         on_table = [make("object_table", -(-4 // self.fingers), 1)] if e.object_table else []
@@ -67,7 +70,7 @@ class Tables:
     def _skin(self, name: str) -> HullSet:
         slots, gathers = hull_slots(self.scene), self.backend in GATHERING
         how = name, self.links + 1, slots, self.size
-        return HullSet(self.scene, *how, gathers=gathers)
+        return HullSet(self.scene, *how, gathers=gathers, remembers=self.remembers["hull"])
 
     def _tables(self) -> None:
         n, a = self.links, self.axes

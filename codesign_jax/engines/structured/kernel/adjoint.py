@@ -1,0 +1,237 @@
+"""The reverse-mode derivative of a whole rollout as one kernel.
+
+It goes through the recorded steps backwards, with the forward kernel's own functions and tables,
+and leaves the cotangents of the forward kernel's arguments.  A block begins at the last step that
+any of its worlds took.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+
+from codesign_jax.compiler import cache
+from codesign_jax.compiler.launch import Kernel, kernel_jaxpr, launch
+from codesign_jax.engines.structured.kernel.bars import STEP, Bars
+from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
+from codesign_jax.engines.structured.kernel.pairs import PairSet
+from codesign_jax.engines.structured.kernel.powers import Place
+from codesign_jax.engines.structured.kernel.program import PACKAGE, UNRELATED, Program, block_spec
+from codesign_jax.engines.structured.kernel.reverse import ReverseStep, Shown
+from codesign_jax.engines.structured.kernel.sweep import SHAPES
+from codesign_jax.engines.structured.lanewise import lanes
+
+
+class Path(NamedTuple):
+    """What the reverse pass reads of a rollout, with a leading world axis.
+
+    In a kernel the rows are those of blocks, see `Packing.by_block`.
+
+    Attributes:
+      finger: Fingers' state before the steps that are recorded, shape (world, time, row, finger).
+      world: Wrist and object alike, shape (world, time, row, 1).
+      finger_end: The same after the last step, shape (world, 1, row, finger).
+      world_end: Likewise.
+      taken: Number of steps that each world took, shape (world, 1, 1, 1).
+    """
+
+    finger: jax.Array
+    world: jax.Array
+    finger_end: jax.Array
+    world_end: jax.Array
+    taken: jax.Array
+
+
+def recorded(out: Any, taken: jax.Array) -> Path:
+    """What `Program.execute` has recorded in blocks; `taken` as in `Path`, of blocks."""
+    finger_end, world_end = out[0][:, None], out[1][:, None]
+    return Path(out[-2], out[-1], finger_end, world_end, taken)
+
+
+class Cotangents(NamedTuple):
+    """Cotangents of a rollout's results, laid out as `Path`.
+
+    Attributes:
+      finger: Of the fingers' state at the end, shape (world, 1, row, finger).
+      world: Of wrist and object at the end, shape (world, 1, row, 1).
+      trace: Of distance, height and speed, shape (world, time, 3, 1).
+      path: Of the positions at every step, (world, time, row, finger) and (world, time, row, 1);
+        none without a trajectory.
+    """
+
+    finger: jax.Array
+    world: jax.Array
+    trace: jax.Array
+    path: tuple[jax.Array, ...] = ()
+
+
+class AdjointProgram(Program):
+    """Tables and kernel of a rollout's derivative."""
+
+    remembers = {"hull": ("vertex",), "pairs": ("owner", "sphere")}
+
+    def _tables(self) -> None:
+        super()._tables()
+        n, a = self.links, self.axes
+        more = {f"chain.{k}": (n + 1, shape) for k, shape in SHAPES._asdict().items()}
+        more |= {"acc_bar": (n, (a,)), "virtual": (n, (a,))}
+        more |= {f"bar.{k}": (1, shape) for k, shape in STEP.items()}
+        if any(isinstance(s, PairSet) for s in self.sets):
+            more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in Place._fields}
+        self.scratch = MemoryLayout.by_item(True, **(self.scratch.groups | more))
+        self.world_bars = MemoryLayout(True, **self.world.groups)
+
+    def adjoint(self, inputs: tuple, path: Path, bars: Cotangents) -> tuple:
+        """Cotangents of `Program.inputs`; where a world took no step they need not be numbers.
+
+        Args:
+          inputs: As in `Program.execute`.
+          path: The steps, as tables of blocks.
+          bars: Cotangents of the results, as tables of blocks.
+        """
+        given = self._arguments(inputs, path, bars)
+        call, outputs = self._adjoint_call(given)
+        if self.backend == "interpreter":
+            found = call(*given)[:6]
+        else:
+            code = cache.sources(PACKAGE, UNRELATED)
+            origin = repr((self.scene.structure, "adjoint", code))
+            shared = (len(given) - 1,) if self.meshes else ()
+            kernel = Kernel(origin, self.backend, self.size, shared, scratch=(6, 7, 8))
+            found = launch(call, given, outputs, kernel)[:6]
+        hand, world, *rest = cast("list[jax.Array]", found)
+        # A number of a world has a cotangent on each of its fingers' lanes.
+        world = world.reshape(*world.shape[:2], self.fingers, self.block).sum(2)
+        grid = (jnp.zeros_like(inputs[-1]),) if self.meshes else ()
+        return hand, world, *rest, *grid
+
+    def sound(self, bars: tuple, taken: jax.Array) -> tuple:
+        """Cotangents of the inputs, zero for worlds that took no step; `taken` as in `Path`."""
+        some = self.by_block(taken)[:, 0] > 0
+        lane = jnp.tile(some, (1, 1, self.fingers))
+        masks = lane, some, lane, some, some[:, None], lane
+        found = [jnp.where(mask, x, 0.0) for mask, x in zip(masks, bars, strict=False)]
+        return (*found, *bars[6:])
+
+    def adjoint_jaxpr(self, inputs: tuple, path: Path, bars: Cotangents) -> Any:
+        """The jaxpr of a block of the kernel; arguments may be `jax.ShapeDtypeStruct`."""
+        given = self._arguments(inputs, path, bars)
+        return kernel_jaxpr(self._adjoint_call(given)[0], list(given))
+
+    @staticmethod
+    def _arguments(inputs: tuple, path: Path, bars: Cotangents) -> tuple:
+        hand, world, _, _, arm, pressure, *grid = inputs
+        ends = bars.finger, bars.world, bars.trace, *bars.path
+        return (hand, world, arm, pressure, *path, *ends, *grid)
+
+    def _adjoint_call(self, given: tuple) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
+        blocks, steps, dtype = given[0].shape[0], given[2].shape[1], given[2].dtype
+        shapes = [
+            (blocks, self.hand.rows, self.size),
+            (blocks, self.world_bars.rows, self.size),
+            (blocks, self.finger_state.rows, self.size),
+            (blocks, self.world_state.rows, self.block),
+            (blocks, steps, 6, self.block),
+            (blocks, steps, self.size),
+            # Scratch memory: that of a step, and the state before it.
+            (blocks, self.scratch.rows, self.size),
+            (blocks, self.finger_state.rows, self.size),
+            (blocks, self.world_state.rows, self.block),
+        ]
+        trajectory = len(given) - int(self.meshes) > 12
+        outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
+        call = pl.pallas_call(
+            partial(self._adjoint_kernel, steps, trajectory),
+            grid=(blocks,),
+            in_specs=[block_spec(x.shape, blocks) for x in given],
+            out_specs=[block_spec(s, blocks) for s in shapes],
+            out_shape=outputs,
+            interpret=self.backend == "interpreter",
+            name="grasp_adjoint",
+        )
+        return call, outputs
+
+    def _adjoint_kernel(self, steps: int, trajectory: bool, *refs: Any) -> None:
+        hand, world, arm, pressure, *rest = refs
+        *states, taken, finger_seed, world_seed, trace = rest[:8]
+        rest = rest[8:]
+        path = [rest.pop(0), rest.pop(0)] if trajectory else []
+        grid = rest.pop(0) if self.meshes else None
+        hand_bar, world_bar, finger_bar, state_bar, arm_bar, pressure_bar, *rest = rest
+        scratch, finger_state, world_state = rest
+        block = Block(self.fingers, self.block)
+        own, none = block.world, jnp.zeros((self.size,), scratch.dtype)
+        bars = Bars(self, block, (hand_bar, world_bar, finger_bar, state_bar), scratch)
+        tables = hand, world, finger_state, world_state, scratch, grid
+        step = ReverseStep(self, block, tables, bars)
+        bars.clear()
+        copy_rows((0, self.finger_state.rows), lambda k: finger_seed[(0, k)], finger_bar)
+        copy_rows((0, self.world_state.rows), lambda k: world_seed[0, k, own], state_bar, own)
+        count = taken[0, 0, own]
+        last = jnp.minimum(jnp.max(count.astype(jnp.int32)), steps - 1)
+
+        def quiet(t: jax.Array, x: jax.Array) -> jax.Array:
+            for k in range(6):
+                arm_bar[t, k, own] = none
+            pressure_bar[(t, slice(None))] = none
+            return x
+
+        def reverse(back: jax.Array, x: jax.Array) -> jax.Array:
+            t = last - back
+            moved = t.astype(count.dtype) < count
+            self._load(t, steps, moved, states, (finger_state, world_state), own)
+            commands = [jnp.where(moved, arm[t, k, own], 0.0) for k in range(6)]
+            chamber = jnp.where(moved, pressure[(t,)], 0.0)
+            shown = Shown(*(trace[t, k, own] for k in range(3)))
+            arms = step.reverse(
+                lanes(commands, (6,), wide=False), lanes([chamber], (), wide=True), moved, shown
+            )
+            for k in range(6):
+                arm_bar[t, k, own] = jnp.where(moved, arms[k].lane, 0.0)
+            pressure_bar[(t, slice(None))] = jnp.where(moved, bars.of_step("pressure").lane, 0.0)
+            if path:
+                angles, places = self.path_rows(states=False)
+                copy_rows((0, angles), lambda k: finger_bar[(k,)] + path[0][(t, k)], finger_bar)
+                rows = lambda k: state_bar[k, own] + path[1][t, k, own]  # noqa: E731
+                copy_rows((0, places), rows, state_bar, own)
+            return x
+
+        jax.lax.fori_loop(last + 1, steps, quiet, jnp.int32(0))
+        jax.lax.fori_loop(0, last + 1, reverse, jnp.int32(0))
+
+    def _load(self, t: Any, steps: int, moved: Any, states: list, target: tuple, own: Any) -> None:
+        """Loads the state before a step, with the step's accelerations.
+
+        A recorded row has the acceleration of the step before it, the solver's warm start.  Where a
+        world stands still they are of no use, nor need they be numbers.
+        """
+        fingers, worlds, finger_end, world_end = states
+        after, more = jnp.minimum(t + 1, steps - 1), t + 1 < steps
+        first = self.finger_state.offset["acc"], self.world_state.offset["acc_wrist"]
+        ends = self.finger_state.rows, self.world_state.rows
+
+        def of_finger(k: jax.Array) -> jax.Array:
+            acc = jnp.where(more, fingers[(after, k)], finger_end[(0, k)])
+            return jnp.where(moved, acc, 0.0)
+
+        def of_world(k: jax.Array) -> jax.Array:
+            acc = jnp.where(more, worlds[after, k, own], world_end[0, k, own])
+            return jnp.where(moved, acc, 0.0)
+
+        copy_rows((0, first[0]), lambda k: fingers[(t, k)], target[0])
+        copy_rows((0, first[1]), lambda k: worlds[t, k, own], target[1], own)
+        copy_rows((first[0], ends[0]), of_finger, target[0])
+        copy_rows((first[1], ends[1]), of_world, target[1], own)
+
+
+def copy_rows(rows: tuple[int, int], read: Callable, target: Any, *where: jax.Array) -> None:
+    """Stores read(row) in the rows of a table; where: the world of each lane, if it has."""
+
+    def one(k: jax.Array, x: jax.Array) -> jax.Array:
+        target[(k, *where)] = read(k)
+        return x
+
+    jax.lax.fori_loop(*rows, one, jnp.int32(0))

@@ -1,0 +1,306 @@
+"""Powers of the forces of a step along virtual accelerations: what its derivative is taken of.
+
+The accelerations a of a step solve F(a, theta) = 0, see `transforms`; with virtual accelerations
+lambda the derivative by theta is that of the scalar -lambda' F, a sum over links, contacts, palm
+and object.  Here is what each of them adds, as a function of one link or of the contacts of one
+item, over arrays as in `lanewise`, made of the functions that the forward pass calls.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import collision, contact
+from codesign_jax.engines.structured.cones import which_cone
+from codesign_jax.engines.structured.constants import apply_columns
+from codesign_jax.engines.structured.contact import Contacts
+from codesign_jax.engines.structured.kernel import hull, objects, sections
+from codesign_jax.engines.structured.kernel.contacts import cone_of, sphere_on_table
+from codesign_jax.engines.structured.kernel.problem import make_body
+from codesign_jax.engines.structured.kernel.slots import HullSet
+from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
+from codesign_jax.engines.structured.lanes import dot, sum_axis
+from codesign_jax.engines.structured.problem import next_motion, palm_motion
+from codesign_jax.scene import Scene
+
+
+class Chain(NamedTuple):
+    """What the links of a finger inherit from one another.
+
+    Attributes:
+      origin: Place of the link's frame, shape (3, ...).
+      frame: Columns of its orientation, shape (3, 3, ...).
+      vel: Spatial velocity, shape (6, ...).
+      bias: Spatial acceleration at zero joint acceleration, same shape.
+      motion: Spatial acceleration without velocity terms, same shape.
+      along: Virtual spatial acceleration, same shape.
+    """
+
+    origin: Any
+    frame: Any
+    vel: Any
+    bias: Any
+    motion: Any
+    along: Any
+
+
+class Place(NamedTuple):
+    """A body with contacts: as `Chain`."""
+
+    origin: Any
+    frame: Any
+    vel: Any
+    motion: Any
+    along: Any
+
+
+class RowSide(NamedTuple):
+    """A link as the vertices of a row of the hull follow it: as `Chain`."""
+
+    frame: Any
+    vel: Any
+    motion: Any
+    along: Any
+
+
+def of_contacts(contacts: Contacts, vel: jax.Array, motion: jax.Array, along: jax.Array):
+    """Power of contacts for relative motions, (6 or 9, ...), with an axis for the items."""
+    jar = contacts.relative(motion) - contacts.reference(contacts.relative(vel))
+    force = contact.constraint_update(contacts, jar).force
+    return sum_axis(dot(force, contacts.relative(along)), 0)
+
+
+def geometry(scene: Scene, name: str, centre, radius, at: dict, still: dict):
+    """Point, normal and gap of points of the hand on the object or the table."""
+    if not name.endswith("_object"):
+        return sphere_on_table(at["height"], centre, radius)
+    local = collision.in_object(at["columns"], centre)
+    distance, gradient = objects.distance_of(scene, local, at, still)
+    point, normal, gap = collision.on_surface(at["columns"], centre, radius, distance, gradient)
+    return point, normal, gap[None]
+
+
+def sphere_centre(place: Place, sphere: jax.Array) -> jax.Array:
+    """Centres (3, k, ...) of a body's spheres."""
+    return place.origin[:, None] + apply_columns(place.frame[:, :, None], sphere)
+
+
+def of_spheres(
+    scene: Scene, name: str, place: Place, sphere, radius, at: dict, still: dict
+) -> jax.Array:
+    """Power of the contacts of a link's or the palm's spheres.
+
+    Args:
+      scene: The scene.
+      name: Pair of bodies, as in `problem.relative`.
+      place: The body.
+      sphere: Centres of its spheres in its frame, shape (3, k, ...).
+      radius: Their radii, shape (k, ...).
+      at: The object and the constants of the contacts, by name.
+      still: What has no derivative here: accelerations, indices and values of grids.
+    """
+    point, normal, gap = geometry(scene, name, sphere_centre(place, sphere), radius, at, still)
+    moves = _from_object(name, place[2:], at, still)
+    return of_contacts(
+        Contacts(point, normal, gap[0], _cone(scene, name, at)), *(m[:, None] for m in moves)
+    )
+
+
+def vertex_point(vertex, joint, before: RowSide, after: RowSide):
+    """Place of a vertex of the hull, shape (3, 1, ...)."""
+    return hull.placed(vertex, joint, before.frame, after.frame)[0]
+
+
+def of_vertex(
+    scene: Scene, name: str, vertex, joint, before: RowSide, after: RowSide, at: dict, still: dict
+) -> jax.Array:
+    """Power of a vertex of the hull.
+
+    Args:
+      scene: The scene.
+      name: Pair of bodies, as in `problem.relative`.
+      vertex: Place, weight and share, shape (5, ...).
+      joint: Place of its row's joint.
+      before: The link before it.
+      after: The link behind it.
+      at: As in `of_spheres`.
+      still: As in `of_spheres`.
+    """
+    point, image, weight, share = hull.placed(vertex, joint, before.frame, after.frame)
+    where, normal, gap = geometry(scene, name, point, 0.0, at, still)
+    lever = hull.lever(weight, image, where, point)
+    contacts = HullSet.contacts((where, normal, gap, lever, share), _cone(scene, name, at))
+    first = _from_object(name, before[1:], at, still)
+    turning = [b[:3] - a[:3] for a, b in zip(before[1:], after[1:], strict=True)]
+    moves = [jnp.concatenate(m)[:, None] for m in zip(first, turning, strict=True)]
+    return of_contacts(contacts, *moves)
+
+
+def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dict) -> jax.Array:
+    """Power of the object's points on the table that an item deals to the fingers' lanes.
+
+    Args:
+      scene: The scene.
+      fingers: Fingers of a block.
+      item: The item.
+      at: As in `of_spheres`.
+      finger: Number of each lane's finger.
+      still: As in `of_spheres`, with the motions of the object.
+    """
+    arms = objects.points_of(scene, at, still)
+    places = collision.on_table(arms, at["height"])
+    dealt = []
+    for place in places:
+        lane = jnp.zeros_like(place[..., 0, None, :]) + 0 * finger
+        for k in range(item * fingers, min((item + 1) * fingers, 4)):
+            lane = jnp.where(finger == k - item * fingers, place[..., k, None, :], lane)
+        dealt.append(lane)
+    point, normal, gap = dealt
+    used = finger < 4 - item * fingers
+    contacts = Contacts(
+        point[:, None], normal[:, None], jnp.where(used, gap, 1.0)[None], _cone(scene, TABLE, at)
+    )
+    moves = at["object_vel"], still["object_motion"], still["object_along"]
+    return of_contacts(contacts, *(m[:, None] for m in moves))
+
+
+TABLE = "object_table"
+
+
+def of_link(axes, chain: Chain, numbers: dict, joint: dict, still: dict):
+    """What a link hands on, and its power.
+
+    Args:
+      axes: Names of a joint's axes.
+      chain: What it inherits.
+      numbers: Its constants, the finger's and the worlds', by name.
+      joint: Angles and velocities of the joint before it, and the chamber's pressure, by name.
+      still: Accelerations and virtual accelerations of the joint, and the cotangent of the centre
+        of mass.
+    """
+    constants = [numbers[n] for n in LINK]
+    at = joint["finger"], joint["finger_vel"], still["acc"]
+    forces = (
+        numbers["gain"], joint["pressure"], numbers.get("section"), numbers.get("gravity")
+    )  # fmt: skip
+    after, found = link_forces(axes, chain[:5], constants, at, forces)
+    along = next_motion(chain.along, found["axes"], still["virtual"])
+    body = make_body(numbers["mass"], found["body_centre"], found["tensor"])
+    inertial = numbers["armature"] * still["acc"] - found["tau"]
+    power = dot(body.times(after[4]) - found["smooth"], along) + dot(inertial, still["virtual"])
+    return Chain(*after, along), dot(still["centre_bar"], found["body_centre"]) - power
+
+
+LINK = ("offset", "mass", "centre", "inertia", "stiffness", "damping")
+"""Constants of a link in the order of `step.link_forces`."""
+
+
+def of_palm(timestep: float, state: dict, arm, constants: list, still: dict) -> tuple:
+    """Geometry and motions of palm and object, and the power of palm, wrist and object.
+
+    Args:
+      timestep: Time step [s].
+      state: Positions and velocities of wrist and object, by name.
+      arm: Commands of the arm frame.
+      constants: See `step.PALM_CONSTANTS`.
+      still: Accelerations of wrist and object, and their virtual ones.
+    """
+    given = {name: still[name] for name in ("acc_wrist", "acc_object")}
+    found = palm_and_object(timestep, state | given, arm, *constants)
+    palm, now, virtual = found["palm"], found["now"], still["virtual_wrist"]
+    along = palm_motion(virtual, palm.axes)
+    power = dot(palm.palm.times(now.palm_motion) - palm.smooth_palm, along)
+    object_force = palm.object.times(now.object_motion) - palm.smooth_object
+    power = power + dot(object_force, still["object_along"])
+    power = power + dot(palm.armature * now.wrist - palm.smooth_wrist, virtual)
+    place = Chain(
+        found["place"], found["frame"], found["vel"], found["bias"], now.palm_motion, along
+    )
+    height = state["position"][2]
+    return place, found["columns"], found["object_vel"], height, now.wrist, -power
+
+
+def sphere_ball(place: Place, sphere, radius, which):
+    """Centre and radius (4, ...) of one of a link's spheres; which: its number."""
+    centre = place.origin + apply_columns(place.frame, _item(sphere, which))
+    return jnp.concatenate([centre, _item(radius[None], which)])
+
+
+def between_spheres(
+    scene: Scene,
+    mine: tuple[Place, Any, Any],
+    theirs: tuple[Place, Any, Any],
+    numbers: Any,
+    which: tuple,
+) -> jax.Array:
+    """Power of two fingers' spheres on one another.
+
+    Args:
+      scene: The scene.
+      mine: Link, and centres and radii of its spheres, on the lane's own side.
+      theirs: The same of the other finger.
+      numbers: Numbers of the cone.
+      which: Number of the sphere on either link.
+    """
+    balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
+    one, other = sections.between(*balls)
+    cone = cone_of(scene.effects.friction, numbers)
+    ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in (one, other)]
+    return _between(ends, mine[0][2:], theirs[0][2:])
+
+
+def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
+    """What a vertex of the own row adds to `sections.pressure` of another finger's row.
+
+    Args:
+      vertex: Place, weight and share of the vertex.
+      mine: Joint of its row, frames of the links before and behind it, and half sizes.
+      theirs: The same of the other row.
+      last: Whether the other row is the last one, see `sections.inside`.
+    """
+    *own, _ = mine
+    *other, size = theirs
+    none = jnp.zeros((sections.SUMS, *own[0].shape[1:]), own[0].dtype)
+    return sections.add_vertex(none, *sections.inside(vertex, tuple(own), tuple(other), size, last))
+
+
+def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
+    """Power of a row on another finger's row; mine and theirs: sides before and behind."""
+    cone = cone_of(scene.effects.friction, numbers)
+    ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
+    moves = [
+        [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
+        for before, after in (mine, theirs)
+    ]
+    return _between(ends, *moves)
+
+
+def _between(ends: list[Contacts], mine: Any, theirs: Any) -> jax.Array:
+    one, other = ends
+    vel, motion, along = (
+        one.relative(a[:, None]) - other.relative(b[:, None])
+        for a, b in zip(mine, theirs, strict=True)
+    )
+    force = contact.constraint_update(one, motion - one.reference(vel)).force
+    return sum_axis(dot(force, along), 0)
+
+
+def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:
+    """Velocity, acceleration and virtual acceleration from the object's, if it is touched."""
+    if not name.endswith("_object"):
+        return list(moves)
+    obj = at["object_vel"], still["object_motion"], still["object_along"]
+    return [m - o for m, o in zip(moves, obj, strict=True)]
+
+
+def _cone(scene: Scene, name: str, at: dict) -> contact.Cone:
+    return cone_of(scene.effects.friction, at[f"cone.{which_cone(name)}"])
+
+
+def _item(values: jax.Array, which: jax.Array) -> jax.Array:
+    """The item of a number, of values (component, k, ...)."""
+    found = values[:, 0]
+    for k in range(1, values.shape[1]):
+        found = jnp.where(which == k, values[:, k], found)
+    return found

@@ -1,0 +1,272 @@
+"""The reverse pass of a step through palm, fingers and contacts, from the tips inwards."""
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured import collision
+from codesign_jax.engines.structured.cones import which_cone
+from codesign_jax.engines.structured.constants import apply_columns
+from codesign_jax.engines.structured.kernel import objects, powers
+from codesign_jax.engines.structured.kernel.bars import Bars
+from codesign_jax.engines.structured.kernel.contacts import zeros
+from codesign_jax.engines.structured.kernel.memory import choose, loop
+from codesign_jax.engines.structured.kernel.objects import WorldObject
+from codesign_jax.engines.structured.kernel.powers import Chain, Place, RowSide
+from codesign_jax.engines.structured.kernel.problem import Iterate, Memory
+from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
+from codesign_jax.engines.structured.kernel.slots import BoundSlots
+from codesign_jax.engines.structured.kinematics import mounted
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+
+if TYPE_CHECKING:
+    from codesign_jax.engines.structured.kernel.step import Step
+
+SHAPES = Chain((3,), (3, 3), (6,), (6,), (6,), (6,))
+
+
+class Sweep:
+    """Adds a step's part of the cotangents, given its virtual accelerations."""
+
+    def __init__(
+        self,
+        step: "Step",
+        m: Memory,
+        state: dict[str, Lanes],
+        at: dict[str, Any],
+        thing: WorldObject,
+        virtual: Iterate,
+        bars: Bars,
+    ):
+        """Takes a step's memory and geometry as the forward pass has left them, see `Step`.
+
+        Args:
+          step: The step.
+          m: Its memory.
+          state: Positions and velocities of wrist and object.
+          at: What `Step` calculates of palm and object.
+          thing: The objects.
+          virtual: Virtual accelerations, see `Virtual.solve`.
+          bars: The cotangents so far.
+        """
+        self.step, self.p, self.m, self.at, self.thing = step, step.p, m, at, thing
+        self.virtual, self.bars, self.block = virtual, bars, step.block
+        self.like = jnp.zeros((step.p.size,), step.finger_state.dtype)
+        self.one = lanes([self.like + 1.0], (), wide=True)
+        self.object = {"columns": at["columns"], "object_vel": at["object_vel"]}
+        self.object |= {"height": state["position"][2]}
+        names = ("object_size", "grid_origin", "grid_cell", "grid_factor")
+        self.object |= {n: step.constant(n) for n in names if n in step.p.world.groups}
+        self.still: dict[str, Any] = {"object_id": step.constant("object_id")}
+        self.still |= {"object_motion": at["now"].object_motion}
+        self.still |= {"object_along": virtual.object_motion}
+        if thing.mesh is not None:
+            self.still |= {n: step.constant(n) for n in ("grid_first", "grid_nodes")}
+            self.still |= {"meshed": thing.mesh.meshed}
+
+    def chain(self, i: Any) -> Chain:
+        """What the link before joint i hands on."""
+        names = (f"chain.{n}" for n in Chain._fields)
+        return Chain(*(self.m.scratch.read(self.m.scratch_ref, n, i) for n in names))
+
+    def fingers(self, pressure: Lanes, centre_bar: Lanes) -> Chain:
+        """Goes through the fingers from their tips, and through the contacts of their links.
+
+        Args:
+          pressure: Chamber pressures.
+          centre_bar: Cotangent of the sum of the segments' centres.
+
+        Returns:
+          Cotangents of what the palm hands on, on each finger's lanes.
+        """
+        p, tips = self.p, self.p.links
+        rows = [c for n, c in self.m.contacts.items() if n.startswith("hull_")]
+        touching = [n for n in ("finger_object", "finger_table") if n in self.m.contacts]
+
+        def link(i: Any, after: Chain) -> Chain:
+            found = [self.row(c, i) for c in rows]
+            for joint, _, behind in found:
+                after = _add(after, origin=joint, **behind._asdict())
+            if touching:
+                place = _place(self.chain(i + 1))
+                for name in touching:
+                    new = self.spheres(name, i, place, ("sphere", "radius"))
+                    after = _add(after, **new._asdict())
+            before = self._link(i, after, pressure, centre_bar)
+            for _, ahead, _ in found:
+                before = _add(before, **ahead._asdict())
+            return self.more(before, i)
+
+        after = Chain(*(zeros(shape, self.like) for shape in SHAPES))
+        for c in rows:
+            joint, ahead, behind = self.row(c, tips)
+            after = _add(_add(after, origin=joint, **ahead._asdict()), **behind._asdict())
+        after = self.more(after, tips)
+        base = loop(tips, link, after, p.size, reverse=True)
+        return self._mount(base, centre_bar)
+
+    def more(self, bars: Chain, i: Any) -> Chain:
+        """Adds what contacts between fingers have left for a link."""
+        if "pairbar.origin" not in self.p.scratch.groups:
+            return bars
+        read = partial(self.p.scratch.read, self.step.scratch)
+        return _add(bars, **{n: read(f"pairbar.{n}", i) for n in Place._fields})
+
+    def _link(self, i: Any, after: Chain, pressure: Lanes, centre_bar: Lanes) -> Chain:
+        p, hand = self.p, self.step.hand
+        names = [*powers.LINK, "armature"]
+        numbers = {n: p.hand.read(hand, n, i) for n in names} | {"gain": p.hand.read(hand, "gain")}
+        if p.scene.effects.neo_hookean:
+            numbers["section"] = p.hand.read(hand, "section")
+        if (gravity := self.step.gravity()) is not None:
+            numbers["gravity"] = gravity
+        angles, rates, acc = self._joint("finger", i), self._joint("finger_vel", i), None
+        acc = self._joint("acc", i)
+        joint = {"finger": angles, "finger_vel": rates, "pressure": pressure}
+        share = p.hand.read(hand, "share", i + 1)
+        still = {"acc": acc, "virtual": self.m.scratch.read(self.m.scratch_ref, "virtual", i)}
+        still["centre_bar"] = lanewise(jnp.multiply, centre_bar, share)
+        run = partial(powers.of_link, p.lay.axes)
+        before, own, moved = pull(run, (self.chain(i), numbers, joint), (still,), (after, self.one))
+        self.bars.add({n: own[n] for n in names}, i)
+        self.bars.add({n: v for n, v in own.items() if n not in names})
+        self.bars.add({"pressure": moved.pop("pressure")})
+        self.bars.add_joint(moved, i)
+        return before
+
+    def _joint(self, name: str, i: Any) -> Lanes:
+        return self.p.finger_state.read(self.step.finger_state, name, i)
+
+    def _mount(self, base: Chain, centre_bar: Lanes) -> Chain:
+        read = partial(self.p.hand.read, self.step.hand)
+        names = ("mount", "base", "stub_centre")
+        palm = self.at["place"], self.at["frame"]
+
+        def run(palm, mount, base, stub, weight):
+            place, frame = palm
+            turned, origin = mounted(place, frame, mount, base)
+            return turned, origin, dot_of(weight, place + apply_columns(frame, stub))
+
+        weight = lanewise(jnp.multiply, centre_bar, read("share"))
+        given = (palm, *(read(n) for n in names))
+        (place, frame), *own = pull(run, given, (weight,), (base.frame, base.origin, self.one))
+        self.bars.add(dict(zip(names, own, strict=True)))
+        return base._replace(origin=place, frame=frame)
+
+    # Contacts
+
+    def palm_and_table(self, base: Chain) -> Chain:
+        """Adds the contacts of the palm's spheres, and of the object with the table."""
+        names = [n for n in ("palm_object", "palm_table") if n in self.m.contacts]
+        at, now = self.at, self.at["now"]
+        place = Place(
+            at["place"], at["frame"], at["vel"], now.palm_motion, self.virtual.palm_motion
+        )
+        for i in range(self.p.palm_groups if names else 0):
+            for name in names:
+                new = self.spheres(name, i, place, ("palm_point", "palm_radius"))
+                base = _add(base, **new._asdict())
+        if powers.TABLE in self.m.contacts:
+            self._table()
+        return base
+
+    def spheres(self, name: str, i: Any, place: Place, constants: tuple[str, str]) -> Place:
+        """Cotangents of a body, of an item of the contacts of its spheres."""
+        given = [self.p.hand.read(self.step.hand, n, i) for n in constants]
+        at = self._object(name)
+
+        def compute() -> Place:
+            still = self.still
+            if "meshed" in still and name.endswith("_object"):
+                centre = lanewise(powers.sphere_centre, place, given[0])
+                still = still | {"values": self._values(centre)}
+            run = partial(powers.of_spheres, self.p.scene, name)
+            found, *own, shared = pull(run, (place, *given, at), (still,), self.one)
+            self.bars.add(dict(zip(constants, own, strict=True)), i)
+            self.bars.add(shared)
+            return found
+
+        empty = Place(*(zeros(getattr(SHAPES, n), self.like) for n in Place._fields))
+        return choose(self.m.contacts[name].touching(i), compute, empty, self.p.size)
+
+    def row(self, slots: BoundSlots, i: Any) -> tuple[Lanes, RowSide, RowSide]:
+        """Cotangents of a row's joint and of the links before and behind it."""
+        name, p, lane = slots.set.name, self.p, self.block.lane
+        behind = jnp.minimum(i + 1, p.links)
+        chains = self.chain(i), self.chain(behind)
+        sides = chains[1].origin, *(_side(c) for c in chains)
+        at, run = self._object(name), partial(powers.of_vertex, p.scene, name)
+
+        def add(slot: Any, sums: tuple) -> tuple:
+            item = slots.read("vertex", slot).lane.astype(jnp.int32)
+            vertex = p.hand.gather(self.step.hand, "vertex", item, lane)
+            live = lanes([slots.read("gap", slot).lane < 0], (), wide=True)
+            still = self.still
+            if "meshed" in still and slots.set.on_object:
+                point = lanewise(powers.vertex_point, vertex, *sides)
+                still = still | {"values": self._values(point)}
+            own, *found, shared = only_on(live, pull(run, (vertex, *sides, at), (still,), self.one))
+            self.bars.add({"vertex": own}, item, lane)
+            self.bars.add(shared)
+            return plus(sums, tuple(found))
+
+        side = RowSide(*(zeros(getattr(SHAPES, n), self.like) for n in RowSide._fields))
+        empty = zeros((3,), self.like), side, side
+        return choose(slots.used(i) > 0, lambda: slots.fold(i, add, empty), empty, p.size)
+
+    def _table(self) -> None:
+        contacts, p = self.m.contacts[powers.TABLE], self.p
+        finger = lanes([self.block.finger.astype(self.like.dtype)], (), wide=True)
+        at, still = self._object(powers.TABLE), self.still
+        if "meshed" in still:
+            factor, columns = self.object["grid_factor"], self.at["columns"]
+            points = objects.table_points(p.scene, self.thing, columns, self.object["height"])
+            still = still | {"factor": factor, "support": lanewise(_turned_back, columns, points)}
+        for i in range(contacts.set.count):
+
+            def compute(i: int = i) -> None:
+                run = partial(powers.of_table, p.scene, p.fingers, i)
+                (found,) = pull(run, (at,), (finger, still), self.one)
+                self.bars.add(found)
+
+            jax.lax.cond(contacts.touching(i), compute, lambda: None)
+
+    def _object(self, name: str) -> dict[str, Lanes]:
+        """What contacts of a pair of bodies depend on beside the hand, by name."""
+        cone = f"cone.{which_cone(name)}"
+        names = {"height"}
+        if not name.endswith("_table"):
+            names = set(self.object) - {"height"}
+        if name == powers.TABLE:
+            names = set(self.object) - {"grid_origin", "grid_cell"}
+        chosen = {n: v for n, v in self.object.items() if n in names}
+        return chosen | {cone: self.step.constant(cone)}
+
+    def _values(self, centre: Lanes) -> Lanes:
+        local = lanewise(collision.in_object, self.at["columns"], centre)
+        return objects.cell_values(self.thing, local)
+
+
+def dot_of(weight: jax.Array, vector: jax.Array) -> jax.Array:
+    """Product of two vectors (3, ...)."""
+    return sum(weight[k] * vector[k] for k in range(3))  # type: ignore[return-value]
+
+
+def _turned_back(columns: jax.Array, points: jax.Array) -> jax.Array:
+    """Points (3, point, world) along the world's axes in the object's frame."""
+    return collision.in_object(columns[:, :, 0], points)
+
+
+def _place(chain: Chain) -> Place:
+    return Place(*(getattr(chain, n) for n in Place._fields))
+
+
+def _side(chain: Chain) -> RowSide:
+    return RowSide(*(getattr(chain, n) for n in RowSide._fields))
+
+
+def _add(bars: Chain, **more: Lanes) -> Chain:
+    old = {n: getattr(bars, n) for n in more}
+    return bars._replace(**plus(old, more))

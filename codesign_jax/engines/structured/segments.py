@@ -1,0 +1,97 @@
+"""A rollout's reverse pass in segments, of whose steps only the first states were stored.
+
+The steps of a segment are simulated once more from its first state, by the kernel that simulated
+them before: their bits are the same, as a block's step depends on nothing but its state.
+"""
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.kernel import Program
+from codesign_jax.engines.structured.kernel.adjoint import (
+    AdjointProgram,
+    Cotangents,
+    Path,
+    recorded,
+)
+
+if TYPE_CHECKING:
+    from codesign_jax.engines.structured.engine import StructuredEngine
+
+
+def reverse(
+    engine: "StructuredEngine",
+    program: AdjointProgram,
+    inputs: tuple,
+    path: Path,
+    bars: Cotangents,
+    *,
+    trajectory: bool,
+) -> tuple:
+    """Cotangents of a rollout's inputs, see `AdjointProgram.adjoint`.
+
+    Args:
+      engine: The engine, which says how long segments are, if there are any.
+      program: The program of the derivative.
+      inputs: The rollout's inputs.
+      path: What was stored of it, as tables of blocks.
+      bars: Cotangents of its results, as tables of blocks.
+      trajectory: As in `Engine.rollout`.
+    """
+    if engine.segment is None:
+        return program.adjoint(inputs, path, bars)
+    size, (hand, world, _, _, arm, pressure, *grid) = engine.segment, inputs
+    steps, count = arm.shape[1], path.finger.shape[1]
+    again = Program(engine.scene, engine.limits, backend=program.backend, width=program.size)
+
+    def split(x: jax.Array) -> jax.Array:
+        """(block, time, ...) to (segment, block, time of the segment, ...)."""
+        x = jnp.pad(x, [(0, 0), (0, count * size - steps)] + [(0, 0)] * (x.ndim - 2))
+        return jnp.moveaxis(x.reshape(x.shape[0], count, size, *x.shape[2:]), 1, 0)
+
+    def segment(ends: tuple, given: tuple) -> tuple[tuple, tuple]:
+        number, start, commands, shown = given
+        taken = jnp.clip(path.taken - number * size, 0, size)
+        moved = _later(program, world, number * size, taken)
+        own = (hand, moved, *start, *commands, *grid)
+        out = again.execute(own, trajectory=trajectory, states=1)
+        here = recorded(out, taken)
+        cotangents = Cotangents(ends[0], ends[1], shown[0], shown[1:])
+        hand_bar, world_bar, *state, arm_bar, pressure_bar = program.adjoint(own, here, cotangents)[
+            :6
+        ]
+        state = [jnp.zeros_like(x) if engine.truncate else x for x in state]
+        return tuple(x[:, None] for x in state), (hand_bar, world_bar, arm_bar, pressure_bar)
+
+    every = jnp.arange(count, dtype=arm.dtype)
+    starts = tuple(jnp.moveaxis(x, 1, 0) for x in path[:2])
+    shown = tuple(split(x) for x in (bars.trace, *bars.path))
+    given = every, starts, (split(arm), split(pressure)), shown
+    ends, found = jax.lax.scan(segment, (bars.finger, bars.world), given, reverse=True)
+    hand_bar, world_bar, *commands = found
+
+    def join(x: jax.Array) -> jax.Array:
+        """Inverse of `split`."""
+        return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :steps]
+
+    state = (x[:, 0] for x in ends)
+    none = [jnp.zeros_like(x) for x in grid]
+    return hand_bar.sum(0), world_bar.sum(0), *state, *map(join, commands), *none
+
+
+def _later(program: Program, world: jax.Array, step: jax.Array, taken: jax.Array) -> jax.Array:
+    """The table of the worlds' constants for a rollout that begins at a later step.
+
+    Args:
+      program: Whose table it is.
+      world: The table, shape (block, row, world).
+      step: The step.
+      taken: Number of steps that each world takes from then on, shape (block, 1, 1, world).
+    """
+    row = jnp.arange(world.shape[1])[:, None]
+    place = program.world.offset
+    times = (row == place["start"]) | (row == place["end"])
+    alive = (taken[:, 0] > 0).astype(world.dtype)
+    return jnp.where(row == place["alive"], alive * world, jnp.where(times, world - step, world))

@@ -1,0 +1,91 @@
+"""A process that meets many structures drops programs before Linux ends it."""
+
+import itertools
+import types
+
+import jax
+import numpy as np
+import pytest
+
+from codesign_jax import codesign, make_engine, memory_maps, programs
+from codesign_jax.compiler.ffi import KernelUnavailable
+from codesign_jax.scene import parameters
+from tests import kernels, small
+
+
+def full(monkeypatch, share):
+    """The process has this share of the maps that it may have."""
+    monkeypatch.setattr(memory_maps, "count", lambda: int(share * memory_maps.most()))
+
+
+def test_the_system_tells_how_many_maps_there_are():
+    assert 100 < memory_maps.count() < memory_maps.most()
+
+
+def test_programs_go_when_many_maps_are_taken(monkeypatch):
+    """All that nobody holds; a program that is held works on."""
+    cleared, built, scene = [], [], types.SimpleNamespace(structure="s")
+    monkeypatch.setattr(memory_maps, "_forget", [])
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
+    find = programs.shared(lambda *how: built.append(how) or (lambda v: v + 1))
+
+    def get(number):
+        return find(scene, "engine", types.SimpleNamespace(structure=number), None)
+
+    full(monkeypatch, 0.29)
+    first = get(0)
+    assert get(0) is first and get(1) is not first and not cleared
+    full(monkeypatch, 0.31)
+    assert get(0) is first and not cleared  # nothing new is made
+    get(2)
+    assert cleared == [1]
+    full(monkeypatch, 0.1)
+    assert get(0) is not first and get(2) is get(2) and cleared == [1]
+    assert first(1) == 2
+
+
+def test_a_kernel_is_refused_before_the_limit(monkeypatch):
+    full(monkeypatch, 0.91)
+    with pytest.raises(KernelUnavailable, match=r"memory maps that Linux allows.*clear_caches"):
+        jax.jit(lambda *v: kernels.run(*v, rounds=3))(*kernels.numbers(2))
+    full(monkeypatch, 0.89)
+    jax.jit(lambda *v: kernels.run(*v, rounds=3))(*kernels.numbers(2))
+
+
+def test_what_ctrl_c_left_in_jax_is_forgotten(monkeypatch):
+    """The next call works; another recursion is an error as ever."""
+    cleared, scene = [], small.pinch("sphere", 2)
+    words = ["Recursively calling <weakref> multiply"]
+
+    def stuck(*_):
+        if words and not cleared:
+            raise RecursionError(words[0])
+        return 3
+
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
+    program = programs.Program(scene, stuck)
+    assert program(0, 0) == 3 and cleared == [1]
+    cleared.clear()
+    words[0] = "maximum recursion depth exceeded"
+    with pytest.raises(RecursionError, match="maximum"):
+        program(0, 0)
+    assert not cleared
+
+
+@pytest.mark.slow  # test_programs_go_when_many_maps_are_taken keeps the idea
+def test_many_structures_stay_below_a_limit(monkeypatch):
+    """Twelve structures of 600 maps each under a limit that three exceed."""
+    first, peak = memory_maps.count(), 0
+    limit = first + 1500
+    monkeypatch.setattr(memory_maps, "most", lambda: int(limit / 0.3))
+    flags = itertools.product((False, True), (2, 3, 4, 5, 6, 7))
+    for palm, links in flags:
+        effects = {"effects__palm_table": palm, "effects__disturb": False}
+        phases = {"phases__approach": 0.05, "phases__inflate": 0.1, "phases__lift": 0.15}
+        scene = small.pinch("sphere", links, **effects, **phases)
+        space = parameters.design_space(scene.hand)
+        evaluate = codesign.make_evaluate(scene, make_engine("structured", scene), space, 2)
+        population = np.repeat(np.asarray(space.default(), np.float32)[None], 2, 0)
+        jax.block_until_ready(evaluate(population, jax.random.key(0)))
+        peak = max(peak, memory_maps.count())
+    assert first + 1000 < peak < limit + 1500

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         report,
         rollout,
         runs,
+        sampling,
         scene,
         types,
     )
@@ -67,6 +68,7 @@ __all__ = [
     "report",
     "rollout",
     "runs",
+    "sampling",
     "scene",
     "types",
     "use_compilation_cache",

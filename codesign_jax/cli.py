@@ -236,6 +236,49 @@ class Report:
         return report.main(self)
 
 
+@dataclasses.dataclass(kw_only=True)
+class Sample:
+    """Simulate random designs, one row a grasp of a Parquet file: a data set.
+
+    Designs are uniform between their bounds, with pressures lowered under the limit of their
+    walls. The same command again goes on where it was stopped.
+    """
+
+    out: Annotated[Path, tyro.conf.arg(metavar="PATH")]
+    """The file, .parquet; what is done of it is kept in a folder beside it until it is finished."""
+    designs: int = 1000
+    """Number of designs."""
+    trials: int = 3
+    """Trials of each design, each with noise of its own; objects take turns."""
+    preset: str = "2d"
+    """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
+    hand: Text = None
+    """Hand: a built-in name or a .toml file; default: the scene's."""
+    objects: Text = None
+    """Object set: a built-in name or a .toml file; default: the scene's."""
+    scene: str = "paper"
+    """Scene: a built-in name or a .toml file."""
+    accuracy: Text = None
+    """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
+    and costs: docs/accuracy.md), or a .toml."""
+    overrides: Overrides = ()
+    engine: str = "structured"
+    """Engine that simulates: structured, mujoco (C, float64) or mjx (stock)."""
+    seed: int = 0
+    """Root of designs and noise."""
+    chunk: Count = None
+    """Most grasps of a call, after each of which the outcomes are saved; default: 512 on CPUs,
+    16384 on a GPU. Results depend on it in the last bits only."""
+    dry_run: Flag = False
+    """Print the number of grasps and an estimate of time and size; simulate and write nothing."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import sample
+
+        return sample.main(self)
+
+
 @dataclasses.dataclass
 class Scenes:
     """List scenes and their effects: on, off, or unsupported by an engine."""
@@ -279,7 +322,7 @@ class Replay(Shown):
         return replay.main(self)
 
 
-COMMANDS = Optimize | Evaluate | Landscape | Report | Replay | Render | Export | Scenes
+COMMANDS = Optimize | Evaluate | Landscape | Sample | Report | Replay | Render | Export | Scenes
 """The commands, in the order of the help text."""
 
 

@@ -76,7 +76,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
     """Scene, design, files and preflight are the example's own; nothing is simulated."""
     arguments = here_alone(example)
     reached = []
-    if arguments[0] == "optimize":
+    if arguments[0] in ("optimize", "sample"):
         arguments.append("--dry-run")
     elif arguments[0] == "evaluate":
         kept = SimpleNamespace(status=np.zeros(1, int))  # of which the exit code is made
@@ -107,6 +107,7 @@ def test_every_command_runs_at_a_small_size(example, here, monkeypatch):
     size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
     size["export"] = ["--overwrite", "--trials", "0", "--tolerance", "off"]
     size["landscape"] = ["--points", "2", "--trials", "1"]
+    size["sample"] = ["--designs", "2", "--trials", "1"]
     arguments = here_alone(example)
     if arguments[0] == "optimize" and "switch" in example:
         size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]

@@ -23,7 +23,7 @@ engines cost
 start
 rollout
 programs
-codesign fit
+codesign fit sampling
 batch
 runs
 report

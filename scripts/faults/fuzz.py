@@ -6,12 +6,14 @@ what should not have come: another error, a file that does not read back, or too
 """
 
 import contextlib
+import dataclasses
 import io
 import random
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -202,7 +204,7 @@ def command_line(rng: random.Random, folder: Path) -> list[str]:
     for _ in range(rng.choice((1, 1, 1, 1, 2, 3))):
         kind = rng.random()
         if kind < 0.7:
-            flag = rng.choice([*_FLAGS])
+            flag = rng.choice(_own(arguments[0]) if rng.random() < 0.95 else [*_FLAGS])
             usual = _USUAL if _FLAGS[flag] is NUMBERS else _FLAGS[flag][:2]
             arguments += [flag, rng.choice(usual if rng.random() < 0.4 else _FLAGS[flag])]
         elif kind < 0.9:
@@ -212,6 +214,15 @@ def command_line(rng: random.Random, folder: Path) -> list[str]:
     if command == "export":
         arguments += ["--out", str(folder / "export")]
     return [*arguments, *_NEVER[command]]
+
+
+def _own(command: str) -> list[str]:
+    """The flags that a command has, of those that have values here; all if there is no such one."""
+    names = [
+        field.name for field in dataclasses.fields(getattr(cli, command.title(), cli.Optimize))
+    ]
+    flags = {"--run" if n == "run_folder" else "--" + n.replace("_", "-") for n in names}
+    return [flag for flag in _FLAGS if flag in flags]
 
 
 def try_command_line(number: int, folder: Path) -> str:
@@ -272,7 +283,7 @@ def _base_mesh(rng: random.Random) -> trimesh.Trimesh:
             ),
         )
     )
-    mesh = make()
+    mesh: Any = make()
     if rng.random() < 0.2:
         mesh.apply_scale(10 ** rng.uniform(-3, 3))
     return mesh
@@ -280,7 +291,9 @@ def _base_mesh(rng: random.Random) -> trimesh.Trimesh:
 
 def _exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
     options = {"encoding": "ascii"} if kind == "ply_ascii" else {}
-    data = mesh.export(file_type=kind.removesuffix("_ascii") if "ply" in kind else kind, **options)
+    data: Any = mesh.export(
+        file_type=kind.removesuffix("_ascii") if "ply" in kind else kind, **options
+    )
     return data.encode() if isinstance(data, str) else data
 
 

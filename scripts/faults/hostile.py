@@ -88,27 +88,27 @@ def _new_line(rng: random.Random) -> str:
 
 def mutate_bytes(rng: random.Random, data: bytes) -> bytes:
     """Flips, inserts, cuts or repeats bytes."""
-    data = bytearray(data)
-    if not data:
+    changed = bytearray(data)
+    if not changed:
         return b"x"
-    at = rng.randrange(len(data))
+    at = rng.randrange(len(changed))
     kind = rng.randrange(6)
     if kind == 0:
         for _ in range(rng.choice((1, 1, 4, 32))):
-            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+            changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
     elif kind == 1:
-        data[at:at] = rng.choice(
+        changed[at:at] = rng.choice(
             (b"\xff", b"\x00", b"\xef\xbb\xbf", b"\r", b"\xe2\x80\xa8", b"\xed\xa0\x80")
         )
     elif kind == 2:
-        del data[at:]
+        del changed[at:]
     elif kind == 3:
-        del data[at : at + rng.choice((1, 4, 50))]
+        del changed[at : at + rng.choice((1, 4, 50))]
     elif kind == 4:
-        data[at:at] = data[at : at + 100] * rng.choice((1, 10, 100))
+        changed[at:at] = changed[at : at + 100] * rng.choice((1, 10, 100))
     else:
-        data[at] = rng.randrange(256)
-    return bytes(data)
+        changed[at] = rng.randrange(256)
+    return bytes(changed)
 
 
 def mutate_toml(rng: random.Random, text: str) -> bytes:

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -146,12 +147,17 @@ def test_the_page_has_a_row_for_each_campaign_and_the_committed_counts():
     bad = {"cases": 3, "counts": {"same": 2, "lost": 1}, "tallies": {"kills": 5}, "most": {}}
     row = page.table({"starts": [], "campaigns": {"kills": bad}})[1]
     assert row[1] == "5" and "2 same, 1 lost (**broken**) of 3" in row[3]
-    path = page.__file__.replace("scripts/faults/page.py", "docs/data/faults.json")
-    if os.path.exists(path):
-        with open(path) as file:
-            committed = page.table(json.load(file))
-        text = open(path.replace("data/faults.json", "faults.md")).read()
-        assert all(" | ".join(row) in text for row in committed), "make faults ARGS=--page"
+    docs = Path(__file__).parents[1] / "docs"
+    if (docs / "data" / "faults.json").exists():
+        committed = page.table(json.loads((docs / "data" / "faults.json").read_text()))
+        text = (docs / "faults.md").read_text()
+        assert all(" | ".join(row) in text for row in committed), "python -m scripts.faults --page"
+
+
+def test_the_quick_tests_that_the_page_names_are_there():
+    text = "".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
+    named = {name for campaign in cases.CAMPAIGNS.values() for name in campaign.tests}
+    assert len(named) > 20 and not [name for name in named if f"def {name}(" not in text]
 
 
 def test_the_number_makes_the_case():

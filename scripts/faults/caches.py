@@ -272,7 +272,7 @@ CAMPAIGNS = (
         frozenset({"same"}),
         "compiled programs, kernels and lists of the caches damaged in eight ways, then a run",
         "the same run without a warning; what was damaged is made again",
-        "test_caches.py",
+        "test_damaged_programs_go_and_sound_ones_stay, test_code_is_kept_and_damage_is_seen",
         limit=900,
     ),
     Campaign(
@@ -282,7 +282,7 @@ CAMPAIGNS = (
         frozenset({"same"}),
         "twenty of JAX's compiled programs exchanged with one another",
         "the same run; none of them is used",
-        "test_caches.py",
+        "test_programs_in_the_place_of_each_other_go",
         limit=900,
     ),
     Campaign(
@@ -292,7 +292,7 @@ CAMPAIGNS = (
         frozenset({"same"}),
         "a full disk below the caches",
         "the same run; the next one finds nothing torn",
-        "test_caches.py",
+        "test_jax_compiles_again_what_was_damaged_and_keeps_it",
         limit=900,
     ),
     Campaign(
@@ -302,7 +302,7 @@ CAMPAIGNS = (
         frozenset({"same"}),
         "SIGKILL while empty caches are filled",
         "no torn entry: the next process says nothing of them",
-        "test_caches.py",
+        "test_jax_compiles_again_what_was_damaged_and_keeps_it",
         limit=900,
     ),
     Campaign(
@@ -313,7 +313,8 @@ CAMPAIGNS = (
         "a byte or some of `reference.npz`, `landscape.npz`, `landscape.part.npz`, "
         "`failures/*.npz` or a stored grid changed or gone",
         "refused in words or computed again; never a wrong number",
-        "test_archives.py",
+        "test_any_damage_of_arrays_is_one_error, "
+        "test_a_failed_world_with_any_damage_is_refused_or_whole",
         size=2500,
         limit=120,
     ),

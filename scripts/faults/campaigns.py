@@ -21,7 +21,7 @@ class Campaign:
       good: Outcomes that keep the promise.
       fault: What happens, for the page.
       promise: What is promised.
-      test: The quick test that keeps the idea.
+      test: The quick tests that keep the idea, their names with commas.
       size: Cases that are done and stored together, by one process.
       limit: Time that a case may take [s], generous: a case beyond it is ended and counts as hung.
       tries: Tally that the page counts as tries; by default the cases.
@@ -41,3 +41,8 @@ class Campaign:
     tries: str = ""
     alone: bool = False
     environment: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def tests(self) -> list[str]:
+        """Names of the quick tests."""
+        return [name for name in self.test.split(", ") if name]

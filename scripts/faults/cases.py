@@ -1,4 +1,4 @@
-"""All campaigns, in the order in which they are run."""
+"""All campaigns, in the order in which they are run: the longest at the end."""
 
 from scripts.faults import (
     caches,
@@ -13,5 +13,5 @@ from scripts.faults import (
 )
 from scripts.faults.campaigns import Campaign
 
-_MODULES = (kills, products, checkpoints, folders, strangers, caches, inputs, numbers, long)
+_MODULES = (kills, products, checkpoints, folders, strangers, caches, numbers, long, inputs)
 CAMPAIGNS: dict[str, Campaign] = {c.name: c for module in _MODULES for c in module.CAMPAIGNS}

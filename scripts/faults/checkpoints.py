@@ -107,7 +107,8 @@ CAMPAIGNS = (
         frozenset({"same and said", "same bytes", "no such file"}),
         "each file of the newest checkpoint damaged in fourteen ways, then `optimize`",
         "it goes on from the checkpoint before, says so, and ends as if nothing had happened",
-        "test_resume.py, test_checkpoint.py",
+        "test_damage_of_any_file_falls_back_to_the_step_before, "
+        "test_damaged_checkpoint_is_said_and_the_older_one_used",
     ),
     Campaign(
         "readers",
@@ -116,6 +117,6 @@ CAMPAIGNS = (
         frozenset({"said", "same bytes", "no such file"}),
         "the same damage, then `evaluate`, `landscape`, `report` and `export` of the run",
         "each says what is damaged and which step it took; `export` refuses",
-        "test_run_folder.py",
+        "test_every_command_says_which_checkpoint_it_takes",
     ),
 )

@@ -230,32 +230,32 @@ CAMPAIGNS = (
         *("tables", len(finished.TABLES) * len(_WAYS), tables, "same, refused"),
         "each table of a finished run damaged in thirteen ways, then `optimize`",
         _MENDED,
-        "test_run_folder.py",
+        "test_tables_are_mended_from_the_checkpoints",
     ),
     campaign(
         *("scenes", 3 * len(finished.SOURCES) * (len(_WAYS) + 1), scenes, "refused, same scene"),
         "`scene.toml`, `hand.toml`, `objects.toml` of a run damaged, or a digit changed; then "
         "`optimize`, `evaluate`, `report`",
         "refused; a change of comments alone does not matter",
-        "test_run_folder.py",
+        "test_changed_scene_files_are_refused_by_all_that_read_the_run",
     ),
     campaign(
         *("provenance", 3 * (len(_WAYS) + len(_HOSTILE)), provenance, "refused, same, harmless"),
         "`provenance.json` damaged or hostile; then `optimize`, `evaluate`, `report`",
         "refused, and no file of the run is lost",
-        "test_run_folder.py",
+        "test_a_hostile_provenance_is_refused_in_words",
     ),
     campaign(
         *("permissions", len(_MODES) * _PLACES, permissions),
         "same, refused; then same, no such place",
         "files and folders of a run that may not be read or written",
         "said; once they may, the run goes on to the same end",
-        "test_run_folder.py",
+        "test_a_step_that_cannot_be_read_now_is_kept",
     ),
     campaign(
         *("notes", 2 * len(_WAYS), notes, "same, refused"),
         "`events.log` and `.lock` damaged, then `optimize`",
         "the run goes on, or the command says why not",
-        "test_run_folder.py",
+        "test_second_process_on_a_folder_is_refused",
     ),
 )

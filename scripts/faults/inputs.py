@@ -60,25 +60,13 @@ def _passable(word: str) -> bool:
 _GOOD = frozenset({"refused", "accepted"})
 CAMPAIGNS = (
     Campaign(
-        "toml",
-        200_000,
-        partial(tried, kind="toml"),
-        _GOOD,
-        "scene, hand, object and accuracy files with hostile changes, and values of `--set`",
-        "refused with the project's own error within 20 s of processor time, or a scene that "
-        "reads back as it was written",
-        "test_hostile_input.py",
-        size=2000,
-        limit=60,
-    ),
-    Campaign(
         "commands",
         2000,
         partial(tried, kind="commands"),
         _GOOD,
         "hostile command lines within one process",
         "exit status 0 or 2, no traceback, and no files where it refuses",
-        "test_hostile_input.py",
+        "test_some_mutated_input, test_arguments_that_are_refused",
         size=100,
         limit=60,
     ),
@@ -89,7 +77,7 @@ CAMPAIGNS = (
         _GOOD,
         "hostile command lines as processes of their own",
         "the same",
-        "test_hostile_input.py",
+        "test_wrong_input_exits_2_and_creates_nothing",
         limit=300,
     ),
     Campaign(
@@ -99,8 +87,20 @@ CAMPAIGNS = (
         _GOOD,
         "STL, OBJ, PLY, OFF and GLB files with hostile changes",
         "refused within 20 s of processor time, or a mesh whose grid is finite",
-        "test_hostile_input.py",
+        "test_some_mutated_input, test_sizes_of_mesh_files",
         size=50,
         limit=120,
+    ),
+    Campaign(
+        "toml",
+        200_000,
+        partial(tried, kind="toml"),
+        _GOOD,
+        "scene, hand, object and accuracy files with hostile changes, and values of `--set`",
+        "refused with the project's own error within 20 s of processor time, or a scene that "
+        "reads back as it was written",
+        "test_some_mutated_input, test_values_that_are_too_much",
+        size=2000,
+        limit=60,
     ),
 )

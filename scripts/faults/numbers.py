@@ -145,7 +145,7 @@ CAMPAIGNS = (
         frozenset({"others unchanged"}),
         "NaN, ±inf, 0, −1, 1e30, 3e38, 1e-45 in one or two of eight designs",
         "the others do not change by a bit, costs are finite, and a design that is no number fails",
-        "test_planted_faults.py, test_containment.py",
+        "test_neighbours_of_a_failing_world_are_bitwise_unaffected",
         size=20,
     ),
     Campaign(
@@ -155,7 +155,8 @@ CAMPAIGNS = (
         frozenset({"finite and in bounds"}),
         "equal, zero, NaN, infinite, huge, negative, denormal costs; four optimisers",
         "particles stay finite and in bounds",
-        "test_resampling.py",
+        "test_without_a_usable_weight_the_result_is_the_identity, "
+        "test_unusable_weights_count_as_zero",
         size=11,
     ),
     Campaign(
@@ -165,7 +166,7 @@ CAMPAIGNS = (
         frozenset({"never 0"}),
         "every trial of a run fails, and its command is given again and again",
         "the exit status is never 0",
-        "test_run_folder.py",
+        "test_all_failed_stops_with_a_diagnosis",
         limit=600,
         tries="starts",
     ),

@@ -36,7 +36,8 @@ def table(data: dict[str, Any]) -> list[list[str]]:
 
 def _tests(campaign: Any) -> str:
     own = f"`make faults`, `{campaign.name}`"
-    return f"{campaign.test}; {own}" if campaign.test else own
+    quick = [f"`{name}`" for name in campaign.tests]
+    return ", ".join([*quick, own])
 
 
 def note(data: dict[str, Any]) -> str:

@@ -166,7 +166,7 @@ CAMPAIGNS = (
         "SIGKILL of `landscape`, `export`, `evaluate --render`, `report` at random moments and "
         "file operations",
         "a file is whole or absent; the same command completes them and leaves nothing else",
-        "test_run_folder.py",
+        "test_an_interrupted_landscape_goes_on, test_stopped_landscape_leaves_nothing",
         limit=600,
         tries="kills",
     ),
@@ -177,7 +177,7 @@ CAMPAIGNS = (
         frozenset({"whole or absent"}),
         "ENOSPC from a file operation of the same commands on, or EIO at one",
         "exit status 1 or 2 and a message; the same",
-        "test_run_folder.py",
+        "test_what_cannot_be_written_in_the_end_is_said_in_words",
         limit=300,
     ),
 )

@@ -7,6 +7,7 @@ the program in JAX's cache on disk.
 """
 
 import functools
+import os
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -43,6 +44,7 @@ class Program:
 
         Raises:
           SceneError: If the constants do not fit the scene, see `scene.constants.check`.
+          RuntimeError: In a process that was forked from one that had simulated.
         """
         return _again_if_stuck(
             lambda: self._jitted(first, second, self._numbers(constants), *self._more)
@@ -62,12 +64,43 @@ class Program:
         return jax.tree.map(lambda v: jnp.asarray(v, float), numbers)
 
 
+_process = {"begun": False, "forked": False}
+"""Whether programs have run in this process, and whether it was forked from one in which they had.
+
+A child of `os.fork` has none of XLA's threads, for which its programs would wait for ever.
+"""
+
+
+def _forked() -> None:
+    """This process is a child."""
+    _process["forked"] = _process["begun"]
+
+
+def _begin() -> None:
+    """A program is about to run.
+
+    Raises:
+      RuntimeError: If the process was forked from one in which programs had run.
+    """
+    if _process["forked"]:
+        raise RuntimeError(
+            "this process was forked from one that had simulated, and would wait for ever for "
+            "XLA's threads, which it has not: begin processes by multiprocessing's `spawn`"
+        )
+    _process["begun"] = True
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)
+
+
 def _again_if_stuck(call: Callable[[], Any]) -> Any:
     """Returns call(), if need be without what JAX had traced.
 
     Ctrl-C at a bad moment of tracing leaves a mark in one of JAX's caches, which takes the next
     call for a recursion.
     """
+    _begin()
     try:
         return call()
     except RecursionError as error:

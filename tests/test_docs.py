@@ -21,7 +21,7 @@ from codesign_jax import cli
 from codesign_jax.commands import evaluate, export, landscape, render, replay, report
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "scripts" / "README.md"]
+PAGES = [ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "scripts/README.md")]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 SMALL = ["--particles", "2", "--trials", "3", "--episodes", "1", "--test-trials", "0"]
 

@@ -72,6 +72,19 @@ def test_what_ctrl_c_left_in_jax_is_forgotten(monkeypatch):
     assert not cleared
 
 
+def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
+    """Only of a process that had simulated; its own first call is then an error at once."""
+    program = programs.Program(small.pinch("sphere", 2), lambda *_: 3)
+    for begun in (False, True):
+        monkeypatch.setattr(programs, "_process", {"begun": begun, "forked": False})
+        programs._forked()
+        if begun:
+            with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
+                program(0, 0)
+        else:
+            assert program(0, 0) == 3
+
+
 @pytest.mark.slow  # test_programs_go_when_many_maps_are_taken keeps the idea
 def test_many_structures_stay_below_a_limit(monkeypatch):
     """Twelve structures of 600 maps each under a limit that three exceed."""

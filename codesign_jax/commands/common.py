@@ -69,7 +69,7 @@ def source_files(options: SceneFlags) -> tuple[Path, ...]:
     Args:
       options: The flags, which `load_scene` has read.
     """
-    scene = library.find("scenes", options.scene)
+    scene = library.find("scenes", options.scene or SCENE)
     table = library.read(scene)
     beside = {"hands": table.get("hand"), "objects": table.get("objects")}
     given = {"hands": options.hand, "objects": options.objects, "accuracy": options.accuracy}

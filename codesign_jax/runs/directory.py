@@ -17,7 +17,7 @@ from typing import Any
 from codesign_jax import files
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment
-from codesign_jax.runs import belongings, manifest, scene_files
+from codesign_jax.runs import belongings, manifest, reading, scene_files
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.settings import Settings, masks_of
@@ -133,6 +133,8 @@ def check_folder(
         belongings.refuse_to_delete(path, (*sources, *meshes))
     else:
         _refuse_other(path, scene, settings, stored)
+        if reading.lost_all(path):
+            raise SceneError([reading.lost_all(path)])
 
 
 def episodes_of(paths: Iterable[Path]) -> int | None:

@@ -60,9 +60,9 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
       SceneError: If the folder is no run, no checkpoint of it can be read, or they are another's.
     """
     tell = tell or (lambda text: warnings.warn(text, stacklevel=3))
+    if problem := lost_all(folder):
+        raise SceneError([problem])
     if not (folder / "checkpoints").is_dir():
-        if episodes := tables.episodes_in(folder):
-            raise SceneError([f"run {folder} has lost its checkpoints, {lost(episodes)}"])
         return None
     stored = manifest.read_provenance(folder)
     settings = Settings(**stored["settings"])
@@ -85,6 +85,12 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
             "computes again what is lost"
         )
     return record
+
+
+def lost_all(folder: Path) -> str:
+    """Says that a run has lost its checkpoints' folder; nothing if it has not, or had none yet."""
+    episodes = 0 if (folder / "checkpoints").is_dir() else tables.episodes_in(folder)
+    return f"run {folder} has lost its checkpoints, {lost(episodes)}" if episodes else ""
 
 
 def lost(episodes: int) -> str:

@@ -50,14 +50,18 @@ class Forked:
     def __init__(self, zygote: "Zygote", pid: int, log: Path):
         """Refers to a running process, whose output goes to `log`."""
         self._zygote, self.pid, self._log = zygote, pid, log
+        self._code: int | None = None
 
     def send(self, number: int) -> None:
         """Sends a signal; nothing happens if it has ended: its number is its own until `wait`."""
-        os.kill(self.pid, number)
+        if self._code is None:
+            os.kill(self.pid, number)
 
     def wait(self, limit: float) -> int | None:
         """Exit status, negative for a signal; None if it goes on after `limit` seconds."""
-        return self._zygote.ask({"wait": self.pid, "limit": limit})
+        if self._code is None:
+            self._code = self._zygote.ask({"wait": self.pid, "limit": limit})
+        return self._code
 
     def text(self) -> str:
         """What it has written to stdout and stderr."""

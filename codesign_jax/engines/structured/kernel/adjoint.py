@@ -109,8 +109,8 @@ class AdjointProgram(Program):
         return hand, world, *rest, *grid
 
     def sound(self, bars: tuple, taken: jax.Array) -> tuple:
-        """Cotangents of the inputs, zero for worlds that took no step; `taken` as in `Path`."""
-        some = self.by_block(taken)[:, 0] > 0
+        """Cotangents of the inputs, zero for worlds that took no step; `taken` of blocks."""
+        some = taken[:, 0] > 0
         lane = jnp.tile(some, (1, 1, self.fingers))
         masks = lane, some, lane, some, some[:, None], lane
         found = [jnp.where(mask, x, 0.0) for mask, x in zip(masks, bars, strict=False)]

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from codesign_jax import sources
 from codesign_jax.compiler.launch import KernelUnavailable, available
 from codesign_jax.engines.base import Equal, Staged
 from codesign_jax.engines.structured import coordinates, mesh, transforms
@@ -235,3 +236,6 @@ def _unavailable(reason: str) -> KernelUnavailable:
         f"engine structured cannot run here: {reason}; engine mjx runs on every device of JAX, "
         "engine mujoco on every CPU"
     )
+
+
+sources.note()  # everything that a kernel is traced from has been imported

@@ -278,6 +278,3 @@ def _copy(source: Any, target: Any, rows: int, *where: jax.Array, at: tuple = ()
         return x
 
     jax.lax.fori_loop(0, rows, one, jnp.int32(0))
-
-
-sources.note()  # everything that a kernel is traced from has been imported

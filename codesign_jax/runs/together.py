@@ -66,6 +66,7 @@ def optimize(
     fresh: bool = False,
     devices: int | None = None,
     chunk: int | None = None,
+    after: float = 0.0,
 ) -> Results:
     """Runs an optimisation of each seed, or goes on with it; the same call does both.
 
@@ -76,6 +77,8 @@ def optimize(
       fresh: Deletes earlier runs in the folders first.
       devices: Devices that simulate; None for all of this host.
       chunk: Most worlds of one device in one call; None for `batch.LIMIT`.
+      after: What the caller simulates of each run afterwards, as a number of its grasps: the time
+        left that is shown includes it.
 
     Raises:
       SceneError: If a folder cannot be used; see `open_run`.
@@ -84,7 +87,7 @@ def optimize(
     timing, seeds = None, list(folders)
     for start in range(0, len(seeds), MOST):
         group = {seed: folders[seed] for seed in seeds[start : start + MOST]}
-        results = _group(plan, group, command, fresh, devices, chunk)
+        results = _group(plan, group, command, fresh, devices, chunk, after)
         found |= results.runs
         timing = timing or results.timing
         if results.signum:
@@ -99,11 +102,15 @@ def _group(
     fresh: bool,
     devices: int | None,
     chunk: int | None,
+    after: float,
 ) -> Results:
     """`optimize` of as many runs as fit into one process."""
-    total, many = plan.settings.episodes, len(folders) > 1
+    settings, many = plan.settings, len(folders) > 1
+    batch = settings.particles * settings.trials
+    ahead = {"test": batch * settings.test_rounds, "after": after}
     with contextlib.ExitStack() as stack:
-        progress = GroupProgress(total) if many else Progress(total)
+        total = settings.episodes
+        progress = GroupProgress(total, len(folders), **ahead) if many else Progress(total, **ahead)
         stack.enter_context(progress)
         loops = {}
         for seed, folder in folders.items():
@@ -118,8 +125,8 @@ def _group(
                 voice.message(note)
             loops[seed] = Loop(own, run, store, voice)
         interrupts = stack.enter_context(Interrupts(progress.message))
-        batch = _batch(plan, devices, chunk)
-        return _Together(plan, loops, progress, interrupts, batch).run()
+        simulator = _batch(plan, devices, chunk)
+        return _Together(plan, loops, progress, interrupts, simulator).run()
 
 
 def _batch(plan: Plan, devices: int | None, chunk: int | None) -> Batch:
@@ -185,6 +192,7 @@ class _Together:
         where = f", {count} devices" if count > 1 else ""
         message = f"compiled in {watch.seconds:.1f} s (engine {engine}{where})"
         self.progress.message(message)
+        self.progress.compiled()
         for seed in self.waiting:
             self.loops[seed].run_directory.log(message)
         self.timing = Timing(watch.seconds, runs=len(self.waiting))

@@ -165,7 +165,7 @@ def full(bench: Bench, number: int) -> Result:
 CAMPAIGNS = (
     Campaign(
         "products",
-        32,
+        24,
         killed,
         frozenset({"whole or absent"}),
         "SIGKILL of `landscape`, `export`, `evaluate --render`, `report` at random moments and "

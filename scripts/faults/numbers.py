@@ -161,7 +161,7 @@ CAMPAIGNS = (
     ),
     Campaign(
         "failing",
-        4,
+        2,
         failing,
         frozenset({"never 0"}),
         "every trial of a run fails, and its command is given again and again",

@@ -6,9 +6,6 @@ from typing import Any
 from scripts.faults import cases
 from scripts.shared.tables import fill, markdown
 
-_PLAIN = {"kills", "entries", "calls", "starts"}
-"""Tallies that are tries, not outcomes."""
-
 
 def table(data: dict[str, Any]) -> list[list[str]]:
     """A row for each campaign: fault, tries, promise, what was seen, test."""
@@ -28,6 +25,8 @@ def table(data: dict[str, Any]) -> list[list[str]]:
             signals = {k: n for k, n in found["tallies"].items() if k.startswith("SIG")}
             more = ", ".join(f"{k} {n}" for k, n in signals.items())
             seen += f" of {found['cases']}" + (f"; {more}" if more else "")
+        if left := found["tallies"].get("temporary files left"):
+            seen += f"; {left} in `.tmp` left"
         if found["most"]:
             seen += "; at most " + ", ".join(f"{v:,.0f} {k}" for k, v in found["most"].items())
         rows.append([campaign.fault, f"{tries:,}", campaign.promise, seen, _tests(campaign)])

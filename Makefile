@@ -12,17 +12,18 @@ CHECKED := codesign_jax scripts tests notebooks
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs test test-browser test-gpu test-slow stability notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo docs test test-browser test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
 	@echo "make test-browser  the report in a headless Chromium"
-	@echo "make stability   the hard cases and their margins, docs/stability.md"
+	@echo "make stability   the hard cases and their margins, docs/notes/stability.md"
+	@echo "make faults      kills, full disks, damage, hostile input, counted: docs/faults.md"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
-	@echo "make effects     what each effect costs and decides: docs/effects.md"
+	@echo "make effects     what each effect costs and decides: docs/notes/effects.md"
 	@echo "make accuracy    what accuracy costs in time: ACCURACY=docs/data/accuracy_cpu.json, SIZE=full"
 	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make format      ruff format          make clean       remove what make built"
@@ -47,9 +48,14 @@ test-gpu: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile --durations=10
 
-# All hard cases; their margins go to docs/stability.md. About half an hour on two cores.
+# All hard cases; their margins go to docs/notes/stability.md. About half an hour on two cores.
 stability: $(STAMP)
 	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
+
+# Needs Linux and a C compiler; goes on where it stopped. FAULTS is its folder.
+FAULTS ?= runs/faults
+faults: $(STAMP)
+	nice -n 5 $(BIN)/python -m scripts.faults --store $(FAULTS)/store.jsonl --work $(FAULTS)/work --page $(ARGS)
 
 notebooks: $(STAMP)
 	$(BIN)/python -m scripts.run_notebooks

@@ -1,11 +1,13 @@
 """Batched simulation of soft hands and co-design of their morphology and control.
 
 The names below are the package's public list; each module has its own.  They are imported when they
-are first asked for, so that importing the package costs nothing and sets nothing.
+are first asked for, so that importing the package costs a millisecond and sets nothing.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+from codesign_jax import sources as _sources  # noqa: F401  # notes the state of the files first
 
 if TYPE_CHECKING:
     from codesign_jax import (
@@ -20,11 +22,12 @@ if TYPE_CHECKING:
         report,
         rollout,
         runs,
+        sampling,
         scene,
         types,
     )
+    from codesign_jax.caches import use_compilation_cache
     from codesign_jax.engines import make_engine
-    from codesign_jax.files import use_compilation_cache
     from codesign_jax.scene import SceneError, constants, hand, objects, parameters
     from codesign_jax.types import Params, Status, Trace, Trial
 
@@ -39,7 +42,7 @@ _HOME = {
     "Status": "codesign_jax.types",
     "Trace": "codesign_jax.types",
     "Trial": "codesign_jax.types",
-    "use_compilation_cache": "codesign_jax.files",
+    "use_compilation_cache": "codesign_jax.caches",
 }
 """Where the names are that are not modules of this folder."""
 
@@ -65,6 +68,7 @@ __all__ = [
     "report",
     "rollout",
     "runs",
+    "sampling",
     "scene",
     "types",
     "use_compilation_cache",

@@ -49,12 +49,14 @@ class _Packed(NamedTuple):
 
     Attributes:
       population: Particles [SI units], shape (particle, parameter).
+      trials: Trials of the worlds, with leading axis (world,).
       initial: Bits of `Status` that the worlds start with, shape (world,).
       blocks: See `engines.base.Staged`.
       common: See `engines.base.Staged`.
     """
 
     population: jax.Array
+    trials: Trial
     initial: jax.Array
     blocks: tuple
     common: tuple
@@ -275,7 +277,7 @@ def _before(
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         worlds = rollout.crossed(jax.vmap(space.params)(population), noise)
         fields, ctrl, initial = rollout.prepare(scene, *worlds, constants)
-        return _Packed(population, initial, *staged(engine, lanes).pack(fields, ctrl))
+        return _Packed(population, worlds[1], initial, *staged(engine, lanes).pack(fields, ctrl))
 
     return before
 
@@ -302,7 +304,7 @@ def _after(
         (state, packed), (mask, out) = asked, found
         shape = packed.population.shape[0], num_trials
         trace = staged(engine, lanes).unpack(out, shape[0] * shape[1])
-        outcome = rollout.judge(scene, trace, None, packed.initial, constants)
+        outcome = rollout.judge(scene, trace, None, packed.initial, packed.trials, constants)
         trials, last = rollout.grid((outcome, trace.last), shape)
         costs = particle_cost(scene.with_constants(constants), trials)
         new, selection = optimizer.tell(state, packed.population, costs, mask)

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from codesign_jax.commands import status
+from codesign_jax import caches
+from codesign_jax.commands import flags, status
 from codesign_jax.commands.flags import (
     Count,
     File,
@@ -235,6 +236,49 @@ class Report:
         return report.main(self)
 
 
+@dataclasses.dataclass(kw_only=True)
+class Sample:
+    """Simulate random designs, one row a grasp of a Parquet file: a data set.
+
+    Designs are uniform between their bounds, with pressures lowered under the limit of their
+    walls. The same command again goes on where it was stopped.
+    """
+
+    out: Annotated[Path, tyro.conf.arg(metavar="PATH")]
+    """The file, .parquet; what is done of it is kept in a folder beside it until it is finished."""
+    designs: int = 1000
+    """Number of designs."""
+    trials: int = 3
+    """Trials of each design, each with noise of its own; objects take turns."""
+    preset: str = "2d"
+    """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
+    hand: Text = None
+    """Hand: a built-in name or a .toml file; default: the scene's."""
+    objects: Text = None
+    """Object set: a built-in name or a .toml file; default: the scene's."""
+    scene: str = "paper"
+    """Scene: a built-in name or a .toml file."""
+    accuracy: Text = None
+    """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
+    and costs: docs/accuracy.md), or a .toml."""
+    overrides: Overrides = ()
+    engine: str = "structured"
+    """Engine that simulates: structured, mujoco (C, float64) or mjx (stock)."""
+    seed: int = 0
+    """Root of designs and noise."""
+    chunk: Count = None
+    """Most grasps of a call, after each of which the outcomes are saved; default: 512 on CPUs,
+    16384 on a GPU. Results depend on it in the last bits only."""
+    dry_run: Flag = False
+    """Print the number of grasps and an estimate of time and size; simulate and write nothing."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import sample
+
+        return sample.main(self)
+
+
 @dataclasses.dataclass
 class Scenes:
     """List scenes and their effects: on, off, or unsupported by an engine."""
@@ -278,7 +322,7 @@ class Replay(Shown):
         return replay.main(self)
 
 
-COMMANDS = Optimize | Evaluate | Landscape | Report | Replay | Render | Export | Scenes
+COMMANDS = Optimize | Evaluate | Landscape | Sample | Report | Replay | Render | Export | Scenes
 """The commands, in the order of the help text."""
 
 
@@ -291,17 +335,26 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
       arguments: Arguments without the program's name; default: those of the process.
     """
+    given = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
-        if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        if given == ["--version"]:
             return _version()
+        refuse(flags.text_problems(given))
         command = tyro.cli(
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,
             prog="codesign",
             description="Co-design of soft hand morphology and control; --version says which.",
         )
+        refuse(caches.problems() + flags.path_problems(command))
         return command.run()
+
+    def refuse(problems: list[str]) -> None:
+        if problems:
+            from codesign_jax.scene.schema import SceneError
+
+            raise SceneError(problems)
 
     code = status.of(run)
     if arguments is None and code == status.INTERRUPTED:

@@ -20,10 +20,15 @@ import numpy as np
 
 from codesign_jax import verdict
 from codesign_jax.scene import Scene
-from codesign_jax.types import WARNINGS, Outcome, Status, Trace, failed
+from codesign_jax.types import WARNINGS, Outcome, Status, Trace, Trial, failed
+
+_ROUNDING = 1.001
+"""A ball's centre rests just as high as its radius: in float32 it may be a little higher."""
 
 
-def outcome(scene: Scene, trace: Trace, initial: jax.Array | int = 0) -> Outcome:
+def outcome(
+    scene: Scene, trace: Trace, initial: jax.Array | int = 0, trial: Trial | None = None
+) -> Outcome:
     """Returns cost and status of one trial from its trace.
 
     c = c_max (t_end - t_lost) / (t_end - t_0), where t_lost is the first time in [t_0, t_end) at
@@ -35,6 +40,8 @@ def outcome(scene: Scene, trace: Trace, initial: jax.Array | int = 0) -> Outcome
       scene: The scene; of `Scene.with_constants` if its numbers are traced.
       trace: Trace of one world, arrays of shape (time,).
       initial: Bits of `Status` that the world starts with, shape () int32.
+      trial: The trial, by the size of whose object it is told whether a released one rests on the
+        table; without it by the largest object of the set.
     """
     steps, (start, end), dtype = trace.distance.shape[0], scene.window, trace.distance.dtype
     lost_step = _first(verdict.lost(verdict.bounds(scene), trace.distance, np.arange(steps)))
@@ -45,7 +52,7 @@ def outcome(scene: Scene, trace: Trace, initial: jax.Array | int = 0) -> Outcome
     lost = (lost_step < steps) & ~bad
     lost_time = jnp.where(lost, lost_step * scene.discretization.timestep, jnp.inf).astype(dtype)
     cost = scene.cost.maximum * (end - jnp.where(lost, lost_time, end)) / (end - start)
-    stuck = verdict.as_bit(_stuck(scene, trace) & ~lost & ~bad, Status.STUCK)
+    stuck = verdict.as_bit(_stuck(scene, trace, trial) & ~lost & ~bad, Status.STUCK)
     status = bad * bits[jnp.minimum(bad_step, steps - 1)] | stuck
     status |= _warnings(trace, jnp.minimum(bad_step, lost_step))
     cost = jnp.where(failed(status), scene.cost.maximum, cost)
@@ -115,7 +122,14 @@ def _refusing(name: str, problems: dict[str, str]) -> type:
     fields = {field: property(refuse(problem)) for field, problem in problems.items()}
     # What unpacks or indexes the trace reads all of it.
     every = refuse(next(iter(problems.values())))
-    return type(name, (Trace,), fields | {"__iter__": every, "__getitem__": every})
+
+    def at(trace: Any, scene: Scene, phase: str | None = None) -> Trace:
+        if "distance" in problems:
+            raise ValueError(problems["distance"])
+        return kind(*Trace(*tuple.__iter__(trace)).at(scene, phase))
+
+    kind = type(name, (Trace,), fields | {"__iter__": every, "__getitem__": every, "at": at})
+    return kind
 
 
 _QPOS = (
@@ -151,12 +165,16 @@ def _warnings(trace: Trace, decided: jax.Array) -> jax.Array:
     return verdict.as_bit(warned.any(), WARNINGS)
 
 
-def _stuck(scene: Scene, trace: Trace) -> jax.Array:
+def _stuck(scene: Scene, trace: Trace, trial: Trial | None) -> jax.Array:
     """Whether the released object neither left the hand nor rests on the table."""
     if not scene.effects.ungrasp:
         return jnp.zeros((), bool)
     # A resting object's centre is at most its bounding radius above the table, whatever side it
     # lies on.
-    radius = jnp.stack([jnp.asarray(shape.radius) for shape in scene.objects.object]).max()
-    resting = trace.height[-1] < radius * (1 + 4 * scene.objects.noise.size)
+    radii = jnp.stack([jnp.asarray(shape.radius) for shape in scene.objects.object])
+    if trial is None:
+        radius = radii.max() * (1 + 4 * scene.objects.noise.size)
+    else:
+        radius = radii[trial.shape] * trial.size * _ROUNDING
+    resting = trace.height[-1] < radius
     return (trace.distance[-1] <= scene.cost.lost_distance) & ~resting

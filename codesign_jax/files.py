@@ -1,7 +1,8 @@
-"""Writes files as a whole or not at all; the folder for what can be computed again."""
+"""Writes files as a whole or not at all."""
 
 import contextlib
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,14 +23,31 @@ def atomically(path: Path) -> Iterator[Path]:
       OSError: If the file cannot be written; the old one stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    # Of this call alone: threads may write the same file, and so may hosts that share a disk.
+    temporary = path.with_name(f"{path.name}.{secrets.randbits(64)}.tmp")
     try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        with naming(path):
+            yield temporary
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Gives an error of writing to a file, such as of a full disk, the file's name.
+
+    Args:
+      path: The file that the block writes.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 @contextlib.contextmanager
@@ -67,28 +85,3 @@ def whole_folder(path: Path, keep: str) -> Iterator[Path]:
     except OSError:
         shutil.copytree(part, path, dirs_exist_ok=True)
         shutil.rmtree(part)
-
-
-def cache_folder() -> Path:
-    """Folder for what can be computed again, such as compiled programs; it may not exist yet."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "codesign-jax"
-
-
-def use_compilation_cache() -> None:
-    """Keeps compiled programs between processes, in `cache_folder`, as the commands do.
-
-    For scripts and notebooks, before their first simulation. A place that was chosen already
-    (`jax_compilation_cache_dir`) stays.
-
-    >>> import jax
-    >>> from codesign_jax import use_compilation_cache
-    >>> use_compilation_cache()
-    >>> jax.config.jax_compilation_cache_dir is None
-    False
-    """
-    import jax
-
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
-        # Small programs too, of which a command has dozens: JAX keeps those that take a second.
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

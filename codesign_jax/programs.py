@@ -1,18 +1,20 @@
 """Jitted programs that every scene of one structure shares within a process.
 
-A program takes the scene's numbers (`Scene.constants`) and the optimiser as arguments, so
-that neither JAX nor XLA sees what hand, objects or bounds they come from: another file of the same
-structure traces and compiles nothing, and a new process finds the program in JAX's cache on disk.
+A program takes the scene's numbers (`Scene.constants`) and the optimiser as arguments, so that
+neither JAX nor XLA sees what hand, objects or bounds they come from.  Another file of the same
+structure, whose preset fixes the same values, traces and compiles nothing, and a new process finds
+the program in JAX's cache on disk.
 """
 
 import functools
+import os
 from collections.abc import Callable, Hashable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import rollout
+from codesign_jax import memory_maps, rollout, sources
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
@@ -42,13 +44,18 @@ class Program:
 
         Raises:
           SceneError: If the constants do not fit the scene, see `scene.constants.check`.
+          RuntimeError: In a process that was forked from one that had simulated.
         """
-        return self._jitted(first, second, self._numbers(constants), *self._more)
+        return _again_if_stuck(
+            lambda: self._jitted(first, second, self._numbers(constants), *self._more)
+        )
 
     def compile(self, first: Any, second: Any) -> Callable[..., Any]:
         """Compiles the program ahead for arguments like these; a function to call it by."""
         numbers = self._numbers(None)
-        compiled = self._jitted.lower(first, second, numbers, *self._more).compile()
+        compiled = _again_if_stuck(
+            lambda: self._jitted.lower(first, second, numbers, *self._more).compile()
+        )
         return lambda first, second: compiled(first, second, numbers, *self._more)
 
     def _numbers(self, constants: Constants | None) -> Constants:
@@ -57,23 +64,79 @@ class Program:
         return jax.tree.map(lambda v: jnp.asarray(v, float), numbers)
 
 
+_process = {"begun": False, "forked": False}
+"""Whether programs have run in this process, and whether it was forked from one in which they had.
+
+A child of `os.fork` has none of XLA's threads, for which its programs would wait for ever.
+"""
+
+
+def _forked() -> None:
+    """This process is a child."""
+    _process["forked"] = _process["begun"]
+
+
+def _begin() -> None:
+    """A program is about to run.
+
+    Raises:
+      RuntimeError: If the process was forked from one in which programs had run.
+    """
+    if _process["forked"]:
+        raise RuntimeError(
+            "this process was forked from one that had simulated, and would wait for ever for "
+            "XLA's threads, which it has not: begin processes by multiprocessing's `spawn`"
+        )
+    _process["begun"] = True
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)
+
+
+def _again_if_stuck(call: Callable[[], Any]) -> Any:
+    """Returns call(), if need be without what JAX had traced.
+
+    Ctrl-C at a bad moment of tracing leaves a mark in one of JAX's caches, which takes the next
+    call for a recursion.
+    """
+    _begin()
+    try:
+        return call()
+    except RecursionError as error:
+        if "Recursively calling" not in str(error):
+            raise
+        jax.clear_caches()
+        return call()
+
+
 def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
-    """Jits what `build` returns once for each structure, engine, design space and further argument.
+    """Jits what `build` returns once for each structure, engine and further argument.
+
+    Nothing is found again once the code is not what was imported, see `sources`.
 
     Args:
       build: Function (scene, engine, space, *arguments) that returns a function to jit, which reads
         numbers from its constants alone; the last argument is a cost of one's own or None.
     """
-    jitted = lambda *arguments: jax.jit(build(*arguments))  # noqa: E731
+
+    def jitted(*arguments: Any) -> Callable:
+        memory_maps.relieve()
+        return jax.jit(build(*arguments))
+
     kept = functools.lru_cache(maxsize=_KEPT)(jitted)
+    memory_maps.holds_programs(kept.cache_clear)
 
     @functools.wraps(build)
     def find(scene: Scene, engine: Engine, space: DesignSpace, *arguments: Any) -> Callable:
         if arguments[-1] is not None:
             # A cost of one's own may read names and whatever else is no number of the scene.
             return jitted(scene, engine, space, *arguments)
-        if not isinstance(engine, Hashable):
-            return jitted(scene.structure, engine, space, *arguments)
-        return kept(scene.structure, engine, space, *arguments)
+        if not isinstance(engine, Hashable) or sources.digest() is None:
+            return jitted(scene.structure, engine, space.structure, *arguments)
+        return kept(scene.structure, engine, space.structure, *arguments)
 
     return find
+
+
+sources.note()  # what programs are traced from has been imported

@@ -24,7 +24,7 @@ import numpy as np
 from codesign_jax import axes, control, model
 from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
-from codesign_jax.scene import Constants, Scene, parameters, schema
+from codesign_jax.scene import Constants, Scene, reach, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes, check
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Trace, Trial, failed
@@ -153,17 +153,20 @@ def simulate(
     Raises:
       SceneError: If the engine was made for a scene of another structure, if an array lacks an
         axis, if the constants do not fit the scene or lie outside their ranges, or if a parameter
-        is out of its range by a factor between units, such as millimetres given for metres; of
+        is out of its range by a factor between units, such as millimetres given for metres, or a
+        finger is so high that its contacts begin farther from a mesh than distances reach; of
         traced ones no values are known.
     """
     axes.refuse_other(scene, engine)
     constants = numbers(scene, constants)
     axes.refuse(scene, params, trials, ("world", "world"))
     axes.refuse_constants(constants, len(trials.yaw), "world")
-    parameters.refuse_unit_slips(params)
+    unit_slips.refuse(params)
+    if not isinstance(params.height, jax.core.Tracer):
+        reach.refuse(scene.objects, float(np.asarray(params.height).max()) / 2)
     fields, ctrl, initial = prepare(scene, params, trials, constants)
     trace = engine.rollout(fields, ctrl, trajectory=bool(trajectory))
-    judged = judge(scene, trace, ctrl, initial, constants, trajectory=trajectory, cost=cost)
+    judged = judge(scene, trace, ctrl, initial, trials, constants, trajectory=trajectory, cost=cost)
     return judged, trace
 
 
@@ -203,6 +206,7 @@ def judge(
     trace: Trace,
     ctrl: jax.Array | None,
     initial: jax.Array,
+    trials: Trial,
     constants: Constants,
     *,
     trajectory: bool | None = None,
@@ -215,18 +219,19 @@ def judge(
       trace: Their trace.
       ctrl: Their controls, for a cost of one's own; None without one.
       initial: Bits of `Status` that they started with, shape (world,).
+      trials: Their trials, with leading axis (world,).
       constants: Their numbers, leaves of shape () or (world,).
       trajectory: As in `simulate`, with which the trace was made.
       cost: As in `simulate`.
     """
 
-    def world(t: Trace, u: jax.Array | None, i: jax.Array, c: Constants) -> Outcome:
+    def world(t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial, c: Constants) -> Outcome:
         own = scene.with_constants(c)
-        result = outcome(own, t, i)
+        result = outcome(own, t, i, trial)
         return result if cost is None else _by_own(own, cost, shown(t, trajectory), u, result)
 
-    every = trace, ctrl, initial, constants
-    return jax.vmap(world, in_axes=(0, 0, 0, batch_axes(constants)))(*every)
+    every = trace, ctrl, initial, trials, constants
+    return jax.vmap(world, in_axes=(0, 0, 0, 0, batch_axes(constants)))(*every)
 
 
 def _by_own(

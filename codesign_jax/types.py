@@ -10,9 +10,10 @@ array([False,  True, False])
 """
 
 import enum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 
 
 class Status(enum.IntFlag):
@@ -132,6 +133,19 @@ class Trial(NamedTuple):
     hand_mass: jax.Array | None = None
 
 
+class Phased(Protocol):
+    """What knows the phases of a grasp: a scene."""
+
+    @property
+    def num_steps(self) -> int:
+        """Time steps of one grasp."""
+        ...
+
+    def last_step(self, phase: str | None = None) -> Any:
+        """Index of the last time step of a phase."""
+        ...
+
+
 class Trace(NamedTuple):
     """What a rollout reports of every time step; entry k describes the state at time k * timestep.
 
@@ -172,6 +186,47 @@ class Trace(NamedTuple):
     qpos: jax.Array
     status: jax.Array | None = None
     last: jax.Array | None = None
+
+    def at(self, scene: Phased, phase: str | None = None) -> "Trace":
+        """The trace in the last time step of a phase, without the axis time.
+
+        A grasp goes on after the part that counts: in the scene `paper` entry -1 is one second
+        after the hand was told to let go.  What a cost asks of the end of a grasp is `at` the end
+        of "disturb".  Works inside `jax.jit`, `jax.vmap` and `jax.grad`, and on batches of worlds.
+
+        Args:
+          scene: The scene that was simulated, or the one that a cost receives.
+          phase: "approach", "inflate", "lift", "disturb" or "ungrasp", as far as the scene has it;
+            None for the last one in which losing the object costs: "disturb", or "lift" where
+            `effects.disturb` is off.
+
+        Returns:
+          A trace whose arrays have lost their axis time; `last` is None.
+
+        Raises:
+          SceneError: If the grasp has no such phase.
+          ValueError: If the trace is not one of a whole grasp of the scene.
+
+        >>> import jax.numpy as jnp
+        >>> from codesign_jax import Trace, scene
+        >>> released = jnp.where(jnp.arange(900) < 850, 0.02, 0.5)  # m: let go after 8.5 s
+        >>> trace = Trace(released, released, released, jnp.zeros((900, 0)))
+        >>> held = trace.at(scene.load("paper"), "disturb")
+        >>> round(float(held.distance), 3), round(float(trace.distance[-1]), 3)
+        (0.02, 0.5)
+        """
+        index, steps = scene.last_step(phase), jnp.shape(self.distance)[-1]
+        if jnp.ndim(index):
+            raise ValueError("the scene's phases differ between worlds: map over them by jax.vmap")
+        if steps != scene.num_steps:
+            raise ValueError(
+                f"the trace has {steps} time steps, but a grasp of the scene {scene.num_steps}: "
+                "was it simulated in another scene?"
+            )
+        series = (self.distance, self.height, self.speed)
+        distance, height, speed = (v[..., index] for v in series)
+        status = None if self.status is None else self.status[..., index]
+        return Trace(distance, height, speed, self.qpos[..., index, :], status)
 
 
 class Outcome(NamedTuple):

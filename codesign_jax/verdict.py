@@ -40,8 +40,7 @@ class Bounds(NamedTuple):
 
 def bounds(scene: Scene) -> Bounds:
     """The bounds of a scene, whose numbers may be arrays or traced."""
-    # Rounds numbers, NumPy and JAX arrays alike.
-    start, end = ((t / scene.discretization.timestep + 0.5) // 1 for t in scene.window)
+    start, end = map(scene.steps_to, scene.window)
     limits = scene.limits
     return Bounds(scene.cost.lost_distance, start, end, limits.speed, limits.penetration)
 

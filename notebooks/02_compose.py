@@ -65,7 +65,7 @@ def distance(design, trial):
     """Distance of object and hand when the object is lifted [m]."""
     one = jax.tree.map(lambda v: v[None], (space.params(design), trial))
     _, trace = rollout.simulate(grasping, engine, *one, trajectory=True)
-    return trace.distance[0, -1]
+    return trace.at(grasping, "lift").distance[0]
 
 
 designs = jnp.asarray([[0.09, 0.03], [0.11, 0.05], [0.13, 0.07]])
@@ -126,13 +126,15 @@ print("mean cost, a row for each seed:\n", np.round(np.asarray(infos.selection.m
 # ## A cost of one's own
 #
 # Any function of the scene, the trace of a world and its controls; here how high the object is at
-# the end.  With `trajectory=True` a world is simulated to the end though it lost its object.
+# the end of the lift.  (In a scene that is shaken too, ask for the trace at the end of "disturb":
+# the last entry of a whole grasp comes after the release.)  With `trajectory=True` a world is
+# simulated to the end though it lost its object.
 
 
 # %%
 def height_missing(scene, trace, ctrl):
     """How far the object stays below 0.2 m [m]."""
-    return jnp.maximum(0.2 - trace.height[-1], 0.0)
+    return jnp.maximum(0.2 - trace.at(scene, "lift").height, 0.0)
 
 
 evaluate = codesign.make_evaluate(

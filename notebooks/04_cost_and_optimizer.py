@@ -41,18 +41,20 @@ space = parameters.design_space(grasping.hand, "2d")  # finger length and arm he
 # ## A cost: how close the object is held
 #
 # The paper's cost asks when the object is lost.  This one asks how near it is to the hand's centre
-# from the end of the inflation on, in units of the distance at which it counts as lost.  It sees
-# the trace of one world, arrays with the axis time, and the controls.  A cost that reads the trace
-# says how much of it there is to be: `trajectory=True` simulates a world to the end though it lost
-# its object; with `trajectory=False` it stops there, which is faster, and its last entry repeats.
+# from the end of the inflation to the end of the shaking, in units of the distance at which it
+# counts as lost; what comes later is the release.  (`trace.at(scene, "disturb")` is one time step
+# of a trace, the last one of a phase.)  The cost sees the trace of one world, arrays with the axis
+# time, and the controls.  A cost that reads the trace says how much of it there is to be:
+# `trajectory=True` simulates a world to the end though it lost its object; with `trajectory=False`
+# it stops there, which is faster, and its last entry repeats.
 
 # %%
-closed = round(grasping.phases.inflate / grasping.discretization.timestep)
+closed, shaken = grasping.last_step("inflate") + 1, grasping.last_step() + 1
 
 
 def looseness(scene, trace, ctrl):
-    """Mean distance of object and hand once the fingers are closed, over the lost distance."""
-    return jnp.mean(jnp.minimum(trace.distance[closed:] / scene.cost.lost_distance, 2.0))
+    """Mean distance of object and hand while it is to be held, over the lost distance."""
+    return jnp.mean(jnp.minimum(trace.distance[closed:shaken] / scene.cost.lost_distance, 2.0))
 
 
 # %% [markdown]

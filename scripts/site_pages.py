@@ -1,8 +1,8 @@
 """What MkDocs asks for when it builds the site: pages from files that lie outside of docs/.
 
-README.md becomes the front page, CONTRIBUTING.md, CHANGELOG.md and scripts/README.md become pages,
-and so does each notebook. Links between them and docs/ are those of the repository; here they
-are turned into those of the site. mkdocs.yml names this file.
+README.md becomes the front page, the other files of `PAGES` become pages, and so does each
+notebook. Links between them and docs/ are those of the repository; here they are turned into those
+of the site. mkdocs.yml names this file.
 """
 
 import posixpath
@@ -19,6 +19,7 @@ PAGES = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
     "scripts/README.md": "scripts.md",
 }
 PAGES |= {

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from codesign_jax import sources
 from codesign_jax.compiler import cache
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.constants import world_constants
@@ -29,6 +30,7 @@ from codesign_jax.engines.structured.kernel import (
     newton,
     pairs,
     problem,
+    program,
     slots,
     step,
 )
@@ -179,7 +181,10 @@ def planted(faults: Mapping[str, Fault]) -> Iterator[Planted]:
 
         patch.setattr(step.Step, "__init__", prepare)
         # Sound kernels must neither be found in the place of this one nor find it.
-        patch.setattr(cache, "sources", lambda *_: f"planted: {sorted(faults)}")
+        patch.setattr(sources, "digest", lambda: f"planted: {sorted(faults)}")
+        patch.setattr(
+            program, "of_code", lambda _: None
+        )  # what has no fault is traced once for all
         patch.setattr(cache, "kept", lambda name, build: build())
         yield fault
     missing = fault.wanted() - fault.used

@@ -9,7 +9,7 @@ import scipy.stats
 
 from codesign_jax.engines.structured.kernel import Limits
 from codesign_jax.types import Trace
-from scripts.benchmark import cases, compare, report
+from scripts.benchmark import cases, compare, grasps, report
 from scripts.shared import statistics, work
 
 
@@ -139,3 +139,11 @@ def test_limits_of_the_kernel_s_solver_are_read():
     assert list(found) == ["mujoco", "mujoco, perturbed", "structured", "structured, 4/6/1e-05"]
     engine = found["structured, 4/6/1e-05"]()
     assert engine.limits == Limits(4, 6, 1e-5)
+
+
+def test_a_case_that_is_measured_again_keeps_its_calls_and_counts_the_shortest():
+    first = grasps.merged(None, {"worlds": 60, "seconds": [2.0, 1.0], "processor_s": [2.0, 1.5]})
+    assert (first["best_s"], first["grasps_per_s"]) == (1.0, 60.0)
+    slow = grasps.merged(first, {"worlds": 60, "seconds": [4.0], "processor_s": [1.4]})
+    assert slow["seconds"] == [2.0, 1.0, 4.0] and slow["grasps_per_s"] == 60.0
+    assert slow["processor_s"] == [2.0, 1.5, 1.4]

@@ -1,5 +1,7 @@
 """Episodes, seeds and tests: what an optimisation does with an engine's outcomes."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,6 +54,25 @@ def test_one_compile_serves_every_schedule_and_seed(setup):
         batch=PARTICLES,
     )
     assert engine.traced == traced > 0
+
+
+def test_other_bounds_and_defaults_share_the_program(setup):
+    """A fixed value of the preset is a constant of it."""
+    the_scene, space, engine, optimizer, episode = setup
+    episode(start(optimizer), np.array([True, True]))
+    traced, free = engine.traced, space.source.index(0)
+    base = tuple(v * 1.1 if k == free else v for k, v in enumerate(space.base))
+    low, high = ([0.04, -0.001], [0.06, 0.001])
+    other = dataclasses.replace(space, bounds=(tuple(low), tuple(high)), base=base)
+    narrow = codesign.make_filter(other)
+    found = codesign.make_episode(the_scene, engine, other, narrow, TRIALS)
+    _, info = found(start(narrow), np.array([True, True]))
+    assert engine.traced == traced > 0
+    assert (np.float32(low) <= info.population).all() and (
+        info.population <= np.float32(high)
+    ).all()
+    fixed = dataclasses.replace(space, base=tuple(1.1 * v for v in space.base))
+    assert fixed.structure != space.structure == other.structure
 
 
 def test_episode_is_move_evaluate_weigh_and_resample(setup):

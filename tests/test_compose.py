@@ -251,24 +251,28 @@ def test_a_cost_does_not_read_what_was_not_simulated():
         return trace.height[-1]
 
     jitted = jax.jit(lambda trace: trace.height[-1])  # the trace is still a tree of arrays
-    for cost in (height, lambda s, t, u: jitted(t), lambda s, t, u: t[1][-1]):
+    reads = [lambda s, t, u: t[1][-1], lambda s, t, u: t.at(s).height]
+    for cost in (height, lambda s, t, u: jitted(t), *reads):
         words = "pass trajectory=True beside cost= to have all of the grasp, or trajectory=False"
         with pytest.raises(ValueError, match=words):
             trace_it(cost)
     for flags in ({}, {"trajectory": False}):
         with pytest.raises(ValueError, match="trace.qpos, which is recorded with trajectory=True"):
             trace_it(lambda s, t, u: t.qpos[-1, -5], **flags)
+    with pytest.raises(ValueError, match="trace.qpos, which is recorded with trajectory=True"):
+        trace_it(lambda s, t, u: t.at(s, "disturb").qpos[-5], trajectory=False)
 
     @jax.jit
     def allowed(p, t):
         return [
             cost_of(p, t, height, trajectory=True),
             cost_of(p, t, height, trajectory=False),
+            cost_of(p, t, lambda s, t, u: t.at(s, "disturb").height, trajectory=False),
             cost_of(p, t, lambda s, t, u: jitted(t), trajectory=False),
             cost_of(p, t, lambda s, t, u: u[0, 0] * 0 + 1.5),  # reads nothing of the trace
         ]
 
-    assert [float(v) for v in allowed(params, trial)] == [0.5, 0.5, 0.5, 1.5]
+    assert [float(v) for v in allowed(params, trial)] == [0.5, 0.5, 0.5, 0.5, 1.5]
     make = codesign.make_evaluate(scene, engine, space, 1, cost=height)
     with pytest.raises(ValueError, match=r"reads trace\.height"):
         make(jnp.array([[0.05, 0.0]]), jax.random.key(0))

@@ -350,6 +350,16 @@ def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
     message = capsys.readouterr().err
     assert "every one of 6 trials failed (SPEED 6)" in message
     assert "discretization.timestep" in message and "codesign replay" in message
+    # However often it is started: no episode is added, and none of its designs is praised.
+    for _ in range(2):
+        assert cli.main([*arguments, "--set", "limits.speed=1"]) == 1
+        assert "every one of 6 trials failed (SPEED 6)" in capsys.readouterr().err
+    assert len((folder / "episodes.csv").read_text().splitlines()) == 2
+    assert cli.main(["evaluate", str(folder), "--dry-run"]) == 0
+    doubt = "every trial of the run's chosen design failed (SPEED 2)"
+    assert doubt in capsys.readouterr().err
+    assert cli.main(["export", str(folder), "--out", str(tmp_path / "models")]) == 2
+    assert "Nothing is exported" in capsys.readouterr().err and not (tmp_path / "models").exists()
 
 
 def test_the_progress_line_counts_by_cause():

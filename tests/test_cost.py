@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from codesign_jax import cost, scene
+from codesign_jax import cost, rollout, scene
 from codesign_jax.types import Outcome, Status, Trace
 from tests import small
 
@@ -15,6 +15,7 @@ SCENE = scene.load("paper_spheres")
 STEPS, LOST = SCENE.num_steps, SCENE.cost.lost_distance
 repeatable = settings(max_examples=50, deadline=None, derandomize=True)
 evaluate = jax.jit(lambda trace: cost.outcome(SCENE, trace))
+judge = jax.jit(lambda trace, trial: cost.outcome(SCENE, trace, 0, trial))
 
 
 def trace(lost_from=None, until=STEPS, **changes):
@@ -110,6 +111,19 @@ def test_a_stuck_object_fails_the_trial():
     assert cost.outcome(without, held).status == Status.OK
 
 
+def test_whether_an_object_rests_is_told_by_its_own_size():
+    """A sphere of 30 mm that is held at 40 mm is stuck; a cuboid may stand there on a corner."""
+    held = trace(distance={STEPS - 1: 0.05}, height={STEPS - 1: 0.04})
+    for name, size, status in (
+        ("sphere", 1.0, Status.STUCK),
+        ("sphere", 1.4, Status.OK),  # this trial's has 42 mm
+        ("cuboid", 1.0, Status.OK),
+        ("cuboid", 0.7, Status.STUCK),  # 36 mm from its centre to a corner
+    ):
+        trial = rollout.nominal_trial(SCENE, name)._replace(size=jnp.float32(size))
+        assert judge(held, trial).status == status, (name, size)
+
+
 @repeatable
 @given(st.integers(350, 799), st.integers(350, 799))
 def test_earlier_losses_cost_more(first, second):
@@ -125,6 +139,67 @@ def test_worlds_are_independent_under_vmap():
     for i, t in enumerate(traces):
         for a, b in zip(evaluate(t), together, strict=True):
             np.testing.assert_array_equal(a, b[i])
+
+
+# --- a trace at the end of a phase ---------------------------------------------------------------
+
+
+def counted(worlds=()):
+    """A trace whose entries are their indices, and five times that in qpos."""
+    step = jnp.broadcast_to(jnp.arange(float(STEPS)), (*worlds, STEPS))
+    qpos = 5 * step[..., None] + jnp.arange(3)
+    return Trace(step, step, step, qpos, step.astype(int), qpos[..., 0, :])
+
+
+ENDS = {"approach": 199, "inflate": 349, "lift": 449, "disturb": 799, "ungrasp": 899, None: 799}
+
+
+@pytest.mark.parametrize("worlds", [(), (2,)])
+def test_a_trace_at_the_end_of_a_phase_is_its_last_step(worlds):
+    for phase, last in ENDS.items():
+        found = counted(worlds).at(SCENE, phase)
+        np.testing.assert_array_equal(found.distance, np.full(worlds, last))
+        np.testing.assert_array_equal(found.qpos, np.full((*worlds, 3), 5 * last) + np.arange(3))
+        assert found.status.shape == worlds and found.last is None
+
+
+def test_the_last_step_that_counts_is_that_of_the_cost():
+    """An object that is lost in it costs, and one step later does not."""
+    last = SCENE.last_step()
+    assert evaluate(trace(last)).cost > 0 and evaluate(trace(last + 1)).cost == 0
+
+
+def test_a_trace_at_a_phase_composes_with_transformations():
+    """Also where the phases' ends are traced numbers, one for each world."""
+    numbers = SCENE.constants()
+    ends = jnp.array([8.0, 7.5])  # s
+    shorter = numbers._replace(phases=numbers.phases._replace(disturb=ends))
+    axes = jax.tree.map(lambda v: 0 if jnp.ndim(v) else None, shorter)
+
+    def distance(trace, constants):
+        return trace.at(SCENE.with_constants(constants), "disturb").distance
+
+    found = jax.jit(jax.vmap(distance, (None, axes)))(counted(), shorter)
+    np.testing.assert_array_equal(found, [799, 749])
+    slope = jax.grad(distance)(counted()._replace(status=None), numbers).distance
+    np.testing.assert_array_equal(np.flatnonzero(slope), [799])
+    with pytest.raises(ValueError, match=r"phases differ between worlds: map .* jax\.vmap"):
+        counted((2,)).at(SCENE.with_constants(shorter), "disturb")
+
+
+def test_a_trace_without_the_phase_says_so():
+    brief = scene.load("paper_spheres", overrides={"effects": {"disturb": False, "ungrasp": False}})
+    assert list(brief.phase_ends) == ["approach", "inflate", "lift"]
+    held = jax.tree.map(lambda v: v[: brief.num_steps], counted())
+    assert held.at(brief).distance == held.at(brief, "lift").distance == 449
+    for the_scene, phase, words in (
+        (SCENE, "distrub", "phase 'distrub' unknown; did you mean 'disturb'"),
+        (SCENE, "shaking", "unknown; valid: approach, disturb, inflate, lift, ungrasp"),
+        (brief, "disturb", "has no phase 'disturb', as effects.disturb = false; its grasp ends"),
+        (brief, "lift", "the trace has 900 time steps, but a grasp of the scene 450"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            counted().at(the_scene, phase)
 
 
 # --- particles -----------------------------------------------------------------------------------

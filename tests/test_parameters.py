@@ -1,6 +1,7 @@
 """Design spaces: the order of Table I, presets, tied parameters, units and the pressure limit."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
-from codesign_jax.scene import hand, parameters, schema
+from codesign_jax.scene import hand, parameters, schema, unit_slips
 
 HAND = hand.load("pneuflex4")
 FULL, PLANAR = parameters.design_space(HAND), parameters.design_space(HAND, "2d")
@@ -32,7 +34,7 @@ def test_the_full_table_is_the_papers():
 
 
 def test_params_are_named_and_in_si_units():
-    design = FULL.from_units(np.arange(1.0, 24.0))  # 1, 2, ... in the file's units
+    design = np.arange(1.0, 24.0) * FULL.scale  # 1, 2, ... in the file's units
     params = FULL.params(jnp.asarray(design))
     np.testing.assert_allclose(params.length, np.arange(1, 5) * 1e-3, rtol=1e-6)
     np.testing.assert_allclose(params.height, np.arange(5, 9) * 1e-3, rtol=1e-6)
@@ -67,7 +69,7 @@ def test_other_units_than_si_are_refused_in_words(name, value, expected):
         assert expected in str(caught.value) and "Python takes SI units" in str(caught.value)
     full = parameters.unflatten(HAND, design)
     with pytest.raises(schema.SceneError, match=r"did you mean"):
-        parameters.refuse_unit_slips(full)
+        unit_slips.refuse(full)
 
 
 def test_designs_of_another_length_are_refused_by_the_conversion_of_units():
@@ -80,6 +82,19 @@ def test_designs_of_another_length_are_refused_by_the_conversion_of_units():
                 convert(design)
 
 
+def test_designs_outside_of_the_bounds_are_converted_with_a_warning():
+    """At the boundary of units; what is in SI already is simulated as it is."""
+    space = parameters.design_space(HAND, "2d")
+    words = re.escape("length = 0.095 is outside [10, 180] mm; did you mean 95? (m given where mm")
+    with pytest.warns(UserWarning, match=words):
+        np.testing.assert_allclose(space.from_units([0.095, 30.0]), [95e-6, 0.03])
+    words = r"length = 190.0 is outside .*; arm_z = nan is outside \[-60, 200\] mm"
+    with pytest.warns(UserWarning, match=words):
+        space.from_units([[100.0, 30.0], [190.0, np.nan]])
+    for end in space.bounds:  # float32's rounding of a bound is none
+        space.from_units(space.in_units(np.array(end, np.float32)))
+
+
 def test_pressures_that_may_be_kilopascals_are_hinted_at():
     """141 Pa is in the range, which begins at 0, and moves nothing."""
     design = FULL.default()
@@ -89,7 +104,7 @@ def test_pressures_that_may_be_kilopascals_are_hinted_at():
     with pytest.warns(UserWarning, match=hint):
         FULL.params(design)
     with pytest.warns(UserWarning, match=hint):
-        parameters.refuse_unit_slips(parameters.unflatten(HAND, design))
+        unit_slips.refuse(parameters.unflatten(HAND, design))
     for faint in (0.0, [141.0, 0.0, 0.0, 120e3]):  # no pressure; one finger left slack
         design[pressures] = faint
         FULL.params(design)
@@ -97,7 +112,7 @@ def test_pressures_that_may_be_kilopascals_are_hinted_at():
 
 def test_what_no_unit_explains_and_what_is_traced_is_left_to_the_status():
     design = FULL.default()
-    parameters.refuse_unit_slips(FULL.params(design)._replace(length=-np.ones(4)))
+    unit_slips.refuse(FULL.params(design)._replace(length=-np.ones(4)))
     jax.eval_shape(FULL.params, 97 + design)
 
 
@@ -191,3 +206,97 @@ def test_a_tied_pressure_obeys_the_thinnest_wall():
     design = jnp.asarray([0.007, 0.005, 0.002, 0.006, 150e3])
     np.testing.assert_allclose(space.project(design)[-1], 80e3, rtol=1e-5)
     assert space.project(design)[-1] < 80e3
+
+
+THUMB = hand.load("thumb4")
+
+
+def test_fingers_may_have_values_and_bounds_of_their_own():
+    """The file has [60, 60, 60, 40] to [180, 180, 180, 110] mm, default [100, 100, 100, 75]."""
+    space = parameters.design_space(THUMB)
+    low, high = space.in_units(np.array(space.low)), space.in_units(np.array(space.high))
+    np.testing.assert_allclose(low[:4], [60, 60, 60, 40])
+    np.testing.assert_allclose(high[:4], [180, 180, 180, 110])
+    np.testing.assert_allclose(space.in_units(space.default())[:4], [100, 100, 100, 75])
+    np.testing.assert_allclose(high[4:8], 25)  # a number is for all fingers
+    fixed = parameters.design_space(THUMB, "2d").params(jnp.asarray([0.8, 0.01]))
+    np.testing.assert_allclose(fixed.length, [0.1, 0.1, 0.1, 0.075], rtol=1e-6)
+    np.testing.assert_allclose(fixed.pressure, [110e3, 110e3, 110e3, 140e3], rtol=1e-6)
+    np.testing.assert_allclose(fixed.wall, 0.005, rtol=1e-6)
+
+
+def test_a_preset_narrows_single_fingers_and_tied_ones_share_the_bounds_of_all():
+    def of(*free):
+        return parameters.design_space(
+            dataclasses.replace(THUMB, preset=(hand.Preset("own", free),)), "own"
+        )
+
+    narrow = of(hand.Free("length", low=(70.0, 80.0, 90.0, 50.0), high=120.0))
+    np.testing.assert_allclose(narrow.in_units(narrow.low), [70, 80, 90, 50])
+    np.testing.assert_allclose(narrow.in_units(narrow.high), 120)
+    tied = of(hand.Free("length", tied=True))
+    assert tied.names == ("length",)
+    np.testing.assert_allclose(tied.in_units([tied.low, tied.high]), [[60], [110]])
+
+
+def test_fingers_that_are_given_one_by_one_are_those_that_share_a_number():
+    """Names, bounds and values are the same, whichever way a file states them."""
+    rows = (
+        dataclasses.replace(r, low=(r.low,) * 4, high=(r.high,) * 4, default=(r.default,) * 4)
+        if r.per == "finger"
+        else r
+        for r in HAND.parameter
+    )
+    one_by_one = parameters.design_space(dataclasses.replace(HAND, parameter=tuple(rows)))
+    assert dataclasses.replace(one_by_one, hand=FULL.hand) == FULL
+    np.testing.assert_array_equal(one_by_one.default(), FULL.default())
+
+
+@pytest.mark.parametrize("the_hand", [HAND, THUMB], ids=lambda h: h.name)
+def test_sampled_designs_are_legal_and_uniform_where_no_limit_acts(the_hand):
+    space = parameters.design_space(the_hand)
+    designs = np.asarray(space.sample(jax.random.key(0), 2000))
+    assert (designs.astype(float) >= space.low).all() and (
+        designs.astype(float) <= space.high
+    ).all()
+    params = parameters.params_of(space, designs)
+    limit = np.float32(40e6) * np.asarray(params.wall)
+    assert (np.asarray(params.pressure) < limit).all()
+    # Of a thick wall every pressure is legal; others are lowered and no longer uniform.
+    free = np.array([name.startswith("pressure") for name in space.names])
+    thick = np.ones(designs.shape, bool)
+    thick[:, free] = limit > space.high[free]
+    scaled = (designs - space.low) / (space.high - space.low)
+    found = [stats.kstest(scaled[thick[:, k], k], "uniform").pvalue for k in range(len(free))]
+    # The smallest of 23 p-values of a true hypothesis is below 1e-4 once in 400 seeds.
+    assert min(found) > 1e-4
+    lowered = (np.asarray(params.pressure) > limit * (1 - 1e-5)).any(1).mean()
+    assert 0.2 < lowered < 0.5  # so the limit was met
+
+
+def test_any_part_of_the_designs_is_drawn_alone_and_traced():
+    key = jax.random.key(7)
+    designs = FULL.sample(key, 12)
+    np.testing.assert_array_equal(designs[:5], FULL.sample(key, 5))
+    part = jax.jit(lambda key, first: FULL.sample(key, 4, first=first))(key, 8)
+    np.testing.assert_array_equal(designs[8:], part)
+    assert (np.asarray(designs) != np.asarray(FULL.sample(jax.random.key(8), 12))).all()
+
+
+@pytest.mark.parametrize(
+    ("key", "n", "expected"),
+    [
+        (jax.random.key(0), 0, "n = 0 designs must be a whole number, at least 1"),
+        (jax.random.key(0), 2.0, "n = 2.0 designs must be"),
+        (0, 3, "key must be one typed key from jax.random.key, got shape () of int32"),
+        (jax.random.split(jax.random.key(0)), 3, "got shape (2,) of key<fry>"),
+    ],
+)
+def test_what_no_designs_are_drawn_from_is_refused(key, n, expected):
+    with pytest.raises(schema.SceneError, match=re.escape(expected)):
+        FULL.sample(key, n)
+
+
+def test_bounds_are_arrays_of_which_jax_draws():
+    drawn = jax.random.uniform(jax.random.key(0), (5, 23), minval=FULL.low, maxval=FULL.high)
+    assert drawn.shape == (5, 23) and hash(FULL) == hash(parameters.design_space(HAND))

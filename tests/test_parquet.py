@@ -78,7 +78,7 @@ def test_types_and_provenance_are_in_the_schema(finished, tmp_path):
     assert bits == {str(int(s)): s.name for s in Status if s}
     types = {f.name: str(f.type) for f in schema}
     assert (types["cost"], types["status"], types["episode"]) == ("float", "uint8", "int16")
-    assert types["strategy"] == "dictionary<values=string, indices=int8, ordered=0>"
+    assert types["strategy"] == "dictionary<values=string, indices=int16, ordered=0>"
     assert all(f.metadata[b"description"] for f in schema)
 
 

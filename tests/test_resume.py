@@ -28,9 +28,9 @@ from command_runs import (  # noqa: F401
 )
 from toy import TINY
 
-from codesign_jax import codesign, runs
+from codesign_jax import runs, sources
 from codesign_jax.commands import reference
-from codesign_jax.runs import choice, columns
+from codesign_jax.runs import choice, columns, manifest
 from codesign_jax.runs.checkpoint import Checkpoints
 
 
@@ -156,13 +156,23 @@ def test_damaged_checkpoint_is_said_and_the_older_one_used(damage, finished, tmp
     assert_same_run(folder, finished)
 
 
-def test_losing_every_checkpoint_starts_anew(finished, tmp_path, capsys):
+@pytest.mark.parametrize("lost", ["*.sha256", "folder"])
+def test_losing_every_checkpoint_is_refused_until_fresh(lost, finished, tmp_path, capsys):
+    """The tables are the last that is left of the results, and a start would replace them."""
     folder = shutil.copytree(finished, tmp_path / "run")
-    for path in (folder / "checkpoints").glob("*.sha256"):
+    if lost == "folder":
+        shutil.rmtree(folder / "checkpoints")
+    for path in (folder / "checkpoints").glob(lost):
         path.unlink()
-    assert command(*RUN, "--out", folder) == 0
-    assert capsys.readouterr().out.count("is lost") == 3
-    assert_same_run(folder, finished)
+    before = {name: (folder / name).read_bytes() for name in RESULTS}
+    assert command(*RUN, "--out", folder) == (2 if lost == "folder" else 1)
+    error = capsys.readouterr().err
+    assert f"while its tables have {EPISODES} episodes" in error and "--fresh" in error
+    assert before == {name: (folder / name).read_bytes() for name in RESULTS}
+    if lost == "*.sha256":
+        assert error.count(".sha256 is missing") == 3 and (folder / "checkpoints" / "14").is_dir()
+        assert command(*RUN, "--out", folder, "--fresh") == 0
+        assert_same_run(folder, finished)
 
 
 def test_resume_with_another_scene_is_refused_with_a_diff(finished, capsys):
@@ -232,11 +242,17 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         raise AssertionError("simulated again")
 
     with monkeypatch.context() as patch:  # kept in the run folder
-        patch.setattr(codesign, "make_evaluate", never)
+        patch.setattr(reference, "_simulate", never)
         assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
         assert line in capsys.readouterr().out.splitlines()
         with pytest.raises(AssertionError, match="simulated again"):
             command(*RUN, "--reference-trials", "3", "--out", folder)
+        capsys.readouterr()
+        patch.setattr(sources, "digest", lambda: "other code")
+        with pytest.raises(AssertionError, match="simulated again"):
+            command(*RUN, "--reference-trials", "2", "--out", folder)
+        said = capsys.readouterr().out
+        assert "reference.npz is of another version of the code: simulated again" in said
     settings = runs.read_run(folder)[1]
     assert reference.number_of_trials(None, settings) == 0  # MuJoCo C would take minutes
     quick = dataclasses.replace(settings, engine="structured")
@@ -289,7 +305,8 @@ def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsy
 
 
 def test_checkpoints_are_written_every_episode(finished):
-    with Checkpoints(Path(finished) / "checkpoints") as store:
+    own = manifest.read_provenance(finished)["id"]
+    with Checkpoints(Path(finished) / "checkpoints", run=own, read_only=True) as store:
         found = store.restore()
     assert found.step == EPISODES + 1 and "test" in found.arrays
     kept = sorted(int(p.stem) for p in (finished / "checkpoints").glob("*.sha256"))

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from codesign_jax import caches
 from codesign_jax.compiler import cache, cpu, ffi, gpu, host, launch, vector
 from codesign_jax.compiler.layout import OUTPUT, SCRATCH, Array, Layout
 from tests import frames, kernels
@@ -482,8 +483,8 @@ def test_code_is_kept_and_damage_is_seen(folder):
 
 def test_what_is_not_used_goes(folder, monkeypatch):
     """Ten kernels of 100 bytes under a limit of 532: four stay, the used one among them."""
-    monkeypatch.setenv(cache.LIMIT, str(4 * 132 + 4))
-    abandoned = folder / "kernels" / "x.part"
+    monkeypatch.setenv(caches.KERNELS, str(4 * 132 + 4))
+    abandoned = folder / "kernels" / "x.tmp"
     for k in range(10):
         cache.kept(f"k{k}", lambda: bytes(100))
         for n in range(k + 1):  # files of one instant have an order all the same
@@ -497,23 +498,6 @@ def test_what_is_not_used_goes(folder, monkeypatch):
     assert {p.name for p in (folder / "kernels").iterdir()} == {
         f"k{k}.kernel" for k in (0, 7, 8, 9)
     }
-    monkeypatch.setenv(cache.LIMIT, "much")
+    monkeypatch.setenv(caches.KERNELS, "much")
     with pytest.raises(ValueError, match="must be a number of bytes"):
         cache.kept("new", lambda: b"")
-
-
-def test_sources_are_part_of_the_key(tmp_path):
-    """Another line of code in any file but in those left out is another kernel."""
-    for name in ("a.py", "deep/b.py", "report/c.py"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(name)
-
-    def digest():
-        cache.sources.cache_clear()
-        return cache.sources(tmp_path, ("report",))
-
-    first = digest()
-    (tmp_path / "report" / "c.py").write_text("other")
-    assert digest() == first
-    (tmp_path / "deep" / "b.py").write_text("other")
-    assert digest() != first

@@ -74,6 +74,13 @@ BY_PATH = {
     "hand.finger[1].tilt=75": lambda s: [f.tilt for f in s.hand.finger[:2]] == [70.0, 75.0],
     "hand.parameter.length.high=150": lambda s: s.hand.parameter[0].high == 150.0,
     "hand.preset.2d.fixed.pressure=110": lambda s: s.hand.preset[0].fixed["pressure"] == 110,
+    "hand.preset.2d.fixed.wall=[4, 5, 5, 6]": lambda s: (
+        s.hand.preset[0].fixed["wall"] == (4, 5, 5, 6)
+    ),
+    "hand.parameter.length.default=[110, 110, 60, 90]": lambda s: (
+        s.hand.parameter[0].default == (110.0, 110.0, 60.0, 90.0)
+    ),
+    "hand.preset.2d.free.arm_z.high=150": lambda s: s.hand.preset[0].free[1].high == 150.0,
     "objects.noise.position=0.01": lambda s: s.objects.noise.position == 0.01,
     "objects.object.sphere.mass=0.2": lambda s: s.objects.object[2].mass == 0.2,
     "objects.object.0.size.2=0.02": lambda s: s.objects.object[0].size == (0.03, 0.03, 0.02),
@@ -265,7 +272,7 @@ def test_all_problems_of_all_files_at_once(tmp_path):
     [
         ('unit = "mm"', 'unit = "kPa"', "unit"),  # a length is no pressure
         ("low = 10\nhigh = 180\ndefault", "low = 200\nhigh = 180\ndefault", "must be below"),
-        ("default = 110", "default = 190", "default = 190"),
+        ("default = 80", "default = 190", "default = 190"),
         ('name = "wall"', 'name = "height"', "'wall' must be given once, not 0 times"),
         ('per = "finger"', 'per = "hand"', "per must be 'finger'"),
         ("high = 7", "high = 9", "no air chamber"),
@@ -280,6 +287,61 @@ def test_all_problems_of_all_files_at_once(tmp_path):
 def test_inconsistent_hand(tmp_path, old, new, expected):
     problems = hand_problems(tmp_path, (old, new))
     assert any(p.startswith(expected) or expected in p[10:] for p in problems), problems
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            "\npressure = 120",
+            "\npressure = [120, 110]",
+            "preset 2d.fixed.pressure = [120, 110] must be a number [kPa] for all fingers or 4, "
+            "one for each, not 2",
+        ),
+        (
+            "\npressure = 120",
+            "\npressure = [120, 110, 0.11, 220]",
+            "preset 2d.fixed.pressure[3] = 220 is outside [0, 150] kPa",
+        ),
+        (
+            "\npressure = 120",
+            '\npressure = [120, 110, "100", 110]',
+            "fixed.pressure = [120, 110, '100', 110] must be a number [kPa], or one for each",
+        ),
+        ("\nwall = 5", "\nwall = [5, 5, 2.5, 5]", "120000 Pa is not below the limit of 100000 Pa"),
+        ("\nspread = 45", "\nspread = [45]", "= [45] must be a number [deg]: the hand has one spr"),
+        (
+            "default = 110",
+            "default = [60, 110]",
+            "parameter length.default = [60.0, 110.0] must be a number [mm] for all fingers or 4, "
+            "one for each, not 2",
+        ),
+        ("default = 110", "default = [60, 9, 60, 60]", "length.default[1] = 9.0 is outside [10, 1"),
+        ("default = 110", "default = [60, true, 60, 60]", "default[1] = True must be a number"),
+        ("high = 7", "high = [7, 7, 9, 7]", "a height of 0.015 m leaves no air chamber"),
+        ("high = 7", "high = [7, 7, 70, 7]", "wall.high[2] = 70.0 is outside [0.1, 50] mm"),
+        ("low = 2\n", "low = [2, 2, 8, 2]\n", "parameter wall[2]: low 8 must be below high 7 mm"),
+        ("high = 110", "high = [110]", "high = [110.0] must be a number [deg]: the hand has one"),
+        (
+            "tied = true\nlow = 10",
+            "tied = true\nlow = [10, 10, 10, 20]",
+            "2d.free length.low = [10.0, 10.0, 10.0, 20.0] must be a number [mm]: tied = true",
+        ),
+        ("tied = true\nlow = 10", "low = [10, 10]", "free length.low = [10.0, 10.0] must be a num"),
+    ],
+)
+def test_numbers_of_fingers_that_do_not_fit_the_hand(tmp_path, old, new, expected):
+    """Each problem is told once, with its key, what was given and how many fingers there are."""
+    problems = hand_problems(tmp_path, (old, new))
+    assert len([p for p in problems if expected in p]) == 1, problems
+
+
+def test_bounds_of_fingers_that_share_nothing_cannot_be_tied(tmp_path):
+    table = "low = 10\nhigh = 180\ndefault = 110"
+    apart = "low = [10, 10, 10, 90]\nhigh = [80, 80, 80, 180]\ndefault = [60, 60, 60, 120]"
+    shared = ("tied = true\nlow = 10\nhigh = 180", "tied = true")
+    (problem,) = hand_problems(tmp_path, (table, apart), shared)
+    assert problem == "hands.toml.preset 2d.free length: low 90 must be below high 80"
 
 
 def test_object_with_the_wrong_number_of_sizes(tmp_path):

@@ -15,7 +15,7 @@ from PIL import Image
 from tiny_run import small_run  # noqa: F401
 from toy import TINY
 
-from codesign_jax import cli, codesign, runs, scene
+from codesign_jax import cli, codesign, runs, scene, sources
 from codesign_jax.commands import calls, failure, replay, status
 from codesign_jax.commands import landscape as command
 from codesign_jax.commands.case import Case
@@ -261,6 +261,7 @@ def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
 def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
     """After the first of three calls; another seed begins anew.  Costs are made of the designs."""
     monkeypatch.setitem(calls.WORLDS, "cpu", 3)
+    monkeypatch.setattr(sources, "digest", lambda: "this code")  # in spite of what is replaced here
     count = []
 
     def made(*arguments):
@@ -297,7 +298,15 @@ def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
     assert cli.main([*grid, "part"]) == 130
     monkeypatch.setattr(codesign, "make_evaluate", made)
     assert cli.main([*grid, "part", "--seed", "1"]) == 0
-    assert "going on" not in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "going on" not in said and f"{command.PART} is of another case: simulated again" in said
+    monkeypatch.setattr(codesign, "make_evaluate", stopping)
+    count.clear()
+    assert cli.main([*grid, "part"]) == 130
+    monkeypatch.setattr(sources, "digest", lambda: "other code")
+    assert cli.main([*grid, "part"]) == 0
+    said = capsys.readouterr().out
+    assert "going on" not in said and "is of another version of the code: simulated again" in said
 
 
 def test_missing_extra_is_one_line(monkeypatch, capsys):

@@ -3,6 +3,9 @@
 On Debian: apt-get install slurm-wlm munge.  The tests start and end daemons of their own.
 """
 
+import os
+import pickle
+import stat
 import subprocess
 import sys
 import time
@@ -121,6 +124,45 @@ def test_why_a_job_failed_is_said_in_words(tmp_path):
     assert "without a word" in jobs.why(job(2), "")
 
 
+class Planted:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_results_that_lay_there_before_are_never_unpickled(tmp_path):
+    """Whatever the number of the next process, by which submitit calls a result."""
+    out, made_by = tmp_path / "runs", tmp_path / "planted"
+    (out / "jobs").mkdir(parents=True)
+    bomb = pickle.dumps(("success", Planted(made_by)))
+    pickle.loads(bomb)
+    assert made_by.exists()  # so it goes off
+    made_by.unlink()
+    for number in range(os.getpid(), os.getpid() + 2000):
+        (out / "jobs" / f"{number}_0_result.pkl").write_bytes(bomb)
+    asked = SimpleNamespace(job_set=(("cluster=local",),), jobs=1)
+    with jobs.private_folder(out) as own:
+        place = jobs.Processes(jobs.executor(asked, own), 1)
+        place.start({5: (abs, -7)})
+    assert own.parent == out / "jobs" and stat.S_IMODE(own.stat().st_mode) == 0o700
+    while not (ended := [*place.ended()]):
+        time.sleep(0.05)
+    [(seed, job, state)] = ended
+    assert (seed, job.result(), state) == (5, 7, "") and not made_by.exists()
+    assert Path(job.paths.result_pickle).parent == own
+
+
+def test_a_start_that_is_refused_leaves_no_folder(tmp_path):
+    asked = SimpleNamespace(job_set=(("cluster=local", "memory=3"),), jobs=1)
+    with pytest.raises(SceneError, match="memory"), jobs.private_folder(tmp_path / "a/b") as own:
+        jobs.executor(asked, own)
+    assert not (tmp_path / "a").exists()
+
+
 @WITHOUT
 @pytest.mark.slow
 def test_runs_are_cancelled_queued_again_resumed_and_those_of_one_batch(on_cluster, capfd):
@@ -140,11 +182,11 @@ def test_runs_are_cancelled_queued_again_resumed_and_those_of_one_batch(on_clust
     ask("scontrol", "update", f"JobId={number}_1", "StartTime=now")
     output = process.communicate()[0]
     assert process.returncode == 1
-    said = output + "".join(p.read_text() for p in (folder / "jobs").glob("*_log.*"))
+    said = output + "".join(p.read_text() for p in (folder / "jobs").glob("*/*_log.*"))
     assert "seed 2: stopped by SIGTERM; the same command resumes" in output, said
     assert "seed 4: failed: CANCELLED" in output, said
     assert "seed 3: done" in output, said
-    log = next((folder / "jobs").glob("*_1_0_log.out")).read_text()
+    log = next((folder / "jobs").glob("*/*_1_0_log.out")).read_text()
     assert "queued again, to resume" in log and "resuming episode" in log
     assert 0 < checkpoint.newest(started[0]) < 40 and not (folder / "seed-4").exists()
 

@@ -12,7 +12,7 @@ from codesign_jax.scene.parameters import DesignSpace
 
 @dataclasses.dataclass(frozen=True)
 class _Projection:
-    """`DesignSpace.project`, equal for equal spaces, so that their filters share programs."""
+    """`DesignSpace.project`, equal for spaces of one structure: their filters share programs."""
 
     space: DesignSpace
 
@@ -46,4 +46,4 @@ def make_optimizer(name: str, space: DesignSpace) -> Optimizer:
 
 
 def _box(space: DesignSpace) -> Space:
-    return Space(np.asarray(space.low), np.asarray(space.high), _Projection(space))
+    return Space(np.asarray(space.low), np.asarray(space.high), _Projection(space.structure))

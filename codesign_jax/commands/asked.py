@@ -1,6 +1,7 @@
 """What a command line of `codesign optimize` asks for: scene, settings, seeds and folders."""
 
 import dataclasses
+import os
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,10 @@ from codesign_jax.scene.schema import SceneError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Optimize
+
+
+_LONGEST = 200
+"""Most bytes of a folder's name; file systems take 255, temporary files add to it."""
 
 
 def resolve(options: "Optimize") -> tuple[Scene, Settings]:
@@ -101,10 +106,19 @@ def seeds_of(options: "Optimize") -> list[int]:
 
 
 def folder(options: "Optimize", scene: Scene, settings: Settings, seed: int) -> Path:
-    """Folder of one run: --out, with a folder inside for each of --seeds."""
+    """Folder of one run: --out, with a folder inside for each of --seeds.
+
+    Raises:
+      SceneError: If there is no --out, and what the files call hand or preset is no name of a
+        folder: whoever wrote them would choose a place on this disk.
+    """
     if options.out is not None:
         return options.out if options.seeds is None else options.out / f"seed-{seed}"
     names = [scene.hand.name, settings.preset, settings.schedule, str(seed)]
     if settings.optimizer != optimize.DEFAULT:
         names.insert(3, settings.optimizer)
-    return Path("runs") / "-".join(names)
+    name = "-".join(names)
+    if name[0] in ".-~" or "/" in name or "\\" in name or len(os.fsencode(name)) > _LONGEST:
+        given = schema.shown(name)
+        raise SceneError([f"{given}, of hand and preset, is no name of a folder: give --out"])
+    return Path("runs") / name

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TimeRemainingColumn
 
-from codesign_jax import batch, codesign
+from codesign_jax import archives, batch, codesign
 from codesign_jax.engines import Engine
 from codesign_jax.runs import outcomes, rates
 from codesign_jax.runs.progress import duration
@@ -113,6 +113,11 @@ class Calls:
 
     Asked for the same designs in the same order, another process finds there what was simulated:
     so the same command goes on.
+
+    Attributes:
+      found: Designs whose outcomes were there.
+      refused: Why outcomes that were there are not taken, in words of which the file is the
+        subject; empty if they are.
     """
 
     def __init__(self, trials: Trials, engine: Engine, size: int, part: Path, designs: np.ndarray):
@@ -126,12 +131,15 @@ class Calls:
           designs: All designs that may be asked for, shape (design, parameter), which with `trials`
             and `size` determine the outcomes: calls of another size round differently.
         """
-        self._trials, self._size, self._part = trials, size, part
+        self._trials, self._size, self._part = trials, size, archives.Parts(part)
         how = trials.scene, trials.engine, designs, trials.count, trials.seed
         self._key = f"{outcomes.key(*how)} {size}"
-        kept = outcomes.load(part, self._key)
-        self._kept = [] if kept is None else [kept]
-        self.found = 0 if kept is None else len(kept.cost)
+        read = [outcomes.unpacked(arrays, self._key) for arrays in self._part.found]
+        self.refused = next((why for _, why in read if why), "")
+        kept = [] if self.refused else [outcome for outcome, _ in read if outcome is not None]
+        self._part.go_on(len(kept))
+        self._kept = joined(kept) if kept else None
+        self.found = sum(len(outcome.cost) for outcome in kept)
         self._next, self._seconds = 0, []
         self._evaluate = codesign.make_evaluate(trials.scene, engine, trials.space, trials.count)
 
@@ -146,14 +154,13 @@ class Calls:
         first, self._next = self._next, self._next + len(designs)
         if self._next <= self.found:
             meter.found(len(designs) * self._trials.count)
-            return jax.tree.map(lambda v: v[first : self._next], joined(self._kept))
+            return jax.tree.map(lambda v: v[first : self._next], self._kept)
         rows = np.minimum(np.arange(self._size), len(designs) - 1)
         population, start = jnp.asarray(designs[rows], jnp.float32), time.perf_counter()
         every = self._evaluate(population, jax.random.key(self._trials.seed))
         outcome = jax.tree.map(lambda v: np.asarray(v)[: len(designs)], every)
         self._seconds.append(time.perf_counter() - start)
-        self._kept = [joined([*self._kept, outcome])]
-        outcomes.save(self._part, self._kept[0], self._key)
+        self._part.append(outcomes.packed(outcome, self._key))
         meter.advance(len(designs) * self._trials.count)
         if len(self._seconds) == 1:
             meter.compiled()

@@ -9,9 +9,13 @@ import numpy as np
 from codesign_jax import engines, runs
 from codesign_jax.commands import common
 from codesign_jax.runs import choice
+from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene, keypaths
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import SceneError
+
+PRESET = "2d"
+"""Design space where none is named."""
 
 
 class Options(Protocol):
@@ -19,10 +23,10 @@ class Options(Protocol):
 
     design: tuple[tuple[str, ...], ...]
     run_folder: Path | None
-    preset: str
+    preset: str | None
     hand: str | None
     objects: str | None
-    scene: str
+    scene: str | None
     accuracy: str | None
     overrides: tuple[tuple[str, ...], ...]
     engine: str | None
@@ -44,30 +48,33 @@ class Case(NamedTuple):
     engine: str
 
 
-def find_case(options: Options) -> Case:
+def find_case(options: Options, *, tell: Tell = common.warn) -> Case:
     """The design that the flags name.
+
+    Args:
+      options: The flags.
+      tell: Called with what is amiss with the run, such as damaged checkpoints.
 
     Raises:
       SceneError: If something is wrong with the flags, the run or the files.
     """
-    return _from_run(options) if options.run_folder else _from_flags(options)
+    return _from_run(options, tell) if options.run_folder else _from_flags(options)
 
 
 def _from_flags(options: Options) -> Case:
     scene = common.load_scene(options)
-    space = design_space(scene.hand, options.preset)
+    space = design_space(scene.hand, options.preset or PRESET)
     design = common.parse_design(space, [*chain.from_iterable(options.design)])
     return Case(scene, space, design, options.engine or engines.DEFAULT)
 
 
-def _from_run(options: Options) -> Case:
+def _from_run(options: Options, tell: Tell) -> Case:
     """The design of a run that tested best, or without a test the best of its last episode.
 
     Objects, accuracy and single values may differ from the run's.
     """
-    own = {"--design": bool(options.design), "--hand": options.hand is not None}
-    own |= {"--scene": options.scene != "paper", "--preset": options.preset != "2d"}
-    given = [flag for flag, is_given in own.items() if is_given]
+    own = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
+    given = ["--design"] * bool(options.design) + [f for f, v in own.items() if v is not None]
     if given:
         flags = " and ".join(given)
         raise SceneError([f"--run brings design, hand and scene of its own; leave out {flags}"])
@@ -79,7 +86,11 @@ def _from_run(options: Options) -> Case:
         overrides=keypaths.parse(chain.from_iterable(options.overrides)),
     )
     # By the run's own rule for failed trials, whatever --set says.
-    design = choice.choose(runs.read_run(folder)[0], choice.read_record(folder)).design
+    own_rule = runs.read_run(folder)[0]
+    chosen = choice.choose(own_rule, choice.read_record(folder, tell=tell))
+    if doubt := choice.doubt(chosen):
+        tell(doubt)
+    design = chosen.design
     space = design_space(scene.hand, settings.preset)
     if len(design) != space.num_parameters:
         raise SceneError(

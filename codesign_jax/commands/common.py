@@ -1,6 +1,7 @@
 """What the commands share: designs, notes and JAX's compilation cache."""
 
 import math
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -12,9 +13,9 @@ import numpy as np
 
 from codesign_jax import engines
 from codesign_jax import scene as scenes
+from codesign_jax.caches import use_compilation_cache
 from codesign_jax.commands import preflight
-from codesign_jax.files import use_compilation_cache
-from codesign_jax.scene import Scene, keypaths, schema
+from codesign_jax.scene import Scene, keypaths, library, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import SceneError
 
@@ -27,14 +28,20 @@ __all__ = [
     "parse_design",
     "preflight_notes",
     "solver_problems",
+    "source_files",
     "use_compilation_cache",
+    "warn",
 ]
+
+
+SCENE = "paper"
+"""Scene where none is named."""
 
 
 class SceneFlags(Protocol):
     """Flags that say which scene; `flags.Subject` has their meaning."""
 
-    scene: str
+    scene: str | None
     hand: str | None
     objects: str | None
     accuracy: str | None
@@ -48,12 +55,32 @@ def load_scene(options: SceneFlags) -> Scene:
       SceneError: If a file or a value is wrong.
     """
     return scenes.load(
-        options.scene,
+        options.scene or SCENE,
         hand_name=options.hand,
         object_set=options.objects,
         accuracy=options.accuracy,
         overrides=keypaths.parse(chain.from_iterable(options.overrides)),
     )
+
+
+def source_files(options: SceneFlags) -> tuple[Path, ...]:
+    """The .toml files that a command's flags name, and those that its scene names.
+
+    Args:
+      options: The flags, which `load_scene` has read.
+    """
+    scene = library.find("scenes", options.scene or SCENE)
+    table = library.read(scene)
+    beside = {"hands": table.get("hand"), "objects": table.get("objects")}
+    given = {"hands": options.hand, "objects": options.objects, "accuracy": options.accuracy}
+    found = [library.find(kind, name) for kind, name in given.items() if name is not None]
+    found += [scene.parent / n for n in beside.values() if isinstance(n, str) and n[-5:] == ".toml"]
+    return scene, *found
+
+
+def warn(text: str) -> None:
+    """Prints a warning that concerns the result, apart from the result."""
+    print(f"warning: {text}", file=sys.stderr)
 
 
 def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
@@ -113,6 +140,11 @@ def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
       SceneError: If the path cannot be written.
     """
     place = path.absolute() if folder else path.absolute().parent
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        shown = ascii(str(path))
+        raise SceneError([f"{flag} {shown}: the name is no text in UTF-8"]) from error
     try:
         if not folder and path.is_dir():
             raise SceneError([f"{flag} {path} cannot be written: it is a folder"])

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from codesign_jax.export import sheet
     from codesign_jax.export.tolerance import Study
 
-PART = "tolerance.part.npz"
+PART = "tolerance.part"
 """What is simulated of a design's tolerance, until it is finished."""
 
 
@@ -43,6 +43,8 @@ def simulate(
     size = calls.equal(first, calls.most_designs(trials))
     _announce(planned, trials, size, options, console)
     run = Calls(trials, engine, size, folder / PART, planned.designs)
+    if run.refused:
+        console.print(f"{folder / PART} {run.refused}: simulated again", markup=False)
     if run.found:
         console.print(f"going on after {run.found * count} grasps")
     with Meter("tolerance", planned.most * count, console) as meter:

@@ -34,7 +34,10 @@ def main(options: "Export") -> int:
       SceneError: If something is wrong with the input; nothing is written then.
     """
     common.use_compilation_cache()
-    case = find_case(options)
+    doubts: list[str] = []
+    case = find_case(options, tell=doubts.append)
+    if doubts:
+        raise SceneError([f"{doubt}. Nothing is exported" for doubt in doubts])
     _check(options, case)
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)

@@ -1,6 +1,8 @@
 """Flags that commands share.  Nothing heavy is imported here: `--help` is to be quick."""
 
 import dataclasses
+import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -38,6 +40,38 @@ File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 
 
+def text_problems(arguments: Sequence[str]) -> list[str]:
+    """What is wrong with arguments whose bytes are no text, which no file or table could hold."""
+    problems = []
+    for argument in arguments:
+        try:
+            argument.encode()
+        except UnicodeEncodeError:
+            problems.append(f"{argument[:100]!r} is no UTF-8 text")
+    return problems
+
+
+def path_problems(command: object) -> list[str]:
+    """What is wrong with the paths of a parsed command: names that no file system has.
+
+    Args:
+      command: One of `cli.COMMANDS`.
+    """
+    problems = []
+    for field in dataclasses.fields(command):  # type: ignore[arg-type]
+        path = getattr(command, field.name)
+        if isinstance(path, Path):
+            try:
+                os.lstat(path)
+            except (FileNotFoundError, NotADirectoryError, PermissionError):
+                pass  # the command says what it misses, or makes it
+            except (OSError, ValueError) as error:
+                why = error.strerror if isinstance(error, OSError) else str(error)
+                name = str(path) if len(str(path)) <= 100 else f"{str(path)[:100]}..."
+                problems.append(f"{name!r}: {why}")
+    return problems
+
+
 @dataclasses.dataclass
 class Subject:
     """Which design, of what scene, simulated by which engine."""
@@ -53,14 +87,14 @@ class Subject:
     ] = None
     """Take scene, design space and best particle from this run folder; --accuracy, --objects, --set
     and --engine then replace the run's."""
-    preset: str = "2d"
-    """Design space that the names belong to."""
+    preset: Text = None
+    """Design space that the names belong to; default: the run's, or 2d."""
     hand: Text = None
     """Hand: a built-in name or a .toml file; default: the scene's."""
     objects: Text = None
     """Object set: a built-in name or a .toml file; default: the scene's."""
-    scene: str = "paper"
-    """Scene: a built-in name or a .toml file."""
+    scene: Text = None
+    """Scene: a built-in name or a .toml file; default: the run's, or paper."""
     accuracy: Text = None
     """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
     and costs: docs/accuracy.md), or a .toml."""

@@ -61,7 +61,7 @@ def _of_run(case: Case, options: "Shown", folder: Path) -> Asked:
     if options.objects is not None and options.object is None:
         raise SceneError(["--objects replaces the run's: --object must say which one to grasp"])
     place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
-    record = choice.read_record(folder)
+    record = choice.read_record(folder, tell=lambda text: None)  # `find_case` has said it
     found = choice.find_grasp(runs.read_run(folder)[0], record, **place)
     case = case._replace(design=found.design)
     if options.object is not None:

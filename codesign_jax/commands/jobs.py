@@ -8,6 +8,8 @@ finish.
 import contextlib
 import dataclasses
 import os
+import secrets
+import shutil
 import signal
 import sys
 import time
@@ -20,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from codesign_jax import codesign, runs
-from codesign_jax.commands import slurm, status
+from codesign_jax.commands import common, slurm, status
 from codesign_jax.runs import RunResult
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from codesign_jax.cli import Optimize
 
 FOLDER = "jobs"
-"""Folder of submitit's files and logs, beside the run folders."""
+"""Folder beside the run folders, with a folder of submitit's files and logs for each start."""
 CONTROLLERS = "controllers.log"
 """File there with what submitit's own processes complain about."""
 POLL_SECONDS = 0.5
@@ -42,7 +44,7 @@ def executor(options: "Optimize", folder: Path) -> Any:
 
     Args:
       options: The command line; `job_set` has parameters of submitit, such as slurm_partition.
-      folder: Folder of the runs.
+      folder: Folder of submitit's files, see `private_folder`.
 
     Raises:
       SceneError: If submitit is missing, or a parameter is none of its own.
@@ -51,7 +53,7 @@ def executor(options: "Optimize", folder: Path) -> Any:
     given = parameters([*chain.from_iterable(options.job_set)])
     kind, asked = given.pop("cluster", None), slurm.parameters(given)
     try:
-        made = submitit.AutoExecutor(folder=folder / FOLDER, cluster=kind)  # type: ignore[arg-type]
+        made = submitit.AutoExecutor(folder=folder, cluster=kind)  # type: ignore[arg-type]
         ours = {"name": "codesign", "slurm_array_parallelism": options.jobs}
         if made.cluster != "slurm":
             ours["timeout_min"] = MINUTES
@@ -60,6 +62,31 @@ def executor(options: "Optimize", folder: Path) -> Any:
     except (AssertionError, NameError, TypeError, ValueError, RuntimeError) as error:
         raise SceneError([f"--job-set: {error}"]) from error
     return made
+
+
+@contextlib.contextmanager
+def private_folder(runs_folder: Path) -> Iterator[Path]:
+    """Makes a folder for submitit's files that was not there before, and that is the user's alone.
+
+    submitit reads results by pickle, which does whatever the file says: so no file that lay there
+    before may be taken for one.
+
+    Args:
+      runs_folder: Folder of the runs; made if it is missing.
+
+    Yields:
+      The folder; it and those made for it are removed if the block raises SceneError.
+    """
+    name = f"{time.strftime('%Y-%m-%dT%H-%M-%S')}-{secrets.token_hex(4)}"
+    folder = runs_folder / FOLDER / name
+    missing = [path for path in [folder, *folder.parents] if not path.exists()]
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(mode=0o700)  # fails if there is something of that name
+    try:
+        yield folder
+    except SceneError:
+        shutil.rmtree(missing[-1])
+        raise
 
 
 def _submitit() -> Any:
@@ -146,17 +173,18 @@ def run(
       SceneError: See `executor`; or if SLURM does not take the jobs.
       KeyboardInterrupt: When all jobs were cancelled.
     """
-    made = executor(options, next(iter(folders.values())).parent)
     calls = {s: (one, options, s, folder.absolute(), sys.argv) for s, folder in folders.items()}
-    console.print(
-        f"{len(calls)} runs, {options.jobs} at a time, on {made.cluster}; logs: {made.folder}",
-        markup=False,
-    )
-    if made.cluster == "slurm":
-        place = slurm.Array(made, console)
-    else:
-        place = Processes(made, options.jobs or 1)
-    place.start(calls)
+    with private_folder(next(iter(folders.values())).parent) as own:
+        made = executor(options, own)
+        console.print(
+            f"{len(calls)} runs, {options.jobs} at a time, on {made.cluster}; logs: {made.folder}",
+            markup=False,
+        )
+        if made.cluster == "slurm":
+            place = slurm.Array(made, console)
+        else:
+            place = Processes(made, options.jobs or 1)
+        place.start(calls)
     results: dict[int, RunResult | None] = {}
     try:
         while len(results) < len(folders):
@@ -243,9 +271,13 @@ def _last_words(log: Path) -> str:
 
 
 def read(scene: Scene, folder: Path) -> RunResult | None:
-    """The run in a folder as it is; None if it has no checkpoint."""
-    record = runs.load_record(folder)
-    if record is None:
+    """The run in a folder as it is; None if it has no checkpoint, or every trial failed."""
+    try:
+        record = runs.load_record(folder, tell=common.warn)
+    except SceneError as error:
+        common.warn(str(error))
+        return None
+    if record is None or record.failed_status() is not None:
         return None
     test = None if record.test is None else codesign.summarize_test(scene, record.test)
     return RunResult(record, test, 0)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, runs
+from codesign_jax import codesign, files, runs
 from codesign_jax.commands import calls, common, estimate
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case, find_case
@@ -16,8 +16,8 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
-from codesign_jax.runs.directory import PROVENANCE
-from codesign_jax.runs.scene_files import write_scene
+from codesign_jax.runs.manifest import PROVENANCE
+from codesign_jax.runs.scene_files import contents, write_scene
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Outcome, failed
@@ -25,7 +25,7 @@ from codesign_jax.types import Outcome, failed
 if TYPE_CHECKING:
     from codesign_jax.cli import Landscape as Options
 
-PART = "landscape.part.npz"
+PART = "landscape.part"
 """What is done of a landscape, until it is finished."""
 
 
@@ -89,7 +89,26 @@ def _folder(options: "Options", case: Case) -> Path:
     if options.out is not None:
         folder = options.out
     common.check_place("--out", folder, folder=True)
+    if not (folder / PROVENANCE).exists():
+        _refuse_other_scene(folder, case)
     return folder
+
+
+def _refuse_other_scene(folder: Path, case: Case) -> None:
+    """Refuses to replace scene files that are not those of the landscape.
+
+    Raises:
+      SceneError: With their names.
+    """
+    others = [
+        str(folder / name)
+        for name, content in contents(case.scene).items()
+        if (folder / name).exists() and (folder / name).read_bytes() != content
+    ]
+    if others:
+        raise SceneError(
+            [f"--out: {', '.join(others)} would be replaced by the landscape's: choose another"]
+        )
 
 
 def _check(options: "Options", case: Case) -> None:
@@ -167,6 +186,8 @@ def _simulate(
     engine = make_engine(case.engine, case.scene)
     simulate = Calls(trials, engine, size, part, designs)
     console.print(f"grasps: {grasps} in {-(-len(designs) // size)} calls")
+    if simulate.refused:
+        console.print(f"{part} {simulate.refused}: simulated again", markup=False)
     if simulate.found:
         done = simulate.found // size
         console.print(f"going on after {done} calls, from {part}", markup=False)
@@ -226,5 +247,7 @@ def _write(case: Case, found: Landscape, folder: Path, console: Console) -> None
     except ImportError:
         console.print("no figure: pip install 'codesign-jax[viz]'", markup=False)
         return
-    path = figures.landscape(found, folder / "figures" / "landscape.png")
+    path = folder / "figures" / "landscape.png"
+    with files.naming(path):
+        figures.landscape(found, path)
     console.print(f"figure: {path}", markup=False)

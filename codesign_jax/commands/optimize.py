@@ -5,6 +5,7 @@ import functools
 import shlex
 import signal
 import sys
+import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,9 +13,11 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, runs
-from codesign_jax.commands import asked, common, estimate, hosts, jobs, reference, seeds, verdicts
+from codesign_jax import codesign, files, runs
+from codesign_jax.commands import asked, common, estimate, hosts, jobs, reference, seeds, status
 from codesign_jax.commands.estimate import Part
+from codesign_jax.report import verdicts
+from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, rates
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
@@ -40,9 +43,12 @@ def main(options: "Optimize") -> int:
     plan = runs.prepare(scene, settings)
     folders = {seed: asked.folder(options, scene, settings, seed) for seed in chosen}
     common.check_place("--out", options.out or next(iter(folders.values())), folder=True)
+    sources = common.source_files(options)
     for seed, folder in folders.items():
         own = dataclasses.replace(settings, seed=seed)
-        runs.check_folder(folder, scene, own, fresh=options.fresh)
+        runs.check_folder(folder, scene, own, fresh=options.fresh, sources=sources)
+    if options.seeds is not None:
+        seeds.check_table(folders)
     notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
@@ -51,16 +57,16 @@ def main(options: "Optimize") -> int:
     if options.jobs is not None:
         return _jobs(options, scene, folders)
     devices, chunk = options.devices, options.chunk
-    found = runs.optimize(
-        plan, folders, sys.argv, fresh=options.fresh, devices=devices, chunk=chunk
-    )
+    trials = reference.number_of_trials(options.reference_trials, settings)
+    after = trials * reference.steps_and_links(scene)
+    opened = {"fresh": options.fresh, "sources": sources, "after": after}
+    found = runs.optimize(plan, folders, sys.argv, **opened, devices=devices, chunk=chunk)
     _record_rate(plan, found, devices)
     results: dict[int, RunResult | None] = {}
     for seed, result in found.runs.items():
         results[seed] = result if isinstance(result, RunResult) else None
         if isinstance(result, Exception):
-            name = "" if options.seeds is None else f"seed {seed}: "
-            print(f"error: {name}{result}", file=sys.stderr)
+            _tell_error("" if options.seeds is None else f"seed {seed}: ", result)
     if found.signum:
         return 128 + found.signum
     console = Console(highlight=False, soft_wrap=True)
@@ -68,6 +74,14 @@ def main(options: "Optimize") -> int:
     if options.seeds is not None:
         _compare(scene, results, folders, console)
     return int(any(result is None for result in results.values()))
+
+
+def _tell_error(name: str, error: Exception) -> None:
+    """Says how a run failed, with the traceback of what nobody expected."""
+    if not isinstance(error, runs.FAILURES):
+        traceback.print_exception(error)
+        name += f"{type(error).__name__}: "
+    print(f"error: {name}{status.words(error)}", file=sys.stderr)
 
 
 def _distributed(options: "Optimize") -> int:
@@ -82,10 +96,10 @@ def _distributed(options: "Optimize") -> int:
         problems.append("--dry-run knows one host: leave out --distributed to have its estimate")
     if problems:
         raise SceneError(problems)
-    status, here = hosts.run(options)
-    if here.index or status == 2 or status >= 128:
-        return status
-    return hosts.in_a_process(functools.partial(_compare_all, options)) or status
+    code, here = hosts.run(options)
+    if here.index or code == 2 or code >= 128:
+        return code
+    return hosts.in_a_process(functools.partial(_compare_all, options)) or code
 
 
 def _compare_all(options: "Optimize") -> int:
@@ -102,8 +116,10 @@ def _compare(
     scene: Scene, results: dict[int, RunResult | None], folders: dict[int, Path], console: Console
 ) -> None:
     """Compares runs on the console and in seeds.csv."""
-    seeds.compare(scene, results, console)
-    console.print(f"table: {seeds.write_table(scene, results, folders)}", markup=False)
+    fresh = reference.of_runs(results, folders)
+    seeds.compare(scene, results, fresh, console)
+    table = seeds.write_table(scene, results, fresh, folders)
+    console.print(f"table: {table}", markup=False)
 
 
 def _tell(
@@ -116,14 +132,18 @@ def _tell(
     """Says how each run ended, and tests its design at reference."""
     trials = reference.number_of_trials(options.reference_trials, plan.settings)
     for seed, result in results.items():
-        if result is None:
+        if result is None or result.record is None:
             continue
         if options.seeds is not None:
             console.print(f"seed {seed}:")
-        own = runs.with_seed(plan, seed)
-        _summarize(own, result, folders[seed])
+        own, fresh = runs.with_seed(plan, seed), None
+        _summarize(own, result, console)
         if trials and result.test is not None:
-            reference.test(folders[seed], own.settings, trials, console)
+            found = reference.test(folders[seed], own.settings, trials, console)
+            fresh = reference.judged(plan.scene, found)
+        if result.test is not None:
+            _judge(own, result, fresh, folders[seed], console)
+        _say_places(result, folders[seed], console)
 
 
 def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
@@ -187,36 +207,52 @@ def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") 
     print(estimate.text(parts))
 
 
-def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:
-    """Prints the final particle that did best, and draws the figures if matplotlib is there."""
-    console = Console(highlight=False, soft_wrap=True)
-    if result.record is None:
-        return
+def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
+    """Prints whether the run converged, and the final particle that did best."""
+    assert result.record is not None
     history, particles = result.record.history, np.asarray(result.record.state.particles)
     converged = codesign.convergence_episode(history.cost.mean(1))
     if converged is None:
         console.print(f"not converged: the mean cost does not stay below {codesign.CONVERGED_COST}")
+    elif converged == 0:
+        console.print(f"converged: no episode has a mean cost above {codesign.CONVERGED_COST}")
     else:
         grasps = converged * plan.settings.particles * plan.settings.trials
         console.print(f"converged from episode {converged + 1} on, after {grasps} grasps")
     if result.test is not None:
-        cost = np.asarray(result.test.cost)
-        best = int(cost.argmin())
-        console.print(f"best final particle: {runs.describe(plan.space, particles[best])}")
-        trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.trials)
-        console.print(f"its test: {verdicts.verdict(plan.scene, trials)}")
-        flags = ["--run", str(folder), "--trials", "150", "--accuracy", reference.ACCURACY]
-        again = shlex.join(["codesign", "evaluate", *flags])
-        console.print(
-            f"chosen as the best of {cost.size} by these trials; for more new ones: {again}",
-            markup=False,
-        )
-    _figures(plan, result, folder, console)
+        best = particles[int(np.asarray(result.test.cost).argmin())]
+        console.print(f"best final particle: {runs.describe(plan.space, best)}")
+
+
+def _judge(
+    plan: Plan, result: RunResult, fresh: Judged | None, folder: Path, console: Console
+) -> None:
+    """Prints the verdict: on fresh trials, or on those of the final test if there are no others."""
+    assert result.test is not None
+    test = seeds.of_test(plan.scene, result)
+    chosen = f"chosen as the best of {len(result.test.cost)} final particles"
+    if fresh is None:
+        lines = [f"verdict: {test}", f"{chosen} by these very trials, which flatters it"]
+    else:
+        lines = [
+            f"{chosen}, by a test that flatters it: {verdicts.tally(test.outcomes)}",
+            f"verdict, on fresh trials: {fresh}",
+        ]
+    flags = ["--run", str(folder), "--trials", "150", "--accuracy", reference.ACCURACY]
+    again = shlex.join(["codesign", "evaluate", *flags])
+    judged = test if fresh is None else fresh
+    for line in [*lines, *verdicts.warnings(judged), f"more fresh trials: {again}"]:
+        console.print(line, markup=False)
+
+
+def _say_places(result: RunResult, folder: Path, console: Console) -> None:
+    """Draws the figure if matplotlib is there, and says where everything is."""
+    _figures(result, folder, console)
     console.print(f"results: {folder}", markup=False)
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}", markup=False)
 
 
-def _figures(plan: Plan, result: RunResult, folder: Path, console: Console) -> None:
+def _figures(result: RunResult, folder: Path, console: Console) -> None:
     try:
         from codesign_jax.report import figures
     except ImportError:
@@ -224,5 +260,6 @@ def _figures(plan: Plan, result: RunResult, folder: Path, console: Console) -> N
         return
     assert result.record is not None
     path = folder / "figures" / "cost_evolution.png"
-    figures.cost_evolution(result.record.history.cost, path)
+    with files.naming(path):
+        figures.cost_evolution(result.record.history.cost, path)
     console.print(f"figure: {path}", markup=False)

@@ -10,7 +10,7 @@ from codesign_jax import runs
 from codesign_jax.commands import common, reference
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Settings, choice
-from codesign_jax.runs.directory import read_provenance
+from codesign_jax.runs.manifest import read_provenance
 from codesign_jax.runs.record import Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
@@ -39,12 +39,19 @@ def main(options: "Report") -> int:
         raise SceneError([message]) from error
     path = options.out or options.folder / "report.html"
     common.check_place("--out", path)
-    record = choice.read_record(options.folder)
+    notes: list[str] = []
+    record = choice.read_record(options.folder, tell=notes.append)
     chosen = choice.choose(scene, record)
+    notes += [text for text in [choice.doubt(chosen)] if text]
+    for note in notes:
+        common.warn(note)
     provenance = read_provenance(options.folder)
-    found = reference.stored(options.folder, settings)
-    run = Run(options.folder, scene, settings, record, chosen, provenance, found)
+    found, why = reference.stored(options.folder, settings)
+    fresh = None if found is None else reference.judged(scene, found)
+    run = Run(options.folder, scene, settings, record, chosen, provenance, fresh, tuple(notes))
     console = Console(highlight=False, soft_wrap=True)
+    if why:
+        console.print(f"{options.folder / reference.FILE} {why}: left out", markup=False)
     shown = None if options.no_replay else _best_grasp(scene, settings, record, name, console)
     page.write(run, shown, path)
     size = path.stat().st_size / 1e6

@@ -7,7 +7,6 @@ not have, and would wait for ever for a job that was cancelled.
 
 import os
 import shlex
-import shutil
 import signal
 import subprocess
 import time
@@ -89,17 +88,12 @@ class Array:
         """Queues a call for each seed.
 
         Raises:
-          SceneError: With SLURM's words, if it does not take them; no file is left behind then.
+          SceneError: With SLURM's words, if it does not take them.
         """
-        folder = Path(self._made.folder)
-        kept = [folder, *folder.parents]
-        missing = [path for path in kept if not path.exists()]
-        before = set() if missing else set(folder.iterdir())
         try:
             with self._made.batch():  # SLURM keeps an array within its number at a time
                 self._jobs = {seed: self._made.submit(*call) for seed, call in calls.items()}
         except (OSError, RuntimeError) as error:
-            _remove(folder, before, missing)
             words = str(error).strip().splitlines()[-1:] or ["without a word"]
             problem = f"SLURM does not take the jobs: {words[0].removeprefix('sbatch: error: ')}"
             advice = "to use this machine instead: --job-set cluster=local"
@@ -154,15 +148,6 @@ class Array:
         state = self._states.get(job_id, State("unknown: it has left the queue"))
         # A job that was cancelled as it waited still has the reason for that.
         return state.name if state.reason in NORMAL else f"{state.name} ({state.reason})"
-
-
-def _remove(folder: Path, before: set[Path], missing: list[Path]) -> None:
-    """Removes the files of a submission that failed, and the folders that it made."""
-    if missing:
-        shutil.rmtree(missing[-1], ignore_errors=True)
-        return
-    for path in {*folder.iterdir()} - before:
-        path.unlink()
 
 
 def states(job_ids: Iterable[str]) -> dict[str, State] | None:

@@ -1,5 +1,6 @@
 """Exit statuses.  Nothing heavy is imported here: `--help` is to be quick."""
 
+import errno
 import os
 import signal
 import sys
@@ -8,6 +9,29 @@ from typing import NoReturn
 
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a command that Ctrl-C ended."""
+
+
+_REMEDIES = {
+    errno.ENOSPC: "make room, and give the same command again: what was saved is whole",
+    errno.EDQUOT: "make room, and give the same command again: what was saved is whole",
+    errno.EIO: "the disk or the network to it fails; when it works, give the same command again: "
+    "what was saved is whole",
+}
+
+
+def words(error: Exception) -> str:
+    """What an error says to a user, in a line; of a full or broken disk also what to do."""
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error)
+    place = "a file" if error.filename is None else ascii_name(error.filename)
+    remedy = _REMEDIES.get(error.errno or 0, "")
+    return f"{place}: {error.strerror}" + (f"; {remedy}" if remedy else "")
+
+
+def ascii_name(name: object) -> str:
+    """A file's name, with bytes that are no text as escapes."""
+    text = os.fsdecode(name) if isinstance(name, bytes | os.PathLike) else str(name)
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def of(run: Callable[[], int]) -> int:
@@ -25,15 +49,22 @@ def of(run: Callable[[], int]) -> int:
         for problem in error.problems:
             print(f"error: {problem}", file=sys.stderr)
         return 2
+    except RuntimeError as error:
+        from codesign_jax.runs.errors import RunError
+
+        if not isinstance(error, RunError):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except BrokenPipeError:
         # Who read the output, such as `head`, has enough. The interpreter would complain when it
         # flushes what is left: Python's documentation, library "signal", note on SIGPIPE.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except OSError as error:
-        if error.filename is None:
+        if error.errno is None:
             raise
-        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
+        print(f"error: {words(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         # Commands with something to save have saved it, and said so, before this.

@@ -1,42 +1,19 @@
 """Compiled kernels on disk, beside JAX's compilation cache, under a limit of size.
 
 Kernels are kept in the folder `kernels` of `jax_compilation_cache_dir`; where that is unset or
-remote, nothing is.  The environment variable CODESIGN_KERNEL_CACHE_BYTES sets the limit (default
-512 MiB, about a thousand kernels); what was not used for the longest time goes first.
+remote, nothing is.  `caches` has the limit and the switch.
 """
 
 import contextlib
-import functools
 import hashlib
-import os
-import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import jax
 
-LIMIT = "CODESIGN_KERNEL_CACHE_BYTES"
-_DEFAULT_LIMIT = 512 * 2**20
-_DIGEST = hashlib.sha256().digest_size
-_SUFFIX, _PART = ".kernel", ".part"
-_ABANDONED = 3600.0  # age of a file that its writer will not finish any more [s]
+from codesign_jax import caches, files
 
-
-@functools.cache
-def sources(root: Path, leave_out: tuple[str, ...] = ()) -> str:
-    """Digest of a package's Python code: what is kept belongs to the code that made it.
-
-    Args:
-      root: Its folder; read once a process, about a millisecond for 200 kB.
-      leave_out: Subfolders of which no kernel depends.
-    """
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        relative = path.relative_to(root)
-        if relative.parts[0] not in leave_out:
-            digest.update(f"{relative} {path.stat().st_size}\n".encode() + path.read_bytes())
-    return digest.hexdigest()
+_SUFFIX = ".kernel"
 
 
 def key(*parts: object) -> str:
@@ -57,28 +34,17 @@ def kept(name: str, build: Callable[[], bytes]) -> bytes:
     if code is None:
         code = build()
         with contextlib.suppress(OSError):
-            _write(path, code)
-            _evict(path)
+            with files.atomically(path) as part:
+                part.write_bytes(_digest(path, code) + code)
+            caches.evict(folder, _SUFFIX, caches.limit(caches.KERNELS), path)
     return code
 
 
 def _folder() -> Path | None:
     place = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if not place or "://" in str(place):
+    if not place or "://" in str(place) or not caches.enabled():
         return None
     return Path(place) / "kernels"
-
-
-def _limit() -> int:
-    """The limit [bytes].
-
-    Raises:
-      ValueError: If the environment states one that is no number.
-    """
-    text = os.environ.get(LIMIT, str(_DEFAULT_LIMIT))
-    if not text.isdecimal():
-        raise ValueError(f"{LIMIT} = {text!r} must be a number of bytes")
-    return int(text)
 
 
 def _read(path: Path) -> bytes | None:
@@ -87,42 +53,14 @@ def _read(path: Path) -> bytes | None:
         found = path.read_bytes()
     except OSError:
         return None
-    digest, code = found[:_DIGEST], found[_DIGEST:]
-    if hashlib.sha256(code).digest() != digest:
+    size = hashlib.sha256().digest_size
+    digest, code = found[:size], found[size:]
+    if _digest(path, code) != digest:
         return None
-    with contextlib.suppress(OSError):  # it is in use: it goes later than others
-        os.utime(path)
+    caches.used(path)
     return code
 
 
-def _write(path: Path, code: bytes) -> None:
-    """Writes a file that other processes see whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, part = tempfile.mkstemp(dir=path.parent, suffix=_PART)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(code).digest() + code)
-        os.replace(part, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            os.unlink(part)
-        raise
-
-
-def _evict(newest: Path) -> None:
-    """Deletes what was not used for the longest time until the limit is met."""
-    found = []
-    for path in newest.parent.iterdir():
-        with contextlib.suppress(OSError):  # another process deletes as well
-            state = path.stat()
-            if path.suffix == _SUFFIX:
-                found.append((state.st_mtime_ns, state.st_size, path))
-            elif path.suffix == _PART and time.time() - state.st_mtime > _ABANDONED:
-                path.unlink()
-    total, limit = sum(size for _, size, _ in found), _limit()
-    for _, size, path in sorted(found):
-        if total <= limit:
-            return
-        if path != newest:
-            path.unlink(missing_ok=True)
-            total -= size
+def _digest(path: Path, code: bytes) -> bytes:
+    """Digest of a kernel and of its name: a file that took another's place is seen."""
+    return hashlib.sha256(path.name.encode() + code).digest()

@@ -52,7 +52,7 @@ def handler_code(name: str, layout: Layout) -> str:
     return _DECLARATIONS + _work(layout) + _task() + _drop() + _handler(name, layout)
 
 
-def register(origin: str, trace: Callable[[], Any], layout: Layout) -> str:
+def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: bool = True) -> str:
     """Compiles a kernel and makes it known to XLA; returns the name to call it by.
 
     Args:
@@ -60,6 +60,7 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout) -> str:
         compiled before is not traced again.
       trace: Returns the kernel's jaxpr; its arguments are references to a block of each array.
       layout: Its arrays.
+      keep: Whether its machine code may be kept on disk and be found there.
 
     Raises:
       KernelUnavailable: If XLA does not take the handler.
@@ -73,7 +74,8 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout) -> str:
 
     with host.LOCK:
         if not host.known(name):
-            host.register(name, host.Loaded(cache.kept(name, build)), "cpu")
+            code = cache.kept(name, build) if keep else build()
+            host.register(name, host.Loaded(code), "cpu")
     return name
 
 

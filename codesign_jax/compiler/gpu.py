@@ -154,21 +154,21 @@ def prepare(name: str, layout: Layout, kernel: int, driver: Driver) -> host.Load
     return loaded
 
 
-def register(origin: str, trace: Callable[[], Any], layout: Layout) -> str:
+def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: bool = True) -> str:
     """Compiles a kernel and makes it known to XLA; arguments as of `cpu.register`.
 
     Raises:
       KernelUnavailable: If the driver does not take the kernel, or XLA the handler.
       NotImplementedError: If the kernel does something that has no instruction.
     """
-    name = cache.key("cuda", origin, layout, host.identity()[0])
+    name = cache.key("cuda", origin, layout, *host.identity()[:2])
 
     def build() -> bytes:
         return device_code(trace(), layout).encode()
 
     with host.LOCK:
         if not host.known(name):
-            text = cache.kept(name, build).decode()
+            text = (cache.kept(name, build) if keep else build()).decode()
             device = jax.local_devices(backend="cuda")[0].local_hardware_id or 0
             loaded = prepare(name, layout, load(driver(), text, device), driver())
             host.register(name, loaded, "CUDA")

@@ -30,7 +30,10 @@ def vector_bytes() -> int:
 
 
 def identity() -> tuple[object, ...]:
-    """What machine code of this processor depends on besides its source."""
+    """What machine code of this processor depends on besides its source.
+
+    The first two, LLVM's level of optimisation and version, are what a GPU's code depends on.
+    """
     return (
         _level(),
         llvmlite.__version__,

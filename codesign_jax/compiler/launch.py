@@ -2,14 +2,15 @@
 
 import functools
 import importlib.metadata
+import uuid
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from codesign_jax.compiler import cache, ffi
+from codesign_jax import memory_maps, sources
+from codesign_jax.compiler import ffi
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.compiler.layout import INPUT, OUTPUT, SCRATCH, Array, Layout
 
@@ -23,8 +24,8 @@ class Kernel(NamedTuple):
 
     Attributes:
       origin: Cache key, beyond the source of the compiler and the types and shapes of the blocks.
-        Kernels of one origin and layout are taken to be the same, so the origin must hold a digest
-        of the code that writes the kernel, see `cache.sources`.
+        Kernels of one origin and layout, written by one state of this package's code (`sources`),
+        are taken to be the same.
       backend: "gpu" or "cpu".
       lanes: Lanes of a block, see `block_lanes`.
       shared: Places of inputs of one block that all blocks read; their leading axis is 1.
@@ -104,11 +105,11 @@ def launch(
       The results, None in the place of scratch memory.
 
     Raises:
-      KernelUnavailable: If kernels cannot run here.
+      KernelUnavailable: If kernels cannot run here, or no longer, see `memory_maps`.
       NotImplementedError: If the kernel does something that the compiler has no instruction for.
       ValueError: If an array's leading axis is not that of the others.
     """
-    if reason := available(kernel.backend):
+    if reason := available(kernel.backend) or memory_maps.problem():
         raise KernelUnavailable(reason)
     if kernel.backend == "cpu":
         from codesign_jax.compiler import cpu as device
@@ -120,8 +121,10 @@ def launch(
     def trace() -> Any:
         return kernel_jaxpr(call, avals)
 
-    origin = f"{kernel.origin} {cache.sources(Path(__file__).parent)} {jax.__version__}"
-    name = device.register(origin, trace, layout)
+    code = sources.digest()
+    # Of code that is not known no kernel is found again, neither on disk nor in this process.
+    origin = f"{kernel.origin} {code or uuid.uuid4()} {jax.__version__}"
+    name = device.register(origin, trace, layout, keep=code is not None)
     made = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
     varying = _varying(inputs)
     shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]

@@ -2,8 +2,7 @@
 
 `codesign export` writes all of it. The commands in its table belong to these phases of a grasp:
 
->>> from codesign_jax import export, parameters, scene
->>> from codesign_jax.export import grasps
->>> [name for name, _ in grasps.phases(scene.load("paper"))]
+>>> from codesign_jax import scene
+>>> list(scene.load("paper").phase_ends)
 ['approach', 'inflate', 'lift', 'disturb', 'ungrasp']
 """

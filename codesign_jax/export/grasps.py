@@ -70,7 +70,7 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
         plain.engine_model(scene, spec, shares),
         controls,
         states,
-        _judge(scene, distance, states, compiled.nq),
+        _judge(scene, distance, states, compiled.nq, trial),
     )
 
 
@@ -124,7 +124,7 @@ def _commands(structure: Scene, constants: Constants, params: Params, trial: Tri
 def _add_keys(scene: Scene, spec: mujoco.MjSpec, controls: np.ndarray, states: np.ndarray) -> None:
     """Key frames at the ends of the phases, from which a viewer may go on."""
     nq = (states.shape[1] + 1) // 2
-    for name, end in phases(scene)[:-1]:
+    for name, end in [*scene.phase_ends.items()][:-1]:
         k = round(end / scene.discretization.timestep)
         if not np.isfinite(states[k]).all():
             return  # a grasp that failed has no states to go on from
@@ -137,20 +137,14 @@ def _add_keys(scene: Scene, spec: mujoco.MjSpec, controls: np.ndarray, states: n
         )
 
 
-def phases(scene: Scene) -> list[tuple[str, float]]:
-    """Names and end times [s] of a grasp's phases, up to the last that is on."""
-    p = scene.phases
-    ends = [(name, getattr(p, name)) for name in ("approach", "inflate", "lift")]
-    ends += [("disturb", p.disturb)] if scene.effects.disturb else []
-    return ends + ([("ungrasp", p.ungrasp)] if scene.effects.ungrasp else [])
-
-
-def _judge(scene: Scene, distance: np.ndarray, states: np.ndarray, nq: int) -> Outcome:
+def _judge(
+    scene: Scene, distance: np.ndarray, states: np.ndarray, nq: int, trial: Trial
+) -> Outcome:
     """Outcome of one's own simulation by the scene's rule."""
     speed = np.abs(states[:, nq:]).max(1)
     trace = Trace(distance, states[:, nq - 5], speed, states[:, :0])
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _outcome(scene, trace))
+        return jax.tree.map(np.asarray, _outcome(scene, trace, 0, trial))
 
 
 _outcome = jax.jit(outcome, static_argnums=0)

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax.export.grasps import phases
 from codesign_jax.export.process import Size
 from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
 from codesign_jax.model import morphology
@@ -150,7 +149,7 @@ def _control(scene: Scene, params: Params) -> Section:
     shares = {"approach": "0", "inflate": "0 to 1", "lift": "1", "disturb": "1"}
     shares |= {"ungrasp": f"1 to 0 in {scene.phases.deflate_time:g} s"}
     begin, rows = 0.0, []
-    for name, end in phases(scene):
+    for name, end in scene.phase_ends.items():
         rows.append((name, f"{begin:g} to {end:g}", heights[name], shares[name]))
         begin = end
     notes = [

@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from codesign_jax.export.grasps import PLAYER, Grasp, phases
+from codesign_jax.export.grasps import PLAYER, Grasp
 from codesign_jax.model.layout import WRIST
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status, Trial, failed
@@ -65,7 +65,7 @@ def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
       The file's path.
     """
     factors = [1e3] * 3 + [180 / np.pi] * 3 + [1e-3] * scene.num_fingers
-    names, ends = zip(*phases(scene), strict=True)
+    names, ends = zip(*scene.phase_ends.items(), strict=True)
     rows = []
     for time, *controls in schedule:
         # A step belongs to the phase in which it begins; 1e-9 s is rounding of k h.

@@ -26,6 +26,7 @@ from codesign_jax.optimize.protocol import Info, Optimizer, State
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
 from codesign_jax.optimize.schedule import schedule
 from codesign_jax.optimize.seeding import (
+    NoSeed,
     answer,
     candidates,
     rejection,
@@ -40,6 +41,7 @@ __all__ = [
     "NAMES",
     "Evolution",
     "Info",
+    "NoSeed",
     "Optimizer",
     "ParticleFilter",
     "Space",

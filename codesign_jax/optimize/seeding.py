@@ -16,6 +16,10 @@ STREAM_SEED = 0x73656564
 """Stream of the candidates ("seed")."""
 
 
+class NoSeed(RuntimeError):
+    """Too few candidates were poor enough to start from."""
+
+
 def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
     """Uniform particles of the box, projected; candidate j depends on ``key`` and j alone.
 
@@ -69,7 +73,7 @@ def rejection_sample(
 
     Raises:
         ValueError: If a count is below 1 or ``evaluate`` returns another shape.
-        RuntimeError: If ``max_batches`` did not hold enough seeds.
+        NoSeed: If ``max_batches`` did not hold enough seeds.
     """
     asked = rejection(
         key, space, num_seeds, threshold=threshold, batch=batch, max_batches=max_batches
@@ -104,7 +108,7 @@ def rejection(
 
     Raises:
         ValueError: See ``rejection_sample``.
-        RuntimeError: See ``rejection_sample``.
+        NoSeed: See ``rejection_sample``.
     """
     if min(num_seeds, batch, max_batches) < 1:
         raise ValueError(f"counts must be at least 1: {num_seeds=}, {batch=}, {max_batches=}")
@@ -120,7 +124,7 @@ def rejection(
         if accepted.size == num_seeds:
             seeds = jnp.concatenate(drawn)[accepted]
             return seeds, jnp.asarray(costs[accepted], float), int(accepted[-1]) + 1
-    raise RuntimeError(
+    raise NoSeed(
         f"accepted {accepted.size} of {num_seeds} seed particles (cost > {threshold}) from "
         f"{costs.size} candidates; the highest finite cost was "
         f"{np.max(costs, initial=-np.inf, where=np.isfinite(costs)):g}"

@@ -1,13 +1,12 @@
 """The mean cost of designs over a grid of two parameters: its files and its figure."""
 
 import csv
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax import files
+from codesign_jax import archives, files
 from codesign_jax.runs import columns
 from codesign_jax.scene.schema import SceneError
 
@@ -46,8 +45,7 @@ class Landscape(NamedTuple):
 def save(found: Landscape, folder: Path) -> list[Path]:
     """Writes a landscape as arrays and as a table of its points; returns the files."""
     npz, table = folder / FILE, folder / TABLE
-    with files.atomically(npz) as part, part.open("wb") as file:
-        np.savez(file, **found._asdict())
+    archives.save(npz, found._asdict())
     axes = [
         f"{n}_{u}".replace("[", "_").replace("]", "")
         for n, u in zip(found.names, found.units, strict=True)
@@ -69,9 +67,9 @@ def load(path: Path) -> Landscape:
       SceneError: If the file holds none.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return Landscape(**{name: stored[name] for name in Landscape._fields})
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        stored = archives.load(path)
+        return Landscape(**{name: stored[name] for name in Landscape._fields})
+    except (OSError, archives.ArchiveError, KeyError) as error:
         problem = (
             f"{path} is not a landscape of this version ({error}); codesign landscape writes one"
         )

@@ -8,26 +8,23 @@ The numerical modules know nothing of files; this package knows nothing of physi
 (10, 6, 64, 4200)
 """
 
-from codesign_jax.runs.directory import check_folder, episodes_of, read_run
-from codesign_jax.runs.loop import (
-    AllFailed,
-    Plan,
-    RunResult,
-    load_record,
-    prepare,
-    with_seed,
-)
+from codesign_jax.runs.directory import check_folder, episodes_of
+from codesign_jax.runs.errors import AllFailed, RunError
+from codesign_jax.runs.loop import Plan, RunResult, prepare, with_seed
+from codesign_jax.runs.reading import load_record, read_run
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, check, make_settings
 from codesign_jax.runs.tables import describe, failure_counts, status_names, warning_counts
-from codesign_jax.runs.together import Results, optimize
+from codesign_jax.runs.together import FAILURES, Results, optimize
 
 __all__ = [
+    "FAILURES",
     "AllFailed",
     "History",
     "Plan",
     "Record",
     "Results",
+    "RunError",
     "RunResult",
     "Settings",
     "check",

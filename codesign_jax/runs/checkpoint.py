@@ -5,20 +5,33 @@ It takes half a second to import, for which commands without a run folder need n
 Orbax 0.12 restores a flipped byte as a wrong number and keeps calling a truncated step its latest.
 So every step has a file of SHA-256 digests beside it: of its files, as `sha256sum -c` reads them,
 and of its arrays (names, types, shapes, bytes).  That file is written last: a step without it was
-cut short.  The newest step whose digests match is used.
+cut short.  The newest step whose digests match is used.  A step that is whole, but of another run
+or another step of this one, is refused, and so is one that cannot be read for a reason that may
+pass: neither is damaged, and only what is damaged may be deleted.
 """
 
+import errno
+import functools
 import hashlib
-import shutil
+import logging
+import os
+import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from codesign_jax import files
+from codesign_jax.runs.belongings import remove
+from codesign_jax.runs.errors import RunError
+from codesign_jax.runs.manifest import SCHEMA
 
+_DAMAGE = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG}
+"""Errors of files that are gone or replaced; all others may pass, such as missing permission."""
+_LABEL = "run"
+"""Name of the arrays that say whose a step is."""
 _TEMPORARY = ".orbax-checkpoint-tmp"
 """Mark in the name of a step that orbax is writing."""
 
@@ -50,6 +63,7 @@ class Checkpoints:
         self,
         folder: Path,
         *,
+        run: str | None = None,
         keep: int = 3,
         tell: Callable[[str], None] = warnings.warn,
         read_only: bool = False,
@@ -58,6 +72,8 @@ class Checkpoints:
 
         Args:
           folder: Folder of the steps.
+          run: Identity of the run, 32 hexadecimal digits, which every step carries; None for one
+            from before runs had any.
           keep: Newest steps to keep.
           tell: Called when the folder is closed, with a message, if a step could not be deleted;
             from then on orbax deletes none.
@@ -78,8 +94,9 @@ class Checkpoints:
         if not read_only:
             # Not by orbax, which begins a thread for it and does not wait for that when it closes.
             for left in self.folder.glob(f"*{_TEMPORARY}*"):
-                shutil.rmtree(left)
-        self._args, self._tell = ocp.args, tell
+                remove(left)
+        self._args, self._tell, self._run = ocp.args, tell, run
+        _silence()
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def __enter__(self) -> "Checkpoints":
@@ -103,12 +120,19 @@ class Checkpoints:
         Raises:
           OSError: If it cannot be written, for example on a full disk; older steps stay intact.
         """
+        labelled = arrays if self._run is None else arrays | {_LABEL: _label(self._run, step)}
         try:
-            saved = self._manager.save(step, args=self._args.StandardSave(arrays))
-        except ValueError as error:  # how tensorstore says that the disk is full
-            raise OSError(f"checkpoint {step} could not be written: {error}") from error
+            saved = self._manager.save(step, args=self._args.StandardSave(labelled))
+            if saved:
+                self._write_digests(step, labelled)
+        except (OSError, ValueError) as error:  # the latter is how tensorstore says it
+            raise _unsaved(self.folder / str(step), error) from error
         if not saved:
             raise OSError(f"checkpoint {step} was not written: {self.folder} holds a newer step")
+        self._forget_old_digests()
+
+    def _write_digests(self, step: int, arrays: Arrays) -> None:
+        """Writes the digests of a step, which make it whole."""
         lines = [f"# arrays {digest(arrays)}"]
         for path in sorted((self.folder / str(step)).rglob("*")):
             if path.is_file():
@@ -116,40 +140,123 @@ class Checkpoints:
                 lines.append(f"{_file_digest(path)}  {name}")
         with files.atomically(self._digests(step)) as part:
             part.write_text("\n".join(lines) + "\n")
-        self._forget_old_digests()
 
     def restore(self) -> Restored:
-        """Reads the newest step whose digest matches; changes nothing on disk."""
+        """Reads the newest step whose digest matches; changes nothing on disk.
+
+        Raises:
+          RunError: If a step cannot be read though it may be whole, or the newest whole one is of
+            another run, or another step of this one.
+        """
         damaged: list[tuple[int, str]] = []
         for step in sorted(self._manager.all_steps(), reverse=True):
             arrays, reason = self._read(step)
             if not reason:
+                self._check_label(step, arrays.pop(_LABEL, None))
                 return Restored(step, arrays, tuple(damaged))
             damaged.append((step, reason))
         return Restored(None, {}, tuple(damaged))
 
-    def discard(self, steps: Iterator[int] | list[int]) -> None:
-        """Deletes damaged steps, so that their numbers can be saved again."""
+    def discard(self, steps: Iterable[int]) -> None:
+        """Deletes damaged steps, so that their numbers can be saved again.
+
+        Raises:
+          RunError: If one cannot be deleted.
+        """
         for step in steps:
             # Not the manager's delete: it fails on a step whose files are missing.
-            shutil.rmtree(self.folder / str(step), ignore_errors=True)
-            self._digests(step).unlink(missing_ok=True)
+            places = self.folder / str(step), self._digests(step)
+            try:
+                for place in places:
+                    remove(place)
+            except OSError as error:
+                raise RunError(
+                    f"checkpoint {step} is damaged, and cannot be deleted ({error.strerror}): "
+                    f"delete {places[0]} and {places[1]} by hand. The same command then goes on "
+                    "from the checkpoint before"
+                ) from error
         self._manager.reload()
 
     def _read(self, step: int) -> tuple[Arrays, str]:
-        """Returns a step's arrays, or why they cannot be trusted."""
+        """Returns a step's arrays, or why they cannot be trusted.
+
+        Raises:
+          RunError: If it cannot be read now, though it may be whole.
+        """
         try:
-            lines = self._digests(step).read_text().splitlines()
-            expected = lines[0].removeprefix("# arrays ")
-            for expected_file, name in (line.split("  ", 1) for line in lines[1:]):
-                if _file_digest(self.folder / name) != expected_file:
-                    return {}, f"the SHA-256 digest of {name} differs"
+            expected, reason = self._compare(step)
+            if reason:
+                return {}, reason
             arrays: Any = self._manager.restore(step, args=self._args.StandardRestore())
-        except FileNotFoundError as error:
-            return {}, f"{Path(error.filename or '').name or 'a file'} is missing"
-        except Exception as error:  # damaged files raise whatever the parser at that byte raises
-            return {}, f"it cannot be read ({type(error).__name__})"
+        except RunError:
+            raise
+        except OSError as error:
+            name = Path(error.filename or "").name or "a file"
+            if error.errno not in _DAMAGE:
+                raise self._unreadable(step, f"{name}: {error.strerror}") from error
+            missing = error.errno in (errno.ENOENT, errno.ENOTDIR)
+            return {}, f"{name} is missing" if missing else f"{name}: {error.strerror}"
+        except Exception as error:  # the files are those that were saved, so they are not damaged
+            problem = f"{type(error).__name__}: {str(error)[:200]}"
+            raise self._unreadable(
+                step, f"its files are whole, but orbax fails: {problem}"
+            ) from error
         return (arrays, "") if digest(arrays) == expected else ({}, "its arrays' digest differs")
+
+    def _compare(self, step: int) -> tuple[str, str]:
+        """Compares a step's files with their digests; returns the arrays' one and what is wrong.
+
+        Raises:
+          OSError: If a file cannot be read.
+          RunError: If the digests are another step's.
+        """
+        path = self._digests(step)
+        if path.exists() and not path.is_file():
+            return "", f"{path.name} is no file"
+        try:
+            lines = path.read_bytes().decode().splitlines()
+            expected = lines[0].removeprefix("# arrays ")
+            pairs = [line.split("  ", 1) for line in lines[1:]]
+            named = [(self.folder / name, digest, name) for digest, name in pairs]
+        except (ValueError, IndexError):
+            return "", f"{path.name} is damaged"
+        steps = {name.split("/")[0] for _, _, name in named}
+        if len(steps) == 1 and steps != {str(step)} and steps.copy().pop().isdigit():
+            raise self._foreign(step, f"step {steps.pop()} under another name")
+        for file, expected_file, name in named:
+            if not name.startswith(f"{step}/") or ".." in name.split("/") or "\0" in name:
+                return "", f"{path.name} is damaged"
+            if file.exists() and not file.is_file():
+                return "", f"{name} is no file"
+            if _file_digest(file) != expected_file:
+                return "", f"the SHA-256 digest of {name} differs"
+        return expected, ""
+
+    def _check_label(self, step: int, label: Arrays | None) -> None:
+        """Refuses a step of another run, and one that has another step's number."""
+        if label is None and self._run is None:
+            return
+        try:
+            run, own = bytes(label["id"]).hex(), int(label["step"])  # type: ignore[index]
+        except (KeyError, TypeError, ValueError):
+            run, own = None, step
+        if run != self._run:
+            raise self._foreign(step, "of another run")
+        if own != step:
+            raise self._foreign(step, f"step {own} under another name")
+
+    def _foreign(self, step: int, what: str) -> RunError:
+        return RunError(
+            f"{self.folder / str(step)} is {what}, and nothing was changed. Move it and "
+            f"{self._digests(step).name} to where they belong"
+        )
+
+    def _unreadable(self, step: int, problem: str) -> RunError:
+        return RunError(
+            f"checkpoint {step} in {self.folder} cannot be read ({problem}), and nothing was "
+            "changed. Make it readable and give the command again; or, to lose it and go on from "
+            f"the one before, delete {step} and {step}.sha256 there"
+        )
 
     def _digests(self, step: int) -> Path:
         return self.folder / f"{step}.sha256"
@@ -179,6 +286,53 @@ def digest(arrays: Arrays) -> str:
 
 def _file_digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _label(run: str, step: int) -> Arrays:
+    """Arrays that say whose a step is."""
+    return {
+        "id": np.frombuffer(bytes.fromhex(run), np.uint8),
+        "step": np.array(step, np.int32),
+        "schema": np.array(SCHEMA, np.int32),
+    }
+
+
+def _unsaved(place: Path, error: Exception) -> OSError:
+    """The error of a step that could not be saved: tensorstore's own has hundreds of characters."""
+    text = str(error)
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.EFBIG):
+        if getattr(error, "errno", None) == number or os.strerror(number) in text:
+            reason = os.strerror(number)
+            return OSError(
+                number, f"checkpoint {place.name} could not be written: {reason}", str(place.parent)
+            )
+    problem = text.splitlines()[0][:200] if text else type(error).__name__
+    return OSError(f"checkpoint {place.name} could not be written to {place.parent}: {problem}")
+
+
+@functools.cache
+def _silence() -> None:
+    """Keeps tracebacks of a failed save off the terminal: `Checkpoints.save` raises the error.
+
+    Orbax logs it from each of its threads, asyncio from each task that nobody asked how it ended,
+    and tensorstore finds the tasks' event loop closed. Some come long after the save, so that this
+    is for the rest of the process.
+    """
+    before = sys.unraisablehook
+
+    def hook(event: Any) -> None:
+        if str(event.exc_value) != "Event loop is closed":
+            before(event)
+
+    sys.unraisablehook = hook
+    for name in ("absl", "asyncio"):
+        logging.getLogger(name).addFilter(_is_news)
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Whether a message is not of orbax's threads or tasks about an error that was raised."""
+    text = record.getMessage()
+    return "_SignalingThread" not in text and not ("never retrieved" in text and "orbax" in text)
 
 
 def _leaves(arrays: Arrays, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:

@@ -8,9 +8,9 @@ import numpy as np
 
 from codesign_jax.codesign import episode_trials
 from codesign_jax.cost import particle_cost
-from codesign_jax.runs.loop import load_record
+from codesign_jax.runs.reading import Tell, load_record
 from codesign_jax.runs.record import Record
-from codesign_jax.runs.tables import status_names
+from codesign_jax.runs.tables import failure_counts, status_names
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError, range_problem
 from codesign_jax.types import Outcome, Trial, failed
@@ -54,13 +54,17 @@ class Chosen(NamedTuple):
     episode: int
 
 
-def read_record(folder: Path) -> Record:
-    """Reads a run's newest good checkpoint.
+def read_record(folder: Path, *, tell: Tell | None = None) -> Record:
+    """Reads a run's newest whole checkpoint.
+
+    Args:
+      folder: The run folder.
+      tell: Called with what is amiss, see `runs.load_record`; None to warn.
 
     Raises:
-      SceneError: If it has no finished episode.
+      SceneError: If it has no finished episode, or none that can be read.
     """
-    record = load_record(folder)
+    record = load_record(folder, tell=tell)
     if record is None or record.done == 0:
         raise SceneError([f"run {folder} has no finished episode yet"])
     return record
@@ -89,6 +93,17 @@ def choose(scene: Scene, record: Record) -> Chosen:
     design = np.asarray(record.state.particles)[best]
     episode, row = _place(record, best)
     return Chosen(design, best, float(cost[best]), trials, True, row, episode)
+
+
+def doubt(chosen: Chosen) -> str:
+    """Why the design should not be called the best of its run, in words; nothing if it may be."""
+    status = np.asarray(chosen.trials.status)
+    if not failed(status).all():
+        return ""
+    return (
+        f"every trial of the run's chosen design failed ({failure_counts(status)}), so that none "
+        "of its designs is known to grasp anything"
+    )
 
 
 def _place(record: Record, particle: int) -> tuple[int, int]:

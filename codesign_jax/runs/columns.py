@@ -121,6 +121,12 @@ MORE = {
             "trials": "trials of that test",
             "successful_particles": f"final particles with a test cost below {SUCCESS_COST}",
             "particles": "final particles",
+            "fresh_kept_trials": "of the best particle's fresh trials at accuracy `reference`, had "
+            "no part in the choice, those that kept the object; empty without them",
+            "fresh_lost_trials": "those that lost it",
+            "fresh_stuck_trials": "those in which the hand did not let go of it",
+            "fresh_failed_trials": "those that failed otherwise",
+            "fresh_cost": "mean cost of these trials by the scene's rule for failed ones",
             "run": "name of the run's folder",
         },
     ),
@@ -137,27 +143,59 @@ MORE = {
 }
 """Tables that are not of a run alone."""
 
+DESIGNS = "the design"
+GRASPS = {
+    "design": ("int32", "", "index of the design, from 0"),
+    "trial": ("int32", "", "index of the design's trial, from 0"),
+    "object": ("name", "", "name of the object"),
+    "noise_x_m": ("float32", "m", "offset of the object on the table, x"),
+    "noise_y_m": ("float32", "m", "offset of the object on the table, y"),
+    "noise_yaw_rad": ("float32", "rad", "rotation of the object about the vertical"),
+    "noise_arm_roll_rad": ("float32", "rad", "rotation of the arm frame, roll"),
+    "noise_arm_pitch_rad": ("float32", "rad", "rotation of the arm frame, pitch"),
+    "noise_mass_factor": ("float32", "", "factor on the object's mass"),
+    "noise_size_factor": ("float32", "", "factor on the object's size"),
+    "noise_friction_factor": ("float32", "", "factor on the friction of all contacts"),
+    "noise_stiffness_factor": ("float32", "", "factor on the fingers' shear modulus"),
+    "noise_hand_mass_factor": ("float32", "", "factor on the masses of fingers and palm"),
+    "verdict": (
+        "name",
+        "",
+        f"kept (it did not fail, and costs less than {SUCCESS_COST}), lost, stuck (it failed: the "
+        "hand did not let go), or failed in another way, see `status`",
+    ),
+    "cost": ("float32", "", TABLES["trials.csv"].columns["cost"]),
+    "lost_time_s": ("float32", "s", TABLES["trials.csv"].columns["lost_time_s"]),
+    "status": ("name", "", TABLES["trials.csv"].columns["status"]),
+    "first_bad_step": ("int32", "", TABLES["trials.csv"].columns["first_bad_step"]),
+}
+"""Columns of the Parquet file of `codesign sample`: type, unit and meaning, by name; those of the
+design follow."""
+
 FILES = {
     "scene.toml": "the scene as simulated, every value with its unit; it names the two files below",
     "hand.toml": "the hand",
     "objects.toml": "the objects",
     "meshes": "mesh files of the objects, if there are any",
-    "provenance.json": "settings, command lines of start, resumptions and extensions, versions of "
-    "code and packages, machine",
-    "checkpoints": "state after each of the last episodes, with SHA-256 digests",
+    "provenance.json": "the run's identity, settings, command lines of start, resumptions and "
+    "extensions, versions of code and packages, machine, SHA-256 digests of the scene's files",
+    "checkpoints": "state after each of the last episodes, with SHA-256 digests and the run's "
+    "identity",
     "events.log": "what happened when, with the wall time of each episode",
     "failures": "worlds that failed, at most ten an episode, for `codesign replay`",
     "figures": "pictures",
     "landscape.npz": "the cost over a grid of two parameters, of `codesign landscape --run`, as "
     "arrays (`codesign_jax.report.landscape.Landscape`)",
     LANDSCAPE: "the same as a table, see below",
-    "landscape.part.npz": "what is done of a landscape that was interrupted; the same command goes "
-    "on",
+    "landscape.part": "what is done of a landscape that was interrupted; the same command goes on",
     "reference.npz": "outcomes of the chosen design's fresh trials at accuracy `reference`, arrays "
     "of shape (trial,), and the digest of what determines them",
     "replay.html": "a grasp in 3D, of `codesign replay`: opens in any browser, without a network",
     "report.html": "the report of `codesign report`: opens in any browser, without a network",
 }
+
+
+_TYPES = {"name": "text (dictionary)"}
 
 
 def page() -> str:
@@ -191,4 +229,12 @@ def page() -> str:
             lines[-1] += (
                 "design space, its name and the hand file's unit; numbers are finger indices |"
             )
+    lines += ["", "## The Parquet file of `codesign sample`", "", "A row for a grasp.", ""]
+    lines += ["| column | type | unit | meaning |", "| --- | --- | --- | --- |"]
+    for column, (kind, unit, text) in GRASPS.items():
+        lines.append(f"| `{column}` | {_TYPES.get(kind, kind)} | {unit} | {text} |")
+    lines.append(
+        f"| `length_0_mm`, `pressure_0_kPa`, ... | float32 | the hand file's | {DESIGNS}: a column "
+        "for each free parameter of the design space |"
+    )
     return "\n".join(lines) + "\n"

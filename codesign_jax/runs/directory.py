@@ -8,53 +8,60 @@ import dataclasses
 import datetime
 import difflib
 import fcntl
-import json
 import os
-import re
 import shlex
-import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from codesign_jax import files
 from codesign_jax import scene as scenes
-from codesign_jax.provenance import environment, git_state
-from codesign_jax.runs import scene_files
-from codesign_jax.runs.columns import FILES, TABLES
+from codesign_jax.provenance import environment
+from codesign_jax.runs import belongings, manifest, reading, scene_files
+from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
 
-_LOCK = ".lock"
 _MOST_LINES = 16
 """Lines of a file's differences that an error shows."""
-PROVENANCE = "provenance.json"
-"""File that makes a folder a run."""
-_OURS = {*FILES, *TABLES, _LOCK}
 
 
 class RunDirectory:
     """An open run folder; see `open_run`."""
 
-    def __init__(self, path: Path):
-        """Refers to a folder that `open_run` has prepared."""
-        self.path = path
+    def __init__(self, path: Path, identity: str | None):
+        """Refers to a folder that `open_run` has prepared, of the run with this identity."""
+        self.path, self.identity = path, identity
         self.checkpoints = path / "checkpoints"
         self.figures = path / "figures"
+
+    def store(self, *, tell: Callable[[str], None]) -> Checkpoints:
+        """Opens the run's checkpoints, see there."""
+        return Checkpoints(self.checkpoints, run=self.identity, tell=tell)
 
     def log(self, message: str) -> None:
         """Appends a line with the time to events.log."""
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        with (self.path / "events.log").open("a", encoding="utf-8") as file:
+        path = self.path / "events.log"
+        with files.naming(path), path.open("a", encoding="utf-8") as file:
             file.write(f"{now} {message}\n")
 
 
 @contextlib.contextmanager
 def open_run(
-    path: Path, scene: Scene, settings: Settings, command: list[str], *, fresh: bool = False
+    path: Path,
+    scene: Scene,
+    settings: Settings,
+    command: list[str],
+    *,
+    fresh: bool = False,
+    sources: Iterable[Path] = (),
 ) -> Iterator[tuple[RunDirectory, list[str]]]:
     """Opens a run folder: makes it, or checks that it is this very run; locks it meanwhile.
+
+    Nothing is deleted in it but what `belongings` tells to be a run's or an unfinished start's.
 
     Args:
       path: The folder.
@@ -62,6 +69,7 @@ def open_run(
       settings: Its settings.
       command: Command line to note in provenance.json.
       fresh: Deletes an earlier run's files first.
+      sources: Files that the scene was read from, which `fresh` must not delete.
 
     Yields:
       The folder and what the user should know about resuming in it.
@@ -70,38 +78,39 @@ def open_run(
       SceneError: If the folder holds other files, belongs to another scene or other settings
         (with a diff; more episodes extend the run), or is in use; nothing is changed then.
     """
-    _refuse_foreign(path)
+    sources = tuple(sources)
+    check_folder(path, scene, settings, fresh=fresh, sources=sources)
     made = not path.exists()
     path.mkdir(parents=True, exist_ok=True)
     with _locked(path):
-        for left in path.glob("*.tmp"):
-            left.unlink()
-        notes = []
-        if fresh:
-            _clear(path)
-        if (path / PROVENANCE).exists():
-            stored = read_provenance(path)
-            _refuse_other(path, scene, settings, stored)
-            notes = _differences(stored["environment"], environment())
-            stored["resumed"] = [*stored.get("resumed", []), _start(command)]
-            before = stored["settings"]["episodes"]
-            if before != settings.episodes:
-                step = {"from": before, "to": settings.episodes}
-                stored["extended"] = [*stored.get("extended", []), _start(command) | step]
-                stored["settings"]["episodes"] = settings.episodes
-                notes.append(f"extended from {before} to {settings.episodes} episodes")
-            _write_provenance(path, stored)
+        # Again: another process may have been here.
+        check_folder(path, scene, settings, fresh=fresh, sources=sources)
+        if fresh and (path / PROVENANCE).exists():
+            contents = scene_files.contents(scene)
+            belongings.delete_run(path)
         else:
-            _clear(path)  # remains of a start that was cut short
-            _create(path, scene, settings, command)
-        run = RunDirectory(path)
+            contents = None
+        notes = []
+        if (path / PROVENANCE).exists():
+            belongings.tidy(path)
+            notes = _resume(path, settings, command)
+        else:
+            _create(path, scene, settings, command, contents)
+        run = RunDirectory(path, manifest.read_provenance(path).get("id"))
         run.log("created" if made or fresh else "opened")
         for note in notes:
             run.log(note)
         yield run, notes
 
 
-def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = False) -> None:
+def check_folder(
+    path: Path,
+    scene: Scene,
+    settings: Settings,
+    *,
+    fresh: bool = False,
+    sources: Iterable[Path] = (),
+) -> None:
     """Checks that a run could start or go on in a folder; changes nothing.
 
     Args:
@@ -109,38 +118,23 @@ def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = 
       scene: The scene of the run.
       settings: Its settings.
       fresh: Whether an earlier run's files will be deleted.
+      sources: Files that the scene was read from.
 
     Raises:
       SceneError: See `open_run`.
     """
-    _refuse_foreign(path)
-    if (path / PROVENANCE).exists() and not fresh:
-        _refuse_other(path, scene, settings, read_provenance(path))
-
-
-def read_run(
-    path: Path,
-    *,
-    object_set: str | Path | None = None,
-    accuracy: str | Path | None = None,
-    overrides: Mapping[Any, Any] | None = None,
-) -> tuple[Scene, Settings]:
-    """Reads scene and settings of a run folder.
-
-    Args:
-      path: The folder.
-      object_set: Object set instead of the run's.
-      accuracy: Preset of discretization and solver instead of the run's.
-      overrides: Values by key path that replace the run's; see `scene.load`.
-
-    Raises:
-      SceneError: If it is not a run folder.
-    """
-    stored = read_provenance(path)
-    scene = scenes.load(
-        path / "scene.toml", object_set=object_set, accuracy=accuracy, overrides=overrides
-    )
-    return scene, Settings(**stored["settings"])
+    belongings.refuse_foreign(path)
+    belongings.refuse_unmarked(path)
+    if not (path / PROVENANCE).exists():
+        return
+    stored = manifest.read_provenance(path)
+    if fresh:
+        meshes = (shape.mesh.path for shape in scene.objects.object if shape.mesh)
+        belongings.refuse_to_delete(path, (*sources, *meshes))
+    else:
+        _refuse_other(path, scene, settings, stored)
+        if reading.lost_all(path):
+            raise SceneError([reading.lost_all(path)])
 
 
 def episodes_of(paths: Iterable[Path]) -> int | None:
@@ -150,7 +144,7 @@ def episodes_of(paths: Iterable[Path]) -> int | None:
       SceneError: If they are to have different numbers, or a run cannot be read.
     """
     found = [path for path in paths if (path / PROVENANCE).exists()]
-    numbers = {path: read_provenance(path)["settings"]["episodes"] for path in found}
+    numbers = {path: manifest.read_provenance(path)["settings"]["episodes"] for path in found}
     if len(set(numbers.values())) > 1:
         least, most = (f(numbers, key=lambda path: numbers[path]) for f in (min, max))
         problem = (
@@ -161,93 +155,53 @@ def episodes_of(paths: Iterable[Path]) -> int | None:
     return next(iter(numbers.values()), None)
 
 
-def read_provenance(path: Path) -> dict[str, Any]:
-    """Reads provenance.json of a run folder.
-
-    Raises:
-      SceneError: If it is not a run folder.
-    """
-    try:
-        stored = json.loads((path / PROVENANCE).read_text(encoding="utf-8"))
-        # Runs from before a setting was there have its default.
-        stored["settings"] = dataclasses.asdict(Settings(**stored["settings"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        why = f"{PROVENANCE} cannot be read" if path.exists() else "there is no such folder"
-        problem = f"{path} is not a run folder: {why}"
-        raise SceneError([problem + _runs_inside(path)]) from error
-    return stored
-
-
-def _runs_inside(path: Path) -> str:
-    """A hint at the runs in a folder of several, such as that of --seeds."""
-    inside = sorted(file.parent for file in path.glob(f"*/{PROVENANCE}"))
-    inside.sort(key=lambda folder: (len(folder.name), folder.name))  # seed-2 before seed-10
-    if not inside:
-        return ""
-    some = f"{inside[0]} or {inside[1]}" if len(inside) > 1 else str(inside[0])
-    return f"; it holds {len(inside)} run{'s' * (len(inside) > 1)}: give one, such as {some}"
-
-
-def _refuse_foreign(path: Path) -> None:
-    if path.exists() and not path.is_dir():
-        raise SceneError([f"--out {path} is a file"])
-    # A killed process leaves the temporary of a file that it was replacing.
-    present = {p.name for p in path.iterdir()} if path.exists() else set()
-    present = {re.sub(r"\.[0-9]+\.tmp$", "", name) for name in present}
-    others = sorted(present - _OURS)
-    if others:
-        names = ", ".join(others[:3])
-        raise SceneError([f"--out {path} holds other files ({names}); choose another folder"])
-
-
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Holds the folder's lock; the kernel releases it with the process, however it ends."""
-    with (path / _LOCK).open("a+") as file:
+    place = os.open(path / belongings.LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    with os.fdopen(place, "r+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            owner = file.read().strip() or "?"
+        except BlockingIOError as error:
+            owner = file.read(64).strip() or "?"
             raise SceneError([f"--out {path} is in use by process {owner}"]) from error
+        except OSError as error:
+            problem = f"--out {path} cannot be locked: {error.strerror}; choose another folder"
+            raise SceneError([problem]) from error
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
         yield
 
 
-def _clear(path: Path) -> None:
-    for target in path.iterdir():
-        if target.name == _LOCK:
-            continue
-        if target.is_dir():
-            shutil.rmtree(target)
-        else:
-            target.unlink()
+def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
+    """Notes a resumption or extension; returns what the user should know about it."""
+    stored = manifest.read_provenance(path)
+    notes = _differences(stored["environment"], environment())
+    stored["resumed"] = [*stored.get("resumed", []), manifest.start(command)]
+    before = stored["settings"]["episodes"]
+    if before != settings.episodes:
+        step = {"from": before, "to": settings.episodes}
+        stored["extended"] = [*stored.get("extended", []), manifest.start(command) | step]
+        stored["settings"]["episodes"] = settings.episodes
+        notes.append(f"extended from {before} to {settings.episodes} episodes")
+    manifest.write(path, stored)
+    return notes
 
 
-def _create(path: Path, scene: Scene, settings: Settings, command: list[str]) -> None:
-    scene_files.write_scene(scene, path)
-    # Last: a folder with this file is a run.
-    _write_provenance(
-        path,
-        {
-            "settings": dataclasses.asdict(settings),
-            "started": _start(command),
-            "environment": environment(),
-            "git": git_state(),
-        },
-    )
-
-
-def _start(command: list[str]) -> dict[str, Any]:
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return {"time": now, "command": command}
-
-
-def _write_provenance(path: Path, content: dict[str, Any]) -> None:
-    with files.atomically(path / PROVENANCE) as part:
-        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+def _create(
+    path: Path,
+    scene: Scene,
+    settings: Settings,
+    command: list[str],
+    contents: Mapping[str, bytes] | None,
+) -> None:
+    """Makes a run: its marker first and provenance.json last, which makes the folder a run."""
+    contents = scene_files.contents(scene) if contents is None else contents
+    belongings.begin(path, contents)
+    scene_files.write_scene(scene, path, contents)
+    manifest.write(path, manifest.new(settings, contents, command))
+    belongings.tidy(path)
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
@@ -260,6 +214,7 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
         elif before != value:
             flag = name.replace("_", "-")
             problems.append(f"--{flag}: the run has {before}, asked for is {value}")
+    manifest.refuse_changed(path, stored)
     if scenes.load(path / "scene.toml") != scene:
         for name, text in scene_files.scene_texts(scene).items():
             old = (path / name).read_text(encoding="utf-8").splitlines()

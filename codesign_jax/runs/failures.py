@@ -1,13 +1,12 @@
 """Failed worlds on disk: what they were and the last good state they were frozen at."""
 
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from codesign_jax import types
+from codesign_jax import archives, types
 from codesign_jax.codesign import EpisodeInfo
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Trial
@@ -53,16 +52,14 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
         trial = jax.tree.map(lambda v, t=t: v[t], trials)
         state = np.zeros(0) if info.last is None else info.last[p, t]
         path = folder / FOLDER / f"episode-{episode}-particle-{p}-trial-{t}.npz"
-        path.parent.mkdir(exist_ok=True)
-        np.savez(
-            path,
-            design=info.population[p],
-            state=state,
-            status=status[p, t],
-            bad_step=info.trials.bad_step[p, t],
-            place=np.array([episode, p, t]),
-            **{f"trial_{k}": v for k, v in trial._asdict().items()},
-        )
+        arrays = {
+            "design": info.population[p],
+            "state": state,
+            "status": status[p, t],
+            "bad_step": info.trials.bad_step[p, t],
+            "place": np.array([episode, p, t]),
+        }
+        archives.save(path, arrays | {f"trial_{k}": v for k, v in trial._asdict().items()})
         files.append(path)
     return files
 
@@ -76,13 +73,11 @@ def load(path: Path) -> Failure:
     if not path.exists():
         raise SceneError([f"{path}: there is no such file or folder"])
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            values = {k: stored[k] for k in stored.files}
-        of_trial = {k.removeprefix("trial_"): v for k, v in values.items() if k[:6] == "trial_"}
-        trial = Trial(**{k: of_trial[k] for k in of_trial if k in Trial._fields})
+        values = archives.load(path)
+        trial = Trial(**{name: values[f"trial_{name}"] for name in Trial._fields})
         place = tuple(int(v) for v in values["place"])
         status, bad_step = int(values["status"]), int(values["bad_step"])
         return Failure(values["design"], trial, values["state"], status, bad_step, place)  # type: ignore[arg-type]
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         problem = f"{path} is not a failed world of a run, which are .npz files in its {FOLDER}/"
         raise SceneError([problem]) from error

@@ -19,13 +19,14 @@ from codesign_jax import codesign, types
 from codesign_jax.batch import Request
 from codesign_jax.codesign import EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import Optimizer, State, translated
-from codesign_jax.runs import failures, tables
+from codesign_jax.optimize import NoSeed, Optimizer, State, translated
+from codesign_jax.runs import failures, reading, tables
 from codesign_jax.runs import record as records
-from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.runs.checkpoint import Checkpoints, Restored
 from codesign_jax.runs.directory import RunDirectory
+from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.interrupts import Stopped
-from codesign_jax.runs.progress import Progress
+from codesign_jax.runs.progress import Progress, Stopwatch
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
@@ -55,10 +56,6 @@ def _numbers(array: Any) -> Any:
     """The numbers of a typed key, and anything else as it is."""
     typed = isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jax.dtypes.prng_key)
     return jax.random.key_data(array) if typed else array
-
-
-class AllFailed(RuntimeError):
-    """Every trial of an episode failed; there is nothing to optimise."""
 
 
 class Plan(NamedTuple):
@@ -122,18 +119,20 @@ class Loop:
         """Runs what is left of the run; to stop it, `Stopped` is thrown in.
 
         Raises:
-          AllFailed: If every trial of an episode failed.
+          AllFailed: If every trial of an episode or of the final test failed, in an earlier process
+            or this one.
+          RunError: If the run's checkpoints are another's, cannot be read now, or are all lost.
           OSError: If an episode cannot be saved; earlier ones stay intact.
         """
         record, signum = self._restore(), 0
         try:
-            if record is None or not self._ended(record):
-                if record is None:
-                    record = yield from self._seed()
-                self._write_tables(record, 0)
-                yield from self._episodes(record)
-                self.save()
-                yield from self._test(record)
+            if record is None:
+                record = yield from self._seed()
+            self._mend_tables(record)
+            self._refuse_all_failed(record)
+            yield from self._episodes(record)
+            self.save()
+            yield from self._test(record)
         except Stopped as stop:
             self.save()
             signum = stop.signum
@@ -158,20 +157,18 @@ class Loop:
     def _tested(self, record: Record) -> bool:
         return record.test is not None or self.plan.settings.test_trials == 0
 
-    def _ended(self, record: Record) -> bool:
-        """Whether nothing of the run is left to do, the tables included."""
-        done = record.done >= self.plan.settings.episodes and self._tested(record)
-        return done and tables.complete(self.run_directory.path, record)
-
     def _restore(self) -> Record | None:
         found = self.store.restore()
+        if found.step is None:
+            self._begin_anew(found)
+            return None
+        record = records.from_arrays(found.arrays)
+        plan = self.plan
+        records.refuse_other(record, plan.settings, found.step, plan.space.num_parameters)
         for step, reason in found.damaged:
             self._say(f"checkpoint {step} is lost: {reason}; using an older one")
         self.store.discard([step for step, _ in found.damaged])
-        if found.step is None:
-            return None
-        record = records.from_arrays(found.arrays)
-        done, total = record.done, self.plan.settings.episodes
+        done, total = record.done, plan.settings.episodes
         if done < total and record.test is not None:
             # The run was extended: its test was of particles that are no longer final, and the next
             # episode takes the step of that test.
@@ -185,13 +182,27 @@ class Loop:
             self._say(f"all {total} episodes are done in {self.run_directory.path}")
         return record
 
+    def _begin_anew(self, found: Restored) -> None:
+        """Refuses to begin anew where results would be overwritten."""
+        reasons = "; ".join(f"{step}: {reason}" for step, reason in found.damaged)
+        folder = self.run_directory.path
+        if episodes := tables.episodes_in(folder):
+            which = f"no checkpoint that is whole ({reasons})" if reasons else "no checkpoint"
+            raise RunError(f"{folder} has {which}, {reading.lost(episodes)}")
+        for step, reason in found.damaged:
+            self._say(f"checkpoint {step} is lost: {reason}; the run begins anew")
+        self.store.discard([step for step, _ in found.damaged])
+
     def _seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Record]:
         """Finds the seed particle and saves it as step 0."""
         plan, settings = self.plan, self.plan.settings
         batch = settings.particles
         search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, batch=batch)
         with self.progress.busy("looking for a poor seed") as watch:
-            seed, cost, drawn = yield from self._evaluated(search)
+            try:
+                seed, cost, drawn = yield from self._evaluated(search)
+            except NoSeed as error:
+                raise RunError(str(error)) from error
         design = tables.describe(plan.space, np.asarray(seed))
         self._say(f"seed {design}: cost {cost:.3f}, candidate {drawn} ({watch.seconds:.1f} s)")
         state = plan.optimizer.init(plan.key, seed, settings.particles)
@@ -199,13 +210,26 @@ class Loop:
         self._save(0, record)
         return record
 
-    def _evaluated(self, asking: Generator[tuple[jax.Array, jax.Array], Outcome, Any]) -> Asking:
-        """Answers what asks for populations by episodes in which nothing moves."""
+    def _evaluated(
+        self,
+        asking: Generator[tuple[jax.Array, jax.Array], Outcome, Any],
+        told: Callable[[], None] = lambda: None,
+    ) -> Asking:
+        """Answers what asks for populations by episodes in which nothing moves; tells of each."""
+
+        def answer(reply: tuple[State, EpisodeInfo]) -> Outcome:
+            told()
+            return reply[1].trials
+
         return translated(
             asking,
             lambda asked: Request(*codesign.closed(self.plan.optimizer, *asked)),
-            lambda told: told[1].trials,
+            answer,
         )
+
+    def _tested_some(self, watch: Stopwatch, grasps: int) -> None:
+        """Tells that a part of the final test is done."""
+        self.progress.tested(grasps, watch.lap())
 
     def _episodes(self, record: Record) -> Asking:
         for e in range(record.done, self.plan.settings.episodes):
@@ -229,8 +253,13 @@ class Loop:
         self.store.save(e + 1, records.to_arrays(record))
         self._write_tables(record, e)
         self._report(record.history, e, seconds)
-        if types.failed(record.history.trials.status[e]).all():
-            _all_failed(record.history.trials.status[e], self.run_directory.path)
+        self._refuse_all_failed(record)
+
+    def _refuse_all_failed(self, record: Record) -> None:
+        """Ends a run whose last episode or final test has not one trial that did not fail."""
+        status = record.failed_status()
+        if status is not None:
+            _all_failed(status, self.run_directory.path)
 
     def _save_failures(self, e: int, info: EpisodeInfo) -> None:
         """Saves failed worlds with their last good states, for `codesign replay`."""
@@ -253,12 +282,15 @@ class Loop:
             num_trials=settings.test_trials,
             previous=previous,
         )
+        batch = settings.particles * settings.trials
         with self.progress.busy("testing the final particles") as watch:
-            test = yield from self._evaluated(testing)
+            told = partial(self._tested_some, watch, batch)
+            test = yield from self._evaluated(testing, told)
         record.test = test.trials
         self._save(settings.episodes + 1, record)
         self._write_tables(record, settings.episodes)
-        grasps = settings.particles * settings.test_rounds * settings.trials
+        self._refuse_all_failed(record)
+        grasps = batch * settings.test_rounds
         self._say(f"final test: {grasps} grasps in {watch.seconds:.1f} s")
 
     def _report(self, history: History, e: int, seconds: float) -> None:
@@ -285,18 +317,17 @@ class Loop:
         if test is not None:
             tables.write_tests(folder, plan.space, np.asarray(record.state.particles), test)
 
+    def _mend_tables(self, record: Record) -> None:
+        """Writes the tables that differ from what the run has so far, and says which."""
+        plan, folder = self.plan, self.run_directory.path
+        mended = tables.mend(folder, plan.scene, plan.space, record, _final_test(plan, record))
+        if mended and record.done:
+            names = ", ".join(mended)
+            self._say(f"{names}: differed from the checkpoints, and written again from these")
+
     def _say(self, message: str) -> None:
         self.progress.message(message)
         self.run_directory.log(message)
-
-
-def load_record(folder: Path) -> Record | None:
-    """Reads the newest good checkpoint of a run folder; None if it has none."""
-    if not (folder / "checkpoints").is_dir():
-        return None
-    with Checkpoints(folder / "checkpoints", read_only=True) as store:
-        found = store.restore()
-    return records.from_arrays(found.arrays) if found.step is not None else None
 
 
 def _final_test(plan: Plan, record: Record) -> FinalTest | None:

@@ -1,11 +1,11 @@
 """Outcomes of trials in a file, with what determines them: simulated once, and found again."""
 
-import zipfile
+import uuid
 from pathlib import Path
 
 import numpy as np
 
-from codesign_jax import files
+from codesign_jax import archives, sources
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
@@ -27,27 +27,51 @@ def key(scene: Scene, engine: str, designs: np.ndarray, trials: int, seed: int) 
     return digest({"scene": texts, "designs": np.asarray(designs)} | how)
 
 
+def packed(outcomes: Outcome, key: str) -> dict[str, np.ndarray]:
+    """Outcomes as arrays by name, with their `key` and the code that simulated them."""
+    # Outcomes of code that is not known are nobody's: nothing is equal to this.
+    code = sources.digest() or f"unknown {uuid.uuid4()}"
+    return {"key": np.array(key), "code": np.array(code), **outcomes._asdict()}
+
+
+def unpacked(arrays: dict[str, np.ndarray], key: str) -> tuple[Outcome | None, str]:
+    """The outcomes of `packed`, or None and why: they are of other code, or of another key."""
+    if set(arrays) != {"key", "code", *Outcome._fields} or str(arrays["key"]) != key:
+        return None, "is of another case"
+    if str(arrays["code"]) != sources.digest():
+        return None, "is of another version of the code"
+    return Outcome(**{name: arrays[name] for name in Outcome._fields}), ""
+
+
 def save(path: Path, outcomes: Outcome, key: str) -> None:
-    """Writes outcomes, arrays of any shape, and their `key`."""
-    with files.atomically(path) as part, part.open("wb") as file:
-        np.savez(file, key=np.array(key), **outcomes._asdict())
+    """Writes outcomes, arrays of any shape, their `key` and the code that simulated them."""
+    archives.save(path, packed(outcomes, key))
 
 
-def load(path: Path, key: str) -> Outcome | None:
-    """Reads outcomes; None if there are none, of another key, or the file is damaged."""
+def load(path: Path, key: str) -> tuple[Outcome | None, str]:
+    """Reads outcomes.
+
+    Args:
+      path: The file.
+      key: Their `key`.
+
+    Returns:
+      The outcomes, or None; and why there are none, in words of which the file is the subject:
+      it is of another key, of other code, or damaged. Empty if there is no such file.
+    """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            if str(stored["key"]) != key:
-                return None
-            return Outcome(**{name: stored[name] for name in Outcome._fields})
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
-        return None
+        return unpacked(archives.load(path), key)
+    except FileNotFoundError:
+        return None, ""
+    except OSError as error:
+        return None, f"cannot be read ({error.strerror})"
+    except archives.ArchiveError:
+        return None, "is damaged, or of another version of the code"
 
 
 def count(path: Path) -> int:
     """Number of trials of the outcomes in a file, whatever their key; 0 if there are none."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return stored["cost"].size
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        return archives.load(path)["cost"].size
+    except (OSError, archives.ArchiveError, KeyError):
         return 0

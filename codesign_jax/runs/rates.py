@@ -15,7 +15,7 @@ import statistics
 
 import jax
 
-from codesign_jax import files
+from codesign_jax import caches, files
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.runs.settings import Settings
 from codesign_jax.scene import Scene
@@ -152,6 +152,8 @@ def record(work: Work, grasps_per_second: float, compile_seconds: float) -> None
     """Keeps a measurement in the user's cache; one that cannot be written is left out."""
     today = datetime.date.today().isoformat()
     entry = Rate(work, grasps_per_second, compile_seconds, f"measured on this machine on {today}")
+    if not caches.enabled():
+        return
     kept = [r for r in measured() if r.work != work][-_KEPT + 1 :]
     with contextlib.suppress(OSError), files.atomically(_path()) as part:
         content = [dataclasses.asdict(r) for r in [*kept, entry]]
@@ -160,6 +162,8 @@ def record(work: Work, grasps_per_second: float, compile_seconds: float) -> None
 
 def measured() -> list[Rate]:
     """The user's measurements, oldest first; a damaged file counts as none."""
+    if not caches.enabled():
+        return []
     try:
         stored = json.loads(_path().read_text(encoding="utf-8"))
         return [Rate(**(entry | {"work": Work(**entry["work"])})) for entry in stored]
@@ -189,6 +193,14 @@ def estimate(work: Work) -> Estimate | None:
     if dataclasses.replace(best.work, scene=work.scene, structure=work.structure) != work:
         basis += ", scaled to these steps, links and batch"
     return Estimate(rate, _compile_seconds(same or shipped, work), basis)
+
+
+def seconds(work: Work) -> float | None:
+    """Expected time of so many grasps at once, with compiling or loading; None if not known."""
+    found = estimate(work)
+    if found is None or found.compile_seconds is None:
+        return None
+    return found.compile_seconds + work.grasps / found.grasps_per_second
 
 
 def _compile_seconds(alike: list[Rate], work: Work) -> float | None:
@@ -230,4 +242,4 @@ def _count(device: str) -> int:
 
 
 def _path():
-    return files.cache_folder() / "rates.json"
+    return caches.folder() / "rates.json"

@@ -9,8 +9,9 @@ import numpy as np
 
 from codesign_jax.codesign import EpisodeInfo
 from codesign_jax.optimize import State
+from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.settings import Settings
-from codesign_jax.types import Outcome
+from codesign_jax.types import Outcome, failed
 
 
 class History(NamedTuple):
@@ -42,7 +43,9 @@ def empty_history(settings: Settings, num_parameters: int) -> History:
     real, whole = np.float32, np.int32
     return History(
         population=np.zeros((e, n, num_parameters), real),
-        trials=Outcome(trials(real), trials(whole), trials(real), trials(whole)),
+        trials=Outcome(
+            cost=trials(real), status=trials(whole), lost_time=trials(real), bad_step=trials(whole)
+        ),
         cost=np.zeros((e, n), real),
         weight=np.zeros((e, n), real),
         ancestors=np.zeros((e, n), whole),
@@ -82,6 +85,12 @@ class Record:
         """Number of finished episodes."""
         return int(self.state.episode)
 
+    def failed_status(self) -> np.ndarray | None:
+        """Status of the final test's or the last episode's trials where every one failed."""
+        told = [] if self.test is None else [np.asarray(self.test.status)]
+        told += [np.asarray(self.history.trials.status[self.done - 1])] if self.done else []
+        return next((status for status in told if failed(status).all()), None)
+
     def last_outcomes(self) -> Outcome:
         """Outcomes in the last episode of the particle filter's final particles.
 
@@ -104,10 +113,56 @@ def to_arrays(record: Record) -> dict:
 
 
 def from_arrays(arrays: dict) -> Record:
-    """Inverse of `to_arrays`; the history is copied, so that `report` may write to it."""
-    s, h = arrays["state"], jax.tree.map(np.array, arrays["history"])
-    key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
-    memory = jax.tree.map(jnp.asarray, s.get("memory"))
-    state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
-    test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
-    return Record(state, History(**(h | {"trials": Outcome(**h["trials"])})), test)
+    """Inverse of `to_arrays`; the history is copied, so that `report` may write to it.
+
+    Raises:
+      RunError: If they are not the arrays of a record, such as those of another version.
+    """
+    try:
+        s, h = arrays["state"], jax.tree.map(np.array, arrays["history"])
+        key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
+        memory = jax.tree.map(jnp.asarray, s.get("memory"))
+        state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
+        test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
+        return Record(state, History(**(h | {"trials": Outcome(**h["trials"])})), test)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise RunError(
+            f"its checkpoints hold other arrays than this version of codesign-jax has ({error}): "
+            "use the version that made the run, which provenance.json names"
+        ) from error
+
+
+def refuse_other(
+    record: Record, settings: Settings, step: int, num_parameters: int | None = None
+) -> None:
+    """Refuses a record that is not of a run of these settings, or of another step.
+
+    Args:
+      record: What was read.
+      settings: Settings of the run.
+      step: Number of the checkpoint that it was read from.
+      num_parameters: Parameters of the design space; None to leave them out.
+
+    Raises:
+      RunError: With what differs.
+    """
+    e, n, t = (settings.episodes, settings.particles, settings.trials)
+    particles, history = np.shape(record.state.particles), record.history
+    d = particles[-1] if num_parameters is None else num_parameters
+    seed = np.asarray(jax.random.key_data(jax.random.key(settings.seed)))
+    own = record.done + (record.test is not None)
+    room = len(history.cost)
+    problems = {
+        "they are of another seed": not np.array_equal(jax.random.key_data(record.state.key), seed),
+        f"they are not of {n} particles of {d} parameters": particles != (n, d)
+        or history.population.shape != (room, n, d),
+        f"they are not of {t} trials": any(v.shape != (room, n, t) for v in history.trials),
+        f"checkpoint {step} holds episode {record.done}": own != step,
+        f"they have {record.done} episodes of {e}": not 0 <= record.done <= min(room, e),
+    }
+    found = [words for words, wrong in problems.items() if wrong]
+    if found:
+        raise RunError(
+            f"its checkpoints are not this run's: {'; '.join(found)}. Nothing was changed. Put its "
+            "own back, or choose another folder"
+        )

@@ -2,11 +2,13 @@
 
 import dataclasses
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
+from codesign_jax import files
 from codesign_jax import scene as scenes
 from codesign_jax.scene import Scene
 from codesign_jax.scene.objects import Shape
@@ -32,22 +34,29 @@ def scene_texts(scene: Scene) -> dict[str, str]:
     }
 
 
-def write_scene(scene: Scene, folder: Path) -> None:
+def contents(scene: Scene) -> dict[str, bytes]:
+    """Returns all files of a resolved scene, its meshes included, by name in the folder."""
+    found = {name: text.encode() for name, text in scene_texts(scene).items()}
+    for i, shape in enumerate(scene.objects.object):
+        if shape.mesh:
+            found[_mesh_name(shape, i)] = shape.mesh.content
+    return found
+
+
+def write_scene(scene: Scene, folder: Path, written: Mapping[str, bytes] | None = None) -> None:
     """Writes a resolved scene, meshes included; `scene.load` of it returns an equal one.
 
     Args:
       scene: The scene.
       folder: An existing folder.
+      written: Its `contents`, if they were read before.
 
     Raises:
       RuntimeError: If what was written does not read back as the same scene.
     """
-    for name, text in scene_texts(scene).items():
-        (folder / name).write_text(text, encoding="utf-8")
-    for i, shape in enumerate(scene.objects.object):
-        if shape.mesh:
-            (folder / MESHES).mkdir(exist_ok=True)
-            (folder / _mesh_name(shape, i)).write_bytes(shape.mesh.path.read_bytes())
+    for name, content in (contents(scene) if written is None else written).items():
+        with files.atomically(folder / name) as part:
+            part.write_bytes(content)
     again = scenes.load(folder / "scene.toml")
     # A scene with other constants is another kind of object than one that was read.
     if again != scene and scene_texts(again) != scene_texts(scene):
@@ -63,7 +72,7 @@ def _mesh_name(shape: Shape, index: int) -> str:
 def _document(table: dict[str, Any], units: dict[str, str]) -> str:
     """TOML of a table, with the units of its values as comments."""
     lines, place = [], ""
-    for line in tomli_w.dumps(table).splitlines():
+    for line in tomli_w.dumps(table).split("\n")[:-1]:  # texts may hold other ends of lines
         if header := re.fullmatch(r"\[+(.*?)\]+", line):
             place = header[1] + "."
         key, equals, _ = line.partition(" = ")

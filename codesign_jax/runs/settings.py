@@ -121,7 +121,8 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
             space = design_space(hand, settings.preset)
         except schema.SceneError as error:
             found += [f"--{problem}" for problem in error.problems]
-    if settings.episodes >= 1:
+    low, high = _RANGES["episodes"]
+    if low <= settings.episodes <= high:  # it is as long as the run
         found += _schedule_problems(settings, space)
     return found
 

@@ -5,6 +5,7 @@ in events.log.
 """
 
 import csv
+import io
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -40,15 +41,13 @@ def write_episodes(
       start: First episode.
       stop: Episode after the last.
     """
-    span = range(start, stop)
-    designs = design_columns(space)
-    rows = {
-        "episodes.csv": _episodes(history, space, span),
-        "particles.csv": _particles(history, space, span),
-        "trials.csv": _trials(history, scene, span),
-    }
-    for name, values in rows.items():
-        _write(folder / name, TABLES[name].head(designs), values, start)
+    for name, (head, rows) in _of_episodes(scene, space, history, range(start, stop)).items():
+        if start == 0:
+            _replace(folder / name, _text([head, *rows]))
+        else:
+            path = folder / name
+            with files.naming(path), path.open("a", newline="", encoding="utf-8") as file:
+                file.write(_text(rows))
 
 
 def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: FinalTest) -> None:
@@ -60,31 +59,44 @@ def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: F
       particles: Final particles [SI units], shape (particle, parameter).
       test: Their test.
     """
-    failed = types.failed(np.asarray(test.trials.status))
-    rows = (
-        [i, _number(test.cost[i]), failed.shape[1], failed[i].sum(), int(test.success[i]), *design]
-        for i, design in enumerate(_designs(space, particles))
-    )
-    _write(folder / TESTS, TABLES[TESTS].head(design_columns(space)), rows, 0)
+    head, rows = _of_test(space, particles, test)
+    _replace(folder / TESTS, _text([head, *rows]))
 
 
-def complete(folder: Path, record: Record) -> bool:
-    """Whether the files have all that a run has so far.
+def mend(
+    folder: Path, scene: Scene, space: DesignSpace, record: Record, test: FinalTest | None
+) -> list[str]:
+    """Makes the files those of a run; returns the names of those that differed.
 
-    A process that was killed between a checkpoint and the rows that belong to it leaves them
-    without these.  Rows of trials are written after those of episodes and particles.
+    A process that was killed between a checkpoint and its rows leaves files without these; others
+    were damaged or changed by somebody.
 
     Args:
       folder: The run folder.
+      scene: The scene.
+      space: The design space.
       record: The run.
+      test: Its final test, or None if it has none yet; its file is deleted then.
     """
-    trials = record.history.trials.cost.shape[1:]
-    try:
-        rows = (folder / "trials.csv").read_bytes().count(b"\n") - 1
-    except FileNotFoundError:
-        return False
-    tested = record.test is None or (folder / TESTS).exists()
-    return tested and rows == record.done * trials[0] * trials[1]
+    wanted = _of_episodes(scene, space, record.history, range(record.done))
+    if test is not None:
+        wanted[TESTS] = _of_test(space, np.asarray(record.state.particles), test)
+    differing = []
+    for name, (head, rows) in wanted.items():
+        text = _text([head, *rows])
+        if _content(folder / name) != text.encode():
+            _replace(folder / name, text)
+            differing.append(name)
+    if TESTS not in wanted and (folder / TESTS).exists():
+        (folder / TESTS).unlink()
+        differing.append(TESTS)
+    return differing
+
+
+def episodes_in(folder: Path) -> int:
+    """Number of episodes of which the tables in a run folder tell, whatever they hold."""
+    content = _content(folder / "episodes.csv") or b""
+    return max(content.count(b"\n") - 1, 0)
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:
@@ -148,13 +160,42 @@ def _number(value: float) -> str:
     return f"{value:.9g}"
 
 
-def _write(path: Path, head: list[str], rows: Iterable[list], start: int) -> None:
-    """Appends rows, or replaces the file as a whole if they are its first."""
-    if start > 0:
-        with path.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
-        return
-    with files.atomically(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(head)
-        writer.writerows(rows)
+def _of_episodes(
+    scene: Scene, space: DesignSpace, history: History, span: range
+) -> dict[str, tuple[list[str], Iterable[list]]]:
+    """Head and rows of the tables of episodes, by the files' names."""
+    designs = design_columns(space)
+    rows = {
+        "episodes.csv": _episodes(history, space, span),
+        "particles.csv": _particles(history, space, span),
+        "trials.csv": _trials(history, scene, span),
+    }
+    return {name: (TABLES[name].head(designs), values) for name, values in rows.items()}
+
+
+def _of_test(
+    space: DesignSpace, particles: np.ndarray, test: FinalTest
+) -> tuple[list[str], Iterable[list]]:
+    """Head and rows of the table of the final test."""
+    failed = types.failed(np.asarray(test.trials.status))
+    rows = (
+        [i, _number(test.cost[i]), failed.shape[1], failed[i].sum(), int(test.success[i]), *design]
+        for i, design in enumerate(_designs(space, particles))
+    )
+    return TABLES[TESTS].head(design_columns(space)), rows
+
+
+def _text(rows: Iterable[list]) -> str:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def _replace(path: Path, text: str) -> None:
+    with files.atomically(path) as part:
+        part.write_bytes(text.encode())
+
+
+def _content(path: Path) -> bytes | None:
+    """A file's bytes; None if there is none."""
+    return path.read_bytes() if path.is_file() else None

@@ -6,13 +6,14 @@ own, as after a resumption; one that fails does not stop the others.
 
 import contextlib
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
+from traceback import format_exception
 from typing import Any, NamedTuple
 
 from codesign_jax.batch import LIMIT, Batch, Request
-from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.directory import open_run
+from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.loop import Loop, Plan, RunResult, begin_fetch, with_seed
 from codesign_jax.runs.progress import GroupProgress, Progress
@@ -20,8 +21,11 @@ from codesign_jax.runs.progress import GroupProgress, Progress
 MOST = 100
 """Most runs at once: each holds open files.  More go on when these have ended."""
 
-FAILURES = (OSError, RuntimeError)
-"""How a run may fail: what it has cannot be saved, no seed is found, or every trial failed."""
+FAILURES = (OSError, RunError)
+"""How a run may fail: what it has cannot be saved, no seed is found, or every trial failed.
+
+Any other error is unexpected: its traceback is kept.
+"""
 
 
 class Timing(NamedTuple):
@@ -64,8 +68,10 @@ def optimize(
     command: list[str],
     *,
     fresh: bool = False,
+    sources: Iterable[Path] = (),
     devices: int | None = None,
     chunk: int | None = None,
+    after: float = 0.0,
 ) -> Results:
     """Runs an optimisation of each seed, or goes on with it; the same call does both.
 
@@ -74,17 +80,21 @@ def optimize(
       folders: Run folder of each seed.
       command: Command line to note in the folders.
       fresh: Deletes earlier runs in the folders first.
+      sources: Files that the scene was read from, which `fresh` must not delete.
       devices: Devices that simulate; None for all of this host.
       chunk: Most worlds of one device in one call; None for `batch.LIMIT`.
+      after: What the caller simulates of each run afterwards, as a number of its grasps: the time
+        left that is shown includes it.
 
     Raises:
       SceneError: If a folder cannot be used; see `open_run`.
     """
     found: dict[int, RunResult | Exception] = {}
     timing, seeds = None, list(folders)
+    begun = {"fresh": fresh, "sources": tuple(sources)}
     for start in range(0, len(seeds), MOST):
         group = {seed: folders[seed] for seed in seeds[start : start + MOST]}
-        results = _group(plan, group, command, fresh, devices, chunk)
+        results = _group(plan, group, command, begun, devices, chunk, after)
         found |= results.runs
         timing = timing or results.timing
         if results.signum:
@@ -96,30 +106,34 @@ def _group(
     plan: Plan,
     folders: Mapping[int, Path],
     command: list[str],
-    fresh: bool,
+    begun: dict[str, Any],
     devices: int | None,
     chunk: int | None,
+    after: float,
 ) -> Results:
-    """`optimize` of as many runs as fit into one process."""
-    total, many = plan.settings.episodes, len(folders) > 1
+    """`optimize` of as many runs as fit into one process; `begun` is how to open the folders."""
+    settings, many = plan.settings, len(folders) > 1
+    batch = settings.particles * settings.trials
+    ahead = {"test": batch * settings.test_rounds, "after": after}
     with contextlib.ExitStack() as stack:
-        progress = GroupProgress(total) if many else Progress(total)
+        total = settings.episodes
+        progress = GroupProgress(total, len(folders), **ahead) if many else Progress(total, **ahead)
         stack.enter_context(progress)
         loops = {}
         for seed, folder in folders.items():
             own = with_seed(plan, seed)
             how = folder, own.scene, own.settings, command
-            run, notes = stack.enter_context(open_run(*how, fresh=fresh))
+            run, notes = stack.enter_context(open_run(*how, **begun))
             voice = (
                 progress.one(f"seed {seed}") if isinstance(progress, GroupProgress) else progress
             )
-            store = stack.enter_context(Checkpoints(run.checkpoints, tell=voice.message))
+            store = stack.enter_context(run.store(tell=voice.message))
             for note in notes:
                 voice.message(note)
             loops[seed] = Loop(own, run, store, voice)
         interrupts = stack.enter_context(Interrupts(progress.message))
-        batch = _batch(plan, devices, chunk)
-        return _Together(plan, loops, progress, interrupts, batch).run()
+        simulator = _batch(plan, devices, chunk)
+        return _Together(plan, loops, progress, interrupts, simulator).run()
 
 
 def _batch(plan: Plan, devices: int | None, chunk: int | None) -> Batch:
@@ -157,7 +171,7 @@ class _Together:
             self._throw(stop)
             self._show()
             self.progress.message(f"stopped by signal {stop.signum}; the same command resumes")
-        except RuntimeError as error:  # what simulates all of them
+        except Exception as error:  # what simulates all of them
             self._throw(error)
         self._show()
         signum = self.interrupts.signum
@@ -173,7 +187,7 @@ class _Together:
             self.waiting[seed] = asking, asking.send(reply)
         except StopIteration as stop:
             self.found[seed] = stop.value
-        except FAILURES as error:
+        except Exception as error:
             self._fail(seed, error)
 
     def _compile(self) -> None:
@@ -185,6 +199,7 @@ class _Together:
         where = f", {count} devices" if count > 1 else ""
         message = f"compiled in {watch.seconds:.1f} s (engine {engine}{where})"
         self.progress.message(message)
+        self.progress.compiled()
         for seed in self.waiting:
             self.loops[seed].run_directory.log(message)
         self.timing = Timing(watch.seconds, runs=len(self.waiting))
@@ -212,7 +227,7 @@ class _Together:
         for seed in list(self.waiting):
             try:
                 self.loops[seed].save()
-            except FAILURES as error:
+            except Exception as error:
                 self.waiting.pop(seed)[0].close()
                 self._fail(seed, error)
 
@@ -228,10 +243,13 @@ class _Together:
                 asking.throw(error)
             except StopIteration as stop:
                 self.found[seed] = stop.value
-            except FAILURES as failure:
+            except Exception as failure:
                 self._fail(seed, failure)
         self.waiting = {}
 
     def _fail(self, seed: int, error: Exception) -> None:
+        """Notes how a run failed; the traceback as well, where it is none of `FAILURES`."""
         self.found[seed] = error
-        self.loops[seed].run_directory.log(f"failed: {error}")
+        how = str(error) if isinstance(error, FAILURES) else "".join(format_exception(error))
+        with contextlib.suppress(OSError):  # a full disk may be why it failed
+            self.loops[seed].run_directory.log(f"failed: {how.rstrip()}")

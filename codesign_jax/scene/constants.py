@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import Constants, Scene, check_together, schema
+from codesign_jax.scene import Constants, Scene, check_together, reach, schema
 from codesign_jax.types import Trial
 
 
@@ -29,7 +29,8 @@ def check(scene: Scene, constants: Constants) -> None:
 
     Raises:
       SceneError: With every key that is missing, unknown, not a number, not finite, of another
-        shape or outside the range of its file.
+        shape or outside the range of its file; or if contacts of the palm would begin farther from
+        a mesh than its distances reach.
     """
     problems = _structure_problems(scene, constants)
     if not problems:
@@ -42,6 +43,9 @@ def check(scene: Scene, constants: Constants) -> None:
         problems = check_together(scene.with_constants(constants), "constants")
     if problems:
         raise schema.SceneError(problems)
+    radius, noise = constants.hand.palm.contact_radius, constants.objects.noise.size
+    if not any(isinstance(v, jax.core.Tracer) for v in (radius, noise)):
+        reach.refuse(scene.objects, float(np.asarray(radius).max()), float(np.asarray(noise).max()))
 
 
 def _paths(tree: Any) -> Iterator[tuple[str, Any]]:

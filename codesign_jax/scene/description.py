@@ -115,7 +115,7 @@ class Scene(SceneFile):
         Scenes of equal structure share model templates, traces and compiled programs.
         """
         step = self.discretization.timestep
-        last = ("approach", "inflate", "lift", "disturb", "ungrasp").index(self._last_phase)
+        last = ("approach", "inflate", "lift", "disturb", "ungrasp").index([*self.phase_ends][-1])
         ends = (self.num_steps * step * (i + 1) / (last + 1) for i in range(5))
         fixed = schema.typical(self)
         return dataclasses.replace(
@@ -145,21 +145,60 @@ class Scene(SceneFile):
     @property
     def end_time(self) -> float:
         """End of the last phase that is on [s]."""
-        return getattr(self.phases, self._last_phase)
+        return [*self.phase_ends.values()][-1]
 
     @property
-    def _last_phase(self) -> str:
-        if self.effects.ungrasp:
-            return "ungrasp"
-        return "disturb" if self.effects.disturb else "lift"
+    def phase_ends(self) -> dict[str, float]:
+        """End times of the grasp's phases by name, in order, without those that are off [s]."""
+        on = {"disturb": self.effects.disturb, "ungrasp": self.effects.ungrasp}
+        names = ("approach", "inflate", "lift", "disturb", "ungrasp")
+        return {name: getattr(self.phases, name) for name in names if on.get(name, True)}
 
     @property
     def window(self) -> tuple[float, float]:
         """Times t_0 and t_end between which losing the object costs: lift to end of disturb [s]."""
-        return (
-            self.phases.inflate,
-            self.phases.disturb if self.effects.disturb else self.phases.lift,
-        )
+        return self.phases.inflate, self.phase_ends[self._judged]
+
+    @property
+    def _judged(self) -> str:
+        """The last phase in which losing the object costs."""
+        return "disturb" if self.effects.disturb else "lift"
+
+    def steps_to(self, time: Any) -> Any:
+        """Whole time steps up to a time [s]; NumPy and JAX arrays, traced or not, as numbers."""
+        return (time / self.discretization.timestep + 0.5) // 1
+
+    def last_step(self, phase: str | None = None) -> Any:
+        """Index of the last time step of a phase: entry of a trace, row of controls.
+
+        Args:
+          phase: A name of `phase_ends`; None for the last phase in which losing the object costs,
+            "disturb", or "lift" in a scene without it.
+
+        Returns:
+          An int, or a traced array of shape () where the scene's numbers are traced.
+
+        Raises:
+          SceneError: If the grasp has no such phase.
+
+        >>> from codesign_jax import scene
+        >>> grasping = scene.load("paper")
+        >>> grasping.last_step("disturb"), grasping.last_step("ungrasp"), grasping.num_steps
+        (799, 899, 900)
+        """
+        ends = self.phase_ends
+        if phase is not None and phase not in ends:
+            raise schema.SceneError([self._no_phase(phase)])
+        last = self.steps_to(ends[phase or self._judged]) - 1
+        return int(last) if isinstance(last, (int, float)) else last.astype(int)
+
+    def _no_phase(self, phase: Any) -> str:
+        if phase in self.effects.__dict__ and phase in self.phases.__dict__:
+            return (
+                f"scene {self.name!r} has no phase {phase!r}, as effects.{phase} = false; its "
+                f"grasp ends with {[*self.phase_ends][-1]!r}"
+            )
+        return f"phase {phase!r} unknown; {schema.nearest(str(phase), self.phase_ends)}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

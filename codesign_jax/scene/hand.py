@@ -10,7 +10,7 @@ codesign_jax.scene.schema.SceneError: hands: 'tripod' unknown; did you mean 'tri
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,14 @@ from codesign_jax.scene.hand_tables import (
     Hand,
     Kind,
     Material,
+    Numbers,
     Palm,
     Parameter,
     Preset,
     PressureLimit,
     Section,
     Wrist,
+    per_finger,
 )
 
 
@@ -60,10 +62,12 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
     changes = keypaths.flatten(overrides or {})
     places = keypaths.apply(table, changes, path.name, problems, root="hand")
     hand = schema.parse(Hand, table, path.name, problems)
-    if hand is not None:
+    if hand is not None and not hand.finger:
+        problems.append(f"{path.name}.finger must name at least one finger")
+    elif hand is not None:
         _check_mounts(hand, path.name, problems)
-        _check_table(hand, path.name, problems)
-        _check_presets(hand, path.name, problems)
+        rows = _check_table(hand, path.name, problems)
+        _check_presets(hand, rows, path.name, problems)
         if not problems:
             _check_sections(hand, path.name, problems)
     if problems or hand is None:
@@ -91,10 +95,9 @@ def _check_mounts(hand: Hand, where: str, problems: list[str]) -> None:
             )
 
 
-def _check_table(hand: Hand, where: str, problems: list[str]) -> None:
-    names = [p.name for p in hand.parameter]
-    if not hand.finger:
-        problems.append(f"{where}.finger must name at least one finger")
+def _check_table(hand: Hand, where: str, problems: list[str]) -> dict[str, Parameter]:
+    """Checks the parameter table; returns by name the rows whose values may be looked at."""
+    names, rows = [p.name for p in hand.parameter], {}
     for name in PARAMETERS:
         if names.count(name) != 1:
             problems.append(
@@ -105,47 +108,77 @@ def _check_table(hand: Hand, where: str, problems: list[str]) -> None:
         unit, factor = UNITS[p.unit]
         if p.per != kind.per:
             problems.append(f"{path}.per must be {kind.per!r}")
+        keys = ("low", "high", "default")
+        fits = all([_fits(f"{path}.{key}", getattr(p, key), p, hand, problems) for key in keys])
+        if fits:
+            rows[p.name] = p
         if unit != kind.unit:
             fitting = ", ".join(repr(u) for u, (si, _) in UNITS.items() if si == kind.unit)
             problems.append(f"{path}.unit = {p.unit!r} does not fit; valid: {fitting}")
+        if not fits or unit != kind.unit:
             continue
         for name in ("low", "high"):
             _check_range(f"{path}.{name}", getattr(p, name), p.unit, kind, factor, problems)
-        if p.low >= p.high:
-            problems.append(f"{path}: low {p.low:g} must be below high {p.high:g} {p.unit}")
-        problem = schema.range_problem(f"{path}.default", p.default, p.unit, p.low, p.high)
-        if problem:
-            problems.append(problem)
+        for finger, (low, high, default) in _by_finger(p.low, p.high, p.default):
+            if low >= high:
+                problems.append(f"{path}{finger}: low {low:g} must be below high {high:g} {p.unit}")
+            name = f"{path}.default{finger}"
+            if problem := schema.range_problem(name, default, p.unit, low, high):
+                problems.append(problem)
+    return rows
+
+
+def _fits(path: str, value: Numbers, row: Parameter, hand: Hand, problems: list[str]) -> bool:
+    """Whether a value is a number, or as many as there are fingers for what each has its own of."""
+    if not isinstance(value, tuple) or (row.per == "finger" and len(value) == len(hand.finger)):
+        return True
+    if row.per != "finger":
+        why = f"must be a number [{row.unit}]: the hand has one {row.name}"
+    else:
+        why = (
+            f"must be a number [{row.unit}] for all fingers or {len(hand.finger)}, one for each, "
+            f"not {len(value)}"
+        )
+    problems.append(f"{path} = {list(value)} {why}")
+    return False
+
+
+def _by_finger(*values: Numbers) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Index in brackets and values of each finger; where all have the same, those without index."""
+    count = max(len(per_finger(v, 0)) for v in values)
+    rows = zip(*(per_finger(v, count or 1) for v in values), strict=True)
+    yield from ((f"[{i}]" if count else "", row) for i, row in enumerate(rows))
 
 
 def _check_range(
-    path: str, value: float, unit: str, kind: Kind, factor: float, problems: list[str]
+    path: str, value: Numbers, unit: str, kind: Kind, factor: float, problems: list[str]
 ) -> None:
-    problem = schema.range_problem(path, value, unit, kind.low / factor, kind.high / factor)
-    if problem:
-        problems.append(problem)
+    low, high = kind.low / factor, kind.high / factor
+    for finger, (number,) in _by_finger(value):
+        if problem := schema.range_problem(path + finger, number, unit, low, high):
+            problems.append(problem)
 
 
-def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
+def _check_presets(
+    hand: Hand, rows: Mapping[str, Parameter], where: str, problems: list[str]
+) -> None:
     table = {p.name: p for p in hand.parameter}
     names = [p.name for p in hand.preset]
     for preset in hand.preset:
         path = f"{where}.preset {preset.name}"
         if names.count(preset.name) > 1 or preset.name == "full":
             problems.append(f"{path}: the name is taken")
+        if len(preset.fixed) > schema.MOST_ENTRIES:
+            problems.append(f"{path}.fixed has {len(preset.fixed):,} keys")
+            continue
         for key, value in preset.fixed.items():
             if key not in table:
                 problems.append(
                     f"{path}.fixed.{key} is not a parameter; {schema.nearest(key, table)}"
                 )
                 continue
-            p = table[key]
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                problems.append(f"{path}.fixed.{key} = {value!r} must be a number [{p.unit}]")
-                continue
-            problem = schema.range_problem(f"{path}.fixed.{key}", value, p.unit, p.low, p.high)
-            if problem:
-                problems.append(problem)
+            if key in rows:
+                _check_fixed(f"{path}.fixed.{key}", value, rows[key], hand, problems)
         free = [f.name for f in preset.free]
         if not free:
             problems.append(f"{path} leaves no parameter free")
@@ -154,27 +187,40 @@ def _check_presets(hand: Hand, where: str, problems: list[str]) -> None:
                 problems.append(f"{path}: {f.name} is both free and fixed")
             if free.count(f.name) > 1:
                 problems.append(f"{path}: {f.name} is free more than once")
-            if f.name in table:
-                _check_free(f, table[f.name], path, problems)
+            if f.name in rows:
+                _check_free(f, rows[f.name], f"{path}.free {f.name}", hand, problems)
 
 
-def _check_free(free: Free, row: Parameter, path: str, problems: list[str]) -> None:
+def _check_fixed(path: str, value: Any, row: Parameter, hand: Hand, problems: list[str]) -> None:
+    for number in value if isinstance(value, tuple) else (value,):
+        if isinstance(number, bool) or not isinstance(number, int | float):
+            given = list(value) if isinstance(value, tuple) else value
+            many = ", or one for each finger" if row.per == "finger" else ""
+            problems.append(f"{path} = {schema.shown(given)} must be a number [{row.unit}]{many}")
+            return
+    if _fits(path, value, row, hand, problems):
+        for finger, (number, low, high) in _by_finger(value, row.low, row.high):
+            if problem := schema.range_problem(path + finger, number, row.unit, low, high):
+                problems.append(problem)
+
+
+def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: list[str]) -> None:
     """A preset may go beyond the table's bounds (the paper's 2D one does) but must make sense."""
-    factor = UNITS[row.unit][1]
+    kind, factor = PARAMETERS[free.name], UNITS[row.unit][1]
     for name, value in (("low", free.low), ("high", free.high)):
-        if value is not None:
-            _check_range(
-                f"{path}.free {free.name}.{name}",
-                value,
-                row.unit,
-                PARAMETERS[free.name],
-                factor,
-                problems,
+        if value is None:
+            continue
+        if not _fits(f"{path}.{name}", value, row, hand, problems):
+            return
+        _check_range(f"{path}.{name}", value, row.unit, kind, factor, problems)
+        if free.tied and isinstance(value, tuple):
+            problems.append(
+                f"{path}.{name} = {list(value)} must be a number [{row.unit}]: "
+                "tied = true gives all fingers one value"
             )
-    low = row.low if free.low is None else free.low
-    high = row.high if free.high is None else free.high
-    if low >= high:
-        problems.append(f"{path}.free {free.name}: low {low:g} must be below high {high:g}")
+    for low, high in dict.fromkeys(zip(*free.bounds(row, hand.width(row)), strict=True)):
+        if low >= high:
+            problems.append(f"{path}: low {low:g} must be below high {high:g}")
 
 
 def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
@@ -182,32 +228,36 @@ def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
     everything = Preset("full", tuple(Free(p.name) for p in hand.parameter))
     for preset in (everything, *hand.preset):
         path = where if preset is everything else f"{where}.preset {preset.name}"
-        lowest = {p.name: _bounds(p, preset)[0] for p in hand.parameter}
-        wall = next(_bounds(p, preset)[1] for p in hand.parameter if p.name == "wall")
-        for name, size in (("height", lowest["height"]), ("section.width", hand.section.width)):
-            if size <= 2 * wall:
+        bounds = {p.name: _bounds(p, preset, hand) for p in hand.parameter}
+        lowest, walls = {name: low for name, (low, _) in bounds.items()}, bounds["wall"][1]
+        fingers = zip(lowest["height"], walls, lowest["wall"], lowest["pressure"], strict=True)
+        # Equal fingers have the same problems, which are told once.
+        for height, wall, thinnest, pressure in dict.fromkeys(fingers):
+            for name, size in (("height", height), ("section.width", hand.section.width)):
+                if size <= 2 * wall:
+                    problems.append(
+                        f"{path}: a {name} of {size:g} m leaves no air chamber "
+                        f"between walls of {wall:g} m"
+                    )
+            limit = hand.pressure_limit.per_wall * thinnest
+            if not pressure < limit:
                 problems.append(
-                    f"{path}: a {name} of {size:g} m leaves no air chamber "
-                    f"between walls of {wall:g} m"
+                    f"{path}: a pressure of {pressure:g} Pa is not below the limit of "
+                    f"{limit:g} Pa for walls of {thinnest:g} m"
                 )
-        limit = hand.pressure_limit.per_wall * lowest["wall"]
-        if not lowest["pressure"] < limit:
-            problems.append(
-                f"{path}: a pressure of {lowest['pressure']:g} Pa is not below the limit of "
-                f"{limit:g} Pa for walls of {lowest['wall']:g} m"
-            )
 
 
-def _bounds(row: Parameter, preset: Preset) -> tuple[float, float]:
-    """Lowest and highest value [SI] that a preset gives a parameter."""
-    factor = UNITS[row.unit][1]
+def _bounds(
+    row: Parameter, preset: Preset, hand: Hand
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Lowest and highest values [SI] that a preset gives a parameter, for each finger."""
+    factor, width = UNITS[row.unit][1], hand.width(row)
     free = next((f for f in preset.free if f.name == row.name), None)
     if free is None:
-        value = preset.fixed.get(row.name, row.default) * factor
-        return value, value
-    low = row.low if free.low is None else free.low
-    high = row.high if free.high is None else free.high
-    return low * factor, high * factor
+        low = high = per_finger(preset.fixed.get(row.name, row.default), width)
+    else:
+        low, high = free.bounds(row, width)
+    return tuple(v * factor for v in low), tuple(v * factor for v in high)
 
 
 __all__ = [

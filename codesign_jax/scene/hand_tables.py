@@ -49,6 +49,15 @@ PARAMETERS = {
 """Every parameter that the hand model understands."""
 
 
+Numbers = float | tuple[float, ...]
+"""A number for all fingers, or a number for each."""
+
+
+def per_finger(value: Numbers, count: int) -> tuple[float, ...]:
+    """The numbers of `count` fingers, each its own or all the same."""
+    return value if isinstance(value, tuple) else (value,) * count
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Finger:
     """Mount of a finger, which leaves the palm at azimuth + spread * gamma, tilted downwards.
@@ -166,6 +175,9 @@ class Wrist:
 class Parameter:
     """A row of the parameter table, in the row's own unit.
 
+    Where each finger has a value of its own, `low`, `high` and `default` are a number for all
+    fingers or an array with a number for each, in the order of `[[finger]]`.
+
     Attributes:
       name: Which parameter; every one is given once.
       per: Whether each finger has a value of its own, or the hand has one.
@@ -180,9 +192,9 @@ class Parameter:
     per: str = choice("finger", "hand")
     domain: str = choice("morphology", "control")
     unit: str = choice(*UNITS)
-    low: float
-    high: float
-    default: float
+    low: Numbers
+    high: Numbers
+    default: Numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,15 +216,26 @@ class Free:
 
     Attributes:
       name: Which parameter.
-      tied: Whether all fingers share one value.
-      low: Lower bound in the table's unit; that of the table if not given.
-      high: Upper bound in the table's unit; that of the table if not given.
+      tied: Whether all fingers share one value, within the bounds of each.
+      low: Lower bound in the table's unit, for all fingers or for each; that of the table if not
+        given.
+      high: Upper bound in the table's unit, for all fingers or for each; that of the table if not
+        given.
     """
 
     name: str = choice(*PARAMETERS)
     tied: bool = False
-    low: float | None = None
-    high: float | None = None
+    low: Numbers | None = None
+    high: Numbers | None = None
+
+    def bounds(self, row: Parameter, count: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper bounds of `count` values [table's unit]; `row` has what is not given.
+
+        Values that are tied have the narrowest bounds, all of them.
+        """
+        low = per_finger(row.low if self.low is None else self.low, count)
+        high = per_finger(row.high if self.high is None else self.high, count)
+        return ((max(low),) * count, (min(high),) * count) if self.tied else (low, high)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,12 +245,18 @@ class Preset:
     Attributes:
       name: Name of the preset, as for `--preset`; "full" is the whole table.
       free: The free parameters.
-      fixed: Values of other parameters by name, in the table's units.
+      fixed: Values of other parameters by name, in the table's units: a number, or an array with
+        one for each finger.
     """
 
     name: str
     free: tuple[Free, ...]
     fixed: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Makes tuples of TOML's arrays, as those of other tables are."""
+        fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in self.fixed.items()}
+        object.__setattr__(self, "fixed", fixed)
 
     def __hash__(self) -> int:
         """Hashes the preset although TOML gives `fixed` as a dict."""
@@ -253,3 +282,7 @@ class Hand:
     parameter: tuple[Parameter, ...]
     pressure_limit: PressureLimit
     preset: tuple[Preset, ...] = ()
+
+    def width(self, row: Parameter) -> int:
+        """Number of values of a row of the parameter table."""
+        return len(self.finger) if row.per == "finger" else 1

@@ -6,11 +6,10 @@ entry of a list is named by its `name` or by its index: `objects.object.sphere.m
 """
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from codesign_jax.scene import schema
+from codesign_jax.scene import library, schema
 
 Path = tuple[str, ...]
 
@@ -32,7 +31,8 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
         key, equals, text = pair.partition("=")
         path = _path(key.strip())
         if not equals or not all(path):
-            problems.append(f"--set {pair!r} must be KEY=VALUE, such as discretization.links=5")
+            given = schema.shown(pair)
+            problems.append(f"--set {given} must be KEY=VALUE, such as discretization.links=5")
         else:
             found.pop(path, None)  # values are applied in the order in which they were given
             found[path] = _toml_value(text)
@@ -47,10 +47,20 @@ def flatten(values: Mapping[Any, Any]) -> dict[Path, Any]:
     Args:
       values: Values by key, dotted key path or tuple of keys; a value that is a mapping holds
         further keys.
+
+    Raises:
+      SceneError: If a key is neither, or tables or keys are nested too deep.
     """
+    if library.too_deep(values):
+        deepest = library.DEEPEST
+        raise schema.SceneError([f"values are nested more than {deepest} tables deep"])
     found: dict[Path, Any] = {}
     for key, value in values.items():
-        path = _path(key) if isinstance(key, str) else tuple(key)
+        path = _path(key) if isinstance(key, str) else key
+        if not (isinstance(path, tuple) and path and all(isinstance(part, str) for part in path)):
+            raise schema.SceneError(
+                [f"{schema.shown(key)} is no key path such as 'solver.iterations'"]
+            )
         if isinstance(value, Mapping):
             found |= {path + rest: v for rest, v in flatten(value).items()}
         else:
@@ -119,17 +129,22 @@ def _apply(
     """Changes one value; `where` has the names of the place in messages, and as it is given."""
     (names, given), rest = where, path[1:]
     key: Any = path[0]
+    if len(rest) >= library.DEEPEST:
+        problems.append(f"{schema.shown('.'.join(path))} is no key: it has {len(path):,} parts")
+        return
     if isinstance(place, list):
         index = _index(place, key)
         if index is None:
-            problems.append(f"{given} has no entry {key!r}; {schema.nearest(key, _names(place))}")
+            hint = schema.nearest(key, _names(place))
+            problems.append(f"{given} has no entry {schema.shown(key)}; {hint}")
             return
         # The schema names an entry by its index, other checks by its name.
         names, key = tuple(n + form for n in names for form in (f"[{index}]", f" {key}")), index
     elif isinstance(place, dict):
         names = tuple(f"{name}.{key}" for name in names)
     else:
-        problems.append(f"{given} = {place!r} is no table: it has no key {key!r}")
+        value = schema.shown(place)
+        problems.append(f"{given} = {value} is no table: it has no key {schema.shown(key)}")
         return
     given += f"[{path[0]}]" if path[0].isdecimal() else "." * bool(given) + path[0]
     if not rest or (isinstance(place, dict) and key not in place):
@@ -153,7 +168,8 @@ def _index(entries: list, key: str) -> int | None:
     for i, entry in enumerate(entries):
         if isinstance(entry, dict) and entry.get("name") == key:
             return i
-    return int(key) if key.isdecimal() and int(key) < len(entries) else None
+    short = key.isdecimal() and len(key) < 10  # Python reads no number of thousands of digits
+    return int(key) if short and int(key) < len(entries) else None
 
 
 def _path(key: str) -> Path:
@@ -163,6 +179,7 @@ def _path(key: str) -> Path:
 
 def _toml_value(text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        table = library.parse(f"value = {text}")
+    except (ValueError, RecursionError):
         return text
+    return table["value"] if len(table) == 1 else text  # more keys on further lines

@@ -1,6 +1,8 @@
 """Finds and reads the TOML files of hands, objects, scenes and presets of accuracy."""
 
+import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,12 @@ _FOLDERS = {
     "scenes": (_PACKAGE / "scenes",),
     "accuracy": (_PACKAGE / "scenes" / "accuracy",),
 }
+MOST_BYTES = 1 << 18
+"""Largest file that is read; those that come with the package have 4 kB."""
+_LONG_KEY = re.compile(r"""(?<![\w-])[\w-]++(?:\s*+\.\s*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')){100}""")
+"""A dotted key for whose parts the parser needs time that grows with the square of their number."""
+DEEPEST = 12
+"""Most tables and arrays inside of one another; a preset's fixed value has three."""
 
 
 def available(kind: str) -> dict[str, Path]:
@@ -33,27 +41,89 @@ def find(kind: str, name: str | Path) -> Path:
     """
     path = Path(name)
     if path.suffix == ".toml":
-        if path.is_file():
+        if is_file(path):
             return path
-        raise schema.SceneError([f"{kind}: no file {str(path)!r}"])
+        raise schema.SceneError([f"{kind}: no file {schema.shown(str(path))}"])
     built_in = available(kind)
     if str(name) in built_in:
         return built_in[str(name)]
     beside = path.with_name(path.name + ".toml") if path.name else path
-    if beside.is_file():
-        hint = f"did you mean the file {str(beside)!r}?"
+    if is_file(beside):
+        hint = f"did you mean the file {schema.shown(str(beside))}?"
     else:
         hint = schema.nearest(str(name), built_in)
-    raise schema.SceneError([f"{kind}: {str(name)!r} unknown; {hint}"])
+    raise schema.SceneError([f"{kind}: {schema.shown(str(name))} unknown; {hint}"])
+
+
+def is_file(path: Path) -> bool:
+    """Whether a path is a file that can be asked for: not too long a name, no folder that is shut.
+
+    Raises:
+      SceneError: If the system does not say, with its reason.
+    """
+    try:
+        return path.is_file()
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name, of some versions
+        why = error.strerror if isinstance(error, OSError) else error
+        raise schema.SceneError([f"{schema.shown(str(path))}: {why}"]) from error
 
 
 def read(path: Path) -> dict[str, Any]:
     """Reads a TOML file.
 
     Raises:
-      SceneError: if the file is not UTF-8 text or not valid TOML, with the parser's position.
+      SceneError: if the file cannot be read or is too large, is not UTF-8 text or not valid TOML,
+        with the parser's position.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise schema.SceneError([f"{path.name}: not valid TOML: {error}"]) from error
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise schema.SceneError([f"{path.name}: {error.strerror}"]) from error
+    if len(data) > MOST_BYTES:
+        raise schema.SceneError([f"{path.name}: has more than {MOST_BYTES:,} bytes"])
+    try:
+        table = parse(data.decode("utf-8"))
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise schema.SceneError([f"{path.name}: not valid TOML: {why_not(error)}"]) from error
+    return table
+
+
+def parse(text: str) -> dict[str, Any]:
+    """TOML text as a table.
+
+    Raises:
+      ValueError: If it is no TOML, or has a whole number of thousands of digits.
+      RecursionError: If tables and arrays are nested too deep.
+    """
+    if _LONG_KEY.search(text):
+        raise RecursionError
+    # Line ends as a text file's: tomllib refuses a lone carriage return.
+    table = tomllib.loads(text.replace("\r\n", "\n").replace("\r", "\n"))
+    if too_deep(table):
+        raise RecursionError
+    return table
+
+
+def why_not(error: Exception) -> str:
+    """Why `parse` did not read a text, in words."""
+    if isinstance(error, RecursionError):
+        return f"tables and arrays are nested more than {DEEPEST} deep"
+    if "integer string conversion" in str(error):
+        return "a whole number has thousands of digits"
+    return schema.shown(str(error))[1:-1]
+
+
+def too_deep(value: Any) -> bool:
+    """Whether tables and arrays are nested more than `DEEPEST` deep; needs no stack."""
+    level = [value]
+    for _ in range(DEEPEST + 1):
+        inside = [
+            list(v.values()) if isinstance(v, Mapping) else v
+            for v in level
+            if isinstance(v, Mapping | list | tuple)
+        ]
+        level = [entry for entries in inside for entry in entries]
+        if not level:
+            return False
+    return True

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax.scene import hand, keypaths, library, objects, schema
+from codesign_jax.scene import hand, keypaths, library, objects, reach, schema
 from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.tables import Accuracy
 
@@ -61,6 +61,7 @@ def load(
             problems += error.problems
     if problems or parsed is None:
         raise schema.SceneError(problems)
+    parts["objects"] = reach.fit(parts["objects"], parts["hand"])
     names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
     return Scene(**parts, **{n: getattr(parsed, n) for n in names})
 

@@ -5,6 +5,7 @@
 [('cuboid', 0.05), ('cylinder', 0.05), ('sphere', 0.05)]
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,8 @@ from codesign_jax.scene.schema import choice, quantity
 if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitives need neither
     from codesign_jax.scene.meshes import Solid
 
+MOST_BYTES = 1 << 25
+"""Largest size of a set's mesh files together; those of the set household have 0.4 MB."""
 SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
 _MESH_KEYS = ("file", "unit", "density", "repair", "voxel_error")
 _MASS, _SIZE = ("kg", 0.001, 10.0), ("m", 0.002, 0.25)
@@ -168,11 +171,24 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
     names = [shape.name for shape in parsed.object]
     for name in sorted({n for n in names if names.count(n) > 1}):
         problems.append(f"{path.name}.object {name}: the name is given {names.count(name)} times")
+    if too_large := _size_problems(parsed, path):
+        raise schema.SceneError(problems + too_large)
     shapes = [_shape(shape, path, problems) for shape in parsed.object]
     if problems:
         raise schema.SceneError(problems)
     found = tuple(s for s in shapes if s is not None)
     return ObjectSet(parsed.name, parsed.description, parsed.noise, parsed.table, found)
+
+
+def _size_problems(given: _ObjectSetFile, path: Path) -> list[str]:
+    """Why the mesh files of a set are too large to be read, if they are."""
+    total = 0
+    for file in [path.parent / shape.file for shape in given.object if shape.file is not None]:
+        with contextlib.suppress(OSError, ValueError):  # said where it is read
+            total += file.stat().st_size
+    if total <= MOST_BYTES:
+        return []
+    return [f"{path.name}: the meshes have {total >> 20} MiB, more than {MOST_BYTES >> 20} MiB"]
 
 
 def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:

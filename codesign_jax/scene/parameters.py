@@ -20,19 +20,19 @@ import dataclasses
 import functools
 import re
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import schema
-from codesign_jax.scene.hand import PARAMETERS, UNITS, Hand, Parameter, Preset, structure
+from codesign_jax.scene import schema, unit_slips
+from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, structure
+from codesign_jax.scene.hand_tables import per_finger
 from codesign_jax.types import Params
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
 _STRICT = 1.0 - 1e-6
-_FAINT = 1000.0
-"""Pressure below which no finger moves visibly [Pa]: 1 kPa bends one of 100 mm by half a degree."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +45,8 @@ class DesignSpace:
       names: Names of the free parameters, e.g. "length[2]" or "length" where tied.
       units: Units in which the hand file states them.
       scale: Factor from that unit to SI, shape (parameter,).
-      low: Lower bounds [SI], shape (parameter,).
-      high: Upper bounds [SI], shape (parameter,).
+      bounds: Lower and upper bounds [SI], as tuples, which can be hashed; `low` and `high` are
+        arrays.
       is_morphology: True for morphology, False for control, shape (parameter,).
       base: Full vector with the fixed values and defaults [SI], shape (full,).
       source: For each full entry the design entry that fills it, or -1, shape (full,).
@@ -56,16 +56,41 @@ class DesignSpace:
     names: tuple[str, ...]
     units: tuple[str, ...]
     scale: tuple[float, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    bounds: tuple[tuple[float, ...], tuple[float, ...]]
     is_morphology: tuple[bool, ...]
     base: tuple[float, ...]
     source: tuple[int, ...]
 
     @property
+    def low(self) -> np.ndarray:
+        """Lower bounds [SI], shape (parameter,)."""
+        return np.array(self.bounds[0])
+
+    @property
+    def high(self) -> np.ndarray:
+        """Upper bounds [SI], shape (parameter,)."""
+        return np.array(self.bounds[1])
+
+    @property
     def num_parameters(self) -> int:
         """Number of free parameters."""
         return len(self.names)
+
+    @functools.cached_property
+    def structure(self) -> "DesignSpace":
+        """The space without numbers that no program reads, so that others share its programs.
+
+        Values of fixed parameters and the pressure limit stay: programs have them as constants.
+        """
+        zeros, place = (0.0,) * self.num_parameters, zip(self.base, self.source, strict=True)
+        rows = (dataclasses.replace(p, low=0.0, high=0.0, default=0.0) for p in self.hand.parameter)
+        return dataclasses.replace(
+            self,
+            hand=dataclasses.replace(self.hand, parameter=tuple(rows)),
+            scale=zeros,
+            bounds=(zeros, zeros),
+            base=tuple(0.0 if source >= 0 else value for value, source in place),
+        )
 
     def expand(self, design: jax.Array) -> jax.Array:
         """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,).
@@ -97,6 +122,28 @@ class DesignSpace:
         self.refuse_unit_slips(design)
         return _projected(self, jnp.asarray(design))
 
+    def sample(self, key: jax.Array, n: int, *, first: Any = 0) -> jax.Array:
+        """Draws legal designs: within the bounds, pressures under the limit of their walls.
+
+        Every parameter is uniform between its bounds and independent of the others, but for
+        pressures above their limit, which are lowered to it (`project`): such a finger has the
+        highest pressure that its wall allows. Design i draws from fold_in(key, i), so that more
+        designs do not change earlier ones, and any of them can be drawn without the others.
+
+        Args:
+          key: Typed key.
+          n: Number of designs.
+          first: Index of the first design; may be traced.
+
+        Returns:
+          Designs first to first + n - 1 [SI], shape (n, parameter).
+
+        Raises:
+          SceneError: If `key` is not one typed key, or `n` is no whole number or below 1.
+        """
+        _refuse_draws(key, n)
+        return _sampled(self, n, key, first)
+
     def refuse_unit_slips(self, designs: np.typing.ArrayLike) -> None:
         """Refuses designs that were given in other units than SI; see `from_units` for those.
 
@@ -117,10 +164,10 @@ class DesignSpace:
         rows = [name.split("[")[0] for name in self.names]
         found = []
         for name, row, column in zip(self.names, rows, columns, strict=True):
-            found += _slips(name, row, column)
+            found += unit_slips.slips(name, row, column)
         if found:
             raise schema.SceneError(found)
-        _hint_at_kilopascals(columns[[row == "pressure" for row in rows]])
+        unit_slips.hint_at_kilopascals(columns[[row == "pressure" for row in rows]])
 
     def refuse_population(self, population: np.typing.ArrayLike) -> None:
         """Refuses what are not designs of this space, shape (particle, parameter).
@@ -146,7 +193,10 @@ class DesignSpace:
             )
 
     def default(self) -> np.ndarray:
-        """Returns the table's default design, shape (parameter,), inside the bounds [SI]."""
+        """Returns the table's default design, shape (parameter,), inside the bounds [SI].
+
+        A value that fingers share is the default of the first of them.
+        """
         base = _defaults(self.hand)
         first = [self.source.index(j) for j in range(self.num_parameters)]
         return np.clip(base[first], self.low, self.high)
@@ -163,14 +213,23 @@ class DesignSpace:
     def from_units(self, design: np.typing.ArrayLike) -> np.ndarray:
         """Converts design vectors from the hand file's units to SI, shape (..., parameter).
 
-        A design outside of the space's bounds is converted as well: it may be simulated, though no
-        optimiser proposes it.
+        A design outside of the space's bounds is converted as well, with a warning: it may be
+        simulated, though no optimiser proposes it.
 
         Raises:
           SceneError: If the last axis is not that of the parameters.
         """
         self._refuse_shape(design, "..., ")
-        return np.asarray(design, float) * np.asarray(self.scale)
+        given, scale = np.asarray(design, float), np.asarray(self.scale)
+        ends = zip(self.names, self.units, self.low / scale, self.high / scale, strict=True)
+        columns = given.reshape(-1, self.num_parameters).T
+        found = [
+            unit_slips.outside(*end, column) for end, column in zip(ends, columns, strict=True)
+        ]
+        if words := "; ".join(problem for problem in found if problem):
+            text = f"design outside of the space's bounds, which is simulated all the same: {words}"
+            warnings.warn(text, stacklevel=2)
+        return given * scale
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -185,6 +244,36 @@ def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
         if j >= 0:
             design = design.at[j].min(caps[i])
     return design
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _sampled(space: DesignSpace, n: int, key: jax.Array, first: Any) -> jax.Array:
+    """`DesignSpace.sample`; one program a space and number."""
+    low, high = _representable(space)
+
+    def draw(i: jax.Array) -> jax.Array:
+        unit = jax.random.uniform(jax.random.fold_in(key, i), low.shape, low.dtype)
+        return _projected(space, jnp.minimum(low + (high - low) * unit, high))
+
+    return jax.vmap(draw)(first + jnp.arange(n))
+
+
+def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds as JAX's floats, none beyond the space's own by rounding."""
+    kind = np.dtype(jnp.result_type(float))
+    low, high = space.low.astype(kind), space.high.astype(kind)
+    low = np.where(low < space.low, np.nextafter(low, kind.type(np.inf)), low)
+    return low, np.where(high > space.high, np.nextafter(high, kind.type(-np.inf)), high)
+
+
+def _refuse_draws(key: Any, n: Any) -> None:
+    """Refuses what no designs can be drawn from."""
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
+        raise schema.SceneError([f"n = {n!r} designs must be a whole number, at least 1"])
+    shape, kind = jnp.shape(key), jnp.result_type(key)
+    if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
+        words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
+        raise schema.SceneError([words])
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -223,7 +312,7 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
     Raises:
       SceneError: if the hand has no such preset.
     """
-    total = sum(_width(hand, p) for p in hand.parameter)
+    total = sum(hand.width(p) for p in hand.parameter)
     if preset in ("full", f"{total}d"):
         chosen = Preset(preset, ())
     else:
@@ -248,76 +337,34 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
     source = np.full(base.shape, -1)
     for name, value in preset.fixed.items():
         row = _row(hand, name)
-        base[offsets[name] : offsets[name] + _width(hand, row)] = value * UNITS[row.unit][1]
+        width, factor = hand.width(row), UNITS[row.unit][1]
+        base[offsets[name] : offsets[name] + width] = np.array(per_finger(value, width)) * factor
     free = {f.name: f for f in preset.free}
     columns: list[tuple[str, str, float, float, float, bool]] = []
     for row in hand.parameter:
         if not everything and row.name not in free:
             continue
-        spec, factor, width = free.get(row.name), UNITS[row.unit][1], _width(hand, row)
-        low = row.low if spec is None or spec.low is None else spec.low
-        high = row.high if spec is None or spec.high is None else spec.high
-        count = 1 if (spec is not None and spec.tied) or row.per == "hand" else width
+        spec = free.get(row.name, Free(row.name))
+        factor, width = UNITS[row.unit][1], hand.width(row)
+        low, high = spec.bounds(row, width)
+        count = 1 if spec.tied else width
         for k in range(width):
             source[offsets[row.name] + k] = len(columns) + (k if count > 1 else 0)
         for k in range(count):
             name = f"{row.name}[{k}]" if count > 1 else row.name
             morphology = row.domain == "morphology"
-            columns.append((name, row.unit, factor, low * factor, high * factor, morphology))
+            columns.append((name, row.unit, factor, low[k] * factor, high[k] * factor, morphology))
     names, units, scale, low, high, domain = zip(*columns, strict=True)
     return DesignSpace(
         _table_alone(hand),
         names,
         units,
         scale,
-        low,
-        high,
+        (low, high),
         domain,
         tuple(base),
         tuple(source.tolist()),
     )
-
-
-def refuse_unit_slips(params: Params) -> None:
-    """Refuses parameters that were given in other units than SI and radians.
-
-    As `DesignSpace.refuse_unit_slips`, for parameters with any leading axes.
-
-    Raises:
-      SceneError: With every such number and its suggested value.
-    """
-    if any(isinstance(v, jax.core.Tracer) for v in params):
-        return
-    arm = [f"arm_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
-    values = {name: getattr(params, name) for name in Params._fields if name != "arm"}
-    values |= {name: np.asarray(params.arm)[..., i] for i, name in enumerate(arm)}
-    found = [slip for name, v in values.items() for slip in _slips(name, name, np.asarray(v))]
-    if found:
-        raise schema.SceneError(found)
-    _hint_at_kilopascals(np.asarray(params.pressure, float))
-
-
-def _hint_at_kilopascals(pressures: np.ndarray) -> None:
-    """Warns of pressures that are all nearly zero, which their range has: kPa, most likely."""
-    largest = float(np.abs(pressures).max(initial=0.0))
-    if 0 < largest < _FAINT:
-        warnings.warn(
-            f"the largest pressure is {largest:g} Pa, next to none; did you mean "
-            f"{1e3 * largest:g}? (kPa given where Pa is expected; Python takes SI units)",
-            stacklevel=3,
-        )
-
-
-def _slips(name: str, row: str, values: np.ndarray) -> list[str]:
-    """What is wrong with the first value, if any, that looks like one of another unit."""
-    kind = PARAMETERS[row]
-    slack = 1e-6 * abs(kind.high)  # a float32 of a bound
-    outside = values[(values < kind.low - slack) | (values > kind.high + slack)]
-    for value in outside.ravel()[:1]:
-        if schema.unit_slip(float(value), kind.unit, kind.low, kind.high):
-            problem = schema.range_problem(name, float(value), kind.unit, kind.low, kind.high)
-            return [f"{problem}; Python takes SI units and radians"]
-    return []
 
 
 def _table_alone(hand: Hand) -> Hand:
@@ -328,21 +375,20 @@ def _table_alone(hand: Hand) -> Hand:
     )
 
 
-def _width(hand: Hand, row: Parameter) -> int:
-    return len(hand.finger) if row.per == "finger" else 1
-
-
 def _row(hand: Hand, name: str) -> Parameter:
     return next(p for p in hand.parameter if p.name == name)
 
 
 @functools.cache
 def _offsets(hand: Hand) -> dict[str, int]:
-    widths = [_width(hand, p) for p in hand.parameter]
+    widths = [hand.width(p) for p in hand.parameter]
     starts = np.concatenate([[0], np.cumsum(widths)])
     return {p.name: int(s) for p, s in zip(hand.parameter, starts[:-1], strict=True)}
 
 
 def _defaults(hand: Hand) -> np.ndarray:
-    values = [[p.default * UNITS[p.unit][1]] * _width(hand, p) for p in hand.parameter]
-    return np.concatenate(values).astype(float)
+    values = [
+        np.array(per_finger(p.default, hand.width(p)), float) * UNITS[p.unit][1]
+        for p in hand.parameter
+    ]
+    return np.concatenate(values)

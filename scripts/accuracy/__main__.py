@@ -64,8 +64,8 @@ def main() -> int:
 
         found = report.studies(args.docs)
         print(report.make(args.docs, found))
-        page = args.docs / "accuracy.md"
-        report.make_summary(args.docs.parent / "README.md", page, SCENES, found)
+        note = args.docs / "notes" / "accuracy.md"
+        report.make_summary(args.docs / "accuracy.md", note, SCENES, found)
         return 0
     if args.merge:
         merge(args.merge, args.json)

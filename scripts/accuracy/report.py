@@ -19,7 +19,7 @@ def studies(docs: Path) -> dict[str, Study]:
 
 
 def make(docs: Path, found: dict[str, Study] | None = None) -> str:
-    """Draws figures, writes CSV and fills in docs/accuracy.md from docs/data.
+    """Draws figures, writes CSV and fills in docs/notes/accuracy.md from docs/data.
 
     Args:
       docs: The folder of the documentation.
@@ -34,25 +34,25 @@ def make(docs: Path, found: dict[str, Study] | None = None) -> str:
         parts.append(_section(study, name, docs))
         table(study, docs / "data" / f"accuracy_{name}.csv")
     text = "\n\n".join(parts) or "Not measured yet."
-    fill(docs / "accuracy.md", text, "results")
+    fill(docs / "notes" / "accuracy.md", text, "results")
     return text
 
 
-def make_summary(readme: Path, page: Path, scenes: Path, found: dict[str, Study]) -> None:
+def make_summary(page: Path, note: Path, scenes: Path, found: dict[str, Study]) -> None:
     """Fills in the tables of the presets and of the errors wanted, and the comments of their files.
 
     Args:
-      readme: The front page.
-      page: The page of the study.
+      page: The user's page, which has the presets in short.
+      note: The note of the study.
       scenes: Folder of the presets.
       found: See `studies`; the full size comes first.
     """
     named = {SHORT[n]: study for n, study in found.items()}
     full, *rest = named.values()
-    fill(readme, markdown(presets.front_page(named)), "accuracy")
-    fill(page, markdown(tables.wanted_here(full, rest[0] if rest else None)), "wanted")
+    fill(page, markdown(presets.in_short(named)), "presets")
+    fill(note, markdown(tables.wanted_here(full, rest[0] if rest else None)), "wanted")
     text = "\n\n".join(markdown(t) for t in (presets.presets_table(named), presets.standing(full)))
-    fill(page, text, "presets")
+    fill(note, text, "presets")
     presets.annotate(scenes, named)
 
 
@@ -68,12 +68,12 @@ def _section(study: Study, name: str, docs: Path) -> str:
     panels = {k: v for k, v in panels.items() if v}
     if panels:
         figures.diagram(panels, docs / "figures" / f"accuracy_{name}.png", study.machine())
-        parts.append(f"![Error against time](figures/accuracy_{name}.png)")
+        parts.append(f"![Error against time](../figures/accuracy_{name}.png)")
         add("Error wanted, cheapest setting, cost", tables.wanted(study))
     lines = tables.lines(study.records)
     if any(lines.values()):
         figures.convergence(lines, docs / "figures" / f"convergence_{name}.png")
-        parts.append(f"![Orders of convergence](figures/convergence_{name}.png)")
+        parts.append(f"![Orders of convergence](../figures/convergence_{name}.png)")
         add("The reference and the orders", tables.confirmed(study.records))
     for part in ("tip", "impulse", "step"):
         add(ERRORS[part][0], tables.errors_table(study, part))

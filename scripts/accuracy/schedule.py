@@ -1,7 +1,8 @@
 """Whether a search should end on a finer setting: the same runs carried on in several ways.
 
 python -m scripts.accuracy.schedule --json docs/data/schedule.json        # an hour of two cores
-python -m scripts.accuracy.schedule --json docs/data/schedule.json --report --page docs/accuracy.md
+python -m scripts.accuracy.schedule --json docs/data/schedule.json --report \
+    --page docs/notes/accuracy.md
 
 Each branch takes the final particles of the concurrent 23-parameter runs of docs/data/paper, which
 were found at `standard`, and lets the particle filter go on: at `standard` for as many episodes as

@@ -159,7 +159,7 @@ CONTACT = (
     "contact.friction_ratio=1", "contact.friction_ratio=3", "contact.friction_ratio=10",
     "contact.normal_stiffness=2000", "contact.normal_stiffness=8000", "contact.time_constant=0.04",
 )  # fmt: skip
-"""Constants of the contact, whose effect on creep stands in docs/accuracy.md as well."""
+"""Constants of the contact, whose effect on creep stands in docs/notes/accuracy.md as well."""
 # Several knobs at once: candidates for the Pareto front beside the single sweeps.
 COMBINED = (
     {"links": 5, "surface": "hull 4 x 8"},

@@ -1,4 +1,4 @@
-"""Draws the benchmark's figures and fills in docs/performance.md from the files in docs/data.
+"""Draws the benchmark's figures and fills in docs/notes/performance.md from the files in docs/data.
 
 python -m scripts.benchmark.figures
 
@@ -126,7 +126,7 @@ def measured(name: str, folder: Path, figures: Path) -> str:
     results = json.loads((folder / MACHINES[name]).read_text())
     picture = figures / f"performance_{name}.png"
     draw(results, picture)
-    parts = [machine(results["runs"][-1]), f"![Rates and growth]({picture.name})"]
+    parts = [machine(results["runs"][-1]), f"![Rates and growth](../{picture.name})"]
     return "\n\n".join(p for p in (*parts, report.tables(results), omissions(results)) if p)
 
 
@@ -137,7 +137,7 @@ def main() -> None:
     )
     parser.add_argument("--docs", type=Path, default=Path(__file__).parents[2] / "docs")
     docs = parser.parse_args().docs
-    path, data = docs / "performance.md", docs / "data"
+    path, data = docs / "notes" / "performance.md", docs / "data"
     for name, file in MACHINES.items():
         if (data / file).exists():
             fill(path, measured(name, data, docs), name)

@@ -6,7 +6,7 @@ python -m scripts.calibration wave second --seed 1 --after runs/calibration/firs
 python -m scripts.calibration wave check --like runs/calibration/first_scores.npz --best 60 \
     --others 60 --fingers                                           # sets of an earlier wave
 python -m scripts.calibration compare first check                     # do they rank sets alike?
-python -m scripts.calibration report --data docs/data/calibration --page docs/calibration.md
+python -m scripts.calibration report --data docs/data/calibration --page docs/notes/calibration.md
 
 A wave simulates a coarse landscape of the 2D experiment for each set of constants, all sets with
 one compiled program; the skinned hull without contact between fingers unless --surface or --fingers

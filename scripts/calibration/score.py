@@ -22,7 +22,7 @@ PAPER_2D = 420.0
 """Simulations to convergence of the concurrent strategy, Sec. VI.5."""
 _LOG_SIMULATIONS = 0.25
 """Standard deviation of the logarithm of a median of simulations: 0.15 for the median of 30 runs
-whose quartiles are a factor of two apart, 0.2 for the surrogate (`docs/calibration.md`)."""
+whose quartiles are a factor of two apart, 0.2 for the surrogate (`docs/notes/calibration.md`)."""
 _SHARE = 0.12
 """Standard deviation of a difference of two shares of 30 runs: sqrt(2 p (1 - p) / 30), p = 0.5."""
 _COST = 0.3

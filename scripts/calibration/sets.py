@@ -58,7 +58,7 @@ OPEN = (
     Open("friction_ratio", "", 3, 100, log=True, label="impratio"),
     Open("cost_maximum", "", 2.2, 4, label="scale of the cost"),
 )
-"""Ranges and their evidence: docs/calibration.md.
+"""Ranges and their evidence: docs/notes/calibration.md.
 
 `base_x` is the distance of the base points from the plane between the two pairs of fingers,
 `pair_gap` that of the two base points of a pair, `half_size` that of the cuboid, with which all

@@ -1,9 +1,9 @@
 """What each effect costs and decides: python -m scripts.effects [--quick] [--draw].
 
 Measures the paper's scene with each effect turned over, writes docs/data/effects.json and .csv and
-draws the table and the figure of docs/effects.md from them; --draw only draws.  An effect's
-decisions come from MuJoCo C, its program and time from the structured engine.  About 15 minutes on
-two idle cores.
+fills in docs/effects.md and docs/notes/effects.md and draws their figure; --draw only draws.  An
+effect's decisions come from MuJoCo C, its program and time from the structured engine.  About 15
+minutes on two idle cores.
 """
 
 import argparse
@@ -30,6 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, default=DOCS / "data" / "effects.json")
     parser.add_argument("--page", type=Path, default=DOCS / "effects.md")
+    parser.add_argument("--note", type=Path, default=DOCS / "notes" / "effects.md")
     parser.add_argument("--quick", action="store_true", help="few grasps, few links; not for docs")
     parser.add_argument("--draw", action="store_true", help="draw from the file; measure nothing")
     common.use_compilation_cache()  # a run that was broken off need not compile again
@@ -47,7 +48,7 @@ def main() -> None:
     figure = options.json.with_suffix(".png") if options.quick else DOCS / "figures" / "effects.png"
     effects_page.draw(results, figure)
     if not options.quick:
-        effects_page.write(results, options.page)
+        effects_page.write(results, options.page, options.note)
 
 
 def _measure(path: Path, parts: list[str], minutes: float, *, quick: bool) -> None:

@@ -88,23 +88,24 @@ def _same(rows: dict[str, Any], name: str) -> bool:
     return name != REFERENCE and mine is not None and mine == reference
 
 
-def write(results: dict[str, Any], page: Path) -> None:
-    """Puts the tables between the page's marks; what stands around them stays.
+def write(results: dict[str, Any], page: Path, note: Path) -> None:
+    """Puts the tables between the pages' marks; what stands around them stays.
 
     Args:
       results: The measured file.
-      page: A page with the marks of "measured" and "support".
+      page: The user's page, with the mark of "support".
+      note: The note of the study, with the mark of "measured".
 
     Raises:
-      ValueError: If the page lacks a mark.
+      ValueError: If a page lacks its mark.
     """
     p = results["provenance"]
     load = [f"{results[k][0]:.1f}" for k in ("load_before", "load_after") if k in results]
     worlds = results["effects"][REFERENCE].get("worlds", 0)
-    note = (
+    made = (
         f"{worlds} grasps, {results.get('trials')} trials a design; {p['cpus']} cores of {p['cpu']}"
         f", jax {p['jax']}, MuJoCo {p['mujoco']}, commit {p['commit']}; load of the machine while "
         f"timing: {' to '.join(load) or 'not timed'}."
     )
-    fill(page, note + "\n\n" + markdown(measured_table(results)), "measured")
+    fill(note, made + "\n\n" + markdown(measured_table(results)), "measured")
     fill(page, markdown(support_table()), "support")

@@ -18,6 +18,7 @@ from codesign_jax import codesign, scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
+from codesign_jax.runs.parquet import library
 from codesign_jax.scene import keypaths, parameters
 from codesign_jax.scene.schema import SceneError
 from scripts.experiments import Batch, Grid, Stop, Worlds, drive, parquet, plan, results
@@ -102,7 +103,7 @@ def simulate(args: argparse.Namespace) -> int:
     """Runs or resumes an experiment; 3 is the exit status of one that was stopped."""
     common.use_compilation_cache()
     if args.parquet:
-        parquet.library()  # refused before hours of simulation, not after
+        library(parquet.FLAG)  # refused before hours of simulation, not after
     experiment, settings, grasps = build(args)
     state = args.out / f"{args.experiment}.state.npz"
     if args.fresh:

@@ -2,7 +2,7 @@
 
 python -m scripts.experiments.fresh --data docs/data/paper --set effects.finger_finger=false
 python -m scripts.experiments.fresh --accuracies standard --engine mujoco ...   # adds to the file
-python -m scripts.experiments.fresh --report --page docs/results.md
+python -m scripts.experiments.fresh --report --page docs/notes/results.md
 
 An optimiser picks what the errors of its simulation favour (the winner's curse), so the order of
 the strategies is looked at once more: the particle of each run that tested best meets trials that

@@ -1,21 +1,20 @@
 """Every grasp of an experiment as a row of a Parquet file (pyarrow, the extra `parquet`)."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from codesign_jax import files
-from codesign_jax.scene.schema import SceneError
-from codesign_jax.types import Status
+from codesign_jax.runs import parquet
+from codesign_jax.runs.parquet import Column
 from scripts.experiments import results
 from scripts.experiments.batch import Batch
 from scripts.experiments.landscape import Grid
 from scripts.shared.record import Arrays
 
+FLAG = "--parquet"
+"""Flag of the study that asks for the file."""
 EPISODE, TEST = "episode", "test"
 """Phases of an experiment on strategies."""
 
@@ -48,21 +47,6 @@ _GRID = {
 }
 
 
-def library() -> ModuleType:
-    """Returns pyarrow.
-
-    Raises:
-      SceneError: If it is not installed; says how to install it.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ModuleNotFoundError as error:
-        message = f"--parquet needs {error.name}: pip install 'codesign-jax[parquet]'"
-        raise SceneError([message]) from error
-    return pyarrow
-
-
 def write(path: Path, experiment: Batch | Grid, record: Arrays, notes: dict[str, Any]) -> Path:
     """Writes one row a grasp, as a whole or not at all.
 
@@ -78,32 +62,27 @@ def write(path: Path, experiment: Batch | Grid, record: Arrays, notes: dict[str,
     Raises:
       SceneError: If pyarrow is missing.
     """
-    pa = library()
-    schema = _schema(pa, experiment, notes)
+    pa = parquet.library(FLAG)
+    metadata = {"provenance": notes, "status_bits": parquet.STATUS_BITS}
+    schema = parquet.schema(pa, _columns(experiment), metadata)
     batch = isinstance(experiment, Batch)
     tables = _strategies(experiment, record) if batch else _points(experiment, record)
-    with (
-        files.atomically(path) as part,
-        pa.parquet.ParquetWriter(part, schema, compression="zstd") as writer,
-    ):
+    with parquet.writing(pa, path, schema) as writer:
         for columns in tables:
-            writer.write_table(_table(pa, schema, columns))
+            writer.write_table(parquet.table(pa, schema, columns, columns["cost"].shape))
     return path
 
 
-def _schema(pa: ModuleType, experiment: Batch | Grid, notes: dict[str, Any]) -> Any:
-    names = pa.dictionary(pa.int8(), pa.string())
-    fields = []
+def _columns(experiment: Batch | Grid) -> dict[str, Column]:
+    space, found = experiment.worlds.space, {}
     columns = _STRATEGIES if isinstance(experiment, Batch) else _GRID
     for name, (kind, text) in columns.items():
-        space, metadata = experiment.worlds.space, {"description": text}
+        more = {}
         if name in ("first", "second"):
             index = ("first", "second").index(name)
-            metadata |= {"parameter": space.names[index], "unit": space.units[index]}
-        kept = names if kind == "name" else getattr(pa, kind)()
-        fields.append(pa.field(name, kept, nullable=name == "episode", metadata=metadata))
-    bits = {str(int(s)): s.name for s in Status if s}
-    return pa.schema(fields, {"provenance": json.dumps(notes), "status_bits": json.dumps(bits)})
+            more = {"parameter": space.names[index], "unit": space.units[index]}
+        found[name] = Column(kind, text, more, nullable=name == "episode")
+    return found
 
 
 def _strategies(batch: Batch, record: Arrays) -> Iterator[dict[str, Any]]:
@@ -144,19 +123,3 @@ def _points(grid: Grid, record: Arrays) -> Iterator[dict[str, Any]]:
         "cost": cost,
         "status": status,
     }
-
-
-def _table(pa: ModuleType, schema: Any, columns: dict[str, Any]) -> Any:
-    """A table of columns that are arrays to broadcast, names, or None."""
-    shape, arrays = columns["cost"].shape, []
-    for field in schema:
-        value, count = columns[field.name], int(np.prod(shape))
-        if value is None:
-            arrays.append(pa.nulls(count, field.type))
-        elif isinstance(value, str):
-            index = pa.array(np.zeros(count, np.int8))
-            arrays.append(pa.DictionaryArray.from_arrays(index, [value]))
-        else:
-            flat = np.broadcast_to(value, shape).ravel().astype(field.type.to_pandas_dtype())
-            arrays.append(pa.array(flat))
-    return pa.Table.from_arrays(arrays, schema=schema)

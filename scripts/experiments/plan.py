@@ -122,7 +122,7 @@ PAPER: dict[str, Strategies | Landscape] = {
 }
 
 PAPER_GRASPS = {"2d": 1_008_000, "landscape": 129_600, "23d": 4_536_000}
-"""The paper's counts; its 1,000,800 of the 2D experiment is a digit swap, see docs/results.md."""
+"""The paper's counts; its 1,000,800 in 2D is a digit swap, see docs/notes/results.md."""
 TOTAL_GRASPS = sum(PAPER_GRASPS.values())
 
 _FEW = ("single", "switch-1", "switch-4", "concurrent")

@@ -41,7 +41,7 @@ def failures(status: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
 
 
 def summarize(experiment: Batch | Grid, record: Arrays) -> Arrays:
-    """Returns what is kept of a record; every array has its name's meaning in docs/results.md."""
+    """Returns what is kept of a record; docs/notes/results.md says what each array is."""
     return (
         _batch(experiment, record) if isinstance(experiment, Batch) else _grid(experiment, record)
     )

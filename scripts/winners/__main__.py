@@ -46,7 +46,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--merge", type=Path, nargs="+", metavar="FILE", help="joined into --out")
     parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
     parser.add_argument("--report", action="store_true", help="draw what --data holds and stop")
-    parser.add_argument("--page", type=Path, default=Path("docs/results_spheres.md"))
+    parser.add_argument("--page", type=Path, default=Path("docs/notes/results_spheres.md"))
     parser.add_argument("--figures", type=Path, default=Path("docs/figures/spheres"))
     return parser.parse_args()
 

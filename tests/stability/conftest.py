@@ -55,7 +55,7 @@ def pytest_sessionfinish(session):
     versions = {"jax": jax.__version__, "mujoco": mujoco.__version__}
     versions["python"] = platform.python_version()
     path.write_text(table.to_json({"command": "make stability", **versions, "rows": rows}))
-    write_page(folder / "stability.md", rows)
+    write_page(folder / "notes" / "stability.md", rows)
 
 
 def commit():

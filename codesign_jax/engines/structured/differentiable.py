@@ -130,7 +130,9 @@ def refuse(scene: Scene) -> None:
         raise SceneError(
             [
                 "effects.finger_finger with surface = 'hull' or friction = 'full' has no "
-                "derivative: use surface = 'spheres' and friction = 'coulomb' or 'none'"
+                "derivative: use surface = 'spheres' and friction = 'coulomb' or 'none', as in "
+                'scene.load("paper_spheres") or scene.load(..., overrides={"effects.surface": '
+                '"spheres"})'
             ]
         )
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from codesign_jax import sources
 from codesign_jax.compiler.launch import KernelUnavailable, available
 from codesign_jax.engines.base import Equal, Staged
 from codesign_jax.engines.structured import coordinates, mesh, transforms
@@ -13,7 +14,7 @@ from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
 from codesign_jax.engines.structured.kernel.adjoint import Path, recorded
 from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.model import ModelFields
-from codesign_jax.scene import Scene, effects
+from codesign_jax.scene import Scene, effects, reach
 from codesign_jax.types import Status, Trace
 
 FAR = 1e30
@@ -71,11 +72,13 @@ class StructuredEngine(Equal):
         Raises:
           ValueError: If a segment has no step, or there is none to truncate.
           KernelUnavailable: If kernels cannot run on this device.
-          SceneError: If a mesh's distance cannot be put on a grid.
+          SceneError: If a mesh's distance cannot be put on a grid, or was read for a hand with
+            smaller contact spheres.
         """
         effects.refuse(scene.effects, self.name)
         if (reason := available(jax.default_backend())) is not None:
             raise _unavailable(reason)
+        reach.refuse(scene.objects, reach.contact_radius(scene.hand))
         if segment is not None and segment < 1:
             raise ValueError(f"segment = {segment}: a segment has one time step at least")
         if truncate and segment is None:
@@ -233,3 +236,6 @@ def _unavailable(reason: str) -> KernelUnavailable:
         f"engine structured cannot run here: {reason}; engine mjx runs on every device of JAX, "
         "engine mujoco on every CPU"
     )
+
+
+sources.note()  # everything that a kernel is traced from has been imported

@@ -161,6 +161,19 @@ def _program(call: _Call) -> Callable[[list], Any]:
     return use
 
 
+_code: list[str | None] = [None]  # digest of the code that `_program` traced
+
+
+def of_code(digest: str | None) -> None:
+    """Forgets what was traced of other code than that of a `sources.digest`; None: it is not known.
+
+    The key of a call has the code of its function, but not of the functions that this one calls.
+    """
+    if digest is None or digest != _code[0]:
+        _program.cache_clear()
+    _code[0] = digest
+
+
 def _emptied(leaf: Lanes, values: list, places: dict[int, int]) -> Lanes:
     """Lanes with places instead of values, which go to the end of a list; `places` by identity."""
     parts = leaf.parts.copy()

@@ -1,27 +1,29 @@
 """Signed distance on a voxel grid, as fine as a bound on its interpolation error asks for."""
 
 import contextlib
+import hashlib
 import time
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
-from codesign_jax import files
+from codesign_jax import archives, caches, sources
 from codesign_jax.scene.meshes import surface as surfaces
 from codesign_jax.scene.meshes.surface import Surface
+from codesign_jax.scene.reach import LEAST
 
-# Contact spheres have radii of up to 12.5 mm (fingers of 25 mm height): no farther from the surface
-# does any contact begin.  The rest is for objects that the size noise shrinks.
-PAD = 0.014
 # The error grows in proportion to the cell at edges and with its square elsewhere.
 COARSEST = 0.0025
 MAX_NODES = 3_000_000  # 12 MB in float32
+# Looking for a node's nearest faces takes longest where all are equally far, as in a ball's middle:
+# 36 s of processor time for a ball of 82,000 faces and 800,000 nodes.
+MAX_WORK = 3e10  # faces times nodes
+_LARGE = 300_000  # nodes; more take a second
 _NEAR = 0.002  # how far from the surface "near the surface" goes [m]
 _WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
-_FORMAT = 1  # of the files in the cache; change it with anything that changes a grid
+_ENDING = ".npz"  # of the files in the cache
 
 
 class Grid(NamedTuple):
@@ -42,7 +44,7 @@ class Grid(NamedTuple):
     worst: float
 
 
-def build(vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
+def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = LEAST) -> Grid:
     """Builds the coarsest grid whose error near the surface stays under a bound.
 
     The error is measured, not derived: trilinear interpolation against the exact distance at random
@@ -53,22 +55,32 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
       vertices: Positions in the body's frame [m], shape (vertex, 3).
       faces: Vertex indices, shape (face, 3).
       bound: Largest error [m].
+      reach: How far beyond the surface the grid goes [m]; see `codesign_jax.scene.reach`.
 
     Raises:
-      ValueError: if the grid would have more than `MAX_NODES` nodes.
+      ValueError: if the grid would have more than `MAX_NODES` nodes, or take more than `MAX_WORK`.
     """
     surface = surfaces.prepare(vertices, faces)
     points = near_surface(vertices, faces, 3000)
     exact = surfaces.signed_distance(surface, points)
-    low, extent = vertices.min(0) - PAD, np.ptp(vertices, axis=0) + 2 * PAD
+    low, extent = vertices.min(0) - reach, np.ptp(vertices, axis=0) + 2 * reach
     cell = _cell(surface, points, exact, low, bound)
     while True:
         shape = np.ceil(extent / cell).astype(int) + 1
         if shape.prod() > MAX_NODES:
             raise ValueError(
                 f"a grid of {cell * 1e3:.2g} mm cells, which a voxel_error of {bound * 1e3:.3g} mm "
-                f"needs, has {shape.prod():,} nodes, more than {MAX_NODES:,}"
+                f"needs, has {shape.prod():,} nodes, more than {MAX_NODES:,}; it goes "
+                f"{reach * 1e3:g} mm beyond the surface, as far as the hand's contacts need"
             )
+        if shape.prod() * len(faces) > MAX_WORK:
+            raise ValueError(
+                f"{len(faces):,} faces are too many for a grid of {shape.prod():,} nodes: "
+                "use fewer faces or a larger voxel_error"
+            )
+        if shape.prod() > _LARGE and _too_coarse(surface, points, exact, low, cell, bound):
+            cell *= 0.9
+            continue
         values = surfaces.signed_distance(surface, _nodes(low, cell, shape), proven=False)
         grid = Grid(low, cell, values.astype(np.float32).reshape(shape), 0.0, 0.0)
         error = np.abs(interpolate(grid, points) - exact)
@@ -108,15 +120,33 @@ def _cell(
     """Cell that meets the bound, tried at a few points without building the grid."""
     points, exact, cell = points[::4], exact[::4], COARSEST
     while True:
-        base = low + np.floor((points - low) / cell) * cell
-        offsets = np.array(list(np.ndindex(2, 2, 2))) * cell
-        corners = (base[:, None] + offsets).reshape(-1, 3)
-        values = surfaces.signed_distance(surface, corners, proven=False).reshape(-1, 8)
-        error = np.abs(_blend(values, (points - base) / cell) - exact)
-        worst = np.quantile(error, 0.99)
+        worst = np.quantile(_errors(surface, points, exact, low, cell), 0.99)
         if worst <= bound or cell < 2e-4:
             return cell
         cell *= max(0.5, min(0.95, bound / worst))
+
+
+def _too_coarse(
+    surface: Surface,
+    points: np.ndarray,
+    exact: np.ndarray,
+    low: np.ndarray,
+    cell: float,
+    bound: float,
+) -> bool:
+    """Whether a grid that was built would clearly not meet the bound, float32 or not."""
+    return bool(np.quantile(_errors(surface, points, exact, low, cell), 0.99) > 1.001 * bound)
+
+
+def _errors(
+    surface: Surface, points: np.ndarray, exact: np.ndarray, low: np.ndarray, cell: float
+) -> np.ndarray:
+    """Errors of interpolation at points of a grid that begins at `low`, without building it."""
+    base = low + np.floor((points - low) / cell) * cell
+    offsets = np.array(list(np.ndindex(2, 2, 2))) * cell
+    corners = (base[:, None] + offsets).reshape(-1, 3)
+    values = surfaces.signed_distance(surface, corners, proven=False).reshape(-1, 8)
+    return np.abs(_blend(values, (points - base) / cell) - exact)
 
 
 def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
@@ -124,7 +154,9 @@ def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
-def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> Grid:
+def cached(
+    key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = LEAST
+) -> Grid:
     """As `build`, but what took longer than a tenth of a second is kept on disk.
 
     Args:
@@ -132,30 +164,39 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float) -> G
       vertices: As for `build`.
       faces: As for `build`.
       bound: As for `build`.
+      reach: As for `build`.
     """
-    path = files.cache_folder() / "meshes" / f"{key}-{_FORMAT}.npz"
+    code = sources.of_files()
+    if code is None or not caches.enabled():
+        return build(vertices, faces, bound)
+    name = hashlib.sha256(f"{key} {code}".encode()).hexdigest()
+    path = caches.folder() / "meshes" / f"{name}{_ENDING}"
     stored = _read(path)
     if stored is not None:
         return stored
     start = time.perf_counter()
-    grid = build(vertices, faces, bound)
+    grid = build(vertices, faces, bound, reach)
     if time.perf_counter() - start > _WORTH_KEEPING:
         _write(path, grid)
     return grid
 
 
 def _read(path: Path) -> Grid | None:
-    """A stored grid, or None; a damaged file (zip has checksums) counts as none."""
+    """A stored grid, or None; a damaged file counts as none."""
     try:
-        # NumPy leaves a damaged file open if it opens it itself.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            scalars = {k: float(file[k]) for k in ("cell", "error", "worst")}
-            return Grid(origin=file["origin"], values=file["values"], **scalars)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        stored = archives.load(path)
+        if str(stored["name"]) != path.name:  # another grid's file
+            return None
+        scalars = {k: float(stored[k]) for k in ("cell", "error", "worst")}
+        found = Grid(origin=stored["origin"], values=stored["values"], **scalars)
+    except (OSError, archives.ArchiveError, KeyError):
         return None
+    caches.used(path)
+    return found
 
 
 def _write(path: Path, grid: Grid) -> None:
     """Writes a grid to the cache; a full disk is no error."""
-    with contextlib.suppress(OSError), files.atomically(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, **grid._asdict())
+    with contextlib.suppress(OSError):
+        archives.save(path, {"name": path.name, **grid._asdict()}, compressed=True)
+        caches.evict(path.parent, _ENDING, caches.limit(caches.MESHES), path)

@@ -6,9 +6,9 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
-from codesign_jax.scene.meshes import grid, mass, repair, support
+from codesign_jax.scene.meshes import grid, mass, reading, repair, support
+from codesign_jax.scene.reach import LEAST
 from codesign_jax.scene.schema import SceneError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
@@ -25,7 +25,8 @@ class Solid:
 
     Attributes:
       path: The file.
-      digest: SHA-256 of the file and of how it was read.
+      content: Its bytes, as they were read.
+      digest: SHA-256 of the bytes and of how they were read.
       vertices: Positions [m], shape (vertex, 3).
       faces: Vertex indices, outwards, shape (face, 3).
       volume: Volume [m^3].
@@ -34,9 +35,11 @@ class Solid:
       rest_height: Centre of mass above the lowest point, upright as in the file [m].
       voxel_error: Bound on the error of the signed distance [m].
       repairs: What a repair changed.
+      reach: How far beyond the surface distances are known [m].
     """
 
     path: Path = dataclasses.field(repr=False)
+    content: bytes = dataclasses.field(repr=False)
     digest: str
     vertices: np.ndarray = dataclasses.field(repr=False)
     faces: np.ndarray = dataclasses.field(repr=False)
@@ -46,6 +49,14 @@ class Solid:
     rest_height: float
     voxel_error: float
     repairs: tuple[str, ...]
+    reach: float = LEAST
+
+    def reaching(self, reach: float) -> "Solid":
+        """The solid with distances up to another way from its surface [m]; see `scene.reach`."""
+        if reach == self.reach:
+            return self
+        digest = hashlib.sha256(f"{self.digest} {reach!r}".encode()).hexdigest()
+        return dataclasses.replace(self, reach=reach, digest=digest)
 
     def __eq__(self, other: object) -> bool:
         """Compares the digests."""
@@ -77,8 +88,9 @@ class Solid:
         Raises:
           SceneError: if the bound asks for too fine a grid, or the surface cuts through itself.
         """
+        known = self.voxel_error, self.reach
         try:
-            built = grid.cached(self.digest, self.vertices, self.faces, self.voxel_error)
+            built = grid.cached(self.digest, self.vertices, self.faces, *known)
         except ValueError as error:
             raise SceneError([f"{self.path.name}: {error}"]) from error
         # Where parts overlap, the mesh counts a volume twice and the distance has inner walls.
@@ -94,7 +106,7 @@ class Solid:
 
 
 def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
-    """Reads and checks a mesh in any format that trimesh knows.
+    """Reads and checks a mesh file; `reading.FORMATS` are the formats.
 
     Args:
       path: The file.
@@ -105,12 +117,14 @@ def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
     Raises:
       SceneError: with every problem of the mesh.
     """
-    vertices, faces, digest = _read(path)
+    vertices, faces, content, digest = reading.read(path)
     repairs: list[str] = []
-    if repaired:
-        vertices, faces, repairs = repair.repair(vertices, faces)
-    problems = _size_problems(np.ptp(vertices, axis=0).max(), unit)
-    problems += surface_problems(vertices, faces, repaired)
+    with np.errstate(over="ignore", invalid="ignore"):
+        problems = _size_problems(np.ptp(vertices, axis=0).max(), unit)
+        # Of a wrong size nothing is repaired: the largest numbers have no differences.
+        if repaired and not problems:
+            vertices, faces, repairs = repair.repair(vertices, faces)
+        problems += surface_problems(vertices, faces, repaired)
     if problems:
         raise SceneError([f"{path.name}: {p}" for p in problems])
     vertices = vertices * UNITS[unit]
@@ -118,6 +132,7 @@ def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
     options = f"{unit} {repaired} {voxel_error!r}"
     return Solid(
         path=path,
+        content=content,
         digest=hashlib.sha256(f"{digest} {options}".encode()).hexdigest(),
         vertices=(vertices - body.centre) @ body.axes,
         faces=faces,
@@ -128,22 +143,6 @@ def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
         voxel_error=voxel_error,
         repairs=tuple(repairs),
     )
-
-
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """Vertices in the file's unit, faces, and the digest of the bytes."""
-    if not path.is_file():
-        raise SceneError([f"no file {str(path)!r}"])
-    try:
-        mesh = trimesh.load_mesh(str(path))
-        # Seams of texture and shading are no holes.
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    except Exception as error:  # every format has its own parser with its own exceptions
-        raise SceneError([f"{path.name}: cannot be read as a mesh: {error}"]) from error
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-    if not len(faces) or not np.isfinite(vertices).all():
-        raise SceneError([f"{path.name}: has no faces, or positions that are not numbers"])
-    return vertices, faces, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _size_problems(longest: float, unit: str) -> list[str]:

@@ -13,16 +13,16 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-from codesign_jax.compiler import cache
+from codesign_jax import sources
 from codesign_jax.compiler.launch import Kernel, kernel_jaxpr, launch
 from codesign_jax.engines.structured.kernel.bars import STEP, Bars
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet
 from codesign_jax.engines.structured.kernel.powers import Place
-from codesign_jax.engines.structured.kernel.program import PACKAGE, UNRELATED, Program, block_spec
+from codesign_jax.engines.structured.kernel.program import Program, block_spec
 from codesign_jax.engines.structured.kernel.reverse import ReverseStep, Shown
 from codesign_jax.engines.structured.kernel.sweep import SHAPES
-from codesign_jax.engines.structured.lanewise import lanes
+from codesign_jax.engines.structured.lanewise import lanes, of_code
 
 
 class Path(NamedTuple):
@@ -97,8 +97,8 @@ class AdjointProgram(Program):
         if self.backend == "interpreter":
             found = call(*given)[:6]
         else:
-            code = cache.sources(PACKAGE, UNRELATED)
-            origin = repr((self.scene.structure, "adjoint", code))
+            of_code(sources.digest())
+            origin = repr((self.scene.structure, "adjoint"))
             shared = (len(given) - 1,) if self.meshes else ()
             kernel = Kernel(origin, self.backend, self.size, shared, scratch=(6, 7, 8))
             found = launch(call, given, outputs, kernel)[:6]

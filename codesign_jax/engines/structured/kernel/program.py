@@ -7,15 +7,13 @@ worlds are decided.
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-from codesign_jax import verdict
-from codesign_jax.compiler import cache
+from codesign_jax import sources, verdict
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.constants import WorldConstants
@@ -23,13 +21,10 @@ from codesign_jax.engines.structured.kernel.memory import Block, anywhere
 from codesign_jax.engines.structured.kernel.packing import Packing
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kinematics import State
-from codesign_jax.engines.structured.lanewise import lanes
+from codesign_jax.engines.structured.lanewise import lanes, of_code
 from codesign_jax.model import layout
 from codesign_jax.scene import Scene
 
-PACKAGE = Path(__file__).parents[3]
-UNRELATED = ("commands", "export", "optimize", "report", "runs")
-"""The package's folders that no kernel depends on: they import engines, never the other way."""
 TRACE = ("distance", "height", "speed", "residual", "iterations", "moved")
 
 
@@ -114,8 +109,8 @@ class Program(Packing):
         call, outputs = self._call(inputs, trajectory, states)
         if self.backend == "interpreter":
             return call(*inputs)
-        code = cache.sources(PACKAGE, UNRELATED)
-        origin = repr((self.scene.structure, self.limits, trajectory, states, code))
+        of_code(sources.digest())
+        origin = repr((self.scene.structure, self.limits, trajectory, states))
         shared = (len(inputs) - 1,) if self.meshes else ()
         kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
         return launch(call, inputs, outputs, kernel)

@@ -1,0 +1,211 @@
+"""`codesign sample`."""
+
+import dataclasses
+import time
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from codesign_jax import batch, sampling
+from codesign_jax.commands import calls, common, estimate
+from codesign_jax.commands.calls import Meter
+from codesign_jax.engines import Engine, make_engine
+from codesign_jax.runs import dataset, parquet, rates
+from codesign_jax.runs.dataset import Question, Shards
+from codesign_jax.runs.interrupts import Interrupts, Stopped
+from codesign_jax.scene import Scene, schema
+from codesign_jax.scene.parameters import design_space
+from codesign_jax.scene.schema import SceneError
+from codesign_jax.types import Outcome
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Sample
+
+MOST = 1_000_000_000
+"""Most designs of a file: their indices are int32."""
+
+
+def main(options: "Sample") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      SceneError: If something is wrong with the input; nothing was created then.
+    """
+    common.use_compilation_cache()
+    _check(options)
+    scene = common.load_scene(options)
+    question, engine = _question(options, scene), make_engine(options.engine, scene)
+    console = Console(highlight=False, soft_wrap=True)
+    if _finished(options, question):
+        console.print(f"{options.out} is finished: {_amount(options)}", markup=False)
+        if dataset.begun(options.out) == question.described:  # killed before it had tidied up
+            Shards(dataset.folder_of(options.out), question.key).delete()
+        return 0
+    dataset.refuse_other(options.out, question)
+    design = question.space.default()
+    notes = common.preflight_notes(scene, question.space, {"the default design": design})
+    for note in [*notes, *common.mesh_notes(scene)]:
+        console.print(note, markup=False)
+    console.print(f"{_amount(options)} in {question.shards(options.designs)} calls")
+    if options.dry_run:
+        _dry_run(options, question, console)
+        return 0
+    with dataset.open_shards(options.out, question) as shards:
+        with Interrupts(console.print) as interrupts:
+            try:
+                found = _simulate(options.designs, question, engine, shards, interrupts, console)
+            except Stopped as stopped:
+                console.print("stopped; the same command goes on")
+                return 128 + stopped.signum
+        dataset.write(options.out, question, options.designs, shards)
+        shards.delete()
+    _report(options.out, found, console)
+    return 0
+
+
+def _check(options: "Sample") -> None:
+    """Refuses numbers out of range, and a place that cannot be written."""
+    ranges = (
+        ("--designs", options.designs, 1, MOST),
+        ("--trials", options.trials, 1, 100_000),
+        ("--seed", options.seed, 0, 2**31 - 1),
+        ("--chunk", 1 if options.chunk is None else options.chunk, 1, 10_000_000),
+    )
+    found = [schema.range_problem(name, v, "", low, high) for name, v, low, high in ranges]
+    problems = [problem for problem in found if problem]
+    if options.out.suffix != ".parquet":
+        problems.append(f"--out {options.out} must end in .parquet")
+    problems += common.solver_problems([*chain.from_iterable(options.overrides)], options.engine)
+    if problems:
+        raise SceneError(problems)
+    common.check_engine(options.engine)
+    parquet.library("codesign sample")
+    common.check_place("--out", options.out)
+
+
+def _question(options: "Sample", scene: Scene) -> Question:
+    """What is asked; without --chunk calls are as large as those that made what is there.
+
+    Raises:
+      SceneError: If the hand has no such preset.
+    """
+    design_space(scene.hand, options.preset)
+    done = dataset.finished(options.out)
+    before = done[0] if done else dataset.begun(options.out)
+    if before is None or options.chunk is not None:
+        grasps = options.chunk or calls.WORLDS.get(jax.default_backend(), batch.LIMIT)
+        chunk = calls.equal(options.designs, max(1, grasps // options.trials))
+    else:
+        chunk = before["chunk"]
+    return Question(scene, options.engine, options.preset, options.trials, options.seed, chunk)
+
+
+def _amount(options: "Sample") -> str:
+    """Designs and grasps in words."""
+    return f"{options.designs} designs x {options.trials} trials: {_grasps(options)} grasps"
+
+
+def _grasps(options: "Sample") -> int:
+    return options.designs * options.trials
+
+
+def _finished(options: "Sample", question: Question) -> bool:
+    """Whether the file is there and has what is asked.
+
+    Raises:
+      SceneError: If it has something else.
+    """
+    done = dataset.finished(options.out)
+    if done is None:
+        return False
+    others = dataset.differences(done[0], question)
+    if done[1] != options.designs:
+        others.insert(0, f"designs {done[1]}, asked for are {options.designs}")
+    if others:
+        head = f"--out {options.out} has other grasps; choose another file, or delete it"
+        raise SceneError([head, *others])
+    return True
+
+
+def _dry_run(options: "Sample", question: Question, console: Console) -> None:
+    work = rates.batch_work(
+        question.scene, options.engine, question.chunk * options.trials, devices=1
+    )
+    console.print(estimate.text([estimate.Part("", work, _grasps(options))]), markup=False)
+    size = dataset.most_bytes(question, options.designs)
+    console.print(f"size: at most about {size / 1e6:.1f} MB")
+
+
+@dataclasses.dataclass
+class _Tally:
+    """How grasps ended, numbers by `dataset.VERDICTS`."""
+
+    counts: np.ndarray
+
+    def add(self, question: Question, shard: int, designs: int, found: Outcome) -> int:
+        """Counts the wanted grasps of a shard; returns how many they are."""
+        wanted = min(question.chunk, designs - shard * question.chunk)
+        ends = dataset.verdicts(found)[:wanted]
+        self.counts += np.bincount(ends.ravel(), minlength=len(self.counts))
+        return ends.size
+
+
+def _simulate(
+    designs: int,
+    question: Question,
+    engine: Engine,
+    shards: Shards,
+    interrupts: Interrupts,
+    console: Console,
+) -> _Tally:
+    """Simulates the shards that are missing.
+
+    Raises:
+      Stopped: If a signal came; what was simulated is saved.
+    """
+    simulate = sampling.make_simulate(question.scene, engine, question.space)
+    tally, missing = _Tally(np.zeros(len(dataset.VERDICTS), int)), []
+    total, seconds = question.shards(designs), []
+    with Meter("sample", designs * question.trials, console) as meter:
+        for shard in range(total):
+            kept = shards.load(shard)
+            if kept is None:
+                missing.append(shard)
+            else:
+                meter.found(tally.add(question, shard, designs, kept))
+        if len(missing) < total:
+            done = total - len(missing)
+            words = f"going on after {done} of {total} calls, from {shards.folder}"
+            console.print(words, markup=False)
+        for shard in missing:
+            start = time.perf_counter()
+            found = interrupts.call(lambda s=shard: simulate(*question.drawn(s)))
+            outcome = jax.tree.map(np.asarray, found)
+            shards.save(shard, outcome)
+            seconds.append(time.perf_counter() - start)
+            meter.advance(tally.add(question, shard, designs, outcome))
+            if len(seconds) == 1:
+                meter.compiled()
+    _record_rate(question, seconds)
+    return tally
+
+
+def _record_rate(question: Question, seconds: list[float]) -> None:
+    """Keeps what was measured for estimates, if a call compiled and others did not."""
+    if len(seconds) > 1:
+        first, *others = seconds
+        each, grasps = sum(others) / len(others), question.chunk * question.trials
+        work = rates.batch_work(question.scene, question.engine, grasps, devices=1)
+        rates.record(work, grasps / each, max(first - each, 0.0))
+
+
+def _report(path: Path, found: _Tally, console: Console) -> None:
+    total = int(found.counts.sum())
+    ends = zip(dataset.VERDICTS, found.counts.tolist(), strict=True)
+    words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
+    console.print(f"of {total} grasps: {words}")
+    console.print(f"table: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)

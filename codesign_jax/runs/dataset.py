@@ -1,0 +1,333 @@
+"""Grasps of random designs in one Parquet file, in steps that survive a kill.
+
+A row follows from the question (scene, design space, seed, ...) and the indices of design and
+trial, but for its outcome.  So the folder beside the unfinished file holds outcomes alone, a shard
+for each call of the engine, sixteen bytes a grasp; the rest is drawn again when the file is
+written, shard by shard.
+"""
+
+import contextlib
+import dataclasses
+import fcntl
+import functools
+import hashlib
+import json
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from codesign_jax import archives, files, sampling, sources
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.provenance import environment
+from codesign_jax.runs import parquet
+from codesign_jax.runs.columns import DESIGNS, GRASPS
+from codesign_jax.runs.errors import RunError
+from codesign_jax.runs.parquet import Column, Names
+from codesign_jax.runs.scene_files import contents, scene_texts
+from codesign_jax.runs.tables import design_columns, status_names
+from codesign_jax.sampling import Drawn
+from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.scene.schema import SceneError
+from codesign_jax.types import Outcome, Status, failed
+
+QUESTION = "question.json"
+"""File of the folder of shards that says what they are of."""
+ROWS = 1 << 16
+"""About as many rows are written at once: a row group of the file."""
+VERDICTS = ["kept", "lost", "stuck", "failed"]
+_LOCK, _KEY = ".lock", "key"
+_NAMES = ("engine", "preset", "trials", "seed", "chunk")
+_WORDS = {"chunk": "designs of a call (by --chunk)"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Question:
+    """What grasps a file has, but for their number.
+
+    Attributes:
+      scene: The scene.
+      engine: Name of the engine.
+      preset: Name of the design space.
+      trials: Trials of each design.
+      seed: Root of designs and trials.
+      chunk: Designs that one call simulates, a shard.
+    """
+
+    scene: Scene
+    engine: str
+    preset: str
+    trials: int
+    seed: int
+    chunk: int
+
+    @functools.cached_property
+    def space(self) -> DesignSpace:
+        """The design space."""
+        return design_space(self.scene.hand, self.preset)
+
+    @functools.cached_property
+    def described(self) -> dict[str, Any]:
+        """What determines the outcomes, beside versions and machine; of JSON's types."""
+        texts, every = scene_texts(self.scene), contents(self.scene)
+        meshes = [hashlib.sha256(every[name]).hexdigest() for name in sorted({*every} - {*texts})]
+        # What code that is not known has simulated is no part of anything else.
+        code = sources.digest() or f"unknown {uuid.uuid4()}"
+        own = {name: getattr(self, name) for name in _NAMES}
+        return own | {"scene": texts, "meshes": meshes, "code": code}
+
+    @functools.cached_property
+    def key(self) -> str:
+        """Digest of it."""
+        return hashlib.sha256(json.dumps(self.described, sort_keys=True).encode()).hexdigest()
+
+    def drawn(self, shard: int) -> Drawn:
+        """Designs and trials of a shard, NumPy arrays."""
+        first, key = shard * self.chunk, jax.random.key(self.seed)
+        sizes = {"n": self.chunk, "num_trials": self.trials}
+        found = sampling.draw(self.scene, self.space, key, first=np.int32(first), **sizes)
+        return jax.tree.map(np.asarray, found)
+
+    def shards(self, designs: int) -> int:
+        """Number of shards of so many designs; the last one may have more than are wanted."""
+        return -(-designs // self.chunk)
+
+
+def differences(before: dict[str, Any], asked: Question) -> list[str]:
+    """What another question has otherwise, in words; empty if it is the same.
+
+    Args:
+      before: The other one, as `Question.described`.
+      asked: The question.
+    """
+    now, words = asked.described, []
+    for name in _NAMES:
+        if before.get(name) != now[name]:
+            words.append(f"{_WORDS.get(name, name)}: {before.get(name)}, asked for is {now[name]}")
+    for name, text in now["scene"].items():
+        old = before.get("scene", {}).get(name, "")
+        pairs = zip(old.splitlines(), text.splitlines(), strict=False)
+        lines = [f"{a} -> {b}" for a, b in pairs if a != b]
+        if old != text:
+            words.append(f"{name}: {lines[0] if lines else 'another length'}")
+    if before.get("meshes") != now["meshes"]:
+        words.append("other meshes")
+    if before.get("code") != now["code"]:
+        words.append("it was simulated by another version of the code")
+    return words
+
+
+class Shards:
+    """Outcomes that were simulated, in a folder beside the file; see `open_shards`."""
+
+    def __init__(self, folder: Path, key: str):
+        """Refers to a folder of shards of the question with this key."""
+        self.folder, self._key = folder, key
+
+    def path(self, shard: int) -> Path:
+        """File of a shard."""
+        return self.folder / f"{shard:08d}.npz"
+
+    def save(self, shard: int, found: Outcome) -> None:
+        """Keeps outcomes of a shard, arrays of shape (design, trial)."""
+        archives.save(self.path(shard), {_KEY: self._key, **found._asdict()})
+
+    def load(self, shard: int) -> Outcome | None:
+        """Outcomes of a shard; None if they are not there, or damaged."""
+        try:
+            arrays = archives.load(self.path(shard))
+        except (OSError, archives.ArchiveError):
+            return None
+        return Outcome(**arrays) if str(arrays.pop(_KEY)) == self._key else None
+
+    def delete(self) -> None:
+        """Deletes the shards and their folder."""
+        for path in self.folder.glob("[0-9]*.npz*"):
+            path.unlink()
+        for name in (QUESTION, _LOCK):
+            (self.folder / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # somebody else's files stay
+            self.folder.rmdir()
+
+
+def folder_of(path: Path) -> Path:
+    """Folder of the shards of an unfinished file."""
+    return path.with_name(f"{path.name}.part")
+
+
+def begun(path: Path) -> dict[str, Any] | None:
+    """The question of an unfinished file, as `Question.described`; None if there is none.
+
+    Raises:
+      SceneError: If it cannot be read.
+    """
+    try:
+        return json.loads((folder_of(path) / QUESTION).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        problem = f"{folder_of(path) / QUESTION} cannot be read: {error}"
+        raise SceneError([problem]) from error
+
+
+def finished(path: Path) -> tuple[dict[str, Any], int] | None:
+    """Question, as `Question.described`, and number of designs of a file; None if there is none.
+
+    Raises:
+      SceneError: If the file is not one of grasps of random designs.
+    """
+    if not path.exists():
+        return None
+    pa = parquet.library("--out")
+    try:
+        metadata = pa.parquet.read_schema(path).metadata or {}
+        return json.loads(metadata[b"question"]), json.loads(metadata[b"designs"])
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+        problem = f"--out {path} is there already, and is no file of `codesign sample`"
+        raise SceneError([f"{problem}; choose another"]) from error
+
+
+def refuse_other(path: Path, question: Question) -> None:
+    """Refuses to go on with what was begun for another question.
+
+    Raises:
+      SceneError: With what differs, or if the folder of shards holds other files.
+    """
+    folder, before = folder_of(path), begun(path)
+    head = f"{folder} has a part of other grasps; choose another --out, or delete the folder"
+    if before is None and folder.exists():
+        ours = {_LOCK, *(left.name for left in folder.glob("*.tmp"))}
+        others = sorted({place.name for place in folder.iterdir()} - ours)[:3]
+        head = f"{folder} holds other files ({', '.join(others)}); choose another --out"
+    else:
+        others = [] if before is None else differences(before, question)
+    if others:
+        raise SceneError([head] if before is None else [head, *others])
+
+
+@contextlib.contextmanager
+def open_shards(path: Path, question: Question) -> Iterator[Shards]:
+    """Makes or finds the folder of a file's shards, and locks it.
+
+    Args:
+      path: The file.
+      question: What it will have.
+
+    Raises:
+      SceneError: If another process writes there, and see `refuse_other`.
+    """
+    folder = folder_of(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / _LOCK).open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise SceneError([f"--out {path} is in use by another process"]) from error
+        refuse_other(path, question)
+        # What a killed process was writing.
+        for left in (*folder.glob("*.tmp"), *path.parent.glob(f"{path.name}.*.tmp")):
+            left.unlink()
+        if not (folder / QUESTION).exists():
+            with files.atomically(folder / QUESTION) as part:
+                part.write_text(json.dumps(question.described, indent=1) + "\n", encoding="utf-8")
+        yield Shards(folder, question.key)
+
+
+def verdicts(found: Outcome) -> np.ndarray:
+    """How trials ended, indices of `VERDICTS`; of any shape."""
+    status = np.asarray(found.status)
+    lost = np.asarray(found.cost) >= SUCCESS_COST
+    bad = np.where(status & Status.STUCK, 2, 3)
+    return np.where(failed(status), bad, lost.astype(int))
+
+
+def columns(space: DesignSpace) -> dict[str, Column]:
+    """The columns of a file, by name."""
+    found = {
+        name: Column(kind, text, {"unit": unit} if unit else {}, nullable=name == "first_bad_step")
+        for name, (kind, unit, text) in GRASPS.items()
+    }
+    names = zip(design_columns(space), space.names, space.units, strict=True)
+    for column, name, unit in names:
+        found[column] = Column("float32", DESIGNS, {"unit": unit, "parameter": name})
+    return found
+
+
+def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[str, Any]:
+    """Values of the columns for a shard, arrays that broadcast to (design, trial).
+
+    Args:
+      question: The question.
+      shard: Index of the shard.
+      drawn: Its designs and trials.
+      found: Their outcomes.
+    """
+    trials, status = drawn.trials, np.asarray(found.status)
+    texts, index = np.unique(status, return_inverse=True)
+    bad_step = np.asarray(found.bad_step)
+    values = {
+        "design": (shard * question.chunk + np.arange(question.chunk))[:, None],
+        "trial": np.arange(question.trials),
+        "object": Names(trials.shape, [s.name for s in question.scene.objects.object]),
+        "noise_x_m": trials.position[..., 0],
+        "noise_y_m": trials.position[..., 1],
+        "noise_yaw_rad": trials.yaw,
+        "noise_arm_roll_rad": trials.arm_tilt[..., 0],
+        "noise_arm_pitch_rad": trials.arm_tilt[..., 1],
+        "noise_mass_factor": trials.mass,
+        "noise_size_factor": trials.size,
+        "noise_friction_factor": trials.friction,
+        "noise_stiffness_factor": trials.stiffness,
+        "noise_hand_mass_factor": trials.hand_mass,
+        "verdict": Names(verdicts(found), VERDICTS),
+        "cost": found.cost,
+        "lost_time_s": found.lost_time,
+        "status": Names(index.reshape(status.shape), [status_names(s) for s in texts]),
+        "first_bad_step": np.ma.masked_less(bad_step, 0),
+    }
+    designs = question.space.in_units(drawn.designs)
+    own = design_columns(question.space)
+    return values | {name: designs[:, k, None] for k, name in enumerate(own)}
+
+
+def write(path: Path, question: Question, designs: int, shards: Shards) -> None:
+    """Writes the file from its shards, as a whole or not at all.
+
+    Args:
+      path: The file.
+      question: What it has.
+      designs: Number of designs.
+      shards: All of its outcomes.
+
+    Raises:
+      RunError: If a shard cannot be read any more.
+    """
+    pa = parquet.library("--out")
+    notes = {"question": question.described, "designs": designs, "environment": environment()}
+    notes |= {"status_bits": parquet.STATUS_BITS}
+    schema = parquet.schema(pa, columns(question.space), notes)
+    shape, left, group = (question.chunk, question.trials), designs * question.trials, []
+    with files.naming(path), parquet.writing(pa, path, schema) as writer:
+        for shard in range(question.shards(designs)):
+            found = shards.load(shard)
+            if found is None:
+                words = f"{shards.path(shard)} cannot be read any more; the same command goes on"
+                raise RunError(words)
+            values = rows(question, shard, question.drawn(shard), found)
+            group.append(parquet.table(pa, schema, values, shape).slice(0, left))
+            left -= group[-1].num_rows
+            if not left or sum(table.num_rows for table in group) >= ROWS:
+                # Groups are written as they are, whatever the writer's own size is.
+                table = pa.concat_tables(group).unify_dictionaries()
+                writer.write_table(table, row_group_size=table.num_rows)
+                group = []
+
+
+def most_bytes(question: Question, designs: int) -> int:
+    """About how many bytes a file has at most: numbers compress by a few per cent."""
+    kinds = [column.kind for column in columns(question.space).values()]
+    return designs * question.trials * sum(1 if kind == "name" else 4 for kind in kinds)

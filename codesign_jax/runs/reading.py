@@ -1,0 +1,115 @@
+"""Runs as others read them: scene, settings and the newest whole checkpoint; nothing is changed.
+
+Whatever is amiss is said or refused: a run whose newest checkpoint is damaged has another best
+design at the one before.
+"""
+
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from codesign_jax import scene as scenes
+from codesign_jax.runs import manifest, tables
+from codesign_jax.runs import record as records
+from codesign_jax.runs.checkpoint import Checkpoints, Restored
+from codesign_jax.runs.errors import RunError
+from codesign_jax.runs.record import Record
+from codesign_jax.runs.settings import Settings
+from codesign_jax.scene import Scene
+from codesign_jax.scene.schema import SceneError
+
+Tell = Callable[[str], None]
+"""Takes a sentence about what is amiss with a run."""
+
+
+def read_run(
+    path: Path,
+    *,
+    object_set: str | Path | None = None,
+    accuracy: str | Path | None = None,
+    overrides: Mapping[Any, Any] | None = None,
+) -> tuple[Scene, Settings]:
+    """Reads scene and settings of a run folder.
+
+    Args:
+      path: The folder.
+      object_set: Object set instead of the run's.
+      accuracy: Preset of discretization and solver instead of the run's.
+      overrides: Values by key path that replace the run's; see `scene.load`.
+
+    Raises:
+      SceneError: If it is not a run folder, or its scene is no longer the one it was made with.
+    """
+    stored = manifest.read_provenance(path)
+    manifest.refuse_changed(path, stored)
+    scene = scenes.load(
+        path / "scene.toml", object_set=object_set, accuracy=accuracy, overrides=overrides
+    )
+    return scene, Settings(**stored["settings"])
+
+
+def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
+    """Reads the newest whole checkpoint of a run folder; None if it has none.
+
+    Args:
+      folder: The folder.
+      tell: Called with what is amiss, such as newer checkpoints that are damaged; None to warn.
+
+    Raises:
+      SceneError: If the folder is no run, no checkpoint of it can be read, or they are another's.
+    """
+    tell = tell or (lambda text: warnings.warn(text, stacklevel=3))
+    if problem := lost_all(folder):
+        raise SceneError([problem])
+    if not (folder / "checkpoints").is_dir():
+        return None
+    stored = manifest.read_provenance(folder)
+    settings = Settings(**stored["settings"])
+    try:
+        with Checkpoints(folder / "checkpoints", run=stored.get("id"), read_only=True) as store:
+            found = store.restore()
+        if found.step is None:
+            return _none(folder, found)
+        record = records.from_arrays(found.arrays)
+        records.refuse_other(record, settings, found.step)
+    except (RunError, OSError) as error:
+        raise SceneError([f"run {folder}: {error}"]) from error
+    if found.damaged:
+        steps = "; ".join(f"{step}: {reason}" for step, reason in found.damaged)
+        test = "with" if record.test is not None else "without"
+        tell(
+            f"{folder} has damaged checkpoints ({steps}). Read instead is checkpoint {found.step}, "
+            f"after episode {record.done} of {settings.episodes}, {test} the final test: another "
+            "design may be the best there. The command of codesign optimize that made the run "
+            "computes again what is lost"
+        )
+    return record
+
+
+def lost_all(folder: Path) -> str:
+    """Says that a run has lost its checkpoints' folder; nothing if it has not, or had none yet."""
+    episodes = 0 if (folder / "checkpoints").is_dir() else tables.episodes_in(folder)
+    return f"run {folder} has lost its checkpoints, {lost(episodes)}" if episodes else ""
+
+
+def lost(episodes: int) -> str:
+    """What to do about a run whose checkpoints are all lost, in words.
+
+    Args:
+      episodes: Episodes of which its tables tell.
+    """
+    return (
+        f"while its tables have {episodes} episode{'s' * (episodes != 1)}. Put checkpoints/ back "
+        "from a copy; or copy the tables, if they are wanted, and begin anew with codesign "
+        "optimize --fresh"
+    )
+
+
+def _none(folder: Path, found: Restored) -> None:
+    """Refuses a run that has lost all checkpoints; one that has none yet is no error."""
+    steps = "; ".join(f"{step}: {reason}" for step, reason in found.damaged)
+    episodes = tables.episodes_in(folder)
+    if found.damaged or episodes:
+        damaged = f"no checkpoint that is whole ({steps})" if steps else "no checkpoint"
+        raise SceneError([f"run {folder} has {damaged}, {lost(episodes)}"])

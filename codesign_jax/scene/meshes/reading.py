@@ -1,0 +1,146 @@
+"""Mesh files: read whole, once, and within limits of bytes, faces and time.
+
+A file is a stranger's: the parsers see bytes that were looked at before, no archive, no other file
+that this one names, and no picture.
+"""
+
+import hashlib
+import io
+import json
+import logging
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+
+from codesign_jax.scene import library
+from codesign_jax.scene.schema import SceneError, shown
+
+# What trimesh logs, tracebacks of what it tried first among it, is no message for a terminal.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+FORMATS = ("glb", "gltf", "obj", "off", "ply", "stl")
+"""Formats whose files hold all of a mesh, and are no archives."""
+MOST_BYTES = 1 << 24
+"""Largest file; a binary STL of 200,000 faces has 10 MB."""
+MOST_FACES = 200_000
+_MOST_PARTS = 1000
+"""Most bodies of a file: each costs trimesh a millisecond, however small it is."""
+
+
+class Read(NamedTuple):
+    """A mesh file.
+
+    Attributes:
+      vertices: Positions in the file's unit, shape (vertex, 3).
+      faces: Vertex indices, shape (face, 3).
+      content: The file's bytes, all of which the mesh was read from.
+      digest: Their SHA-256.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    content: bytes
+    digest: str
+
+
+def read(path: Path) -> Read:
+    """Reads a mesh file of one of `FORMATS`.
+
+    Raises:
+      SceneError: If there is no such file, it is too large, or it is no mesh.
+    """
+    if not library.is_file(path):
+        raise SceneError([f"no file {shown(str(path))}"])
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        valid = ", ".join(f".{name}" for name in FORMATS)
+        raise SceneError([f"{path.name}: is no mesh file that is read; valid: {valid}"])
+    try:
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise SceneError([f"{path.name}: {error.strerror}"]) from error
+    if len(content) > MOST_BYTES:
+        raise SceneError([f"{path.name}: has more than {MOST_BYTES >> 20} MiB; use fewer faces"])
+    try:
+        vertices, faces = _parse(content, kind)
+    except Exception as error:  # every format has its own parser with its own exceptions
+        why = shown(str(error))[1:-1] or type(error).__name__
+        raise SceneError([f"{path.name}: cannot be read as a mesh: {why}"]) from error
+    if problem := _problem(vertices, faces):
+        raise SceneError([f"{path.name}: {problem}"])
+    return Read(vertices, faces, content, hashlib.sha256(content).hexdigest())
+
+
+def _parse(content: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a file's bytes.
+
+    Raises:
+      Exception: Of any type, if they are no mesh; trimesh's parsers have no type of their own.
+    """
+    options: dict[str, Any] = {}
+    if kind in ("glb", "gltf"):
+        _check_gltf(content)
+    elif kind in ("obj", "off") or (kind == "stl" and not _is_binary_stl(content)):
+        # What is no UTF-8 trimesh would give to a detector of encodings, which takes minutes.
+        text = content.decode("utf-8", "replace")
+        if text.lower().count("endsolid") > _MOST_PARTS:
+            raise ValueError(f"more than {_MOST_PARTS:,} solids")
+        content = text.encode()
+    if kind in ("glb", "gltf", "obj", "ply"):
+        options["skip_materials"] = True
+    with np.errstate(all="ignore"):  # numbers out of range are looked at below
+        mesh = trimesh.load_mesh(io.BytesIO(content), file_type=kind, **options)
+        # Seams of texture and shading are no holes.
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+
+
+def _is_binary_stl(content: bytes) -> bool:
+    """Whether the length is the one that a binary STL's header says."""
+    return len(content) >= 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
+
+
+def _check_gltf(content: bytes) -> None:
+    """Refuses glTF that needs other files, or grows when it is read.
+
+    Raises:
+      ValueError: With the reason.
+    """
+    text = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    tree = json.loads(text if content[:4] == b"glTF" else content)
+    parts = {key: tree.get(key, []) for key in ("buffers", "nodes", "meshes", "accessors")}
+    for buffer in parts["buffers"]:
+        if not str(buffer.get("uri", "data:")).startswith("data:"):
+            uri = shown(buffer["uri"])
+            raise ValueError(f"its numbers are in another file, {uri}; save it as .glb")
+    for key in ("nodes", "meshes"):
+        if len(parts[key]) > _MOST_PARTS:
+            raise ValueError(f"{len(parts[key]):,} {key}, more than {_MOST_PARTS:,}")
+    children = [child for node in parts["nodes"] for child in node.get("children", [])]
+    if len(children) != len({*children}):
+        raise ValueError("a node has two parents")
+    counts = [int(accessor["count"]) for accessor in parts["accessors"]]
+    sizes = [
+        sum(counts[p.get("indices", p["attributes"]["POSITION"])] for p in m["primitives"])
+        for m in parts["meshes"]
+    ]
+    # A mesh may stand in many places.
+    placed = sum(sizes[node["mesh"]] for node in parts["nodes"] if "mesh" in node)
+    if max([placed, *counts]) > 3 * MOST_FACES:
+        raise ValueError(f"more than {MOST_FACES:,} faces")
+
+
+def _problem(vertices: np.ndarray, faces: np.ndarray) -> str | None:
+    """What is wrong with the numbers of a file, if anything."""
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        return "is no mesh of triangles"
+    if not len(faces) or not np.isfinite(vertices).all():
+        return "has no faces, or positions that are not numbers"
+    if len(faces) > MOST_FACES:
+        return f"has {len(faces):,} faces, more than {MOST_FACES:,}"
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        return "has faces of vertices that it does not have"
+    return None

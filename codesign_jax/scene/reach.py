@@ -1,0 +1,87 @@
+"""How far from a mesh distances are needed: as far away as a contact of the scene's hand begins.
+
+Beyond its grid a mesh's distance is taken for larger than it is, so that a contact would begin
+late. A scene that is read has grids for its hand; one that was put together otherwise is refused.
+"""
+
+import dataclasses
+import math
+
+from codesign_jax.scene import schema
+from codesign_jax.scene.hand_tables import UNITS, Hand, Numbers, per_finger
+from codesign_jax.scene.objects import ObjectSet
+
+LEAST = 0.014
+"""Reach of every grid [m]: contact spheres of fingers up to 25 mm high, on objects that the noise
+makes a tenth smaller."""
+_STEP = 0.005
+"""Step of larger ones [m]: hands that differ a little share grids and programs."""
+_DEVIATIONS = 2
+"""Standard deviations of the size noise by which an object may be smaller than its mesh."""
+
+
+def of(radius: float, size_noise: float) -> float:
+    """How far from the surface of a mesh in its own size distances are needed [m].
+
+    Args:
+      radius: Largest radius of a contact sphere [m].
+      size_noise: Standard deviation of the object's size, relative.
+    """
+    needed = radius / (1 - _DEVIATIONS * size_noise)
+    return LEAST if needed <= LEAST else math.ceil(needed / _STEP - 1e-9) * _STEP
+
+
+def contact_radius(hand: Hand) -> float:
+    """Largest radius [m] of the contact spheres of a hand, in any design of its table or presets.
+
+    Spheres of a finger have half its height as their radius.
+    """
+    heights = [
+        high * UNITS[row.unit][1]
+        for row in hand.parameter
+        if row.name == "height"
+        for numbers in [row.high, *_widened(hand)]
+        for high in per_finger(numbers, 1)
+    ]
+    return max([hand.palm.contact_radius, *(height / 2 for height in heights)])
+
+
+def _widened(hand: Hand) -> list[Numbers]:
+    """Upper bounds of the height that presets give instead of the table's, in its unit."""
+    free = [f for preset in hand.preset for f in preset.free if f.name == "height"]
+    return [f.high for f in free if f.high is not None]
+
+
+def fit(objects: ObjectSet, hand: Hand) -> ObjectSet:
+    """The set with the distances of its meshes as far out as the hand needs."""
+    if not any(shape.mesh for shape in objects.object):
+        return objects
+    needed = of(contact_radius(hand), objects.noise.size)
+    shapes = (
+        dataclasses.replace(shape, mesh=shape.mesh.reaching(needed)) if shape.mesh else shape
+        for shape in objects.object
+    )
+    return dataclasses.replace(objects, object=tuple(shapes))
+
+
+def refuse(objects: ObjectSet, radius: float, size_noise: float | None = None) -> None:
+    """Refuses contact spheres that are larger than the distances of the set's meshes reach.
+
+    Args:
+      objects: The set.
+      radius: Largest radius of a contact sphere [m].
+      size_noise: Standard deviation of the object's size instead of the set's.
+
+    Raises:
+      SceneError: With every mesh.
+    """
+    needed = of(radius * (1 - 1e-6), objects.noise.size if size_noise is None else size_noise)
+    problems = [
+        f"object {shape.name!r}: distances reach {1e3 * shape.mesh.reach:g} mm from its surface, "
+        f"contact spheres of radius {1e3 * radius:g} mm need {1e3 * needed:g} mm: raise the "
+        "bounds of `height` or palm.contact_radius in the hand file, and read the scene again"
+        for shape in objects.object
+        if shape.mesh and shape.mesh.reach < needed
+    ]
+    if problems:
+        raise schema.SceneError(problems)

@@ -1,0 +1,70 @@
+"""Numbers given from Python in other units than SI: refused, or hinted at."""
+
+import warnings
+
+import jax
+import numpy as np
+
+from codesign_jax.scene import schema
+from codesign_jax.scene.hand_tables import PARAMETERS
+from codesign_jax.types import Params
+
+_FAINT = 1000.0
+"""Pressure below which no finger moves visibly [Pa]: 1 kPa bends one of 100 mm by half a degree."""
+
+
+def refuse(params: Params) -> None:
+    """Refuses parameters that were given in other units than SI and radians.
+
+    As `DesignSpace.refuse_unit_slips`, for parameters with any leading axes.
+
+    Raises:
+      SceneError: With every such number and its suggested value.
+    """
+    if any(isinstance(v, jax.core.Tracer) for v in params):
+        return
+    arm = [f"arm_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
+    values = {name: getattr(params, name) for name in Params._fields if name != "arm"}
+    values |= {name: np.asarray(params.arm)[..., i] for i, name in enumerate(arm)}
+    found = [slip for name, v in values.items() for slip in slips(name, name, np.asarray(v))]
+    if found:
+        raise schema.SceneError(found)
+    hint_at_kilopascals(np.asarray(params.pressure, float))
+
+
+def hint_at_kilopascals(pressures: np.ndarray) -> None:
+    """Warns of pressures that are all nearly zero, which their range has: kPa, most likely."""
+    largest = float(np.abs(pressures).max(initial=0.0))
+    if 0 < largest < _FAINT:
+        warnings.warn(
+            f"the largest pressure is {largest:g} Pa, next to none; did you mean "
+            f"{1e3 * largest:g}? (kPa given where Pa is expected; Python takes SI units)",
+            stacklevel=3,
+        )
+
+
+def outside(name: str, unit: str, low: float, high: float, values: np.ndarray) -> str | None:
+    """What is wrong with the first value, if any, that is outside of bounds, or None.
+
+    Args:
+      name: What the values are of.
+      unit: Their unit.
+      low: Lower bound.
+      high: Upper bound.
+      values: The values, shape (n,).
+    """
+    slack = 1e-6 * max(abs(low), abs(high))  # bounds that went to SI and back, also as float32
+    bad = values[~((values >= low - slack) & (values <= high + slack))]
+    return schema.range_problem(name, float(bad[0]), unit, low, high) if bad.size else None
+
+
+def slips(name: str, row: str, values: np.ndarray) -> list[str]:
+    """What is wrong with the first value, if any, that looks like one of another unit."""
+    kind = PARAMETERS[row]
+    slack = 1e-6 * abs(kind.high)  # a float32 of a bound
+    outside = values[(values < kind.low - slack) | (values > kind.high + slack)]
+    for value in outside.ravel()[:1]:
+        if schema.unit_slip(float(value), kind.unit, kind.low, kind.high):
+            problem = schema.range_problem(name, float(value), kind.unit, kind.low, kind.high)
+            return [f"{problem}; Python takes SI units and radians"]
+    return []

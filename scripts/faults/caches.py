@@ -1,0 +1,321 @@
+"""Caches that are damaged, exchanged, full or filled by a killed process; files of arrays."""
+
+import os
+import random
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scripts.faults import damage, finished, products
+from scripts.faults.bench import Bench
+from scripts.faults.campaigns import Campaign
+from scripts.faults.kills import judged
+from scripts.faults.numbers import FAILING
+from scripts.faults.shim import Mode
+from scripts.faults.store import Result
+
+KIND = "filter"
+_WAYS = ("emptied", "half", "first byte flipped", "middle byte flipped", "last byte flipped")
+_WAYS += ("zeros", "a folder", "deleted")
+_MANY = 5
+"""Programs that a case damages: the others need not be compiled again."""
+
+
+def _copy(scratch: Path) -> Path:
+    """A copy of the harness's own caches; returns the folder that a process gets for all caches."""
+    place = scratch / "cache"
+    shutil.copytree(Path(os.environ["XDG_CACHE_HOME"]) / "codesign-jax", place / "codesign-jax")
+    return place
+
+
+def _programs(place: Path) -> list[Path]:
+    return sorted((place / "codesign-jax" / "jax").glob("*-cache"))
+
+
+def _run(bench: Bench, scratch: Path, cache: Path, armed: Any = None) -> Result:
+    """A run in a process that has these caches: the same, and nothing said of caches."""
+    run = scratch / "run"
+    words = [*finished.arguments(KIND), "--out", run]
+    said = bench.finish(
+        bench.start(*words, environment={"XDG_CACHE_HOME": str(cache)}, armed=armed)
+    )
+    if "Error reading persistent" in said.text:
+        return Result("warnings", said.text)
+    return judged(said, run, finished.place(bench, KIND))
+
+
+def _json(place: Path) -> list[Path]:
+    return sorted((place / "codesign-jax").rglob("*.json"))
+
+
+def _kernels(place: Path) -> list[Path]:
+    return sorted((place / "codesign-jax" / "jax" / "kernels").glob("*.kernel"))
+
+
+_ENTRIES: tuple[Callable[[Path], list[Path]], ...] = (_programs, _kernels)
+
+
+def damaged(bench: Bench, number: int) -> Result:
+    """Damaged entries are found, deleted and made again: the same run, without a warning."""
+    chance = random.Random(f"caches {number}")
+    way = _WAYS[number // len(_ENTRIES) % len(_WAYS)]
+    with bench.scratch() as scratch:
+        finished.place(bench, KIND)
+        cache = _copy(scratch)
+        entries = _ENTRIES[number % len(_ENTRIES)](cache)
+        for path in chance.sample(entries, min(_MANY, len(entries))) + _json(cache):
+            damage.apply(path, way)
+        result = _run(bench, scratch, cache)
+        return result._replace(detail=f"{way}, {entries[0].name}: {result.detail}")
+
+
+def exchanged(bench: Bench, number: int) -> Result:
+    """JAX's entries exchanged with one another: it would load the wrong program."""
+    chance = random.Random(f"exchanged {number}")
+    with bench.scratch() as scratch:
+        finished.place(bench, KIND)
+        cache = _copy(scratch)
+        entries = _programs(cache)
+        chosen = chance.sample(entries, 20)
+        contents = [path.read_bytes() for path in chosen]
+        for path, content in zip(chosen, contents[1:] + contents[:1], strict=True):
+            path.write_bytes(content)
+        return _run(bench, scratch, cache)
+
+
+def full(bench: Bench, number: int) -> Result:
+    """A full disk below the caches alone: the run is the same, and the next finds nothing torn."""
+    chance = random.Random(f"full caches {number}")
+    with bench.scratch() as scratch:
+        finished.place(bench, KIND)
+        cache = _copy(scratch)
+        for path in chance.sample(_programs(cache), _MANY):
+            path.unlink()
+        at = chance.randint(1, 2 * _MANY)
+        result = _run(bench, scratch, cache, (cache, at, Mode.FULL))
+        if result.word != "same":
+            return result
+        shutil.rmtree(scratch / "run")
+        return _run(bench, scratch, cache)
+
+
+def cold(bench: Bench, number: int) -> Result:
+    """SIGKILL while empty caches are filled: the next process finds no torn entry."""
+    chance = random.Random(f"cold {number}")
+    with bench.scratch() as scratch:
+        finished.place(bench, KIND)
+        cache = scratch / "cache"
+        words = [*finished.arguments(KIND), "--out", scratch / "run"]
+        process = bench.start(*words, environment={"XDG_CACHE_HOME": str(cache)})
+        moment = chance.uniform(0.3, 1.0) * 4 * finished.seconds(bench, KIND)
+        if process.wait(moment) is None:
+            process.send(signal.SIGKILL)
+        bench.finish(process)
+        entries = len(_programs(cache))
+        result = _run(bench, scratch, cache)
+        return result._replace(tallies={"entries": entries})
+
+
+def _failure(bench: Bench) -> Path:
+    """A file of a failed world, from a run in which all fail; made at first use."""
+    path = bench.folder / "finished" / "failure.npz"
+    if not path.exists():
+        with bench.scratch() as scratch:
+            words = ["optimize", *finished.SIZE, "--scene", "paper_spheres", *FAILING]
+            bench.command(*words, "--episodes", "1", "--out", scratch / "run")
+            found = sorted((scratch / "run" / "failures").glob("*.npz"))
+            shutil.copyfile(found[0], path)
+    return path
+
+
+def _part(bench: Bench) -> Path:
+    """The file from which a landscape that was killed goes on."""
+    from codesign_jax import archives
+
+    path = bench.folder / "finished" / "part.npz"
+    if not path.exists():
+        file = archives.Parts(path)
+        for k in range(3):
+            file.append({"cost": np.arange(6.0) + k, "status": np.zeros(6, np.int32)})
+    return path
+
+
+def _grid(bench: Bench) -> Path:
+    """A stored grid, of a mesh small enough to be read some thousand times."""
+    from codesign_jax import archives
+
+    path = bench.folder / "finished" / "grid.npz"
+    if not path.exists():
+        values = np.random.default_rng(0).normal(size=(12, 12, 12)).astype(np.float32)
+        archives.save(path, {"name": path.name, "values": values}, compressed=True)
+    return path
+
+
+def _read_reference(path: Path) -> Any:
+    from codesign_jax.runs import outcomes
+
+    outcomes.count(path)
+    found = outcomes.load(path, _KEYS[path.parent])[0]
+    return None if found is None else found._asdict()
+
+
+def _read_landscape(path: Path) -> Any:
+    from codesign_jax.report import landscape
+
+    return landscape.load(path)._asdict()
+
+
+def _read_failure(path: Path) -> Any:
+    from codesign_jax.runs import failures
+
+    found = failures.load(path)
+    return {**found._asdict(), **found.trial._asdict(), "trial": 0}
+
+
+def _read_part(path: Path) -> Any:
+    from codesign_jax import archives
+
+    found = archives.Parts(path).found
+    return {f"{k}-{n}": v for k, part in enumerate(found) for n, v in part.items()}
+
+
+def _read_grid(path: Path) -> Any:
+    from codesign_jax import archives
+
+    return archives.load(path)
+
+
+_KEYS: dict[Path, str] = {}
+
+
+def _reference(bench: Bench) -> Path:
+    path = finished.place(bench, "tested") / "reference.npz"
+    with np.load(path, allow_pickle=False) as stored:
+        _KEYS[bench.scratch_folders] = str(stored["key"])
+    return path
+
+
+def _landscape(bench: Bench) -> Path:
+    return products.product(bench, "landscape") / "landscape.npz"
+
+
+_ARCHIVES: tuple[tuple[Callable[[Bench], Path], Callable[[Path], Any]], ...] = (
+    (_reference, _read_reference),
+    (_landscape, _read_landscape),
+    (_failure, _read_failure),
+    (_part, _read_part),
+    (_grid, _read_grid),
+)
+_WHOLE: dict[int, tuple[bytes, Any]] = {}
+
+
+def _changed(content: bytes, chance: random.Random) -> bytes:
+    """A bit flipped, a byte set or deleted, some zeroed, or the end cut off."""
+    data, at = bytearray(content), chance.randrange(len(content))
+    match chance.randrange(6):
+        case 0 | 1 | 2:
+            data[at] ^= 1 << chance.randrange(8)
+        case 3:
+            data[at] = chance.randrange(256)
+        case 4:
+            del data[at : at + chance.choice((1, 1, 4, len(data)))]
+        case 5:
+            stop = min(len(data), at + chance.choice((4, 64)))
+            data[at:stop] = bytes(stop - at)
+    return bytes(data)
+
+
+def archive(bench: Bench, number: int) -> Result:
+    """A file of arrays with a damage is refused by its own error, or holds what was written."""
+    from codesign_jax.archives import ArchiveError
+    from codesign_jax.scene.schema import SceneError
+
+    which = number % len(_ARCHIVES)
+    make, read = _ARCHIVES[which]
+    path = bench.scratch_folders / "archive.npz"
+    if which not in _WHOLE:
+        content = make(bench).read_bytes()
+        path.write_bytes(content)
+        _WHOLE[which] = content, read(path)
+    content, whole = _WHOLE[which]
+    other = _changed(content, random.Random(f"archive {number}"))
+    path.write_bytes(other)
+    try:
+        found = read(path)
+    except (SceneError, ArchiveError):
+        return Result("refused")
+    except Exception as error:
+        return Result("escaped", f"{make.__name__}: {error!r}")
+    if found is None:
+        return Result("refused")
+    wrong = [n for n, v in found.items() if not _equal(v, whole.get(n))]
+    if wrong:
+        return Result("wrong", f"{make.__name__}: {wrong}")
+    same = other == content or set(found) == set(whole)
+    return Result("same" if same else "fewer parts")
+
+
+def _equal(a: Any, b: Any) -> bool:
+    a, b = np.asarray(a), np.asarray(b)
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+CAMPAIGNS = (
+    Campaign(
+        "caches",
+        len(_ENTRIES) * len(_WAYS),
+        damaged,
+        frozenset({"same"}),
+        "compiled programs, kernels and lists of the caches damaged in eight ways, then a run",
+        "the same run without a warning; what was damaged is made again",
+        "test_damaged_programs_go_and_sound_ones_stay, test_code_is_kept_and_damage_is_seen",
+        limit=900,
+    ),
+    Campaign(
+        "exchanged",
+        2,
+        exchanged,
+        frozenset({"same"}),
+        "twenty of JAX's compiled programs exchanged with one another",
+        "the same run; none of them is used",
+        "test_programs_in_the_place_of_each_other_go",
+        limit=900,
+    ),
+    Campaign(
+        "caches-full",
+        2,
+        full,
+        frozenset({"same"}),
+        "a full disk below the caches",
+        "the same run; the next one finds nothing torn",
+        "test_jax_compiles_again_what_was_damaged_and_keeps_it",
+        limit=900,
+    ),
+    Campaign(
+        "cold",
+        2,
+        cold,
+        frozenset({"same"}),
+        "SIGKILL while empty caches are filled",
+        "no torn entry: the next process says nothing of them",
+        "test_jax_compiles_again_what_was_damaged_and_keeps_it",
+        limit=900,
+    ),
+    Campaign(
+        "archives",
+        25_000,
+        archive,
+        frozenset({"refused", "same", "fewer parts"}),
+        "a byte or some of `reference.npz`, `landscape.npz`, `landscape.part.npz`, "
+        "`failures/*.npz` or a stored grid changed or gone",
+        "refused in words or computed again; never a wrong number",
+        "test_any_damage_of_arrays_is_one_error, "
+        "test_a_failed_world_with_any_damage_is_refused_or_whole",
+        size=2500,
+        limit=120,
+    ),
+)

@@ -1,0 +1,210 @@
+"""Fills in README's table of rates, and says which of README's figures are not in docs/data.
+
+python -m scripts.front_page
+
+Every number of README's text stands in a sentence of `STATEMENTS`, filled in with what docs/data
+has and rounded as the sentence says, or in a name of `NAMES`.  A test fails where one does not.
+"""
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign_jax.types import failed
+from scripts.accuracy.results import Study
+from scripts.accuracy.settings import PRESETS, Setting
+from scripts.experiments import study
+from scripts.shared.tables import fill, markdown
+
+ROOT = Path(__file__).parents[1]
+MARK = "rates"
+CASE = "paper"
+"""The default scene, in the files of `scripts.benchmark.grasps`."""
+MACHINES = {"2 CPU cores": "grasps_cpu.json", "one H200": "grasps_h200.json"}
+
+BATCHES = {60: ", an episode of a 2D run", 360: ", an episode of a 23D run"}
+
+STATEMENTS = (
+    "both at once succeeds in {success_2d_concurrent:.0f} of {runs:.0f} runs, one alone in "
+    "{success_2d_single:.0f}",
+    "keep {kept_2d_concurrent:.0f} % of fresh grasps",
+    "{success_23d_concurrent:.0f} and {success_23d_single:.0f} of {runs:.0f} runs succeed, and "
+    "the best designs keep {kept_23d_concurrent:.0f} %",
+    "With {parameters:.0f} parameters",
+    "best designs with {parameters:.0f} parameters",
+    "{paper_2d:,.0f} simulations to convergence are {converged_2d:,.0f} here, its "
+    "{paper_23d:,.0f} are {converged_23d:,.0f}",
+    "takes {install_seconds:.0f} seconds or more and {install_gb:.1f} GB",
+    "{c_ratio:.0f} times as many grasps a second as MuJoCo C on two cores",
+    "{c_ratio_here:.0f} times as many steps in contact",
+    "{flips_concurrent:.1f} % of fresh grasps",
+    "{flips_switch:.1f} % with one switch and {flips_single:.1f} % in a single domain",
+    "{fast_rate:.1f} times the rate of `standard`",
+    "{compared:,.0f} of {same:,.0f} verdicts",
+    "{c_differs:.1f} % of {c_trials:.0f} verdicts differ, and C differs from itself in "
+    "{c_chaos:.1f} %",
+)
+NAMES = (
+    "IROS 2017",
+    "H100 and H200",
+    "an H200",
+    "an H100",
+    "CUDA 13",
+    "CUDA 12",
+    "jax[cuda13]<0.13",
+    "`cuda12`",
+    "compute capability 8.0",
+    "x86-64",
+    "Python 3.11, 3.12 and 3.13",
+    "WSL2",
+    "3D",
+    "10 ms",
+    "1 ms",
+    "10 links",
+    "20 links",
+    "Apache-2.0",
+    "--seeds 0-29",
+)
+"""Numbers that were not measured: names, and settings that the presets' files have."""
+
+
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _experiments(data: Path) -> Iterator[tuple[str, float]]:
+    """Success and convergence with the default scene: 30 runs a strategy."""
+    folders = {"concurrent": "paper_fingers", "single": "paper_fingers_single"}
+    for name, paper in (("2d", 420), ("23d", 6120)):
+        for strategy, folder in folders.items():
+            found = study.load_study(data / ("paper_fingers" if name == "2d" else folder), name)
+            assert found is not None, f"docs/data has no {name} of {folder}"
+            place = found.strategies.index(strategy)
+            yield f"success_{name}_{strategy}", float(found.success()[place].sum())
+            yield "runs", float(found.success()[place].size)
+            yield "parameters", float(found.data["final_particles"].shape[-1])
+            if strategy == "concurrent":
+                episodes = np.median(found.convergence()[place])
+                yield f"converged_{name}", float(episodes * found.per_episode)
+        yield f"paper_{name}", float(paper)
+
+
+def _fresh(data: Path) -> Iterator[tuple[str, float]]:
+    """What the winners keep of fresh trials, and how many verdicts `reference` changes [%]."""
+    folders = {"concurrent": "paper_fingers", "single": "paper_fingers_single"}
+    for strategy, folder in {**folders, "switch": "paper_fingers_switch"}.items():
+        with np.load(data / folder / "fresh.npz", allow_pickle=False) as file:
+            for name in ("2d", "23d"):
+                if f"{name}|standard|cost" not in file:
+                    continue
+                names = [str(s) for s in file[f"{name}|strategies"]]
+                place = next(i for i, s in enumerate(names) if s.startswith(strategy))
+                kept, good = _verdicts(file, name, "standard", place)
+                yield f"kept_{name}_{strategy}", 100 * float(kept[good].mean())
+                if f"{name}|reference|cost" in file:
+                    other, fine = _verdicts(file, name, "reference", place)
+                    both = good & fine
+                    yield f"flips_{strategy}", 100 * float((kept != other)[both].mean())
+
+
+def _verdicts(file: Any, name: str, label: str, place: int) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each trial kept its object, and whether it did not fail."""
+    good = ~np.asarray(failed(file[f"{name}|{label}|status"][place]))
+    return file[f"{name}|{label}|cost"][place] < 0.01, good
+
+
+def _engines(data: Path) -> Iterator[tuple[str, float]]:
+    """Against MuJoCo C: verdicts, and rates with spheres; the preset `fast` against `standard`."""
+    same = _json(data / "compare_engines.json")["against_mujoco"]["structured"]
+    yield "same", float(same["worlds"])
+    yield "compared", round(same["worlds"] * same["same_verdict"])
+    records = [r for r in _json(data / "benchmark_cpu.json")["records"] if r["kind"] == "grasp"]
+    rates = {}
+    for engine, setting in (("structured", "default"), ("mujoco", "documented")):
+        found = [r for r in records if (r["engine"], r["setting"]) == (engine, setting)]
+        rates[engine] = [r["grasps_per_s"] for r in found if "grasps_per_s" in r]
+    yield "c_ratio", min(rates["structured"]) / max(rates["mujoco"])
+    cpu, made = (Study(sorted(data.glob(f"accuracy_{n}*.json"))) for n in ("cpu", "h200"))
+    spheres = Setting(surface="spheres 1")
+    times = [cpu.cost(engine, spheres) for engine in ("mujoco", "structured")]
+    yield "c_ratio_here", times[0] / times[1]  # type: ignore[operator]
+    costs = [made.cost("structured", PRESETS[n]) for n in ("standard", "fast")]
+    yield "fast_rate", costs[0] / costs[1]  # type: ignore[operator]
+    c = replace(spheres, engine="mujoco")
+    kept = {moved: made.grasps[c, moved, "spread"] < 0.01 for moved in (False, True)}
+    ours = made.grasps[spheres, False, "spread"] < 0.01
+    yield "c_trials", float(kept[False].size)
+    yield "c_differs", 100 * float((kept[False] != ours[:, : kept[False].shape[1]]).mean())
+    yield "c_chaos", 100 * float((kept[False] != kept[True]).mean())
+
+
+def figures(data: Path) -> dict[str, float]:
+    """The numbers that README states, from docs/data alone."""
+    install = _json(data / "install.json")
+    found = {"install_seconds": install["seconds"], "install_gb": install["disk_gb"]}
+    return found | dict(_experiments(data)) | dict(_fresh(data)) | dict(_engines(data))
+
+
+def table(data: Path) -> str:
+    """Grasps a second of the default scene, by batch and machine, as a Markdown table."""
+    records: dict[str, dict[tuple[str, int], dict[str, Any]]] = {}
+    for machine, name in MACHINES.items():
+        found = _json(data / name)["records"] if (data / name).exists() else []
+        records[machine] = {(r["case"], r["worlds"]): r for r in found}
+    rows = [["batch", *(f"{machine}: grasps a second" for machine in MACHINES)]]
+    for size in sorted({n for found in records.values() for case, n in found if case == CASE}):
+        cells = [_cell(found.get((CASE, size))) for found in records.values()]
+        rows.append([f"{size:,} grasps{BATCHES.get(size, '')}", *cells])
+    return markdown(rows)
+
+
+def _cell(record: dict[str, Any] | None) -> str:
+    if record is None:
+        return "–"
+    rate = float(f"{record['grasps_per_s']:.2g}")
+    return f"{rate:,.0f} ({record['best_s']:#.2g} s a batch)"
+
+
+def words(readme: str) -> str:
+    """The text of a page without code, link targets and tables that are filled in, on one line."""
+    text = re.sub(r"<!-- (\w+):begin -->.*?<!-- \1:end -->", " ", readme, flags=re.S)
+    text = re.sub(r"^```.*?^```", " ", text, flags=re.S | re.M)
+    text = re.sub(r"\]\([^)]*\)", "]", text)
+    return re.sub(r"[\s>|]+", " ", text)
+
+
+def sentences(data: Path) -> list[str]:
+    """`STATEMENTS` with their figures."""
+    found = figures(data)
+    return [s.format(**found) for s in STATEMENTS]
+
+
+def unexplained(readme: str, stated: list[str]) -> list[str]:
+    """Numbers of a page that stand in no statement and in no name, each with what is around it."""
+    text = words(readme)
+    for known in (*stated, *NAMES):
+        text = text.replace(known, " ")
+    return [text[max(0, m.start() - 30) : m.end() + 20] for m in re.finditer(r"\d[\d,.]*", text)]
+
+
+def main() -> int:
+    """Fills in the tables; exit status 1 if README states what docs/data does not have."""
+    data = ROOT / "docs" / "data"
+    for page in (ROOT / "README.md", ROOT / "docs" / "performance.md"):
+        fill(page, table(data), MARK)
+    readme, stated = (ROOT / "README.md").read_text(encoding="utf-8"), sentences(data)
+    missing = [s for s in stated if s not in words(readme)]
+    other = unexplained(readme, stated)
+    for where, found in (("README", missing), ("docs/data", other)):
+        print("".join(f"not in {where}: {text}\n" for text in found), end="")
+    return int(bool(missing or other))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,212 @@
+"""Run folders: nothing is deleted that is not a run's."""
+
+import json
+import os
+import shutil
+
+import pytest
+from command_runs import command, own_workplace, snapshot, without  # noqa: F401
+from tiny_run import RUN, copied
+from toy import TINY, tiny
+
+from codesign_jax import runs, scene
+from codesign_jax.runs import belongings, manifest, scene_files
+from codesign_jax.runs.directory import open_run
+from codesign_jax.scene.schema import SceneError
+
+SETTINGS = runs.make_settings("2d", "concurrent", "control", "mujoco", 0, particles=4, episodes=2)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A finished run of its own."""
+    return copied(tmp_path / "run")
+
+
+def start(folder, **how):
+    """Opens a run folder and closes it again; returns its notes."""
+    with open_run(folder, tiny()[0], SETTINGS, ["codesign", "optimize"], **how) as (_, notes):
+        return notes
+
+
+@pytest.fixture
+def mine(tmp_path):
+    """A folder with a user's own scene, as a run would name its files."""
+    folder = tmp_path / "mine"
+    (folder / "meshes").mkdir(parents=True)
+    scene_files.write_scene(tiny()[0], folder)
+    (folder / "hand.toml").write_text("# years of work\n" + (folder / "hand.toml").read_text())
+    (folder / "meshes" / "capsule.stl").write_text("solid")
+    return folder
+
+
+@pytest.mark.parametrize("more", [(), ("--fresh",)])
+def test_a_users_own_scene_stays_where_it_is(more, mine, capsys):
+    before = snapshot(mine)
+    own = ["optimize", "--scene", mine / "scene.toml", "--engine", "mujoco", "--out", mine]
+    assert command(*own, *more) == 2
+    error = capsys.readouterr().err
+    assert f"{mine} holds hand.toml, meshes/capsule.stl, objects.toml and 1 more" in error
+    assert "Choose another folder" in error
+    assert snapshot(mine) == before and not (mine / ".lock").exists()
+
+
+def test_landscapes_replace_no_scene_of_the_users(mine, capsys):
+    before = snapshot(mine)
+    own = ["--scene", mine / "scene.toml", "--engine", "mujoco", "--dry-run", "--out", mine]
+    assert command("landscape", *own) == 2
+    assert "hand.toml would be replaced" in capsys.readouterr().err and snapshot(mine) == before
+
+
+def test_a_users_own_seeds_table_is_not_replaced(tmp_path, capsys):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "seeds.csv").write_text("tomatoes,3\n")
+    own = without(RUN, "--seed")
+    assert command(*own, "--seeds", "1-2", "--out", tmp_path / "runs") == 2
+    assert "seeds.csv is no table of runs" in capsys.readouterr().err
+    assert [p.name for p in (tmp_path / "runs").iterdir()] == ["seeds.csv"]
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize("left", [None, ["landscape.npz", "report.html"], ["scene.toml"]])
+def test_what_is_no_run_is_not_cleared(left, fresh, run, capsys):
+    """A run that lost provenance.json, results alone, and a start by a version without marker."""
+    for path in run.iterdir():
+        if path.name == "provenance.json" or (left and path.name not in left):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for name in left or ():
+        (run / name).touch()
+    before = snapshot(run)
+    assert command(*RUN, "--out", run, *(["--fresh"] if fresh else [])) == 2
+    error = capsys.readouterr().err
+    assert "and no provenance.json" in error and "Nothing was changed" in error
+    assert ("put that back from a copy" in error) == (left is None)
+    assert snapshot(run) == before
+
+
+@pytest.mark.parametrize("moment", range(6))
+def test_a_start_that_was_cut_short_begins_anew(moment, tmp_path, monkeypatch):
+    """At any file that it writes: the marker, three of the scene, provenance.json, and after it."""
+    folder, replace, count = tmp_path / "run", os.replace, [0]
+
+    def killed(source, target):
+        if count[0] == moment:
+            shutil.copy(source, f"{target}.4711.tmp")  # which a kill leaves
+            raise KeyboardInterrupt
+        count[0] += 1
+        replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", killed)
+        patch.setattr(belongings, "tidy", lambda path: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            start(folder)
+    assert (folder / ".start.json").exists() == (moment > 0)
+    assert (folder / "provenance.json").exists() == (moment == 5)
+    left = sorted(os.listdir(folder))
+    if 0 < moment < 5:  # and a file that somebody put there stays
+        (folder / "meshes").mkdir()
+        (folder / "meshes" / "object_0.stl").write_text("solid")
+        with pytest.raises(SceneError, match="meshes/object_0.stl and no provenance"):
+            start(folder)
+        shutil.rmtree(folder / "meshes")
+        assert sorted(os.listdir(folder)) == left
+    start(folder)
+    names = [".lock", "events.log", "hand.toml", "objects.toml", "provenance.json", "scene.toml"]
+    assert sorted(os.listdir(folder)) == names
+    assert scene.load(folder / "scene.toml") == tiny()[0]
+
+
+def test_a_file_changed_after_a_start_was_cut_short_is_kept(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(manifest, "write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            start(folder)
+    (folder / "hand.toml").write_text("# my own\n")
+    before = snapshot(folder)
+    with pytest.raises(SceneError, match="holds hand.toml and no provenance.json"):
+        start(folder)
+    assert snapshot(folder) == before
+
+
+@pytest.mark.parametrize("marker", ["[" * 100_000, '{"files": {"../x": "0"}}', "[1]", "\xff"])
+def test_a_marker_names_no_other_files(marker, tmp_path):
+    (tmp_path / "run").mkdir()
+    for path in (tmp_path / "x", tmp_path / "run" / "scene.toml"):
+        path.write_text("mine")
+    (tmp_path / "run" / ".start.json").write_text(marker)
+    with pytest.raises(SceneError, match="holds scene.toml and no provenance"):
+        start(tmp_path / "run")
+    assert (tmp_path / "x").exists() and (tmp_path / "run" / "scene.toml").exists()
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link", "dangling", "lock"])
+def test_fresh_deletes_no_file_that_is_not_the_runs(kind, run, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "picture.png").touch()
+    if kind == "file":
+        (run / "figures" / "my own.png").touch()
+    elif kind == "folder":
+        (run / "tests.csv").unlink()
+        (run / "tests.csv").mkdir()
+    elif kind == "lock":
+        (run / ".lock").write_text("of another program")
+    else:
+        (run / "failures").symlink_to(other if kind == "link" else tmp_path / "nowhere")
+    before = snapshot(run)
+    with pytest.raises(SceneError) as refused:
+        start(run, fresh=True)
+    words = {"file": "figures/my own.png in", "folder": "tests.csv in", "lock": r"files (.lock)"}
+    assert words.get(kind, "no symbolic links (failures in") in str(refused.value)
+    assert snapshot(run) == before and (other / "picture.png").exists()
+
+
+def test_fresh_does_not_delete_the_scene_that_it_reads(run, capsys):
+    before = snapshot(run)
+    again = [str(run / "scene.toml") if a == str(TINY) else a for a in RUN]
+    assert command(*again, "--out", run, "--fresh") == 2
+    error = capsys.readouterr().err
+    assert f"--fresh would delete {run / 'scene.toml'}, {run / 'hand.toml'}" in error
+    assert snapshot(run) == before
+    assert command(*again, "--out", run, "--dry-run") == 0, "without it the run goes on"
+
+
+def test_fresh_that_was_cut_short_can_be_given_again(run, monkeypatch):
+    files = len(belongings._all(run))
+    remove = belongings.remove
+    for moment in (0, 1, files // 2):
+        count = [0]
+
+        def killed(path, count=count, moment=moment):
+            if count[0] == moment:
+                raise KeyboardInterrupt
+            count[0] += 1
+            remove(path)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(belongings, "remove", killed)
+            with pytest.raises(KeyboardInterrupt):
+                start(run, fresh=True)
+        assert (run / "provenance.json").exists(), "the last file to go: it is still a run"
+    assert start(run, fresh=True) == []
+    assert manifest.read_provenance(run)["settings"]["particles"] == SETTINGS.particles
+    assert not (run / "checkpoints").exists() and not (run / "figures").exists()
+
+
+def test_a_run_has_no_files_but_its_own(run):
+    """What `--fresh` deletes is all that a run makes."""
+    assert command("report", run, "--no-replay") == 0
+    belongings.refuse_to_delete(run)
+    belongings.delete_run(run)
+    assert os.listdir(run) == [".lock"]
+
+
+def test_a_new_run_has_an_identity_of_its_own(tmp_path):
+    start(tmp_path / "a")
+    start(tmp_path / "b")
+    first, second = (json.loads((tmp_path / n / "provenance.json").read_text()) for n in "ab")
+    assert first["schema"] == second["schema"] == manifest.SCHEMA
+    assert first["id"] != second["id"] and first["files"] == second["files"]
+    assert [*first["files"]] == ["scene.toml", "hand.toml", "objects.toml"]

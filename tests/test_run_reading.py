@@ -1,0 +1,426 @@
+"""Runs as others read them: what is damaged, another's or changed is said or refused."""
+
+import errno
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from command_runs import command, own_workplace, snapshot, stored  # noqa: F401
+from tiny_run import RUN, copied
+
+from codesign_jax import runs
+from codesign_jax.batch import Batch
+from codesign_jax.commands import status
+from codesign_jax.runs import checkpoint, choice, directory, manifest, tables
+from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.scene.schema import SceneError
+
+NEWEST = 4  # the final test, after three episodes
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A finished run that no test changes."""
+    return copied(tmp_path_factory.mktemp("whole") / "run")
+
+
+@pytest.fixture
+def run(whole, tmp_path):
+    """A finished run of its own."""
+    return shutil.copytree(whole, tmp_path / "run")
+
+
+def damage(path, how):
+    """One of ten ways in which a file of a checkpoint is damaged."""
+    content = bytearray(path.read_bytes())
+    if how in ("first", "middle", "last"):
+        place = {"first": 0, "middle": len(content) // 2, "last": -1}[how]
+        content[place] ^= 1
+        path.write_bytes(content)
+    elif how == "zeros":
+        path.write_bytes(bytes(len(content)))
+    elif how == "append":
+        path.write_bytes(content + b"x")
+    elif how.startswith("truncate"):
+        ends = {"truncate 0": 0, "truncate half": len(content) // 2, "truncate -1": -1}
+        path.write_bytes(content[: ends[how]])
+    elif how == "older":
+        older = str(path).replace(f"/{NEWEST}/", f"/{NEWEST - 1}/")
+        shutil.copy(older if os.path.exists(older) else path.parent / "manifest.ocdbt", path)
+    else:
+        path.unlink()
+        if how == "rename":
+            path.with_name("other").write_bytes(content)
+        elif how == "symlink":
+            path.symlink_to(path)
+        elif how == "directory":
+            path.mkdir()
+
+
+DAMAGES = ("truncate 0", "truncate half", "truncate -1", "first", "middle", "last", "zeros")
+DAMAGES += ("delete", "rename", "append", "older", "symlink", "directory")
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(how, run):
+    """Of another file in each way; `test_checkpoint` has every file."""
+    step = run / "checkpoints" / str(NEWEST)
+    paths = [p for p in sorted(step.rglob("*")) if p.stat().st_size and p.is_file()]
+    damage(paths[DAMAGES.index(how) % len(paths)], how)
+    before, said = sorted(os.walk(run)), []
+    record = runs.load_record(run, tell=said.append)
+    assert record is not None and record.test is None and record.done == 3
+    (words,) = said
+    assert f"{run} has damaged checkpoints ({NEWEST}: " in words
+    assert f"Read instead is checkpoint {NEWEST - 1}, after episode 3 of 3, without the" in words
+    assert sorted(os.walk(run)) == before
+    with pytest.warns(UserWarning, match="damaged checkpoints"):  # in a notebook
+        runs.load_record(run)
+
+
+@pytest.mark.parametrize("how", ["truncate 0", "middle", "zeros", "delete", "directory"])
+def test_a_damaged_file_of_digests_is_damage_that_a_resumption_mends(how, run, whole, capsys):
+    damage(run / "checkpoints" / f"{NEWEST}.sha256", how)
+    said = []
+    runs.load_record(run, tell=said.append)
+    assert f"{NEWEST}: " in said[0]
+    if how == "directory":
+        assert command(*RUN, "--out", run) == 0
+        assert f"checkpoint {NEWEST} is lost" in capsys.readouterr().out
+        assert stored(run) == stored(whole)
+        assert (run / "tests.csv").read_bytes() == (whole / "tests.csv").read_bytes()
+
+
+def test_every_command_says_which_checkpoint_it_takes(run, tmp_path, capsys):
+    """All but export, which refuses; what is simulated is not asked for."""
+    damage(run / "checkpoints" / str(NEWEST) / "default" / "manifest.ocdbt", "middle")
+    before = snapshot(run)
+    words = f"Read instead is checkpoint {NEWEST - 1}"
+    page = tmp_path / "report.html"
+    for arguments in (
+        ["evaluate", run, "--dry-run"],
+        ["landscape", "--run", run, "--dry-run"],
+        ["report", run, "--no-replay", "--out", page],
+    ):
+        assert command(*arguments) == 0
+        error = capsys.readouterr().err
+        assert error.startswith("warning: ") and error.count(words) == 1, arguments
+    assert words in page.read_text(encoding="utf-8")
+    assert command("export", run, "--out", tmp_path / "models") == 2
+    error = capsys.readouterr().err
+    assert words in error and "Nothing is exported" in error and not (tmp_path / "models").exists()
+    assert snapshot(run) == before
+
+
+def test_a_run_without_a_whole_checkpoint_is_refused(run):
+    for path in (run / "checkpoints").glob("*.sha256"):
+        path.unlink()
+    with pytest.raises(SceneError, match=r"no checkpoint that is whole \(4: 4.sha256 is missing"):
+        choice.read_record(run)
+    shutil.rmtree(run / "checkpoints")
+    with pytest.raises(SceneError, match="lost its checkpoints, while its tables have 3 episodes"):
+        choice.read_record(run)
+
+
+def renumbered(run, old, new):
+    """Gives a step another number, as whoever renames its folder and mends its digests."""
+    folder = run / "checkpoints"
+    (folder / str(old)).rename(folder / str(new))
+    text = (folder / f"{old}.sha256").read_text()
+    (folder / f"{old}.sha256").unlink()
+    (folder / f"{new}.sha256").write_text(text.replace(f"  {old}/", f"  {new}/"))
+
+
+@pytest.mark.parametrize("careful", [False, True])
+def test_a_step_under_another_name_is_refused(careful, run, capsys):
+    if careful:
+        renumbered(run, NEWEST - 1, 7)
+    else:
+        for name in ("{}", "{}.sha256"):
+            folder = run / "checkpoints"
+            (folder / name.format(NEWEST - 1)).rename(folder / name.format(7))
+    words = f"checkpoints/7 is step {NEWEST - 1} under another name, and nothing was changed"
+    with pytest.raises(SceneError, match=words):
+        runs.load_record(run)
+    before = snapshot(run / "checkpoints")
+    assert command(*RUN, "--out", run) == 1
+    assert words in capsys.readouterr().err and snapshot(run / "checkpoints") == before
+
+
+def relabelled(run, identity):
+    """Saves the newest step of a run as one of a run with this identity, or with none."""
+    own = manifest.read_provenance(run).get("id")
+    with Checkpoints(run / "checkpoints", run=own, read_only=True) as store:
+        arrays = store.restore().arrays
+    shutil.rmtree(run / "checkpoints")
+    with Checkpoints(run / "checkpoints", run=identity) as store:
+        store.save(NEWEST, arrays)
+
+
+@pytest.mark.parametrize("identity", ["0" * 32, None])
+def test_checkpoints_of_another_run_are_refused(identity, run, capsys):
+    relabelled(run, identity)
+    before = snapshot(run / "checkpoints")
+    with pytest.raises(SceneError, match="is of another run, and nothing was changed"):
+        runs.load_record(run)
+    assert command(*RUN, "--out", run) == 1
+    assert "is of another run" in capsys.readouterr().err
+    assert snapshot(run / "checkpoints") == before
+
+
+def as_before_versions(run):
+    """Makes a run one from before runs had an identity."""
+    relabelled(run, None)
+    content = manifest.read_provenance(run)
+    for key in ("schema", "id", "files"):
+        del content[key]
+    manifest.write(run, content)
+    return content
+
+
+def test_a_run_from_before_versions_is_read_and_goes_on(run, whole, capsys):
+    content = as_before_versions(run)
+    assert stored(run) == stored(whole)
+    assert command(*RUN, "--out", run) == 0
+    assert "all 3 episodes are done" in capsys.readouterr().out
+    content["settings"]["seed"] = 4  # whose checkpoints they are, its key tells
+    manifest.write(run, content)
+    with pytest.raises(SceneError, match="not this run's: they are of another seed"):
+        runs.load_record(run)
+    content["settings"] |= {"seed": 3, "particles": 5}
+    manifest.write(run, content)
+    with pytest.raises(SceneError, match="they are not of 5 particles"):
+        runs.load_record(run)
+    content["settings"]["particles"] = 4
+    manifest.write(run, content)
+    renumbered(run, NEWEST, 7)
+    with pytest.raises(SceneError, match="checkpoint 7 holds episode 3"):
+        runs.load_record(run)
+
+
+def test_a_run_of_a_newer_version_is_refused(run):
+    content = manifest.read_provenance(run)
+    manifest.write(run, content | {"schema": manifest.SCHEMA + 1})
+    with pytest.raises(SceneError, match="made by a newer version of codesign-jax"):
+        runs.read_run(run)
+
+
+@pytest.mark.parametrize("change", ["less", "more"])
+def test_arrays_of_another_version_are_refused_in_words(change, run):
+    own = manifest.read_provenance(run)["id"]
+    with Checkpoints(run / "checkpoints", run=own) as store:
+        arrays = store.restore().arrays
+        if change == "less":
+            del arrays["history"]["trials"]["bad_step"]
+        else:
+            arrays["history"]["trials"]["kept"] = np.zeros(3)
+        store.save(NEWEST + 1, arrays)
+    with pytest.raises(SceneError, match="other arrays than this version"):
+        runs.load_record(run)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.EMFILE])
+def test_a_step_that_cannot_be_read_now_is_kept(number, run, monkeypatch, capsys):
+    """It is not damaged: permissions come back, and so do network disks."""
+    before = snapshot(run / "checkpoints")
+
+    def refused(path):
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(checkpoint, "_file_digest", refused)
+    assert command(*RUN, "--out", run) == 1
+    error = capsys.readouterr().err
+    assert f"checkpoint {NEWEST} in " in error and os.strerror(number) in error
+    assert "nothing was changed" in error and "go on from the one before" in error
+    with pytest.raises(SceneError, match="cannot be read"):
+        runs.load_record(run)
+    assert snapshot(run / "checkpoints") == before
+
+
+def test_a_damaged_step_that_cannot_be_deleted_is_said(run, monkeypatch, capsys):
+    damage(run / "checkpoints" / f"{NEWEST}.sha256", "delete")
+
+    def refused(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(checkpoint, "remove", refused)
+    assert command(*RUN, "--out", run) == 1
+    error = capsys.readouterr().err
+    assert "cannot be deleted (Permission denied): delete" in error and "by hand" in error
+
+
+def test_changed_scene_files_are_refused_by_all_that_read_the_run(run, capsys):
+    path = run / "objects.toml"
+    text = path.read_text()
+    path.write_text("# a comment of the user's\n" + text)
+    runs.read_run(run)
+    path.write_text(text.replace("    0.03,", "    0.031,"))
+    assert path.read_text() != text
+    own = ["optimize", "--scene", run / "scene.toml", *RUN[3:], "--out", run]
+    for arguments in (["report", run, "--no-replay"], ["evaluate", run, "--dry-run"], own):
+        assert command(*arguments) == 2
+        error = capsys.readouterr().err
+        assert "objects.toml was changed since the run was made" in error, arguments
+        assert "--set KEY=VALUE" in error
+    path.unlink()
+    with pytest.raises(SceneError, match="objects.toml is missing"):
+        runs.read_run(run)
+    path.write_text(text)
+    runs.read_run(run)
+
+
+HOSTILE = {
+    "nested": "[" * 100_000,
+    "no JSON": "{",
+    "no table": "[1, 2]",
+    "a number": "1" * 5_000,
+    "no text": b"\xff\xfe",
+    "empty": "",
+}
+CHANGES = {
+    "no environment": {"environment": None},
+    "no device": {"environment": {"versions": {}}},
+    "episodes as text": {"settings": {"episodes": "4"}},
+    "episodes as truth": {"settings": {"episodes": True}},
+    "too many episodes": {"settings": {"episodes": 10**12}},
+    "another setting": {"settings": {"colour": 3}},
+    "resumed": {"resumed": 5},
+    "resumed at": {"resumed": [{"time": 3}]},
+    "id": {"id": "x"},
+    "files": {"files": {"../../etc/passwd": "0"}},
+    "git": {"git": {"commit": 7}},
+    "schema": {"schema": "1"},
+}
+
+
+@pytest.mark.parametrize("case", [*HOSTILE, *CHANGES])
+def test_a_hostile_provenance_is_refused_in_words(case, run):
+    path = run / "provenance.json"
+    if case in HOSTILE:
+        content = HOSTILE[case]
+    else:
+        content = json.loads(path.read_text())
+        for key, value in CHANGES[case].items():
+            own = content.get(key)
+            content[key] = own | value if key == "settings" else value
+        content = json.dumps(content)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(
+        SceneError, match=r"provenance\.json is damaged: .* Put it back from a copy"
+    ):
+        runs.read_run(run)
+    with pytest.raises(SceneError, match="is damaged"):
+        runs.episodes_of([run])
+
+
+def test_a_name_that_is_too_long_for_a_run_is_refused():
+    assert command("report", "x" * 300) == 2
+
+
+def test_tables_are_mended_from_the_checkpoints(run, whole, capsys):
+    (run / "episodes.csv").unlink()
+    text = (run / "particles.csv").read_text()
+    (run / "particles.csv").write_text(text[:-20])
+    text = (run / "trials.csv").read_text()
+    (run / "trials.csv").write_text(text.replace("sphere", "sphare", 1))
+    (run / "tests.csv").write_text("")
+    assert command(*RUN, "--out", run) == 0
+    names = ", ".join(tables.TABLES)
+    assert f"{names}: differed from the checkpoints" in capsys.readouterr().out
+    for name in tables.TABLES:
+        assert (run / name).read_bytes() == (whole / name).read_bytes()
+    assert command(*RUN, "--out", run) == 0
+    assert "differed" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "a file: No space left on device; make"),
+        (OSError(errno.EIO, "Input/output error", "x.csv"), "x.csv: Input/output error; the disk"),
+        (runs.RunError("the run is lost"), "error: the run is lost"),
+        (
+            PermissionError(errno.EACCES, "Permission denied", b"a\xff"),
+            "a\\udcff: Permission denied",
+        ),
+    ],
+)
+def test_errors_of_the_disk_are_a_line_that_says_what_to_do(error, words, capsys):
+    def run():
+        raise error
+
+    assert status.of(run) == 1
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    if error.errno if isinstance(error, OSError) else False:
+        assert ("give the same command again" in said) == (error.errno != errno.EACCES)
+
+
+def test_a_bug_is_no_error_of_the_disk():
+    for bug in (RuntimeError("bug"), OSError("without a number")):
+        with pytest.raises(type(bug)):
+            status.of(lambda bug=bug: (_ for _ in ()).throw(bug))
+
+
+@pytest.mark.parametrize("name", ["report.html", "provenance.json"])
+def test_a_full_disk_names_the_file_that_could_not_be_written(name, run, monkeypatch, capsys):
+    """The write fails, not the opening: such errors have no name of their own."""
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    report = ["report", run, "--no-replay"]
+    assert command(*(report if name == "report.html" else [*RUN, "--out", run])) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {run / name}: No space left on device; make room, and give")
+    assert error.count("\n") == 1
+
+
+def test_a_run_that_cannot_be_saved_says_why(run, tmp_path, monkeypatch, capsys):
+    """Neither tensorstore's line of hundreds of characters, nor that the log is full as well."""
+    save, log = checkpoint.Checkpoints.save, directory.RunDirectory.log
+
+    def full(store, step, arrays):
+        text = "RESOURCE_EXHAUSTED: Failed writing: x" + "/x" * 300 + ": No space left on device"
+        monkeypatch.setattr(
+            store._manager, "save", lambda *a, **k: (_ for _ in ()).throw(ValueError(text))
+        )
+        save(store, step, arrays)
+
+    def full_log(folder, message):
+        if message.startswith("failed"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        log(folder, message)
+
+    monkeypatch.setattr(checkpoint.Checkpoints, "save", full)
+    monkeypatch.setattr(directory.RunDirectory, "log", full_log)
+    assert command(*RUN, "--out", tmp_path / "new") == 1
+    error = capsys.readouterr().err
+    place = tmp_path / "new" / "checkpoints"
+    assert error == (
+        f"error: {place}: checkpoint 0 could not be written: No space left on device; make room, "
+        "and give the same command again: what was saved is whole\n"
+    )
+
+
+def test_an_unexpected_error_keeps_its_traceback(run, monkeypatch, capsys):
+    """On the terminal and in events.log: it is a bug, or the device's."""
+
+    def broken(batch, requests):
+        raise RuntimeError("a bug of somebody's")
+
+    monkeypatch.setattr(Batch, "begin", broken)
+    assert command(*RUN, "--out", run, "--episodes", "4") == 1
+    error, log = capsys.readouterr().err, (run / "events.log").read_text()
+    for text in (error, log):
+        assert "Traceback (most recent call last)" in text and "in broken" in text
+    assert "error: RuntimeError: a bug of somebody's" in error
+
+
+def test_a_folder_whose_name_is_no_text_is_refused(tmp_path, capsys):
+    assert command(*RUN, "--out", os.fsdecode(bytes(tmp_path / "a") + b"\xff")) == 2
+    assert r"a\udcff" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["work"]  # as it was

@@ -1,0 +1,297 @@
+"""`codesign sample`: rows that follow from keys, what a kill leaves, and other questions."""
+
+import json
+
+import jax
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from toy import TINY, ToyEngine, tiny
+
+from codesign_jax import cli, rollout, sampling, scene
+from codesign_jax.commands import sample
+from codesign_jax.runs import dataset
+from codesign_jax.runs.tables import design_columns
+from codesign_jax.scene import parameters
+from codesign_jax.types import Outcome, Status
+from tests.small import nth
+
+KEY = jax.random.key(3)
+THREE = scene.load(TINY, object_set="paper")  # three objects, of which toy engines know nothing
+SPACE = tiny()[1]
+COMMAND = ("sample", "--scene", str(TINY), "--objects", "paper", "--preset", "2d", "--seed", "3")
+
+
+ENGINE = ToyEngine(THREE, failing=[1, 4])  # of the worlds of each call
+
+
+class Killed(BaseException):
+    """A process that ends."""
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch):
+    """An empty working directory, and a toy engine."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(sample, "make_engine", lambda name, the_scene: ENGINE)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "work"
+
+
+def run(*more, designs=10, trials=2, out="a.parquet", chunk=8):
+    """Exit status; 10 designs of 2 trials are three calls of 4 designs."""
+    sizes = ["--designs", designs, "--trials", trials, "--out", out]
+    sizes += [] if chunk is None else ["--chunk", chunk]
+    return cli.main([*COMMAND, *map(str, sizes), *more])
+
+
+def killed_after(saves, monkeypatch, **sizes):
+    """Runs the command until so many shards have been saved."""
+    save, done = dataset.Shards.save, []
+
+    def counted(self, shard, found):
+        if len(done) == saves:
+            raise Killed
+        done.append(shard)
+        save(self, shard, found)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(dataset.Shards, "save", counted)
+        run(**sizes)
+    return done
+
+
+# --- draws ---------------------------------------------------------------------------------------
+
+
+def test_any_part_is_drawn_alone():
+    whole = sampling.draw(THREE, SPACE, KEY, first=0, n=9, num_trials=2)
+    part = sampling.draw(THREE, SPACE, KEY, first=4, n=5, num_trials=2)
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
+        np.testing.assert_array_equal(a[4:], b)
+    assert len(np.unique(whole.trials.yaw)) == 18  # noise of its own for each grasp
+    np.testing.assert_array_equal(np.bincount(np.ravel(whole.trials.shape)), [6, 6, 6])
+
+
+def test_objects_take_turns_with_one_trial_and_at_large_indices():
+    first = 2**31 - 8
+    drawn = sampling.draw(THREE, SPACE, KEY, first=first, n=6, num_trials=1)
+    np.testing.assert_array_equal(drawn.trials.shape[:, 0], (first + np.arange(6)) % 3)
+    with pytest.raises(scene.SceneError, match="num_trials = 0 must be"):
+        sampling.draw(THREE, SPACE, KEY, first=0, n=6, num_trials=0)
+
+
+def test_outcomes_are_those_of_each_grasp_by_itself():
+    drawn = sampling.draw(THREE, SPACE, KEY, first=4, n=4, num_trials=2)
+    engine = ToyEngine(THREE)
+    found = sampling.make_simulate(THREE, engine, SPACE)(drawn.designs, drawn.trials)
+    assert found.cost.shape == (4, 2) and len(np.unique(found.cost)) > 3
+    every = jax.jit(lambda p, t: rollout.evaluate(THREE, engine, p, t))
+    hands = parameters.params_of(SPACE, drawn.designs)
+    for i in (1, 3):  # all designs in the trials of one
+        cost = every(hands, nth(drawn.trials, i)).cost
+        np.testing.assert_allclose(found.cost[i], cost[i], atol=1e-5)
+
+
+# --- the file ------------------------------------------------------------------------------------
+
+
+def test_a_row_has_design_noise_and_outcome(place, capsys):
+    assert run() == 0
+    assert [p.name for p in place.iterdir()] == ["a.parquet"]
+    table = pq.read_table("a.parquet")
+    rows = {name: np.array(table[name].to_pylist()) for name in table.column_names}
+    np.testing.assert_array_equal(rows["design"], np.repeat(np.arange(10), 2))
+    np.testing.assert_array_equal(rows["trial"], np.tile([0, 1], 10))
+    # The same from the library: draws from the key, and outcomes of the engine's calls.
+    drawn = sampling.draw(THREE, SPACE, KEY, first=0, n=12, num_trials=2)
+    names = [shape.name for shape in THREE.objects.object]
+    assert rows["object"].tolist() == [names[k] for k in np.ravel(drawn.trials.shape)[:20]]
+    for name, values in {
+        "noise_y_m": drawn.trials.position[..., 1],
+        "noise_arm_pitch_rad": drawn.trials.arm_tilt[..., 1],
+        "noise_mass_factor": drawn.trials.mass,
+        "length_mm": 1e3 * np.repeat(drawn.designs[:, :1], 2, axis=1),
+        "arm_z_mm": 1e3 * np.repeat(drawn.designs[:, 1:], 2, axis=1),
+    }.items():
+        np.testing.assert_allclose(rows[name], np.ravel(values)[:20], rtol=1e-6)
+    simulate = sampling.make_simulate(THREE, ENGINE, SPACE)
+    calls = [
+        simulate(drawn.designs[k : k + 4], jax.tree.map(lambda v, k=k: v[k : k + 4], drawn.trials))
+        for k in (0, 4, 8)
+    ]
+    cost = np.concatenate([np.ravel(call.cost) for call in calls])[:20]
+    np.testing.assert_array_equal(rows["cost"], cost)
+    bad = np.isin(np.arange(20) % 8, [1, 4])
+    np.testing.assert_array_equal(rows["status"] == "NONFINITE", bad)
+    np.testing.assert_array_equal(rows["verdict"] == "failed", bad)
+    np.testing.assert_array_equal(
+        rows["verdict"] == "lost", ~bad & np.isfinite(rows["lost_time_s"])
+    )
+    assert [v is None for v in rows["first_bad_step"]] == (~bad).tolist()
+    counts = {name: int((rows["verdict"] == name).sum()) for name in dataset.VERDICTS}
+    said = ", ".join(f"{name} {n} ({5 * n:.1f} %)" for name, n in counts.items())
+    assert f"of 20 grasps: {said}" in capsys.readouterr().out and counts["lost"] > 0
+
+
+def test_units_and_the_question_are_in_the_schema(place):
+    assert run("--preset", "full", designs=1, trials=1) == 0
+    schema = pq.read_schema("a.parquet")
+    space = parameters.design_space(THREE.hand, "full")
+    for column, name, unit in zip(design_columns(space), space.names, space.units, strict=True):
+        metadata = schema.field(column).metadata
+        assert (metadata[b"unit"].decode(), metadata[b"parameter"].decode()) == (unit, name)
+    assert schema.field("noise_yaw_rad").metadata[b"unit"] == b"rad"
+    assert all(field.metadata[b"description"] for field in schema)
+    question = json.loads(schema.metadata[b"question"])
+    assert (question["seed"], question["trials"], question["preset"]) == (3, 1, "full")
+    assert {"scene.toml", "hand.toml", "objects.toml"} == set(question["scene"])
+
+
+def test_row_groups_end_where_memory_would_grow(place, monkeypatch):
+    monkeypatch.setattr(dataset, "ROWS", 12)
+    assert run() == 0
+    found = pq.ParquetFile("a.parquet").metadata
+    assert [found.row_group(k).num_rows for k in range(found.num_row_groups)] == [16, 4]
+
+
+def test_verdicts_are_the_costs_and_the_status():
+    """A warning fails no trial, and a loss that costs next to nothing is none."""
+    status = np.array([Status.OK, Status.SOLVER_CAP, Status.OK, Status.STUCK, Status.SPEED])
+    cost = np.array([0.0, 0.009, 0.011, 3.0, 3.0])
+    found = dataset.verdicts(Outcome(cost, status, cost, status))
+    assert [dataset.VERDICTS[k] for k in found] == ["kept", "kept", "lost", "stuck", "failed"]
+
+
+# --- kills ---------------------------------------------------------------------------------------
+
+
+def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):
+    assert run(out="whole.parquet") == 0
+    assert killed_after(1, monkeypatch) == [0]
+    (place / "a.parquet.part" / "00000000.npz.123.tmp").touch()
+    (place / "a.parquet.123.tmp").touch()
+    # Without --chunk: as large as the calls that made what is there.
+    assert killed_after(1, monkeypatch, chunk=None) == [1]
+    capsys.readouterr()
+    assert run(chunk=None) == 0
+    assert "going on after 2 of 3 calls, from a.parquet.part" in capsys.readouterr().out
+    assert (place / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
+    assert sorted(p.name for p in place.iterdir()) == ["a.parquet", "whole.parquet"]
+
+
+def test_a_damaged_shard_is_simulated_again(place, monkeypatch):
+    assert run(out="whole.parquet") == 0
+    killed_after(2, monkeypatch)
+    shard = place / "a.parquet.part" / "00000001.npz"
+    shard.write_bytes(shard.read_bytes()[:200])
+    assert run() == 0
+    assert (place / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
+
+
+def test_fewer_designs_of_what_was_begun_are_enough(place, monkeypatch):
+    """And a command that was killed while it wrote writes again."""
+    assert run(out="whole.parquet") == 0
+    killed_after(2, monkeypatch)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(dataset.parquet, "table", lambda *_: (_ for _ in ()).throw(Killed))
+        run(designs=7, chunk=None)
+    assert not (place / "a.parquet").exists()
+    assert run(designs=7, chunk=None) == 0
+    seven = pq.read_table("a.parquet")
+    assert seven.equals(pq.read_table("whole.parquet").slice(0, 14))
+
+
+def test_a_finished_file_is_left_as_it_is(place, capsys):
+    assert run() == 0
+    before = (place / "a.parquet").stat()
+    dataset.folder_of(place / "a.parquet").mkdir()  # killed before it had tidied up
+    question = pq.read_schema("a.parquet").metadata[b"question"]
+    (place / "a.parquet.part" / dataset.QUESTION).write_bytes(question)
+    assert run(chunk=None) == 0
+    assert "a.parquet is finished: 10 designs x 2 trials: 20 grasps" in capsys.readouterr().out
+    assert (place / "a.parquet").stat() == before
+    assert [p.name for p in place.iterdir()] == ["a.parquet"]
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        (("--seed", "4"), "seed: 3, asked for is 4"),
+        (("--preset", "full"), "preset: 2d, asked for is full"),
+        (("--set", "gravity=9"), "scene.toml: gravity = 9.81"),
+        (("--set", "hand.material.density=1000"), "hand.toml: density = 1070.0"),
+        (("--chunk", "4"), "designs of a call (by --chunk): 4, asked for is 2"),
+        (("--trials", "3"), "trials: 2, asked for is 3"),
+    ],
+)
+def test_another_question_is_refused(more, expected, place, monkeypatch, capsys):
+    killed_after(1, monkeypatch)
+    part = sorted(p.name for p in (place / "a.parquet.part").iterdir())
+    assert run(*more) == 2
+    words = capsys.readouterr().err
+    assert "a.parquet.part has a part of other grasps; choose another --out" in words
+    assert expected in words
+    assert part == sorted(p.name for p in (place / "a.parquet.part").iterdir())
+
+
+def test_a_file_that_is_there_is_never_replaced(place, monkeypatch, capsys):
+    assert run(designs=4) == 0
+    assert run(designs=5) == 2
+    words = capsys.readouterr().err
+    assert "--out a.parquet has other grasps; choose another file, or delete it" in words
+    assert "designs 4, asked for are 5" in words
+    monkeypatch.setattr(dataset.sources, "digest", lambda: "other")
+    assert run(designs=4) == 2
+    assert "it was simulated by another version of the code" in capsys.readouterr().err
+    for content in (b"PAR1 no table", b""):
+        (place / "a.parquet").write_bytes(content)
+        assert run() == 2
+        assert "and is no file of `codesign sample`" in capsys.readouterr().err
+        assert (place / "a.parquet").read_bytes() == content
+
+
+def test_a_folder_of_somebody_else_is_left_alone(place, capsys):
+    (place / "a.parquet.part").mkdir()
+    (place / "a.parquet.part" / "00000000.npz").write_bytes(b"mine")
+    assert run() == 2
+    assert "a.parquet.part holds other files (00000000.npz)" in capsys.readouterr().err
+    assert (place / "a.parquet.part" / "00000000.npz").read_bytes() == b"mine"
+
+
+def test_two_processes_do_not_write_one_file(place, capsys):
+    question = sample.Question(THREE, "structured", "2d", 2, 3, 4)
+    with dataset.open_shards(place / "a.parquet", question):
+        assert run() == 2
+    assert "--out a.parquet is in use by another process" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        (("--designs", "0"), "--designs = 0 is outside [1, 1e+09]"),
+        (("--trials", "-1"), "--trials = -1 is outside"),
+        (("--chunk", "0"), "--chunk = 0 is outside"),
+        (("--out", "a.csv"), "--out a.csv must end in .parquet"),
+        (("--out", "/proc/a.parquet"), "--out /proc/a.parquet cannot be written"),
+        (("--preset", "3d"), "preset '3d' unknown"),
+        (("--engine", "mojoco"), "did you mean 'mujoco'?"),
+        (("--objects", "papr"), "did you mean 'paper'?"),
+    ],
+)
+def test_bad_input_creates_nothing(more, expected, place, capsys):
+    assert run(*more) == 2
+    assert expected in capsys.readouterr().err
+    assert not list(place.iterdir())
+
+
+def test_a_dry_run_tells_time_and_size_and_writes_nothing(place, capsys):
+    assert run("--dry-run", designs=1000, trials=6, chunk=None) == 0
+    words = capsys.readouterr().out
+    assert "1000 designs x 6 trials: 6000 grasps in 12 calls" in words
+    assert "time: " in words and "size: at most about 0.4 MB" in words
+    assert not list(place.iterdir())

@@ -109,6 +109,12 @@ class Case:
             tables.append(np.repeat(block[None], blocks, 0))
         return tables + [x.copy() for x in self.tables[6:]]
 
+    def _move(self, table, world, change):
+        """Adds to a world's numbers of a table."""
+        block, place = divmod(world, self.program.block)
+        split = table.reshape(*table.shape[:-1], -1, self.program.block)
+        split[(block, ..., place)] += change
+
     def rows(self, k, name):
         """Rows of a group in its table."""
         if k > 3:
@@ -133,11 +139,15 @@ class Case:
     def differences(self, weights, step):
         """Central differences of the weighted results along the groups' directions; the trace."""
         tables, count = self.many(2 * len(self.groups) + 1), 2 * len(self.groups) + 1
-        for g, ((k, _), along) in enumerate(zip(self.groups, self.directions(), strict=True)):
+        for g, ((k, name), along) in enumerate(zip(self.groups, self.directions(), strict=True)):
             for side, sign in ((2 * g, 1), (2 * g + 1, -1)):
-                split = tables[k].reshape(*tables[k].shape[:-1], -1, self.program.block)
-                block, world = divmod(side, self.program.block)
-                split[(block, ..., world)] += sign * step * along
+                self._move(tables[k], side, sign * step * along)
+                if name == "grid_factor":  # a mesh's support points are as large as its grid
+                    rows, support = self.rows(1, name), self.rows(0, "support")
+                    growth = along[rows] / self.world(self.tables[1])[rows]
+                    more = np.zeros_like(self.world(tables[0]))
+                    more[support] = sign * step * growth * self.world(self.tables[0])[support]
+                    self._move(tables[0], side, more)
         found, last = self.program.outputs(self.execute(tables), count, states=True)
         found = {name: np.asarray(v) for name, v in found.items()}
         entries = np.stack([found[n] for n in ("distance", "height", "speed")], 2)

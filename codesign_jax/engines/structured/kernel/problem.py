@@ -54,7 +54,7 @@ class Problem:
       block: The lanes.
       m: The memory.
       palm: Palm, wrist and object.
-      rigid: Whether the wrist's accelerations are known, see the batch form's `Problem.palm_acc`.
+      rigid: Whether the wrist's accelerations are known, see `problem.Problem.palm_acc`.
       pairs: Contacts between fingers, if there are any.
       fingers: Contacts of the fingers' spheres.
       skin: Contacts of the hull.

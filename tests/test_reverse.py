@@ -29,12 +29,9 @@ from tests.reverse import Case, curled, weights_of
 
 DATA, STEP = small.DATA, 1e-6
 BOUND = 1e-8
-"""Of the largest derivative of any group.
-
-Differences lose rounding of 1e-15 over the step, and the step times the kink where a vertex of the
-hull enters a section within it: the quick tests' state has none, by two steps' differences that
-agree to 2e-10.
-"""
+"""Of the largest derivative of any group.  Differences lose rounding of 1e-15 over the step, and
+the step times the kink where a vertex of the hull enters a section within it: the quick tests'
+state has none, by two steps' differences that agree to 2e-10."""
 EVERYTHING = {
     "effects__surface": "hull",
     "effects__finger_finger": True,

@@ -88,7 +88,7 @@ def tip_positions(scene: Scene, fields: ModelFields, qpos: jax.Array) -> jax.Arr
     hand = world_constants(scene, world)
     # Times stand in for worlds: all of them see the same hand.
     state = reset(scene, world._replace(start=qpos))
-    kin = kinematics(Stages(None), hand, layout(scene).axes, state)
+    kin = kinematics(Stages(), hand, layout(scene).axes, state)
     half = jnp.zeros_like(kin.origin[:, -1]).at[0].set(0.5 * hand.offset[-1])
     tip = kin.origin[:, -1] + apply_columns(kin.link[:, :, -1], half) + state.position
     return jnp.moveaxis(tip, 0, -1).swapaxes(0, 1)

@@ -7,13 +7,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.assembly import contacts
 from codesign_jax.engines.structured.constants import (
     WorldConstants,
     apply_columns,
     world_constants,
 )
 from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.differentiable import contacts
 from codesign_jax.engines.structured.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
@@ -69,7 +69,7 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     alone = dataclasses.replace(scene.effects, finger_finger=False)
     hand, kin, height = _straight(scene.structure, fields)
     scene = dataclasses.replace(scene, effects=alone)
-    every = contacts(scene, Stages(None), hand, kin, height)
+    every = contacts(scene, Stages(), hand, kin, height)
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
     if not found:
         return jnp.zeros(fields.body_mass.shape[0], fields.body_mass.dtype)

@@ -12,7 +12,6 @@ import pytest
 from codesign_jax import codesign, control, model, rollout
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.unstack import unstacked
 from codesign_jax.optimize import schedule
 from codesign_jax.scene import parameters
 from codesign_jax.types import WARNINGS
@@ -363,20 +362,3 @@ def test_what_has_no_derivative_says_so():
         jax.jit(lambda x: jax.jvp(value, (x,), (x,))).lower(x)
     with pytest.raises(NotImplementedError, match="first derivatives only"):
         jax.eval_shape(jax.grad(lambda x: jax.grad(value)(x).sum()), x)
-
-
-def test_components_from_one_unstack():
-    """The same values and the same derivative, and no slice of the operand is left in it."""
-
-    def component_wise(a, b):
-        return jnp.stack([a[0] * b[1] - a[1] * b[0], jnp.sin(a[2]) * b[:, 1].sum(), a[-1] ** 2 * 3])
-
-    a, b = np.random.default_rng(0).normal(size=(2, 3, 3, 4))
-    again = unstacked(component_wise)
-    np.testing.assert_array_equal(jax.jit(again)(a, b), jax.jit(component_wise)(a, b))
-    slopes = [jax.grad(lambda *x, f=f: (f(*x) ** 2).sum(), (0, 1)) for f in (again, component_wise)]
-    for got, want in zip(*(s(a, b) for s in slopes), strict=True):
-        np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
-    assert "pad" in str(jax.make_jaxpr(slopes[1])(a, b))
-    names = str(jax.make_jaxpr(slopes[0])(a, b))
-    assert "pad" not in names and "stack" in names

@@ -73,7 +73,7 @@ def engine_contacts(kind, position, quat, centre):
         ]  # column, row, 1, world
         kin = SimpleNamespace(object=jnp.asarray(frames))
         return collision.spheres_on_object(
-            paper, hand, kin, Stages(None), jnp.asarray((centre - position).T[:, None]), RADIUS
+            paper, hand, kin, Stages(), jnp.asarray((centre - position).T[:, None]), RADIUS
         )
 
 

@@ -10,16 +10,15 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from codesign_jax import control, model, rollout
+from codesign_jax import control, model
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
-from codesign_jax.engines.structured import StructuredEngine, coordinates, differentiable
+from codesign_jax.engines.structured import StructuredEngine, coordinates
 from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.scene import effects, schema
 from codesign_jax.types import WARNINGS
 from tests import small, steps
-from tests.test_structured import lanes_state
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
@@ -99,47 +98,6 @@ def test_mjx_steps_equal_mujocos():
                 # MJX keeps its warm start where it is good enough: 4e-9 at rest (test_engines).
                 assert np.linalg.norm(found.qacc - data.qacc) / scale < 1e-7, k
             mujoco.mj_step(oracle, data)
-
-
-@slow
-@pytest.mark.parametrize("name", ["new models", "no contact"])
-def test_gradients_of_a_step(name):
-    """The implicit derivative with respect to controls and stiffness against differences."""
-    with jax.enable_x64(True):
-        scene, _, fields, ctrl = setting(SETTINGS[name])
-        engine = StructuredEngine(scene, iterations=100, evaluations=16, tolerance=1e-24)
-        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-        # Fingers bent against the table.
-        qpos = np.array(fields.start)
-        qpos[2] = 0.06
-        qpos[6 : 6 + model.layout(scene).dofs.size] = 0.1
-        start = lanes_state(engine, scene, batch, qpos, np.zeros(len(qpos) - 1))
-        base = jnp.asarray(ctrl[200]).at[2].set(0.0601)
-
-        def inputs(change):
-            u = base.at[2].add(change[0]).at[6].add(1e5 * change[1])
-            stiffer = batch._replace(jnt_stiffness=batch.jnt_stiffness * (1 + change[2]))
-            return world_constants(scene, stiffer), u[:, None]
-
-        def end(new):
-            return (engine.qvel(new) ** 2).sum()
-
-        def run(change):
-            hand, u = inputs(change)
-            new, info = engine.step(hand, start, u)
-            return end(new), info.acc
-
-        def known(change, acc):
-            hand, u = inputs(change)
-            return end(differentiable.step(scene, hand, start._replace(acc=acc), u).state)
-
-        run, zero = jax.jit(run), jnp.zeros(3)
-        # Options are for the outermost program only.
-        found = jax.jit(jax.grad(known), compiler_options=QUICK)(zero, run(zero)[1])
-        expected = [(run(d)[0] - run(-d)[0]) / 2e-6 for d in 1e-6 * jnp.eye(3)]
-        assert np.abs(expected).min() > 0
-        # Central differences of 1e-6 lose ten of 16 digits and add their square.
-        np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 # --- without a stimulus --------------------------------------------------------------------------
@@ -294,20 +252,6 @@ def test_without_contacts_the_kernel_has_no_cone():
     assert "cond" not in free and touching["cond"] > 0
     assert free["div"] < touching["div"] / 4
     assert sum(free.values()) < 0.7 * sum(touching.values())
-
-
-def test_what_has_no_derivative_is_refused():
-    """The kernel runs every effect; a derivative names what it lacks as it is asked for."""
-    for values in ({"surface": "hull"}, {"friction": "full"}):
-        scene = effects_scene({"finger_finger": True, **values})
-        world, trial = (small.stack(v) for v in small.hand_world(scene))
-        engine = StructuredEngine(scene)
-
-        def cost(p, scene=scene, engine=engine, trial=trial):
-            return rollout.simulate(scene, engine, p, trial)[0].cost.sum()
-
-        with pytest.raises(schema.SceneError, match="has no derivative"):
-            jax.eval_shape(jax.grad(cost), jax.tree.map(jnp.asarray, world))
 
 
 def test_kernel_without_palm_on_table():

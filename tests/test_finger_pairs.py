@@ -19,7 +19,7 @@ SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 
 @jax.jit
 def contacts(centre, radius):
     """The engine's contacts between spheres of fingers, without a friction cone."""
-    return finger_pairs.contacts(Stages(None), None, centre, radius)
+    return finger_pairs.contacts(Stages(), None, centre, radius)
 
 
 def curled(the_scene, seed, bend, height):

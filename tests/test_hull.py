@@ -97,7 +97,7 @@ def test_velocities_are_derivatives_of_positions():
         def at(h):
             qpos = data.qpos + h * np.append(rate, 0.0)
             state = lanes_state(engine, the_scene, fields, qpos, rate)
-            kin = kinematics(Stages(None), lanes, model.layout(the_scene).axes, state)
+            kin = kinematics(Stages(), lanes, model.layout(the_scene).axes, state)
             return kin, skin.vertices(the_scene, lanes, kin), state.position[:, 0, 0]
 
         kin, points, _ = at(0.0)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured import StructuredEngine, coordinates, differentiable
+from codesign_jax.engines.structured import StructuredEngine, assembly, coordinates
 from codesign_jax.engines.structured.constants import WorldConstants, world_constants
 from codesign_jax.engines.structured.contact import constraint_update
 from codesign_jax.engines.structured.kinematics import State
@@ -95,8 +95,8 @@ def grip(scene: Scene, hand: WorldConstants, state: State, ctrl: jax.Array) -> j
       state: Their states before the step, with the accelerations of the step.
       ctrl: Controls of the step, shape (nu, world).
     """
-    run = Stages(None)
-    problem, velocity = differentiable.problem(scene, run, hand, state, ctrl)
+    run = Stages()
+    problem, velocity = assembly.problem(scene, run, hand, state, ctrl)
     motion = propagate(run, problem.kin, state.acc)
     found = jnp.zeros(ctrl.shape[1], ctrl.dtype)
     for name, contacts in problem.contacts.items():

@@ -8,12 +8,13 @@ joint accelerations a gives the same form in v_parent: Featherstone's articulate
 (Rigid Body Dynamics Algorithms, 2008, ch. 7) extended by the object that every finger may touch.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import Stages, contract, inverse_spd
+from codesign_jax.engines.structured.lanes import Stages, contract, inverse_spd, sum_fingers
+from codesign_jax.engines.structured.problem import Forces, Matrices
 
 
 class Quadratic(NamedTuple):
@@ -227,3 +228,60 @@ def solve_object(run: Stages, q: jax.Array, r: jax.Array) -> jax.Array:
         return jnp.concatenate([contract(top, left[None], 1), second])
 
     return run(finish, q, r, *run(schur, q, r))
+
+
+class Own(NamedTuple):
+    """A link's own inertia, forces and contacts.
+
+    Attributes:
+      matrix: Inertia with that of all contacts, shape (6, 6, link, finger, world).
+      push: Force with that of all contacts, shape (6, link, finger, world).
+      object: The contacts with the object alone, alike, if the scene has them.
+    """
+
+    matrix: jax.Array
+    push: jax.Array
+    object: tuple[jax.Array, jax.Array] | None
+
+
+def link_terms(matrix: jax.Array, push: jax.Array, terms: dict) -> Own:
+    """Sums inertia, forces and contacts of the links."""
+    for inertia, wrench in terms.values():
+        matrix, push = matrix + inertia, push + wrench
+    return Own(matrix, push, terms.get("finger_object"))
+
+
+def add_link(node: Quadratic, own: Own) -> Quadratic:
+    """Adds a link's own inertia, forces and contacts to what its children left."""
+    p, c, q, r, ro = node
+    p, r = p + own.matrix, r + own.push
+    if own.object is not None:
+        coupling, wrench = own.object
+        c, q, ro = c + coupling, q + coupling, ro - wrench
+    return Quadratic(p, c, q, r, ro)
+
+
+def add_palm(node: Quadratic, matrix: Matrices, force: Forces, pushes: dict) -> Quadratic:
+    """Sums the fingers and adds the palm, the object and their contacts."""
+    sums: Any = [None if v is None else sum_fingers(v) for v in node]
+    p, c, q, r, ro = sums
+    p, r = p + matrix.palm, r + force.palm
+    q = matrix.object if q is None else q + matrix.object
+    ro = force.object if ro is None else ro + force.object
+    if "object_table" in pushes:
+        inertia, wrench = pushes["object_table"]
+        q, ro = q + inertia, ro + wrench
+    if "palm_table" in pushes:
+        inertia, wrench = pushes["palm_table"]
+        p, r = p + inertia, r + wrench
+    if "palm_object" in pushes:
+        inertia, wrench = pushes["palm_object"]
+        p, c, q = p + inertia, c + inertia, q + inertia
+        r, ro = r + wrench, ro - wrench
+    return Quadratic(p, c, q, r, ro)
+
+
+def wrist_slides(like: jax.Array) -> jax.Array:
+    """Motion subspace of the three wrist slides, shape (3, 6, 1, world)."""
+    eye = jnp.eye(3, 6, 3, dtype=like.dtype)[:, :, None, None]
+    return jnp.broadcast_to(eye, (3, 6, *like.shape[1:]))

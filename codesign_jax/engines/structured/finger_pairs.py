@@ -7,8 +7,6 @@ first, and loops over them end after the last block of slots that any world uses
 """
 
 import itertools
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +16,8 @@ from codesign_jax.engines.structured.contact import (
     Cone,
     Contacts,
     Ends,
-    contact_wrench,
 )
-from codesign_jax.engines.structured.lanes import Stages, dot, total
+from codesign_jax.engines.structured.lanes import Stages, dot
 
 BLOCK = 8
 """Slots that are done at a time."""
@@ -141,56 +138,3 @@ def relative(links: jax.Array, ends: jax.Array) -> jax.Array:
     flat = links.reshape(6, -1, links.shape[-1])
     first, second = (jnp.take_along_axis(flat, e[None, :, 0], axis=1, mode="clip") for e in ends)
     return (first - second)[:, :, None]
-
-
-def ends_of(c: Contacts) -> Ends:
-    """The links of contacts between fingers."""
-    assert c.ends is not None
-    return c.ends
-
-
-def blocks(c: Contacts) -> jax.Array:
-    """Number of blocks of slots that any world uses, shape ()."""
-    used = jnp.minimum(ends_of(c).touching.max(), c.distance.shape[0])
-    return (used + BLOCK - 1) // BLOCK
-
-
-def each_block(c: Contacts, function: Callable, each: tuple, start: Any) -> Any:
-    """Folds function(carry, block's first slot, contacts, *each) over the blocks in use."""
-    # Planes to the compiler, as in `lanes.scan_links`.
-    every, structure = jax.tree.flatten((c.point, c.normal, c.distance, ends_of(c).link, each))
-    planes = [x.reshape(-1, x.shape[-3], x.shape[-1]) for x in every]
-
-    def body(i: jax.Array, carry: Any) -> Any:
-        cut = [
-            jax.lax.dynamic_slice_in_dim(p, BLOCK * i, BLOCK, 1).reshape(
-                *x.shape[:-3], BLOCK, *x.shape[-2:]
-            )
-            for p, x in zip(planes, every, strict=True)
-        ]
-        point, normal, distance, link, own = jax.tree.unflatten(structure, cut)
-        ends = ends_of(c)._replace(link=link)
-        part = c._replace(point=point, normal=normal, distance=distance, ends=ends)
-        return function(carry, BLOCK * i, part, *own)
-
-    return jax.lax.fori_loop(0, blocks(c), body, start)
-
-
-def store(whole: jax.Array, part: jax.Array, at: jax.Array) -> jax.Array:
-    """Array of all slots with those of a block written from slot `at` on."""
-    return jax.lax.dynamic_update_slice_in_dim(whole, part, at, whole.ndim - 3)
-
-
-def on_links(c: Contacts, force: jax.Array, like: jax.Array) -> jax.Array:
-    """Spatial forces on the links, shaped as `like`, (6, link, finger, world), of a few slots."""
-    wrench = contact_wrench(c, force)[:, :, 0]
-    index = jnp.arange(like.shape[1] * like.shape[2])[:, None, None]
-    first, second = (index == e[None, :, 0] for e in ends_of(c).link)
-    # No scatter: a CPU does them one number after the other.
-    zero = jnp.zeros((), like.dtype)
-    terms = [
-        jnp.where(first[:, s], wrench[:, None, s], zero)
-        - jnp.where(second[:, s], wrench[:, None, s], zero)
-        for s in range(wrench.shape[1])
-    ]
-    return total(terms).reshape(like.shape)

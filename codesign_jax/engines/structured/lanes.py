@@ -11,35 +11,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.unstack import unstacked
-
 
 class Stages:
     """Runs parts of a program so that XLA computes each result once.
 
     XLA's fusion recomputes an intermediate in every kernel that uses it; in a chain of small matrix
-    products that multiplies the work by ten and the compile time by a hundred.  On a CPU the
-    optimization barrier is gone before fusion, but a conditional is not: with a predicate that is
-    true at run time its branch is compiled by itself.  On a GPU, where a predicate costs a round
-    trip, the barrier works.
+    products that multiplies the work by ten and the compile time by a hundred.
     """
-
-    def __init__(self, predicate: jax.Array | None):
-        """Takes a scalar, true at run time, that the compiler does not know; None: barriers."""
-        self.predicate = predicate
 
     def __call__(self, function: Callable, *args: Any) -> Any:
         """Returns function(*args), computed once; both are pytrees of arrays."""
-        if self.predicate is None:
-            return jax.lax.optimization_barrier(function(*args))
-        # Traced once for both the shapes and the branch: tracing is most of a cached compile.
-        traced = jax.jit(unstacked(function), inline=True)
-        shapes = jax.eval_shape(traced, *args)
-
-        def never(*_: Any) -> Any:
-            return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-
-        return jax.lax.cond(self.predicate, traced, never, *args)
+        return jax.lax.optimization_barrier(function(*args))
 
 
 def scan_links(
@@ -78,7 +60,7 @@ def scan_links(
             for x, like in zip(planes, middle, strict=True)
         ]
         link = jax.tree.unflatten(treedef, own), jax.tree.unflatten(inner_def, others)
-        carry, out = unstacked(step)(carry, link)
+        carry, out = step(carry, link)
         out_shapes[:] = [x.shape for x in jax.tree.leaves(out)]
         return carry, jax.tree.map(lambda x: x.reshape(-1), out)
 

@@ -195,7 +195,10 @@ def locate(grid: GridLanes, p: jax.Array) -> Cell:
     # A place that is not a number has to lead to a cell too: kernels do not check indices.
     index = [jnp.clip(inside[k].astype(jnp.int32), 0, nodes[k] - 2) for k in axes]
     part = jnp.stack([inside[k] - index[k].astype(p.dtype) for k in axes])
-    beyond = jnp.stack([scaled[k] - inside[k] for k in axes]) * grid.cell
+    # Inside of the grid a constant: in a derivative the two terms would cancel to rounding, and
+    # `interpolate` divides by a length of zero.
+    beyond = [jnp.where(scaled[k] == inside[k], 0.0, scaled[k] - inside[k]) for k in axes]
+    beyond = jnp.stack(beyond) * grid.cell
     first = grid.first.astype(jnp.int32)
     return Cell(first + (index[0] * nodes[1] + index[1]) * nodes[2] + index[2], part, beyond)
 

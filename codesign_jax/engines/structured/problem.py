@@ -14,11 +14,8 @@ from codesign_jax.engines.structured.inertia import Bodies, Smooth
 from codesign_jax.engines.structured.kinematics import Acc, Kinematics
 from codesign_jax.engines.structured.lanes import (
     Stages,
-    dot,
     scan_links,
     spatial,
-    sum_axis,
-    sum_fingers,
     total,
 )
 
@@ -125,28 +122,3 @@ class Forces(NamedTuple):
     object: jax.Array
     wrist: jax.Array
     finger: jax.Array
-
-
-def inertial_forces(run: Stages, problem: Problem, acc: Acc, motion: Spatial) -> Forces:
-    """M a in factored form: spatial forces of the bodies and armature forces of the joints."""
-    body, hand = problem.body, problem.hand
-    moves = problem.palm_acc is None
-    return Forces(
-        body.palm.times(motion.palm),
-        run(lambda b, m: b.times(m), body.link, motion.link),
-        body.object.times(motion.object),
-        hand.wrist_armature * acc.wrist if moves else jnp.zeros_like(acc.wrist),
-        hand.armature * acc.finger,
-    )
-
-
-def inner(run: Stages, force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
-    """Product of forces and accelerations over all bodies and joints, shape (1, world)."""
-
-    def product(force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
-        links = sum_axis(dot(force.link, motion.link), 0)
-        joints = sum_axis(sum_axis(force.finger * acc.finger, 0), 0)
-        rest = dot(force.palm, motion.palm) + dot(force.object, motion.object)
-        return sum_fingers(links + joints) + rest + dot(force.wrist, acc.wrist)
-
-    return run(product, force, acc, motion)

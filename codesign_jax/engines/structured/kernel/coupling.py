@@ -1,7 +1,11 @@
 """Newton steps with contacts between fingers, inside a kernel: conjugate gradients in their forces.
 
-The method is that of `codesign_jax.engines.structured.coupling`: H = P + J'KJ, P what the
-elimination solves, K the Hessians of the contacts between fingers and J their Jacobian.  The first
+With these contacts the Newton matrix is H = P + J'KJ, P what the elimination solves, K the Hessians
+of the contacts between fingers and J their Jacobian.  H x = g is solved by conjugate gradients
+preconditioned with P, started at P^-1 g (Nocedal and Wright, Numerical Optimization, 2006, ch. 5).
+P^-1 H is the identity but for three directions a contact, so that the iteration ends after at most
+3 n + 1 steps for n contacts, and often far earlier.  Since H >= P, the residual r has
+|x - H^-1 g|_H^2 <= r'P^-1 r, which is known: that is where it stops.  The first
 residual of x = P^-1 g is -J'KJx, and all later ones are J'f, f a force at each contact: iterates
 need no memory but a few numbers a contact, and x = P^-1 (g + J's) with the sum s of the steps.
 
@@ -16,7 +20,6 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured.coupling import ITERATIONS
 from codesign_jax.engines.structured.kernel.contacts import direct, zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
@@ -24,8 +27,9 @@ from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.newton import wrist_slides
 
+ITERATIONS = 60
+"""Largest number of conjugate gradient steps; a longer one would be of rounding."""
 TOLERANCE = 1e-2
 """Squared error of a step, relative to its squared size, both as measured by H.
 
@@ -225,7 +229,7 @@ class Coupling:
                 none = jnp.zeros_like(obj)
                 return Iterate(none, none, obj)
             r, ro, hinges = el.eliminate_again(direct, axes, done.hinges, r, ro)
-            slide_axes = wrist_slides(armature)
+            slide_axes = el.wrist_slides(armature)
             _, ro, slides = el.eliminate_again(direct, slide_axes, done.slides, r, ro)
             obj = el.solve_object(direct, done.q, ro)
             first, motion = el.substitute(slide_axes, slides, jnp.zeros_like(obj), obj)

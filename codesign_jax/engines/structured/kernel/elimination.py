@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured import newton
 from codesign_jax.engines.structured.kernel import hull
 from codesign_jax.engines.structured.kernel.contacts import BoundContacts, direct, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
@@ -66,7 +65,7 @@ class Elimination:
                 wrench, turned = pairs
                 push = push + wrench
                 tau = tau if turned is None else tau + contract(axes[:, :3], turned[None], 1)
-            node = newton.add_link(node, newton.link_terms(link.matrix(), push, pushes))
+            node = el.add_link(node, el.link_terms(link.matrix(), push, pushes))
             y = contract(axes, node.r[None], 1) + tau
             node, kept = el.eliminate_and_keep(direct, node, axes, armature, tau, terms)
             if terms is not None:
@@ -188,14 +187,14 @@ class Elimination:
                 None,  # type: ignore[arg-type]
             )
             matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
-            node = newton.add_palm(node, matrices, force, pushes)
+            node = el.add_palm(node, matrices, force, pushes)
             if rigid:
                 obj = el.solve_object(direct, node.q, node.r_object)
                 none = jnp.zeros_like(obj)
                 step = Iterate(none, none, obj)
                 return step, Eliminated(None, None, node.q, dot(node.r_object, obj))
             armature, work = palm.armature, []
-            axes = (palm.axes, newton.wrist_slides(armature))
+            axes = (palm.axes, el.wrist_slides(armature))
             kept = []
             for subspace, inertia, twist in zip(
                 axes, (armature[3:], armature[:3]), (force.wrist[3:], force.wrist[:3]), strict=True

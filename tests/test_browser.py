@@ -16,25 +16,40 @@ pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")
-def browser():
-    """A headless Chromium of the system, or one that playwright installed."""
+def launch():
+    """Starts a headless Chromium of the system, or one that playwright installed."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    program = (
-        shutil.which("chromium")
-        or shutil.which("chromium-browser")
-        or shutil.which("google-chrome")
-    )
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
-    flags += [f"--disable-{what}" for what in ("background-networking", "component-update", "sync")]
+    names = ("chromium", "chromium-browser", "google-chrome", "chromium-headless-shell")
+    program = next(filter(None, map(shutil.which, names)), None)
+    off = ("background-networking", "component-update", "sync", "gpu")
+    flags = ["--headless", "--no-sandbox", *(f"--disable-{what}" for what in off)]
     with api.sync_playwright() as play:
-        try:
-            started = play.chromium.launch(executable_path=program, args=flags)
-        except api.Error as error:
-            if program is None:
-                pytest.skip("no Chromium: apt-get install chromium, or playwright install chromium")
-            raise error
-        yield started
-        started.close()
+
+        def start(*more):
+            try:
+                return play.chromium.launch(executable_path=program, args=[*flags, *more])
+            except api.Error as error:
+                if program is None:
+                    pytest.skip("no Chromium: apt-get install chromium, or playwright install it")
+                raise error
+
+        yield start
+
+
+@pytest.fixture(scope="module")
+def browser(launch):
+    """A browser with WebGL by software."""
+    started = launch("--enable-unsafe-swiftshader")
+    yield started
+    started.close()
+
+
+@pytest.fixture(scope="module")
+def flat_browser(launch):
+    """A browser without WebGL."""
+    started = launch("--disable-3d-apis")
+    yield started
+    started.close()
 
 
 @pytest.fixture
@@ -117,6 +132,42 @@ def test_camera_turns_while_it_plays(opened, tmp_path):
     page.locator("#replay .home").click()
     assert page.evaluate(camera) == before
     assert complaints == []
+
+
+def test_a_browser_without_webgl_shows_a_film_strip(run, flat_browser, tmp_path):
+    """Pictures at the ends of the phases, and no controls of what is not there."""
+    page = flat_browser.new_page(viewport={"width": 1000, "height": 900})
+    complaints = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto((run / "report.html").as_uri())
+    assert page.evaluate("document.createElement('canvas').getContext('webgl2')") is None
+    assert "this browser offers no WebGL 2" in page.locator("#replay .message").inner_text()
+    pictures = page.locator("#replay .strip img")
+    captions = [pictures.nth(k).get_attribute("alt") for k in range(pictures.count())]
+    assert captions == [
+        "start, 0 s",
+        "end of approach, 0.3 s",
+        "end of inflate, 0.5 s",
+        "end of lift, 0.7 s",
+        "amid disturb, 0.85 s",
+        "end of disturb, 1 s",
+        "end of release, 1.2 s",
+    ]
+    for name in (".view", ".controls", ".label"):
+        assert not page.locator(f"#replay {name}").is_visible()
+    assert page.locator("#replay").bounding_box()["height"] < 700
+    path = tmp_path / "strip.png"
+    shown = []
+    for k in (0, 2):
+        pictures.nth(k).screenshot(path=path)
+        with Image.open(path) as image:
+            shown.append(np.asarray(image.convert("RGB")).astype(int))
+        r, g, b = np.moveaxis(shown[-1], -1, 0)
+        assert ((r > b + 80) & (r > g + 40)).sum() > 50, "an orange object"
+        assert ((b > r + 60) & (b > 100)).sum() > 50, "blue fingers"
+    assert (np.abs(shown[1] - shown[0]).max(-1) > 40).sum() > 100, "pictures differ"
+    assert complaints == []
+    page.close()
 
 
 def test_browser_skins_as_python_does(browser, tmp_path):

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow.parquet
 import pytest
 from toy import TINY
 
@@ -53,7 +54,8 @@ def test_an_optimisation_as_on_the_front_page(short, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_every_example_of_the_library(short):
+def test_every_example_of_the_library(short, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # the last example writes a table
     names = {}
     for block in blocks("docs/library.md"):
         exec(block, names)
@@ -62,6 +64,7 @@ def test_every_example_of_the_library(short):
     assert names["best"].shape == (2,) and np.isfinite(names["info"].selection.cost).all()
     assert names["by_design"].shape == (2,) and np.isfinite(names["by_design"]).all()
     assert names["outcome"].cost.shape == (2,)
+    assert pyarrow.parquet.read_metadata("grasps.parquet").num_rows == 600
 
 
 MEASURES = [

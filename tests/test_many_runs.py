@@ -24,11 +24,13 @@ from command_runs import (
     stored,
     without,
 )
+from rich.console import Console
 from toy import TINY
 
 from codesign_jax import codesign, runs, scene
 from codesign_jax.batch import Batch
 from codesign_jax.commands import jobs, seeds
+from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.types import Outcome, Status
 
@@ -64,10 +66,10 @@ def test_seeds_are_compared(compared):
     both, output = compared
     assert output.count("compiled in") == 1 and "  2 runs  mean" in output
     assert stored(both / "seed-2") != stored(both / "seed-3")
-    table = output.split("best test cost")[1]
-    rows = [line.split() for line in table.splitlines()]
-    assert [row[0] for row in rows if row[-1:] == ["particles"]] == ["2", "3"]
-    assert "of 2 runs have a particle below the limit of success" in table
+    table = output[output.rindex("judged by") :]
+    rows = [line for line in table.splitlines() if "final test" in line]
+    assert [row.split()[0] for row in rows] == ["2", "3"]
+    assert "of 2 runs found a design that keeps at least 95 % of all trials" in table
     assert "% of such runs (95 % interval)" in table
     with (both / "seeds.csv").open(newline="") as file:
         rows = [*csv.DictReader(file)]
@@ -82,8 +84,8 @@ def test_seeds_are_compared(compared):
         assert int(row["counted_trials"]) == int(best["trials"]) - int(best["failed_trials"])
 
 
-def test_failed_trials_are_no_trials_that_a_run_lost():
-    """One kept, one lost and one failed: kept in one of two, as the verdict has it."""
+def test_rows_of_runs_are_verdicts():
+    """One kept, one lost and one stuck: kept in one of three. Fresh trials judge where they are."""
     tiny = scene.load(TINY)
     status = np.array([[0, 0, Status.STUCK]])
     lost = np.array([[np.inf, 1.0, np.inf]])
@@ -91,8 +93,21 @@ def test_failed_trials_are_no_trials_that_a_run_lost():
         tiny, Outcome(np.array([[0.0, 1.0, 3.0]]), status, lost, np.full((1, 3), -1))
     )
     record = SimpleNamespace(history=SimpleNamespace(cost=np.ones((1, 1))))
-    row = seeds._row(tiny, runs.RunResult(record, test, 0))
-    assert row == ("no", "0.5000", "1 of 2 trials", "0 of 1 particles")
+    result = runs.RunResult(record, test, 0)
+    own = seeds.of_test(tiny, result)
+    row = seeds._row(tiny, result, own, tested=True)
+    assert row == ("no", "final test", "1 of 3", "1", "1", "0", "0.5000", "no")
+    kept = Outcome(np.zeros(2), np.zeros(2, int), np.full(2, np.inf), np.full(2, -1))
+    fresh = Judged(tiny, kept, "reference")
+    row = seeds._row(tiny, result, fresh, tested=False)
+    assert row[1:] == ("reference", "2 of 2", "0", "0", "0", "0.0000", "yes")
+    assert seeds._fresh_values(fresh) == [2, 0, 0, 0, "0"]
+    text = io.StringIO()
+    runs_of = {1: result, 2: None, 3: result}
+    seeds.compare(tiny, runs_of, {1: fresh, 2: None, 3: None}, Console(file=text, width=80))
+    shown = text.getvalue()
+    assert "1 of 2 runs found a design" in shown and "success" in shown
+    assert "3     no         final test" in shown  # 80 columns have room for it
 
 
 class Here:
@@ -221,5 +236,5 @@ def test_hosts_share_the_seeds(tmp_path, capsys):
         assert stored(tmp_path / "two" / seed) == stored(tmp_path / "one" / seed)
     tables = [(tmp_path / name / "seeds.csv").read_bytes() for name in ("one", "two")]
     assert tables[0] == tables[1]
-    assert "of 3 runs have a particle" in outputs[0]
+    assert "of 3 runs found a design" in outputs[0]
     assert "seed 4: final test" not in outputs[0] and "of 3 runs" not in outputs[1]

@@ -34,7 +34,7 @@ def test_the_full_table_is_the_papers():
 
 
 def test_params_are_named_and_in_si_units():
-    design = FULL.from_units(np.arange(1.0, 24.0))  # 1, 2, ... in the file's units
+    design = np.arange(1.0, 24.0) * FULL.scale  # 1, 2, ... in the file's units
     params = FULL.params(jnp.asarray(design))
     np.testing.assert_allclose(params.length, np.arange(1, 5) * 1e-3, rtol=1e-6)
     np.testing.assert_allclose(params.height, np.arange(5, 9) * 1e-3, rtol=1e-6)
@@ -80,6 +80,19 @@ def test_designs_of_another_length_are_refused_by_the_conversion_of_units():
         for design in (95.0, [95.0], [95.0, 30.0, 1.0], np.ones((2, 3))):
             with pytest.raises(schema.SceneError, match=r"designs have shape .*: length, arm_z"):
                 convert(design)
+
+
+def test_designs_outside_of_the_bounds_are_converted_with_a_warning():
+    """At the boundary of units; what is in SI already is simulated as it is."""
+    space = parameters.design_space(HAND, "2d")
+    words = re.escape("length = 0.095 is outside [10, 180] mm; did you mean 95? (m given where mm")
+    with pytest.warns(UserWarning, match=words):
+        np.testing.assert_allclose(space.from_units([0.095, 30.0]), [95e-6, 0.03])
+    words = r"length = 190.0 is outside .*; arm_z = nan is outside \[-60, 200\] mm"
+    with pytest.warns(UserWarning, match=words):
+        space.from_units([[100.0, 30.0], [190.0, np.nan]])
+    for end in space.bounds:  # float32's rounding of a bound is none
+        space.from_units(space.in_units(np.array(end, np.float32)))
 
 
 def test_pressures_that_may_be_kilopascals_are_hinted_at():

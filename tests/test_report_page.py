@@ -34,11 +34,11 @@ def test_report_shows_the_best_tested_particle_with_its_interval(run, text):
     the_scene, _ = runs.read_run(run)
     chosen = choice.choose(the_scene, choice.read_record(run))
     kept = int(((chosen.trials.cost < 0.01) & ~failed(chosen.trials.status)).sum())
-    counted = int(best["trials"]) - int(best["failed_trials"])
-    low, high = stats.binomtest(kept, counted).proportion_ci(0.95, method="wilson")
-    share = f"{kept} of {counted}: {100 * kept / counted:.0f} %"
-    assert f"{share}, 95 % interval {100 * low:.0f} to {100 * high:.0f} %" in text
-    assert f"Particle {best['particle']}, mean cost {float(best['test_cost']):.4f}" in text
+    low, high = stats.binomtest(kept, int(best["trials"])).proportion_ci(0.95, method="wilson")
+    share = f"{100 * low:.0f} to {100 * high:.0f} % of grasps (95 % interval"
+    assert f"kept {kept} of {best['trials']}, " in text and share in text
+    assert f"Particle {best['particle']}, chosen as the best by the final test" in text
+    assert f"; mean cost {float(best['test_cost']):.4f}" in text
     for column, unit in (("length_mm", "mm"), ("arm_z_mm", "mm")):
         value = f"{float(best[column]):.4g}"
         assert re.search(rf"<td class='number'>{re.escape(value)}</td>.*<td>{unit}</td>", text)
@@ -114,9 +114,11 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
         outcomes.save(copy / reference.FILE, found, key if design == "own" else other)
         page = tmp_path / f"{design}.html"
         assert cli.main(["report", str(copy), "--no-replay", "--out", str(page)]) == 0
-        low, high = stats.binomtest(3, 4).proportion_ci(0.95, method="wilson")
-        share = f"3 of 4: 75 %, 95 % interval {100 * low:.0f} to {100 * high:.0f} % (1 more failed)"
-        assert (share in page.read_text(encoding="utf-8")) == words
+        low, high = stats.binomtest(3, 5).proportion_ci(0.95, method="wilson")
+        text = page.read_text(encoding="utf-8")
+        share = f"it keeps {100 * low:.0f} to {100 * high:.0f} % of grasps (95 % interval"
+        assert (share in text) == ("kept 3 of 5, 1 lost, 1 stuck (accuracy reference" in text)
+        assert ("1 of 5 trials failed (STUCK 1)" in text) == words
 
 
 @pytest.mark.parametrize("moved", [False, True])

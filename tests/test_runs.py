@@ -2,16 +2,19 @@
 
 import csv
 import dataclasses
+import io
 import os
 import signal
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 from toy import tiny
 
 from codesign_jax import codesign, files, scene
@@ -20,7 +23,7 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.runs.progress import Progress, duration
+from codesign_jax.runs.progress import Busy, GroupProgress, Progress, Ticker, duration
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import library, parameters
@@ -308,6 +311,77 @@ def test_progress_line(capsys):
     assert "episode 16/64  mean 1.500  best 0.250  failed 1/60  6.0 grasps/s" in line
     assert line.endswith("ETA 8:00")  # 48 episodes of 10 s
     assert line in capsys.readouterr().out
+
+
+def test_time_left_includes_the_tests(capsys):
+    """At 6 grasps/s: 48 episodes of 60 grasps, 600 of the final test, and what comes afterwards."""
+    with Progress(64, test=600, after=120) as progress:
+        line = progress.episode(16, mean=1.5, best=0.25, failed=1, grasps=60, seconds=10.0)
+        assert line.endswith("ETA 10:00")
+        progress.episode(64, mean=1.5, best=0.25, failed=1, grasps=60, seconds=10.0)
+        progress.tested(300, 50.0)
+        progress.tested(300, 50.0)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].endswith("ETA 2:00")
+    assert lines[2] == "final test 300/600 grasps  6.0 grasps/s  ETA 1:10"
+    assert len(lines) == 3  # the second part came at once: a line now and then
+
+
+def test_time_left_of_many_runs(capsys):
+    """Two runs, at 2 x 60 grasps in 10 s: two episodes are left, and 60 of the test for each."""
+    with GroupProgress(3, 2, test=60) as group:
+        each = [group.one(f"seed {k}") for k in (0, 1)]
+        for one in each:
+            one.episode(1, mean=1.0, best=0.5, failed=0, grasps=60, seconds=10.0)
+        group.round(10.0)
+        for one in each:
+            one.tested(60, 10.0)
+        group.round(10.0)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith("12.0 grasps/s  ETA 0:30")
+    assert lines[1] == "final test 120/120 grasps  12.0 grasps/s  ETA 0:00"
+
+
+def test_compiling_is_no_time_of_an_episode(monkeypatch):
+    """A resumed run begins its first episode before its program is compiled."""
+    now = iter([0.0, 100.0, 103.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(now))
+    with Progress(2) as progress, progress.busy("simulating") as watch:
+        progress.compiled()
+    assert watch.seconds == 3.0
+
+
+def test_silence_is_broken_where_there_is_no_terminal(monkeypatch, capsys):
+    """After five seconds and then ever less often, and not while something else is said."""
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(
+        "codesign_jax.runs.progress.time", SimpleNamespace(monotonic=lambda: clock.now)
+    )
+    ticker, said = Ticker(), {}
+    ticker.begin("simulating")
+    for second in range(1, 200):
+        clock.now = 100.0 + second
+        if second == 18:
+            ticker.spoke()
+        ticker.tick()
+        said[second] = capsys.readouterr().err
+    told = {second: text for second, text in said.items() if text}
+    assert list(told) == [5, 15, 23, 33, 53, 93, 153]
+    assert told[5] == "simulating: 0:05\n" and told[93] == "simulating: 1:33\n"
+
+
+def test_what_is_busy_says_so_where_there_is_no_terminal(monkeypatch, capsys):
+    told = threading.Event()
+    monkeypatch.setattr(Ticker, "FIRST", 0.0)
+    monkeypatch.setattr(Ticker, "tick", lambda self, tick=Ticker.tick: (tick(self), told.set()))
+    with Busy(Console(file=io.StringIO()), "simulating", expected=65):
+        assert told.wait(60)
+    assert "simulating: 0:00 of about 1:05" in capsys.readouterr().err
+    told.clear()
+    bar = io.StringIO()
+    with Busy(Console(file=bar, force_terminal=True), "simulating"):
+        pass
+    assert "simulating" in bar.getvalue() and capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(

@@ -272,7 +272,7 @@ def test_all_problems_of_all_files_at_once(tmp_path):
     [
         ('unit = "mm"', 'unit = "kPa"', "unit"),  # a length is no pressure
         ("low = 10\nhigh = 180\ndefault", "low = 200\nhigh = 180\ndefault", "must be below"),
-        ("default = 110", "default = 190", "default = 190"),
+        ("default = 80", "default = 190", "default = 190"),
         ('name = "wall"', 'name = "height"', "'wall' must be given once, not 0 times"),
         ('per = "finger"', 'per = "hand"', "per must be 'finger'"),
         ("high = 7", "high = 9", "no air chamber"),

@@ -10,12 +10,14 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, rollout, runs, types
-from codesign_jax.commands import common, estimate, verdicts
+from codesign_jax.commands import common, estimate
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.estimate import Part
 from codesign_jax.engines import make_engine
+from codesign_jax.report import verdicts
 from codesign_jax.runs import rates
 from codesign_jax.runs.interrupts import interruptible
+from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import SceneError
 
@@ -86,17 +88,21 @@ def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
 def _evaluate(
     case: Case, engine: engines.Engine, options: "Evaluate", console: Console
 ) -> types.Outcome:
-    """Simulates the trials and prints the costs of each object; outcomes (trial,)."""
+    """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
     evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
     population = jnp.asarray(case.design, jnp.float32)[None]
-    found = interruptible(evaluate, population, jax.random.key(options.seed))
+    work = rates.batch_work(case.scene, case.engine, options.trials, devices=1)
+    with Busy(console, f"simulating {options.trials} grasps", rates.seconds(work)):
+        found = interruptible(evaluate, population, jax.random.key(options.seed))
     outcomes = jax.tree.map(np.asarray, found)
     one = jax.tree.map(lambda v: v[0], outcomes)
     names = [shape.name for shape in case.scene.objects.object]
     for k, name in enumerate(names[: options.trials]):
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
         console.print(f"{name:>12}: {verdicts.of_object(case.scene, own)}", markup=False)
-    console.print(f"{'all':>12}: {verdicts.verdict(case.scene, one)}", markup=False)
+    judged = verdicts.Judged(case.scene, one, options.accuracy)
+    for line in [f"{'all':>12}: {judged}", *verdicts.warnings(judged)]:
+        console.print(line, markup=False)
     return one
 
 

@@ -14,18 +14,10 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import (
-    asked,
-    common,
-    estimate,
-    hosts,
-    jobs,
-    reference,
-    seeds,
-    status,
-    verdicts,
-)
+from codesign_jax.commands import asked, common, estimate, hosts, jobs, reference, seeds, status
 from codesign_jax.commands.estimate import Part
+from codesign_jax.report import verdicts
+from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, rates
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
@@ -65,7 +57,9 @@ def main(options: "Optimize") -> int:
     if options.jobs is not None:
         return _jobs(options, scene, folders)
     devices, chunk = options.devices, options.chunk
-    opened = {"fresh": options.fresh, "sources": sources}
+    trials = reference.number_of_trials(options.reference_trials, settings)
+    after = trials * reference.steps_and_links(scene)
+    opened = {"fresh": options.fresh, "sources": sources, "after": after}
     found = runs.optimize(plan, folders, sys.argv, **opened, devices=devices, chunk=chunk)
     _record_rate(plan, found, devices)
     results: dict[int, RunResult | None] = {}
@@ -122,8 +116,10 @@ def _compare(
     scene: Scene, results: dict[int, RunResult | None], folders: dict[int, Path], console: Console
 ) -> None:
     """Compares runs on the console and in seeds.csv."""
-    seeds.compare(scene, results, console)
-    console.print(f"table: {seeds.write_table(scene, results, folders)}", markup=False)
+    fresh = reference.of_runs(results, folders)
+    seeds.compare(scene, results, fresh, console)
+    table = seeds.write_table(scene, results, fresh, folders)
+    console.print(f"table: {table}", markup=False)
 
 
 def _tell(
@@ -136,14 +132,18 @@ def _tell(
     """Says how each run ended, and tests its design at reference."""
     trials = reference.number_of_trials(options.reference_trials, plan.settings)
     for seed, result in results.items():
-        if result is None:
+        if result is None or result.record is None:
             continue
         if options.seeds is not None:
             console.print(f"seed {seed}:")
-        own = runs.with_seed(plan, seed)
-        _summarize(own, result, folders[seed])
+        own, fresh = runs.with_seed(plan, seed), None
+        _summarize(own, result, console)
         if trials and result.test is not None:
-            reference.test(folders[seed], own.settings, trials, console)
+            found = reference.test(folders[seed], own.settings, trials, console)
+            fresh = reference.judged(plan.scene, found)
+        if result.test is not None:
+            _judge(own, result, fresh, folders[seed], console)
+        _say_places(result, folders[seed], console)
 
 
 def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
@@ -207,36 +207,52 @@ def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") 
     print(estimate.text(parts))
 
 
-def _summarize(plan: Plan, result: RunResult, folder: Path) -> None:
-    """Prints the final particle that did best, and draws the figures if matplotlib is there."""
-    console = Console(highlight=False, soft_wrap=True)
-    if result.record is None:
-        return
+def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
+    """Prints whether the run converged, and the final particle that did best."""
+    assert result.record is not None
     history, particles = result.record.history, np.asarray(result.record.state.particles)
     converged = codesign.convergence_episode(history.cost.mean(1))
     if converged is None:
         console.print(f"not converged: the mean cost does not stay below {codesign.CONVERGED_COST}")
+    elif converged == 0:
+        console.print(f"converged: no episode has a mean cost above {codesign.CONVERGED_COST}")
     else:
         grasps = converged * plan.settings.particles * plan.settings.trials
         console.print(f"converged from episode {converged + 1} on, after {grasps} grasps")
     if result.test is not None:
-        cost = np.asarray(result.test.cost)
-        best = int(cost.argmin())
-        console.print(f"best final particle: {runs.describe(plan.space, particles[best])}")
-        trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.trials)
-        console.print(f"its test: {verdicts.verdict(plan.scene, trials)}")
-        flags = ["--run", str(folder), "--trials", "150", "--accuracy", reference.ACCURACY]
-        again = shlex.join(["codesign", "evaluate", *flags])
-        console.print(
-            f"chosen as the best of {cost.size} by these trials; for more new ones: {again}",
-            markup=False,
-        )
-    _figures(plan, result, folder, console)
+        best = particles[int(np.asarray(result.test.cost).argmin())]
+        console.print(f"best final particle: {runs.describe(plan.space, best)}")
+
+
+def _judge(
+    plan: Plan, result: RunResult, fresh: Judged | None, folder: Path, console: Console
+) -> None:
+    """Prints the verdict: on fresh trials, or on those of the final test if there are no others."""
+    assert result.test is not None
+    test = seeds.of_test(plan.scene, result)
+    chosen = f"chosen as the best of {len(result.test.cost)} final particles"
+    if fresh is None:
+        lines = [f"verdict: {test}", f"{chosen} by these very trials, which flatters it"]
+    else:
+        lines = [
+            f"{chosen}, by a test that flatters it: {verdicts.tally(test.outcomes)}",
+            f"verdict, on fresh trials: {fresh}",
+        ]
+    flags = ["--run", str(folder), "--trials", "150", "--accuracy", reference.ACCURACY]
+    again = shlex.join(["codesign", "evaluate", *flags])
+    judged = test if fresh is None else fresh
+    for line in [*lines, *verdicts.warnings(judged), f"more fresh trials: {again}"]:
+        console.print(line, markup=False)
+
+
+def _say_places(result: RunResult, folder: Path, console: Console) -> None:
+    """Draws the figure if matplotlib is there, and says where everything is."""
+    _figures(result, folder, console)
     console.print(f"results: {folder}", markup=False)
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}", markup=False)
 
 
-def _figures(plan: Plan, result: RunResult, folder: Path, console: Console) -> None:
+def _figures(result: RunResult, folder: Path, console: Console) -> None:
     try:
         from codesign_jax.report import figures
     except ImportError:

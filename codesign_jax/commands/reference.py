@@ -13,12 +13,14 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines
-from codesign_jax.commands import verdicts
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.estimate import Part
 from codesign_jax.commands.flags import Subject
 from codesign_jax.engines import make_engine
-from codesign_jax.runs import Settings, outcomes, rates
+from codesign_jax.report.verdicts import Judged
+from codesign_jax.runs import RunResult, Settings, outcomes, rates, read_run
+from codesign_jax.runs.interrupts import interruptible
+from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene, with_accuracy
 from codesign_jax.types import Outcome
 
@@ -59,7 +61,7 @@ def part(scene: Scene, settings: Settings, trials: int, runs: int) -> Part:
 
 
 def test(folder: Path, settings: Settings, trials: int, console: Console) -> Outcome:
-    """Simulates the best particle of a run in fresh trials at `reference` and says how it did.
+    """Simulates the best particle of a run in fresh trials at `reference`.
 
     Its outcomes are kept in the run folder: a finished run does not simulate them again.
 
@@ -67,7 +69,7 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
       folder: Run folder.
       settings: The run's settings.
       trials: Fresh trials.
-      console: Told the verdict.
+      console: Shown that it goes on.
 
     Returns:
       Outcomes of the trials, shape (trial,).
@@ -77,15 +79,46 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
     if found is None:
         if why:
             console.print(f"{folder / FILE} {why}: simulated again", markup=False)
-        found = _simulate(case, settings, trials)
+        work = rates.batch_work(case.scene, case.engine, trials, devices=1)
+        with Busy(console, f"reference test, {trials} grasps", rates.seconds(work)):
+            found = _simulate(case, settings, trials)
         outcomes.save(folder / FILE, found, key)
-    size = case.scene.discretization
-    verdict = verdicts.verdict(case.scene, found)
-    console.print(
-        f"on {trials} fresh trials at accuracy {ACCURACY} ({1e3 * size.timestep:g} ms, "
-        f"{size.links} links): {verdict}"
-    )
     return found
+
+
+def judged(scene: Scene, found: Outcome) -> Judged:
+    """Outcomes of the test with the scene that was simulated.
+
+    Args:
+      scene: Scene of the run.
+      found: The outcomes.
+    """
+    return Judged(with_accuracy(scene, ACCURACY), found, ACCURACY)
+
+
+def of_runs(
+    results: dict[int, RunResult | None], folders: dict[int, Path]
+) -> dict[int, Judged | None]:
+    """What `test` kept of each run; None where there is nothing.
+
+    Args:
+      results: Runs of a command by their seeds.
+      folders: Their folders.
+    """
+    kept: dict[int, Judged | None] = dict.fromkeys(results)
+    for seed, result in results.items():
+        if result is not None and result.test is not None and (folders[seed] / FILE).exists():
+            scene, settings = read_run(folders[seed])
+            found, _ = stored(folders[seed], settings)
+            kept[seed] = None if found is None else judged(scene, found)
+    return kept
+
+
+def steps_and_links(scene: Scene) -> float:
+    """How much more time a grasp of the test takes than one of the scene, by steps and links."""
+    finer = with_accuracy(scene, ACCURACY)
+    sizes = [s.num_steps * s.discretization.links for s in (finer, scene)]
+    return sizes[0] / sizes[1]
 
 
 def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
@@ -115,5 +148,5 @@ def _simulate(case: Case, settings: Settings, trials: int) -> Outcome:
         case.scene, make_engine(case.engine, case.scene), case.space, trials
     )
     key = codesign.stream_key(jax.random.key(settings.seed), STREAM_REFERENCE)
-    found = evaluate(jnp.asarray(case.design, jnp.float32)[None], key)
+    found = interruptible(evaluate, jnp.asarray(case.design, jnp.float32)[None], key)
     return jax.tree.map(lambda v: np.asarray(v)[0], found)

@@ -47,7 +47,8 @@ def main(options: "Report") -> int:
         common.warn(note)
     provenance = read_provenance(options.folder)
     found, why = reference.stored(options.folder, settings)
-    run = Run(options.folder, scene, settings, record, chosen, provenance, found, tuple(notes))
+    fresh = None if found is None else reference.judged(scene, found)
+    run = Run(options.folder, scene, settings, record, chosen, provenance, fresh, tuple(notes))
     console = Console(highlight=False, soft_wrap=True)
     if why:
         console.print(f"{options.folder / reference.FILE} {why}: left out", markup=False)

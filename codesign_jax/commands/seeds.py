@@ -4,13 +4,15 @@ import csv
 import re
 from pathlib import Path
 
+import jax
 import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from codesign_jax import codesign, cost, files
-from codesign_jax.report import statistics
+from codesign_jax.report import statistics, verdicts
+from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, columns
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
@@ -37,26 +39,51 @@ def parse(text: str) -> list[int]:
     return sorted(found)
 
 
-def compare(scene: Scene, results: dict[int, RunResult | None], console: Console) -> None:
+def of_test(scene: Scene, result: RunResult) -> Judged:
+    """The final test of a run's best final particle.
+
+    Args:
+      scene: Scene of the run.
+      result: The run, with a final test.
+    """
+    assert result.test is not None
+    best = int(np.asarray(result.test.cost).argmin())
+    trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.trials)
+    return Judged(scene, trials)
+
+
+def compare(
+    scene: Scene,
+    results: dict[int, RunResult | None],
+    fresh: dict[int, Judged | None],
+    console: Console,
+) -> None:
     """Prints a row for each run and the share of successful ones.
 
     Args:
       scene: Scene of the runs.
       results: Each run by its seed; None for one that could not finish.
+      fresh: Fresh trials of each run's design; None for one without.
       console: Where to print.
     """
-    head = ("seed", "converged", "best test cost", "kept", "successful")
-    table = Table(*head, box=box.SIMPLE)
-    solved = []
+    head = ("seed", "converged", "judged by", "kept", "lost", "stuck", "failed", "cost", "success")
+    table = Table(box=box.SIMPLE, collapse_padding=True, pad_edge=False)
+    for name in head:
+        table.add_column(name, no_wrap=True)
+    good = []
     for seed, result in results.items():
-        table.add_row(str(seed), *_row(scene, result))
-        if result is not None and result.test is not None:
-            solved.append(bool(np.asarray(result.test.success).any()))
+        judged = fresh[seed]
+        if judged is None and result is not None and result.test is not None:
+            judged = of_test(scene, result)
+        table.add_row(str(seed), *_row(scene, result, judged, tested=fresh[seed] is None))
+        if judged is not None:
+            good.append(bool(verdicts.success(judged.scene, judged.outcomes)))
     console.print(table)
-    if solved:
-        share = statistics.wilson(sum(solved), len(solved))
+    if good:
+        share = statistics.wilson(sum(good), len(good))
         console.print(
-            f"{sum(solved)} of {len(solved)} runs have a particle below the limit of success, "
+            f"{sum(good)} of {len(good)} runs found a design that keeps at least "
+            f"{100 * verdicts.RELIABLE:.0f} % of all trials at a mean cost below "
             f"{codesign.SUCCESS_COST}: {100 * share.low:.0f} to {100 * share.high:.0f} % of such "
             "runs (95 % interval)"
         )
@@ -84,13 +111,17 @@ def check_table(folders: dict[int, Path]) -> None:
 
 
 def write_table(
-    scene: Scene, results: dict[int, RunResult | None], folders: dict[int, Path]
+    scene: Scene,
+    results: dict[int, RunResult | None],
+    fresh: dict[int, Judged | None],
+    folders: dict[int, Path],
 ) -> Path:
     """Writes seeds.csv beside the run folders: a row for each run; see `runs.columns.MORE`.
 
     Args:
       scene: Scene of the runs.
       results: Each run by its seed; None for one that could not finish.
+      fresh: Fresh trials of each run's design; None for one without.
       folders: Run folder of each seed.
     """
     path = next(iter(folders.values())).parent / columns.SEEDS
@@ -98,9 +129,8 @@ def write_table(
         writer = csv.writer(file)
         writer.writerow([*columns.MORE[columns.SEEDS].columns])
         for seed, result in results.items():
-            writer.writerow(
-                [seed, int(result is not None), *_values(scene, result), folders[seed].name]
-            )
+            values = *_values(scene, result), *_fresh_values(fresh[seed])
+            writer.writerow([seed, int(result is not None), *values, folders[seed].name])
     return path
 
 
@@ -121,17 +151,27 @@ def _values(scene: Scene, result: RunResult | None) -> list[object]:
     return [*first, f"{costs[best]:.9g}", *sizes]
 
 
-def _row(scene: Scene, result: RunResult | None) -> tuple[str, ...]:
-    """Convergence, best particle's test cost and trials kept, and successful particles."""
+def _fresh_values(judged: Judged | None) -> list[object]:
+    """Kept, lost, stuck and failed fresh trials, and their mean cost."""
+    if judged is None:
+        return [""] * 5
+    mean = float(cost.particle_cost(judged.scene, judged.outcomes))
+    return [*verdicts.tally(judged.outcomes), f"{mean:.9g}"]
+
+
+def _row(
+    scene: Scene, result: RunResult | None, judged: Judged | None, *, tested: bool
+) -> tuple[str, ...]:
+    """Convergence of a run, and how its design did."""
     if result is None or result.record is None:
-        return ("failed", "", "", "")
-    episode, lowest, kept, counted, _, good, particles = _values(scene, result)
+        return ("failed", *[""] * 7)
+    episode = _values(scene, result)[0]
     converged = f"episode {episode}" if episode else "no"
-    if lowest == "":
-        return (converged, "", "", "")
-    return (
-        converged,
-        f"{float(str(lowest)):.4f}",
-        f"{kept} of {counted} trials",
-        f"{good} of {particles} particles",
-    )
+    if judged is None:
+        return (converged, *[""] * 7)
+    where = "final test" if tested else f"{judged.accuracy}"
+    found = verdicts.tally(judged.outcomes)
+    mean = float(cost.particle_cost(judged.scene, judged.outcomes))
+    word = "yes" if verdicts.success(judged.scene, judged.outcomes) else "no"
+    numbers = f"{found.kept} of {found.total}", *map(str, found[1:]), f"{mean:.4f}"
+    return (converged, where, *numbers, word)

@@ -92,14 +92,30 @@ def frames(
     Returns:
       Frames, uint8, shape (frame, height, width, 3).
     """
+    way = _opengl()
+    if way is None:
+        return sketches(scene, grasp, times, size=size)
+    qpos, index = _states(scene, grasp, times)
+    return _render(_visual_model(scene, grasp), qpos, size, way)[index]
+
+
+def sketches(
+    scene: Scene, grasp: Replay, times: np.ndarray, *, size: tuple[int, int] = (240, 240)
+) -> np.ndarray:
+    """As `frames`, drawn without OpenGL: lines of fingers and object."""
+    qpos, index = _states(scene, grasp, times)
+    compiled = _visual_model(scene, grasp)
+    return sketch.draw(scene, compiled, qpos, int(grasp.trial.shape), size)[index]
+
+
+def _states(scene: Scene, grasp: Replay, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Different states among those at some times, and which of them each time has.
+
+    A world that was lost or failed stands still from then on: its frames are drawn once.
+    """
     step = np.rint(times / scene.discretization.timestep).astype(int)
     qpos = grasp.qpos[np.clip(step, 0, len(grasp.qpos) - 1)]
-    compiled, way = _visual_model(scene, grasp), _opengl()
-    # A world that was lost or failed stands still from then on: its frames are drawn once.
-    qpos, index = np.unique(qpos, axis=0, return_inverse=True)
-    if way is not None:
-        return _render(compiled, qpos, size, way)[index]
-    return sketch.draw(scene, compiled, qpos, int(grasp.trial.shape), size)[index]
+    return np.unique(qpos, axis=0, return_inverse=True)
 
 
 def write_gif(

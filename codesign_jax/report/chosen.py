@@ -2,77 +2,52 @@
 
 import numpy as np
 
-from codesign_jax import codesign, cost, types
-from codesign_jax.report import markup
+from codesign_jax.report import markup, verdicts
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.statistics import wilson
+from codesign_jax.report.verdicts import Judged
 from codesign_jax.types import Outcome
 
 
 def design(run: Run) -> str:
-    """The design's parameters within their ranges, and its success in all and by object."""
-    chosen, trials = run.chosen, run.chosen.trials
-    kept, counted = _kept(run, trials)
+    """The verdict on the design, its parameters within their ranges, and its trials by object."""
+    chosen, judged = run.chosen, run.judged
     source = "the final test" if chosen.tested else "its last episode (there was no final test)"
-    success = f"In {source} it kept the object in {_share(int(kept.sum()), int(counted.sum()))}."
+    tested = Judged(run.scene, chosen.trials)
     note = (
-        f"Particle {chosen.particle}, mean cost {chosen.cost:.4f} over {counted.sum()} of "
-        f"{counted.size} trials of {source}. It was chosen as the best by these very trials, which "
-        "flatters it. "
+        f"Particle {chosen.particle}, chosen as the best by {source}, which flatters it: "
+        f"{verdicts.tally(chosen.trials)}; {verdicts.mean_cost(run.scene, chosen.trials)}. "
     )
+    if run.reference is None:
+        trials = f"Verdict, in the trials of {source}: {tested}."
+    else:
+        trials = f"Verdict, in fresh trials, which had no part in the choice: {judged}."
     again = ["evaluate", "--run", str(run.folder), "--trials", "150", "--accuracy", "reference"]
     parts = [
-        markup.paragraph(success, "key"),
-        markup.paragraph(_reference(run), "key"),
-        markup.paragraph(note + "New trials at the reference accuracy: ", "note", again),
-        _by_object(run, kept, counted),
+        markup.paragraph(trials, "key"),
+        *(markup.paragraph(words, "warning") for words in verdicts.warnings(judged)),
+        markup.paragraph(note + "More fresh trials: ", "note", again),
+        _by_object(run, judged),
         _parameters(run),
     ]
     return markup.section("Chosen design", *parts)
 
 
-def _kept(run: Run, trials: Outcome) -> tuple[np.ndarray, np.ndarray]:
-    """Which trials kept the object, and which count by the scene's rule for failed ones."""
-    counted = np.asarray(cost.counts(run.scene, np.asarray(trials.status)))
-    return (np.asarray(trials.cost) < codesign.SUCCESS_COST) & counted, counted
-
-
-def _reference(run: Run) -> str:
-    """How the design did in the fresh trials at the end of the run; empty without them."""
-    if run.reference is None:
-        return ""
-    kept, counted = _kept(run, run.reference)
-    left = counted.size - int(counted.sum())
-    failed = f" ({left} more failed)" if left else ""
-    return (
-        "In fresh trials at the reference accuracy, which had no part in the choice, it kept the "
-        f"object in {_share(int(kept.sum()), int(counted.sum()))}{failed}."
-    )
-
-
-def _share(kept: int, total: int) -> str:
-    """A share of successes with its interval, in words."""
-    if not total:
-        return "no trial that counts"
-    share = wilson(kept, total)
-    return (
-        f"{kept} of {total}: {100 * share.value:.0f} %, 95 % interval "
-        f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
-    )
-
-
-def _by_object(run: Run, kept: np.ndarray, counted: np.ndarray) -> str:
-    """Success for each object; every batch of trials takes turns between the objects."""
-    failed = types.failed(np.asarray(run.chosen.trials.status))
+def _by_object(run: Run, judged: Judged) -> str:
+    """How the judging trials ended with each object; batches take turns between the objects."""
     names = [shape.name for shape in run.scene.objects.object]
-    index = np.arange(counted.size) % run.settings.trials % len(names)
+    count = judged.outcomes.cost.size
+    turns = np.arange(count) % (count if run.reference is not None else run.settings.trials)
     rows = []
     for k, name in enumerate(names):
-        own = index == k
+        own = turns % len(names) == k
         if own.any():
-            share = _share(int(kept[own].sum()), int(counted[own].sum()))
-            rows.append((name, share, int(failed[own].sum())))
-    return markup.table(("object", "kept", "failed trials"), rows, (2,))
+            found = verdicts.tally(Outcome(*(np.asarray(v)[own] for v in judged.outcomes)))
+            share = wilson(found.kept, found.total)
+            span = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
+            rows.append((name, f"{found.kept} of {found.total}", span, *found[1:]))
+    head = ("object", "kept", "95 % interval of all", "lost", "stuck", "failed otherwise")
+    return markup.table(head, rows, (1, 2, 3, 4, 5))
 
 
 def _parameters(run: Run) -> str:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from codesign_jax import types
+from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings
 from codesign_jax.runs.choice import Chosen
 from codesign_jax.runs.record import History, Record
@@ -21,8 +22,7 @@ class Run(NamedTuple):
       record: Its episodes, at least one.
       chosen: The design it found.
       provenance: Content of its provenance.json.
-      reference: Outcomes of the design's fresh trials at the end of the run, every array of shape
-        (trial,); None without them.
+      reference: The design's fresh trials at the end of the run; None without them.
       notes: What is amiss with the run, in sentences.
     """
 
@@ -32,8 +32,13 @@ class Run(NamedTuple):
     record: Record
     chosen: Chosen
     provenance: dict[str, Any]
-    reference: types.Outcome | None = None
+    reference: Judged | None = None
     notes: tuple[str, ...] = ()
+
+    @property
+    def judged(self) -> Judged:
+        """The trials that judge the design: the fresh ones, or else those that chose it."""
+        return self.reference or Judged(self.scene, self.chosen.trials)
 
     @property
     def space(self) -> DesignSpace:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from codesign_jax import codesign, files, types
-from codesign_jax.report import charts, chosen, landscape, markup, viewer
+from codesign_jax.report import charts, chosen, landscape, markup, verdicts, viewer
 from codesign_jax.report.animation import Replay
 from codesign_jax.report.of_run import Run
 from codesign_jax.runs import choice, tables
@@ -86,11 +86,12 @@ def _converged(run: Run) -> str:
 def _solved(run: Run) -> str:
     if run.record.test is None:
         return "not tested"
-    test = codesign.summarize_test(run.scene, run.record.test)
-    success = np.asarray(test.success)
+    test = run.record.test
+    good = verdicts.success(run.scene, test)
     return (
-        f"{success.sum()} of {success.size} have a mean cost below {codesign.SUCCESS_COST} in "
-        f"{test.trials.cost.shape[1]} trials"
+        f"{good.sum()} of {good.size} kept at least {100 * verdicts.RELIABLE:.0f} % of all "
+        f"{test.cost.shape[1]} trials of the final test at a mean cost below "
+        f"{codesign.SUCCESS_COST}"
     )
 
 

@@ -1,18 +1,22 @@
 """A grasp in 3D that plays in a browser, offline: one HTML file, or a piece of a page.
 
-The viewer is `web/replay.js`: fingers deform with their links, the camera turns while it plays.
+The viewer is `web/replay.js`: fingers deform with their links, the camera turns while it plays.  A
+browser without WebGL shows a film strip instead, which the page has with it.
 """
 
 import base64
 import html
+import io
+import itertools
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from codesign_jax import files
-from codesign_jax.report import bodies
+from codesign_jax.report import animation, bodies
 from codesign_jax.report.animation import Replay
 from codesign_jax.scene import Scene
 
@@ -21,7 +25,7 @@ _TABLE = 0.6  # half side of the table that is drawn [m]
 
 _FRAGMENT = """
 <div class="replay" id="{name}">
-<canvas class="view"></canvas><p class="message"></p>
+<canvas class="view"></canvas><p class="message"></p><div class="strip"></div>
 <div class="controls">
 <button class="play" type="button">Play</button>
 <div class="track"><input class="time" type="range" min="0" step="0.01" aria-label="time [s]">
@@ -34,7 +38,7 @@ _FRAGMENT = """
 </div>
 <div class="label"></div>
 </div>
-<p class="note">Drag to turn, scroll to zoom, shift-drag to move; click a phase to go there.
+<p class="note turn">Drag to turn, scroll to zoom, shift-drag to move; click a phase to go there.
 A square of the table is 5 cm.</p>
 <script>startReplay(document.getElementById("{name}"), {data});</script>
 """
@@ -110,7 +114,30 @@ def _data(scene: Scene, grasp: Replay) -> dict[str, Any]:
         "still": scene.phases.lift,
         "table": _TABLE,
         "camera": {"target": [0.0, 0.0, 0.14], "distance": 0.54, "azimuth": -0.9, "elevation": 0.3},
+        "strip": _strip(scene, grasp),
     }
+
+
+def _strip(scene: Scene, grasp: Replay) -> list[tuple[str, str]]:
+    """Sketches at the start, at the ends of the phases and amid the longest: captions and PNGs."""
+    ends = [("start", 0.0), *phases(scene)]
+    spans = [
+        (later - first, k) for k, ((_, first), (_, later)) in enumerate(itertools.pairwise(ends))
+    ]
+    k = max(spans)[1]
+    amid = (f"amid {ends[k + 1][0]}", (ends[k][1] + ends[k + 1][1]) / 2)
+    moments = [("start", 0.0), *((f"end of {name}", end) for name, end in ends[1:])]
+    moments.insert(k + 1, amid)
+    times = np.array([time for _, time in moments])
+    found = []
+    for (caption, time), frame in zip(
+        moments, animation.sketches(scene, grasp, times), strict=True
+    ):
+        file = io.BytesIO()
+        Image.fromarray(frame).quantize(64).save(file, "png", optimize=True)
+        picture = base64.b64encode(file.getvalue()).decode()
+        found.append((f"{caption}, {time:g} s", picture))
+    return found
 
 
 def phases(scene: Scene) -> list[tuple[str, float]]:

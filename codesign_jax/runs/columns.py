@@ -121,6 +121,12 @@ MORE = {
             "trials": "trials of that test",
             "successful_particles": f"final particles with a test cost below {SUCCESS_COST}",
             "particles": "final particles",
+            "fresh_kept_trials": "of the best particle's fresh trials at accuracy `reference`, had "
+            "no part in the choice, those that kept the object; empty without them",
+            "fresh_lost_trials": "those that lost it",
+            "fresh_stuck_trials": "those in which the hand did not let go of it",
+            "fresh_failed_trials": "those that failed otherwise",
+            "fresh_cost": "mean cost of these trials by the scene's rule for failed ones",
             "run": "name of the run's folder",
         },
     ),

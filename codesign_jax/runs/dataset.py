@@ -12,6 +12,7 @@ import fcntl
 import functools
 import hashlib
 import json
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from codesign_jax import files, sampling, sources
+from codesign_jax import archives, files, sampling, sources
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.provenance import environment
-from codesign_jax.runs import outcomes, parquet
+from codesign_jax.runs import parquet
 from codesign_jax.runs.columns import DESIGNS, GRASPS
+from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.parquet import Column, Names
-from codesign_jax.runs.scene_files import scene_texts
+from codesign_jax.runs.scene_files import contents, scene_texts
 from codesign_jax.runs.tables import design_columns, status_names
 from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
@@ -38,7 +40,7 @@ QUESTION = "question.json"
 ROWS = 1 << 16
 """About as many rows are written at once: a row group of the file."""
 VERDICTS = ["kept", "lost", "stuck", "failed"]
-_LOCK = ".lock"
+_LOCK, _KEY = ".lock", "key"
 _NAMES = ("engine", "preset", "trials", "seed", "chunk")
 _WORDS = {"chunk": "designs of a call (by --chunk)"}
 
@@ -71,12 +73,12 @@ class Question:
     @functools.cached_property
     def described(self) -> dict[str, Any]:
         """What determines the outcomes, beside versions and machine; of JSON's types."""
-        meshes = [shape.mesh for shape in self.scene.objects.object if shape.mesh]
-        return {name: getattr(self, name) for name in _NAMES} | {
-            "scene": scene_texts(self.scene),
-            "meshes": [hashlib.sha256(mesh.path.read_bytes()).hexdigest() for mesh in meshes],
-            "code": sources.digest(),
-        }
+        texts, every = scene_texts(self.scene), contents(self.scene)
+        meshes = [hashlib.sha256(every[name]).hexdigest() for name in sorted({*every} - {*texts})]
+        # What code that is not known has simulated is no part of anything else.
+        code = sources.digest() or f"unknown {uuid.uuid4()}"
+        own = {name: getattr(self, name) for name in _NAMES}
+        return own | {"scene": texts, "meshes": meshes, "code": code}
 
     @functools.cached_property
     def key(self) -> str:
@@ -132,11 +134,15 @@ class Shards:
 
     def save(self, shard: int, found: Outcome) -> None:
         """Keeps outcomes of a shard, arrays of shape (design, trial)."""
-        outcomes.save(self.path(shard), found, self._key)
+        archives.save(self.path(shard), {_KEY: self._key, **found._asdict()})
 
     def load(self, shard: int) -> Outcome | None:
         """Outcomes of a shard; None if they are not there, or damaged."""
-        return outcomes.load(self.path(shard), self._key)
+        try:
+            arrays = archives.load(self.path(shard))
+        except (OSError, archives.ArchiveError):
+            return None
+        return Outcome(**arrays) if str(arrays.pop(_KEY)) == self._key else None
 
     def delete(self) -> None:
         """Deletes the shards and their folder."""
@@ -298,18 +304,19 @@ def write(path: Path, question: Question, designs: int, shards: Shards) -> None:
       shards: All of its outcomes.
 
     Raises:
-      RuntimeError: If a shard is missing.
+      RunError: If a shard cannot be read any more.
     """
     pa = parquet.library("--out")
     notes = {"question": question.described, "designs": designs, "environment": environment()}
     notes |= {"status_bits": parquet.STATUS_BITS}
     schema = parquet.schema(pa, columns(question.space), notes)
     shape, left, group = (question.chunk, question.trials), designs * question.trials, []
-    with parquet.writing(pa, path, schema) as writer:
+    with files.naming(path), parquet.writing(pa, path, schema) as writer:
         for shard in range(question.shards(designs)):
             found = shards.load(shard)
             if found is None:
-                raise RuntimeError(f"{shards.path(shard)} cannot be read any more")
+                words = f"{shards.path(shard)} cannot be read any more; the same command goes on"
+                raise RunError(words)
             values = rows(question, shard, question.drawn(shard), found)
             group.append(parquet.table(pa, schema, values, shape).slice(0, left))
             left -= group[-1].num_rows

@@ -26,7 +26,7 @@ from codesign_jax.runs.checkpoint import Checkpoints, Restored
 from codesign_jax.runs.directory import RunDirectory
 from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.interrupts import Stopped
-from codesign_jax.runs.progress import Progress
+from codesign_jax.runs.progress import Progress, Stopwatch
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
@@ -210,13 +210,26 @@ class Loop:
         self._save(0, record)
         return record
 
-    def _evaluated(self, asking: Generator[tuple[jax.Array, jax.Array], Outcome, Any]) -> Asking:
-        """Answers what asks for populations by episodes in which nothing moves."""
+    def _evaluated(
+        self,
+        asking: Generator[tuple[jax.Array, jax.Array], Outcome, Any],
+        told: Callable[[], None] = lambda: None,
+    ) -> Asking:
+        """Answers what asks for populations by episodes in which nothing moves; tells of each."""
+
+        def answer(reply: tuple[State, EpisodeInfo]) -> Outcome:
+            told()
+            return reply[1].trials
+
         return translated(
             asking,
             lambda asked: Request(*codesign.closed(self.plan.optimizer, *asked)),
-            lambda told: told[1].trials,
+            answer,
         )
+
+    def _tested_some(self, watch: Stopwatch, grasps: int) -> None:
+        """Tells that a part of the final test is done."""
+        self.progress.tested(grasps, watch.lap())
 
     def _episodes(self, record: Record) -> Asking:
         for e in range(record.done, self.plan.settings.episodes):
@@ -269,13 +282,15 @@ class Loop:
             num_trials=settings.test_trials,
             previous=previous,
         )
+        batch = settings.particles * settings.trials
         with self.progress.busy("testing the final particles") as watch:
-            test = yield from self._evaluated(testing)
+            told = partial(self._tested_some, watch, batch)
+            test = yield from self._evaluated(testing, told)
         record.test = test.trials
         self._save(settings.episodes + 1, record)
         self._write_tables(record, settings.episodes)
         self._refuse_all_failed(record)
-        grasps = settings.particles * settings.test_rounds * settings.trials
+        grasps = batch * settings.test_rounds
         self._say(f"final test: {grasps} grasps in {watch.seconds:.1f} s")
 
     def _report(self, history: History, e: int, seconds: float) -> None:

@@ -1,5 +1,11 @@
-"""Progress on the terminal: a live bar where there is one, plain lines where not."""
+"""Progress on the terminal: a live bar where there is one, plain lines where not.
 
+Where there is no terminal and nothing else is said, a line on the standard error says after a few
+seconds what goes on and for how long, and then ever less often.
+"""
+
+import sys
+import threading
 import time
 from typing import NamedTuple
 
@@ -14,12 +20,101 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-class Progress:
-    """Reports a run's episodes; use as a context manager."""
+class Ticker:
+    """Says on the standard error what goes on, when nothing has been said for a while."""
 
-    def __init__(self, total: int, *, console: rich.console.Console | None = None):
-        """Takes the number of episodes."""
-        self.total = total
+    FIRST, LAST = 5.0, 60.0
+    """Silence before the first line, and the longest one; each is twice the one before [s]."""
+
+    def __init__(self, *, disable: bool = False):
+        """Starts nothing yet; with `disable` it never says anything."""
+        self._disable, self._stop = disable, threading.Event()
+        self._text, self._about = "", ""
+        self._since, self._spoken, self._gap = 0.0, 0.0, self.FIRST
+
+    def __enter__(self) -> "Ticker":
+        """Starts."""
+        if not self._disable:
+            threading.Thread(target=self._run, daemon=True).start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Stops."""
+        self._stop.set()
+
+    def begin(self, text: str, expected: float | None = None) -> None:
+        """Something else goes on from now, for about so many seconds if that is known."""
+        self._text, self._since = text, time.monotonic()
+        self._about = "" if expected is None else f" of about {duration(expected)}"
+        self.spoke()
+
+    def spoke(self) -> None:
+        """Something was said by somebody else."""
+        self._spoken, self._gap = time.monotonic(), self.FIRST
+
+    def tick(self) -> None:
+        """Says what goes on if nothing has been said for so long."""
+        now = time.monotonic()
+        if self._text and now - self._spoken >= self._gap:
+            self._spoken, self._gap = now, min(2 * self._gap, self.LAST)
+            words = f"{self._text}: {duration(now - self._since)}{self._about}"
+            print(words, file=sys.stderr, flush=True)
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.2):
+            self.tick()
+
+
+class Busy:
+    """Shows that something of unknown progress goes on, and for how long; a context manager."""
+
+    def __init__(self, console: rich.console.Console, text: str, expected: float | None = None):
+        """Takes what goes on, and how long that is expected to take [s], if it is known."""
+        self._ticker = Ticker(disable=console.is_terminal)
+        self._ticker.begin(text, expected)
+        columns = rich.progress.SpinnerColumn(), rich.progress.TextColumn("{task.description}")
+        self._bar = rich.progress.Progress(
+            *columns,
+            rich.progress.TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        about = "" if expected is None else f" (about {duration(expected)})"
+        self._bar.add_task(text + about, total=None)
+
+    def __enter__(self) -> "Busy":
+        """Shows it."""
+        self._bar.start()
+        self._ticker.__enter__()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Ends it."""
+        self._ticker.__exit__()
+        self._bar.stop()
+
+
+class Progress:
+    """Reports a run's episodes and its final test; use as a context manager."""
+
+    def __init__(
+        self,
+        total: int,
+        *,
+        test: int = 0,
+        after: float = 0.0,
+        console: rich.console.Console | None = None,
+    ):
+        """Takes what there is to do.
+
+        Args:
+          total: Episodes.
+          test: Grasps of the final test.
+          after: What else is simulated when the run has ended, as a number of its grasps.
+          console: Where to tell.
+        """
+        self.total, self._test, self._after = total, test, after
         self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
         columns = (
             rich.progress.BarColumn(),
@@ -29,26 +124,39 @@ class Progress:
         self._bar = rich.progress.Progress(
             *columns, console=self.console, transient=True, disable=not self.console.is_terminal
         )
-        self._task = self._bar.add_task("", total=total)
-        self._seconds, self._grasps = 0.0, 0
+        self._task = self._bar.add_task("", total=None)
+        self._ticker = Ticker(disable=self.console.is_terminal)
+        self._watches: list[Stopwatch] = []
+        self._seconds, self._grasps, self._tested, self._told = 0.0, 0, 0, 0.0
 
     def __enter__(self) -> "Progress":
         """Starts the bar."""
         self._bar.start()
+        self._ticker.__enter__()
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Removes the bar; the lines stay."""
+        self._ticker.__exit__()
         self._bar.stop()
 
     def message(self, text: str) -> None:
         """Prints a line above the bar."""
         self.console.print(text, markup=False)
+        self._ticker.spoke()
 
     def busy(self, text: str) -> "Stopwatch":
         """Shows what goes on while a block runs, and measures it."""
         self._bar.update(self._task, description=text)
-        return Stopwatch()
+        self._ticker.begin(text)
+        watch = Stopwatch()
+        self._watches = [w for w in self._watches if not w.seconds] + [watch]
+        return watch
+
+    def compiled(self) -> None:
+        """Leaves the time so far out of what is being measured: it was not for simulating."""
+        for watch in self._watches:
+            watch.restart()
 
     def episode(
         self,
@@ -74,7 +182,8 @@ class Progress:
           causes: How often each cause of failure occurs, such as "SPEED 1, STUCK 3".
           warnings: How often each warning occurs, such as "SOLVER_CAP 3".
         """
-        pace = self._pace(done, grasps, seconds)
+        left = (self.total - done) * grasps + self._test + self._after
+        pace = self._pace(grasps, seconds, left)
         reasons = f" ({causes})" if causes else ""
         reasons += f"  warnings: {warnings}" if warnings else ""
         count = f"{done:>{len(str(self.total))}}/{self.total}"
@@ -85,16 +194,37 @@ class Progress:
         self._show(_Entry(done, mean, best, failed, grasps), line, pace)
         return line
 
-    def _pace(self, done: int, grasps: int, seconds: float) -> str:
-        """Counts grasps that took so long; the rate so far and the time left, in words."""
+    def tested(self, grasps: int, seconds: float) -> None:
+        """Reports a part of the final test.
+
+        Args:
+          grasps: Grasps of the part.
+          seconds: Wall time of the part.
+        """
+        self._tested += grasps
+        pace = self._pace(grasps, seconds, max(self._test - self._tested, 0) + self._after)
+        line = f"final test {self._tested}/{self._test} grasps  {pace}"
+        self._bar.update(self._task, description=line)
+        if not self.console.is_terminal and time.monotonic() - self._told >= Ticker.FIRST:
+            self._told = time.monotonic()
+            self.message(line)
+
+    def _pace(self, grasps: int, seconds: float, left: float) -> str:
+        """Counts grasps that took so long; the rate so far and the time left, in words.
+
+        Args:
+          grasps: Grasps that were simulated.
+          seconds: Wall time of these.
+          left: Grasps that are still to be simulated.
+        """
         self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
+        self._bar.update(self._task, completed=self._grasps, total=self._grasps + left)
         rate = self._grasps / max(self._seconds, 1e-9)
-        left = duration((self.total - done) * grasps / rate)
-        return f"{rate:.1f} grasps/s  ETA {left}"
+        return f"{rate:.1f} grasps/s  ETA {duration(left / rate)}"
 
     def _show(self, entry: "_Entry", line: str, pace: str) -> None:
         """Shows a finished episode."""
-        self._bar.update(self._task, completed=entry.done, description=pace)
+        self._bar.update(self._task, description=pace)
         self.message(line)
 
 
@@ -111,10 +241,19 @@ class _Entry(NamedTuple):
 class GroupProgress(Progress):
     """Progress of several runs at once: a line for all of them after each round."""
 
-    def __init__(self, total: int, *, console: rich.console.Console | None = None):
-        """Takes the number of episodes of each run."""
-        super().__init__(total, console=console)
+    def __init__(
+        self,
+        total: int,
+        runs: int,
+        *,
+        test: int = 0,
+        after: float = 0.0,
+        console: rich.console.Console | None = None,
+    ):
+        """Takes the number of runs; the others are of each run, as of `Progress`."""
+        super().__init__(total, test=runs * test, after=runs * after, console=console)
         self._entries: list[_Entry] = []
+        self._part = 0
 
     def one(self, name: str) -> "OneOfMany":
         """The progress of one of the runs."""
@@ -124,17 +263,26 @@ class GroupProgress(Progress):
         """Takes a run's report of an episode for the line of this round."""
         self._entries.append(entry)
 
+    def tested(self, grasps: int, seconds: float) -> None:
+        """Takes a run's report of a part of its final test, which took the round's time."""
+        self._part += grasps
+
     def round(self, seconds: float) -> None:
-        """Prints the line of a round that took so long; nothing if no episode ended in it."""
+        """Tells of a round that took so long: its episodes in a line, if any ended in it."""
         entries, self._entries = self._entries, []
+        tested, self._part = self._part, 0
         if not entries:
+            if tested:
+                super().tested(tested, seconds)
             return
+        self._tested += tested
         grasps, failed = (sum(getattr(e, k) for e in entries) for k in ("grasps", "failed"))
         first, last = min(e.done for e in entries), max(e.done for e in entries)
-        pace = self._pace(first, grasps, seconds)
+        left = (self.total - first) * grasps + max(self._test - self._tested, 0) + self._after
+        pace = self._pace(grasps + tested, seconds, left)
         means, bests = ([getattr(e, k) for e in entries] for k in ("mean", "best"))
         count = f"{first:>{len(str(self.total))}}" + (f" to {last}" if last > first else "")
-        self._bar.update(self._task, completed=first, description=pace)
+        self._bar.update(self._task, description=pace)
         self.message(
             f"episode {count}/{self.total}  {len(entries)} runs  "
             f"mean {min(means):.3f} to {max(means):.3f}  best {min(bests):.3f} to {max(bests):.3f}"
@@ -158,6 +306,10 @@ class OneOfMany(Progress):
         """As of the group."""
         return self._group.busy(text)
 
+    def tested(self, grasps: int, seconds: float) -> None:
+        """As of the group."""
+        self._group.tested(grasps, seconds)
+
     def _show(self, entry: _Entry, line: str, pace: str) -> None:
         """Leaves it to the group, which prints one line for all runs of a round."""
         self._group.add(entry)
@@ -166,12 +318,21 @@ class OneOfMany(Progress):
 class Stopwatch:
     """Measures the wall time of a block."""
 
-    seconds = 0.0
+    seconds, _start, _lap = 0.0, 0.0, 0.0
 
     def __enter__(self) -> "Stopwatch":
         """Starts."""
-        self._start = time.perf_counter()
+        self.restart()
         return self
+
+    def restart(self) -> None:
+        """Starts again: what was until now does not count."""
+        self._start = time.perf_counter()
+
+    def lap(self) -> float:
+        """Seconds since the start or the last lap."""
+        before, self._lap = max(self._lap, self._start), time.perf_counter()
+        return self._lap - before
 
     def __exit__(self, *exception: object) -> None:
         """Stops."""

@@ -195,6 +195,14 @@ def estimate(work: Work) -> Estimate | None:
     return Estimate(rate, _compile_seconds(same or shipped, work), basis)
 
 
+def seconds(work: Work) -> float | None:
+    """Expected time of so many grasps at once, with compiling or loading; None if not known."""
+    found = estimate(work)
+    if found is None or found.compile_seconds is None:
+        return None
+    return found.compile_seconds + work.grasps / found.grasps_per_second
+
+
 def _compile_seconds(alike: list[Rate], work: Work) -> float | None:
     """Time to compile or load: the program's own last one, or the median of others'.
 

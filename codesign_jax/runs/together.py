@@ -71,6 +71,7 @@ def optimize(
     sources: Iterable[Path] = (),
     devices: int | None = None,
     chunk: int | None = None,
+    after: float = 0.0,
 ) -> Results:
     """Runs an optimisation of each seed, or goes on with it; the same call does both.
 
@@ -82,6 +83,8 @@ def optimize(
       sources: Files that the scene was read from, which `fresh` must not delete.
       devices: Devices that simulate; None for all of this host.
       chunk: Most worlds of one device in one call; None for `batch.LIMIT`.
+      after: What the caller simulates of each run afterwards, as a number of its grasps: the time
+        left that is shown includes it.
 
     Raises:
       SceneError: If a folder cannot be used; see `open_run`.
@@ -91,7 +94,7 @@ def optimize(
     begun = {"fresh": fresh, "sources": tuple(sources)}
     for start in range(0, len(seeds), MOST):
         group = {seed: folders[seed] for seed in seeds[start : start + MOST]}
-        results = _group(plan, group, command, begun, devices, chunk)
+        results = _group(plan, group, command, begun, devices, chunk, after)
         found |= results.runs
         timing = timing or results.timing
         if results.signum:
@@ -106,11 +109,15 @@ def _group(
     begun: dict[str, Any],
     devices: int | None,
     chunk: int | None,
+    after: float,
 ) -> Results:
     """`optimize` of as many runs as fit into one process; `begun` is how to open the folders."""
-    total, many = plan.settings.episodes, len(folders) > 1
+    settings, many = plan.settings, len(folders) > 1
+    batch = settings.particles * settings.trials
+    ahead = {"test": batch * settings.test_rounds, "after": after}
     with contextlib.ExitStack() as stack:
-        progress = GroupProgress(total) if many else Progress(total)
+        total = settings.episodes
+        progress = GroupProgress(total, len(folders), **ahead) if many else Progress(total, **ahead)
         stack.enter_context(progress)
         loops = {}
         for seed, folder in folders.items():
@@ -125,8 +132,8 @@ def _group(
                 voice.message(note)
             loops[seed] = Loop(own, run, store, voice)
         interrupts = stack.enter_context(Interrupts(progress.message))
-        batch = _batch(plan, devices, chunk)
-        return _Together(plan, loops, progress, interrupts, batch).run()
+        simulator = _batch(plan, devices, chunk)
+        return _Together(plan, loops, progress, interrupts, simulator).run()
 
 
 def _batch(plan: Plan, devices: int | None, chunk: int | None) -> Batch:
@@ -192,6 +199,7 @@ class _Together:
         where = f", {count} devices" if count > 1 else ""
         message = f"compiled in {watch.seconds:.1f} s (engine {engine}{where})"
         self.progress.message(message)
+        self.progress.compiled()
         for seed in self.waiting:
             self.loops[seed].run_directory.log(message)
         self.timing = Timing(watch.seconds, runs=len(self.waiting))

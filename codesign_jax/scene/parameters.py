@@ -19,6 +19,7 @@ codesign_jax.scene.schema.SceneError: length = 95.0 is outside [0.001, 1] m; did
 import dataclasses
 import functools
 import re
+import warnings
 from typing import Any
 
 import jax
@@ -212,14 +213,23 @@ class DesignSpace:
     def from_units(self, design: np.typing.ArrayLike) -> np.ndarray:
         """Converts design vectors from the hand file's units to SI, shape (..., parameter).
 
-        A design outside of the space's bounds is converted as well: it may be simulated, though no
-        optimiser proposes it.
+        A design outside of the space's bounds is converted as well, with a warning: it may be
+        simulated, though no optimiser proposes it.
 
         Raises:
           SceneError: If the last axis is not that of the parameters.
         """
         self._refuse_shape(design, "..., ")
-        return np.asarray(design, float) * np.asarray(self.scale)
+        given, scale = np.asarray(design, float), np.asarray(self.scale)
+        ends = zip(self.names, self.units, self.low / scale, self.high / scale, strict=True)
+        columns = given.reshape(-1, self.num_parameters).T
+        found = [
+            unit_slips.outside(*end, column) for end, column in zip(ends, columns, strict=True)
+        ]
+        if words := "; ".join(problem for problem in found if problem):
+            text = f"design outside of the space's bounds, which is simulated all the same: {words}"
+            warnings.warn(text, stacklevel=2)
+        return given * scale
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -13,8 +13,10 @@ import math
 import re
 import types
 import typing
-import unicodedata
 from typing import Any, TypeVar
+
+from codesign_jax.scene import texts
+from codesign_jax.scene.texts import SHOWN, printable, shown
 
 T = TypeVar("T")
 
@@ -30,16 +32,10 @@ _SMALLER = (1e-3, 1e-6)
 _UNIT = re.compile(r"(µ|m|k|M)?(m|s|g|N|Pa|Hz)(?![A-Za-z])(.*)")
 _COMMON = {"Mg/m^3": "g/cm^3"}
 """What a unit is usually called."""
-_CONTROL = {"Cc", "Cs", "Zl", "Zp"}
-"""Unicode categories of what is no text: control characters, halves of a pair, ends of lines."""
 MOST_ENTRIES = 1000
 """Most entries of an array."""
 _UNKNOWN = 20
 """Most unknown keys of a table that are named."""
-MOST_LETTERS = 1000
-"""Most characters of a text."""
-_SHOWN = 120
-"""Most characters of a value in a message."""
 
 
 class SceneError(ValueError):
@@ -59,7 +55,7 @@ class SceneError(ValueError):
 
     def __init__(self, problems: list[str]):
         """Joins the problems into one message, a line each."""
-        self.problems = [_printable(problem) for problem in problems]
+        self.problems = [printable(problem) for problem in problems]
         super().__init__("\n".join(self.problems))
 
 
@@ -104,29 +100,10 @@ def choice(*options: str, **kwargs: Any) -> Any:
     return dataclasses.field(metadata={"options": options}, **kwargs)
 
 
-def shown(value: Any) -> str:
-    """A value as in Python's source, for a message; a long one is cut short."""
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # an int of thousands of digits, lists in lists
-        return f"({type(value).__name__} too long to show)"
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}... ({len(text):,} characters)"
-
-
-def _printable(message: str) -> str:
-    """A message without what a terminal would take for a command, or could not show."""
-    if message.isprintable():
-        return message
-    return "".join(
-        c if c in "\n\t" or unicodedata.category(c) not in _CONTROL else ascii(c)[1:-1]
-        for c in message
-    )
-
-
 def nearest(name: str, names: typing.Iterable[str]) -> str:
     """Returns a hint naming the valid name closest to a misspelt one, or the whole list."""
     names = list(names)
-    close = difflib.get_close_matches(name[:_SHOWN], names, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(name[:SHOWN], names, n=1, cutoff=0.5)
     return f"did you mean {close[0]!r}?" if close else "valid: " + ", ".join(sorted(names))
 
 
@@ -214,7 +191,7 @@ def parse(cls: type[T], table: Any, path: str, problems: list[str]) -> T | None:
     hints = _hints(cls)
     unknown = [key for key in table if key not in fields]
     for key in unknown[:_UNKNOWN]:
-        problems.append(f"{path}.{key[:_SHOWN]} is not a known key; {nearest(key, fields)}")
+        problems.append(f"{path}.{key[:SHOWN]} is not a known key; {nearest(key, fields)}")
     if len(unknown) > _UNKNOWN:
         problems.append(f"{path} has {len(unknown) - _UNKNOWN:,} more unknown keys")
     values = {}
@@ -331,7 +308,7 @@ def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
         problems.append(f"{path} = {shown(value)} must be {_kind(hint, field)}")
         return None
-    if hint is str and (problem := text_problem(path, value, lines=field.name == "description")):
+    if hint is str and (problem := texts.problem(path, value, lines=field.name == "description")):
         problems.append(problem)
         return None
     options = field.metadata.get("options")
@@ -347,23 +324,6 @@ def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems
     except OverflowError:
         problems.append(f"{path} = {shown(value)} is too large")
         return None
-
-
-def text_problem(path: str, text: str, *, lines: bool = False) -> str | None:
-    """Returns why a text is none that a file, a table or a terminal could hold, or None.
-
-    Args:
-      path: Key path shown to the user.
-      text: The text.
-      lines: Whether it may have several lines.
-    """
-    if len(text) > MOST_LETTERS:
-        return f"{path} has {len(text):,} characters, more than {MOST_LETTERS:,}"
-    allowed = "\n\r\t" if lines else ""
-    for c in text:
-        if unicodedata.category(c) in _CONTROL and c not in allowed:
-            return f"{path} = {shown(text)} has a character that is no text, U+{ord(c):04X}"
-    return None
 
 
 def _kind(hint: type, field: dataclasses.Field) -> str:

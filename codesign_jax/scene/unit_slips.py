@@ -43,6 +43,21 @@ def hint_at_kilopascals(pressures: np.ndarray) -> None:
         )
 
 
+def outside(name: str, unit: str, low: float, high: float, values: np.ndarray) -> str | None:
+    """What is wrong with the first value, if any, that is outside of bounds, or None.
+
+    Args:
+      name: What the values are of.
+      unit: Their unit.
+      low: Lower bound.
+      high: Upper bound.
+      values: The values, shape (n,).
+    """
+    slack = 1e-6 * max(abs(low), abs(high))  # bounds that went to SI and back, also as float32
+    bad = values[~((values >= low - slack) & (values <= high + slack))]
+    return schema.range_problem(name, float(bad[0]), unit, low, high) if bad.size else None
+
+
 def slips(name: str, row: str, values: np.ndarray) -> list[str]:
     """What is wrong with the first value, if any, that looks like one of another unit."""
     kind = PARAMETERS[row]

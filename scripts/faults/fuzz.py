@@ -6,13 +6,14 @@ what should not have come: another error, a file that does not read back, or too
 """
 
 import contextlib
+import dataclasses
 import io
 import random
-import re
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -21,147 +22,18 @@ from codesign_jax import cli
 from codesign_jax import scene as scenes
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import SceneError, keypaths, library, meshes
+from scripts.faults.hostile import (
+    NUMBER,
+    NUMBERS,
+    TEXTS,
+    mutate_bytes,
+    mutate_toml,
+    replace,
+    value,
+)
 
 SECONDS = 20.0
 """Processor time within which input is refused."""
-NUMBERS = (
-    *("0", "-1", "1", "1e308", "-1e308", "1e-320", "1e999", "inf", "-inf", "nan", "-0.0", "0x10"),
-    *("9" * 400, "9" * 5000, "0x" + "f" * 5000, "1e", "1_000", "01", "true", "2147483648"),
-    *("9223372036854775808", "0.1", "200", "3", "1979-05-27", "07:32:00", "1e-9", "25", "100"),
-)
-TEXTS = (
-    *("", " ", ".", "..", "/etc/passwd", "../../x", "a/b", "nan", "-x", "~", "paper", "full", "2d"),
-    *(
-        "a\u2028b",
-        "a\u2029b",
-        "a\u0085b",
-        "a\x00b",
-        "a\x1b[31mb",
-        "a\rb",
-        "a\nb",
-        "\ufeffa",
-        "\u202ea",
-    ),
-    *("é" * 200, "x" * 5000, "<img src=x>", "a.toml", "none.toml", "%j", "$(id)", "日本", "😀"),
-    *("a" * 300 + ".toml", "\\", '"', "a\\u0000b", "[0]", "\udcff", "\ud800"),
-)
-VALUES = (
-    *("[]", "{}", "[[]]", "[{}]", "[1, 2]", "[1, 'a']", "{a = 1}", "''", "'''\na'''", "[nan]"),
-    *("[" * 2000, "[" * 50 + "]" * 50, "{a=" * 100 + "1" + "}" * 100, "[" + "0," * 2000 + "]"),
-)
-_NUMBER = re.compile(r"-?\d[\d_.]*(e-?\d+)?")
-_STRING = re.compile(r'"[^"\n]*"')
-
-
-def _toml_text(text: str) -> str:
-    """A text as a TOML string, raw: what is not allowed there is part of the test."""
-    return f'"{text}"'
-
-
-def value(rng: random.Random) -> str:
-    """A hostile TOML value."""
-    kind = rng.randrange(4)
-    if kind == 0:
-        return rng.choice(VALUES)
-    if kind == 1:
-        return _toml_text(rng.choice(TEXTS))
-    return rng.choice(NUMBERS)
-
-
-def _replace(rng: random.Random, pattern: re.Pattern, text: str, new: str) -> str:
-    found = [*pattern.finditer(text)]
-    if not found:
-        return text
-    at = rng.choice(found)
-    return text[: at.start()] + new + text[at.end() :]
-
-
-def _lines(rng: random.Random, text: str) -> str:
-    """Leaves out, repeats, exchanges or moves lines."""
-    lines = text.split("\n")
-    i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
-    kind = rng.randrange(4)
-    if kind == 0:
-        del lines[min(i, j) : min(i, j) + rng.choice((1, 1, 1, 5))]
-    elif kind == 1:
-        lines[i:i] = lines[j : j + rng.choice((1, 1, 3, 10))] * rng.choice((1, 1, 2, 1000))
-    elif kind == 2:
-        lines[i], lines[j] = lines[j], lines[i]
-    else:
-        lines.insert(i, _new_line(rng))
-    return "\n".join(lines)
-
-
-def _new_line(rng: random.Random) -> str:
-    """A line of a key, a table or nothing of the kind."""
-    key = rng.choice(("x", "name", "hand", "gravity", '"a b"', "a.b.c", "a." * 3000 + "b", "size"))
-    kind = rng.randrange(5)
-    if kind == 0:
-        return f"[{key}]"
-    if kind == 1:
-        return f"[[{key}]]"
-    if kind == 2:
-        return rng.choice(TEXTS)
-    return f"{key} = {value(rng)}"
-
-
-def _bytes(rng: random.Random, data: bytes) -> bytes:
-    """Flips, inserts, cuts or repeats bytes."""
-    data = bytearray(data)
-    if not data:
-        return b"x"
-    at = rng.randrange(len(data))
-    kind = rng.randrange(6)
-    if kind == 0:
-        for _ in range(rng.choice((1, 1, 4, 32))):
-            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-    elif kind == 1:
-        data[at:at] = rng.choice(
-            (b"\xff", b"\x00", b"\xef\xbb\xbf", b"\r", b"\xe2\x80\xa8", b"\xed\xa0\x80")
-        )
-    elif kind == 2:
-        del data[at:]
-    elif kind == 3:
-        del data[at : at + rng.choice((1, 4, 50))]
-    elif kind == 4:
-        data[at:at] = data[at : at + 100] * rng.choice((1, 10, 100))
-    else:
-        data[at] = rng.randrange(256)
-    return bytes(data)
-
-
-def mutate_toml(rng: random.Random, text: str) -> bytes:
-    """A TOML file with one to three hostile changes.
-
-    Args:
-      rng: Says which.
-      text: The file as it should be.
-    """
-    data: bytes | None = None
-    for _ in range(rng.choice((1, 1, 2, 3))):
-        kind = rng.randrange(10)
-        if kind < 3:
-            text = _replace(
-                rng, _NUMBER, text, value(rng) if rng.random() < 0.3 else rng.choice(NUMBERS)
-            )
-        elif kind < 5:
-            text = _replace(rng, _STRING, text, _toml_text(rng.choice(TEXTS)))
-        elif kind == 5:
-            text = _replace(rng, re.compile(r"(?<== ).*"), text, value(rng))
-        elif kind == 6:
-            text = _replace(
-                rng, re.compile(r"^[\w.]+(?= =)", re.M), text, rng.choice(("x", "a" * 5000))
-            )
-        elif kind == 7:
-            text = _lines(rng, text)
-        elif kind == 8:
-            text = text + rng.choice(("\n", "x = 1\n" * 60_000, "#" * 400_000, "\n[a]\n" * 2000))
-        else:
-            data = _bytes(rng, text.encode("utf-8", "surrogatepass"))
-            text = data.decode("utf-8", "replace") if rng.random() < 0.5 else text
-    if data is not None and rng.random() < 0.5:
-        return data
-    return text.encode("utf-8", "surrogatepass")
 
 
 def _category(trial: Callable[[], str], others: tuple[type[BaseException], ...] = ()) -> str:
@@ -253,6 +125,7 @@ def _reads_back(loaded: scenes.Scene, folder: Path) -> str:
     return "accepted"
 
 
+_USUAL = ("1", "2", "3", "6")
 _WORDS = (
     "--dry-run",
     "--fresh",
@@ -331,8 +204,9 @@ def command_line(rng: random.Random, folder: Path) -> list[str]:
     for _ in range(rng.choice((1, 1, 1, 1, 2, 3))):
         kind = rng.random()
         if kind < 0.7:
-            flag = rng.choice([*_FLAGS])
-            arguments += [flag, rng.choice(_FLAGS[flag])]
+            flag = rng.choice(_own(arguments[0]) if rng.random() < 0.95 else [*_FLAGS])
+            usual = _USUAL if _FLAGS[flag] is NUMBERS else _FLAGS[flag][:2]
+            arguments += [flag, rng.choice(usual if rng.random() < 0.4 else _FLAGS[flag])]
         elif kind < 0.9:
             arguments += ["--set", _pair(rng)]
         else:
@@ -340,6 +214,15 @@ def command_line(rng: random.Random, folder: Path) -> list[str]:
     if command == "export":
         arguments += ["--out", str(folder / "export")]
     return [*arguments, *_NEVER[command]]
+
+
+def _own(command: str) -> list[str]:
+    """The flags that a command has, of those that have values here; all if there is no such one."""
+    names = [
+        field.name for field in dataclasses.fields(getattr(cli, command.title(), cli.Optimize))
+    ]
+    flags = {"--run" if n == "run_folder" else "--" + n.replace("_", "-") for n in names}
+    return [flag for flag in _FLAGS if flag in flags]
 
 
 def try_command_line(number: int, folder: Path) -> str:
@@ -400,7 +283,7 @@ def _base_mesh(rng: random.Random) -> trimesh.Trimesh:
             ),
         )
     )
-    mesh = make()
+    mesh: Any = make()
     if rng.random() < 0.2:
         mesh.apply_scale(10 ** rng.uniform(-3, 3))
     return mesh
@@ -408,7 +291,9 @@ def _base_mesh(rng: random.Random) -> trimesh.Trimesh:
 
 def _exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
     options = {"encoding": "ascii"} if kind == "ply_ascii" else {}
-    data = mesh.export(file_type=kind.removesuffix("_ascii") if "ply" in kind else kind, **options)
+    data: Any = mesh.export(
+        file_type=kind.removesuffix("_ascii") if "ply" in kind else kind, **options
+    )
     return data.encode() if isinstance(data, str) else data
 
 
@@ -428,9 +313,9 @@ def mutate_mesh(rng: random.Random, data: bytes, kind: str) -> bytes:
             data = data[:at] + four + data[at + 4 :]
         elif kind in ("obj", "off", "ply_ascii", "stl_ascii", "glb") and rng.random() < 0.6:
             text = data.decode("latin-1")
-            data = _replace(rng, _NUMBER, text, rng.choice(_MESH_NUMBERS)).encode("latin-1")
+            data = replace(rng, NUMBER, text, rng.choice(_MESH_NUMBERS)).encode("latin-1")
         else:
-            data = _bytes(rng, data)
+            data = mutate_bytes(rng, data)
     return data
 
 

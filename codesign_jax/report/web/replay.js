@@ -9,7 +9,24 @@
 //           face (uint32, 3 a triangle).  A vertex is (1 - w) T_first(first) + w T_second(second).
 //   poses   base64 float32 (frame, body, 7): position [m] and unit quaternion (w, x, y, z)
 //   bodies, frames, rate [frames/s], phases [[name, end time s], ...], camera, table, object
+//   strip   pictures [[caption, base64 PNG], ...] for a browser without WebGL 2
 "use strict";
+
+// Pictures in place of the 3D view and its controls.
+function showStrip(root, strip) {
+  const find = (name) => root.querySelector(`.${name}`);
+  find("message").textContent = "Pictures instead of 3D: this browser offers no WebGL 2. " +
+    "Its settings may have hardware acceleration switched off.";
+  for (const [caption, png] of strip) {
+    const figure = document.createElement("figure"), picture = document.createElement("img");
+    const words = document.createElement("figcaption");
+    picture.src = `data:image/png;base64,${png}`;
+    picture.alt = words.textContent = caption;
+    figure.append(picture, words);
+    find("strip").append(figure);
+  }
+  root.classList.add("still");
+}
 
 function startReplay(root, data) {
   const decode = (text, type) => new type(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
@@ -20,8 +37,7 @@ function startReplay(root, data) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true,
     preserveDrawingBuffer: true });
   if (!gl) {
-    find("message").textContent =
-      "No 3D here: this browser offers no WebGL 2. Its settings may have hardware acceleration switched off.";
+    showStrip(root, data.strip);
     return null;
   }
 

@@ -1,0 +1,174 @@
+"""Derivatives of a rollout's kernel against central differences of the kernel itself, in float64.
+
+They are taken of the kernel's own tables: one call of the forward kernel has a world for each side
+of each group of numbers, moved along a random direction, and one call of the reverse kernel has the
+derivatives by all of them.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import model
+from codesign_jax.engines.structured import StructuredEngine, coordinates
+from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, recorded
+from tests import small
+
+EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-26}
+"""Solved to rounding: differences divide the solver's error by twice the step."""
+FIXED = ("alive", "object_id", "lost_distance", "start", "end", "speed", "penetration", "share")
+FIXED += ("ball", "support", "grid_first", "grid_nodes", "grid_reach")
+"""Rows of the tables that no derivative is asked for: indices, bounds, and what only saves time."""
+TABLES = ("hand", "world", "finger_state", "world_state", "arm", "pressure")
+
+
+class Start(NamedTuple):
+    """One world: its fields, its velocities at the start and its controls, (time, nu)."""
+
+    fields: Any
+    qvel: np.ndarray
+    ctrl: np.ndarray
+
+
+class Weights(NamedTuple):
+    """Cotangents of what a rollout returns: of a world's last state, entries and positions."""
+
+    last: np.ndarray
+    entries: np.ndarray
+    qpos: np.ndarray
+
+    def times(self, factor):
+        return Weights(*(factor * x for x in self))
+
+
+def curled(scene, steps, *, bend=0.9, height=0.07, seed=1):
+    """A hand with bent fingers around the object, all of it moving."""
+    params, trial = small.hand_world(scene, length=0.1)
+    fields, ctrl = small.world_inputs(scene, params, trial)
+    random, lay, qpos = np.random.default_rng(seed), model.layout(scene), np.array(fields.start)
+    angles = 0.1 * random.normal(size=lay.dofs.shape)
+    angles[..., 0] += bend
+    qpos[2] = height
+    qpos[6 : 6 + lay.dofs.size] = angles.ravel()
+    qpos[-7:-4] += [0.001, 0.002, -0.002]
+    ctrl = np.repeat(np.asarray(ctrl)[:1], steps, 0)
+    ctrl[:, :6], ctrl[:, 6:] = qpos[:6], 60e3
+    qvel = 0.3 * random.normal(size=len(qpos) - 1)
+    qvel[-4] = -6.0  # the object is thrown at the table
+    return Start(fields._replace(start=jnp.asarray(qpos)), qvel, ctrl)
+
+
+def weights_of(start, seed=0):
+    """Random ones; the first entry of the speed is a constant, zero."""
+    random, nq, steps = np.random.default_rng(seed), len(start.fields.start), len(start.ctrl)
+    shapes = (2 * nq - 1,), (steps, 3), (steps, nq)
+    found = Weights(*(random.normal(size=shape) for shape in shapes))
+    found.entries[0, 2] = 0.0
+    return found
+
+
+class Case:
+    """A scene's kernels and the tables of one world."""
+
+    def __init__(self, scene, start, width=8):
+        """Packs the world into tables; width: lanes of a block."""
+        engine = StructuredEngine(scene, **EXACT)
+        self.program = AdjointProgram(scene, engine.limits, backend="cpu", width=width)
+        self.start, (hand, state) = start, self._lanes(scene, engine, start)
+        ctrl = jnp.asarray(start.ctrl)[None]
+        self.tables = [np.array(x) for x in jax.jit(self.program.inputs)(hand, state, ctrl)]
+        layouts = [getattr(self.program, name) for name in TABLES[:4]]
+        self.groups = [
+            (k, name)
+            for k, layout in enumerate(layouts)
+            for name in layout.groups
+            if name not in FIXED and not name.startswith("acc")
+        ] + [(4, "arm"), (5, "pressure")]
+
+    @staticmethod
+    def _lanes(scene, engine, start):
+        fields = jax.tree.map(lambda v: jnp.asarray(v)[None], start.fields)
+        state = engine.reset(fields)
+        state = engine.place(state, engine.qpos(state), jnp.asarray(start.qvel)[None])
+        return small.lanes(scene, fields), state
+
+    def world(self, table, k=0):
+        """A world's numbers of a table, (block, ..., lane or world) to (..., finger or 1)."""
+        split = table.reshape(*table.shape[:-1], -1, self.program.block)
+        return split[(k // self.program.block, ..., k % self.program.block)]
+
+    def many(self, worlds):
+        """Tables of so many copies of the world, and a function that sets one world's numbers."""
+        blocks = -(-worlds // self.program.block)
+        tables = []
+        for x in self.tables[:6]:
+            one = self.world(x)[..., None]
+            block = np.repeat(one, self.program.block, -1).reshape(x.shape[1:])
+            tables.append(np.repeat(block[None], blocks, 0))
+        return tables + [x.copy() for x in self.tables[6:]]
+
+    def rows(self, k, name):
+        """Rows of a group in its table."""
+        if k > 3:
+            return Ellipsis
+        layout = getattr(self.program, TABLES[k])
+        count, first = layout.groups[name][0] * layout.stride[name], layout.offset[name]
+        return slice(first, first + count)
+
+    def directions(self):
+        """A random direction for each group, as large as its numbers."""
+        random, found = np.random.default_rng(0), []
+        for k, name in self.groups:
+            here, rows = self.world(self.tables[k]), self.rows(k, name)
+            along, noise = np.zeros_like(here), random.normal(size=here.shape)
+            size = {2: 0.1, 3: 0.1, 4: 0.01, 5: np.abs(here).max()}.get(k)
+            along[rows] = noise[rows] * (np.abs(here[rows]) if size is None else size)
+            if name == "quat":  # it stays one
+                along[rows] -= here[rows] * (here[rows] * along[rows]).sum()
+            found.append(along)
+        return found
+
+    def differences(self, weights, step):
+        """Central differences of the weighted results along the groups' directions; the trace."""
+        tables, count = self.many(2 * len(self.groups) + 1), 2 * len(self.groups) + 1
+        for g, ((k, _), along) in enumerate(zip(self.groups, self.directions(), strict=True)):
+            for side, sign in ((2 * g, 1), (2 * g + 1, -1)):
+                split = tables[k].reshape(*tables[k].shape[:-1], -1, self.program.block)
+                block, world = divmod(side, self.program.block)
+                split[(block, ..., world)] += sign * step * along
+        found, last = self.program.outputs(self.execute(tables), count, states=True)
+        found = {name: np.asarray(v) for name, v in found.items()}
+        entries = np.stack([found[n] for n in ("distance", "height", "speed")], 2)
+        value = np.asarray(coordinates.flat(last)) @ weights.last
+        value = value + np.einsum("wte,te->w", entries, weights.entries)
+        value = value + np.einsum("wtq,tq->w", found["qpos"], weights.qpos)
+        sides = value[:-1].reshape(-1, 2)
+        return (sides[:, 0] - sides[:, 1]) / (2 * step), found
+
+    def execute(self, tables):
+        """What the forward kernel makes of tables, all states recorded."""
+        run = jax.jit(lambda *x: self.program.execute(x, states=1))
+        return run(*map(jnp.asarray, tables))
+
+    def bars(self, tables, out, weights):
+        """Cotangents of tables for weights of each world, by what `execute` made of them."""
+        program, count = self.program, tables[0].shape[0] * self.program.block
+        missing = [weights[0].times(0.0)] * (count - len(weights))
+        last, entries, qpos = (np.stack(x) for x in zip(*weights, *missing, strict=True))
+
+        def run(tables, out, last, entries, qpos):
+            trace, _ = program.outputs(out, count)
+            taken = program.by_block(trace["moved"].sum(1)[:, None, None, None])
+            rows = Cotangents(*program.rows_of_end(last), entries[..., None], program.rows_of(qpos))
+            rows = jax.tree.map(program.by_block, rows)
+            return program.adjoint(tables, recorded(out, taken), rows)
+
+        tables = tuple(map(jnp.asarray, tables))
+        return [np.asarray(x) for x in jax.jit(run)(tables, out, last, entries, qpos)]
+
+    def along(self, bars, world=0):
+        """Derivatives of a world along the groups' directions."""
+        directions = zip(self.groups, self.directions(), strict=True)
+        return np.array([(self.world(bars[k], world) * d).sum() for (k, _), d in directions])

@@ -1,0 +1,368 @@
+"""The derivative of a rollout: a kernel against differences of the kernel, and planted faults."""
+
+import contextlib
+import functools
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from codesign_jax import scene
+from codesign_jax.compiler import cache
+from codesign_jax.engines.structured.kernel import (
+    pair_sweep,
+    pull,
+    reverse,
+    sweep,
+    virtual,
+)
+from codesign_jax.engines.structured.kernel.bars import Bars
+from codesign_jax.engines.structured.kernel.virtual import Virtual
+from codesign_jax.engines.structured.lanewise import lanewise
+from tests import small
+from tests.planted import chosen, name_of
+from tests.reverse import Case, curled, weights_of
+
+DATA, STEP = small.DATA, 1e-6
+BOUND = 1e-8
+"""Of the largest derivative of any group.  Differences lose rounding of 1e-15 over the step, and
+the step times the kink where a vertex of the hull enters a section within it: the quick tests'
+state has none, by two steps' differences that agree to 2e-10."""
+EVERYTHING = {
+    "effects__surface": "hull",
+    "effects__finger_finger": True,
+    "effects__neo_hookean": True,
+    "contact__finger_finger_friction": 0.6,  # not the object's
+    "discretization__hull_rings": 2,
+    "discretization__hull_points": 4,
+}
+
+
+def compared(case, steps=(STEP,)):
+    """Errors of the groups' derivatives over the largest, the least of several difference steps."""
+    weights = weights_of(case.start)
+    tables = case.many(1)
+    slope = case.along(case.bars(tables, case.execute(tables), [weights]))
+    errors = []
+    for step in steps:
+        difference, found = case.differences(weights, step)
+        assert (found["moved"] == 1).all()
+        errors.append(np.abs(slope - difference) / np.abs(slope).max())
+    for group, *row in zip(case.groups, slope, *errors, strict=True):
+        print(group[1], *(f"{v:.2e}" for v in row))
+    return np.min(errors, 0), dict(zip((name for _, name in case.groups), slope, strict=True))
+
+
+# --- planted faults ------------------------------------------------------------------------------
+
+DEEP = 1e6
+"""Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
+
+
+class Fault(NamedTuple):
+    """What is wrong in the reverse pass of a world.
+
+    Attributes:
+      seeds: Wrong cotangents of a stage's results by its name, a function of the right ones.
+      results: Wrong cotangents of a stage's arguments, likewise.
+      methods: Wrong results of methods by class and name, functions of the right result and of
+        the method's arguments.
+      names: Of what no cotangent is kept.
+    """
+
+    seeds: dict = {}
+    results: dict = {}
+    methods: dict = {}
+    names: tuple = ()
+
+
+def none(tree):
+    return lanewise(partial(jax.tree.map, jnp.zeros_like), tree)
+
+
+def without(place, *fields):
+    """Of several cotangents one, or fields of it, is zero."""
+
+    def change(found):
+        new = list(found)
+        new[place] = (
+            none(new[place])
+            if not fields
+            else new[place]._replace(**{f: none(getattr(new[place], f)) for f in fields})
+        )
+        return type(found)(new)
+
+    return change
+
+
+FAULTS = {
+    "links do not hand on what velocities cause": Fault(results={"of_link": without(0, "bias")}),
+    "links do not hand on virtual motions": Fault(seeds={"of_link": without(0, "along")}),
+    "links have no power": Fault(seeds={"of_link": without(1)}),
+    "the palm does not feel the fingers": Fault(seeds={"of_palm": without(0, "motion", "along")}),
+    "the arm's commands do nothing": Fault(results={"of_palm": without(1)}),
+    "angles hand on nothing": Fault(seeds={"_turned": without(1)}),
+    "the object's frame stands still": Fault(names=("columns",)),
+    "the object's velocity does nothing": Fault(names=("object_vel",)),
+    "the table stands still": Fault(names=("height",)),
+    "no power of a vertex's joint": Fault(results={"of_vertex": without(1)}),
+    "no power of vertices behind a joint": Fault(results={"of_vertex": without(3, "frame")}),
+    "sections of one size": Fault(names=("section_box",)),
+    "rows push without their sums": Fault(results={"between_rows": without(0)}),
+    "the other finger's row stands still": Fault(results={"vertex_sums": without(2)}),
+    "both fingers own a contact": Fault(
+        methods={(pair_sweep, "only_on"): lambda right, mask, tree: tree}
+    ),
+    "contacts push on the right side": Fault(
+        methods={
+            (Virtual, "push"): lambda right, self, contacts, item, alpha: contacts.push(item, alpha)
+        }
+    ),
+    "contacts of another stiffness": Fault(
+        methods={
+            (Virtual, "push"): lambda right, *_: (lanewise(lambda m: 0.99 * m, right[0]), right[1])
+        }
+    ),
+    "smooth forces on the right side": Fault(
+        methods={
+            (Virtual, "smooth"): lambda right, self, i: [
+                *self.problem.read("smooth", item=i),
+                right[1],
+            ]
+        }
+    ),
+    "palm without conjugate gradients": Fault(
+        methods={(virtual.Coupling, "correct"): lambda right, self, step, idle: step}
+    ),
+}
+
+
+class Planted:
+    """Stages of the reverse pass, wrong in the worlds of the faults; `used`: what was planted."""
+
+    def __init__(self, faults):
+        self.faults, self.used, self.step = faults, set(), None
+
+    def mine(self, number):
+        """Lanes of a fault's world."""
+        return self.step.constant("penetration").lane - DEEP == number
+
+    def each(self, kind, key):
+        """Faults of a stage or method: their wrong results and lanes."""
+        for number, (name, fault) in enumerate(self.faults.items()):
+            if key in (known := getattr(fault, kind)):
+                self.used.add(name)
+                yield known[key] if isinstance(known, dict) else none, self.mine(number)
+
+    def pull(self, function, args, fixed, bars):
+        """Instead of `pull`."""
+        stage = name_of(function)
+        for change, mine in self.each("seeds", stage):
+            bars = chosen(mine, change(bars), bars)
+        found = pull.pull(function, args, fixed, bars)
+        for change, mine in self.each("results", stage):
+            found = chosen(mine, change(found), found)
+        return found
+
+    def method(self, owner, name):
+        """Instead of a method."""
+        right = getattr(owner, name)
+
+        def call(*args, **kwargs):
+            found = right(*args, **kwargs)
+            for change, mine in self.each("methods", (owner, name)):
+                found = chosen(mine, change(found, *args), found)
+            return found
+
+        return call
+
+    def add(self, right):
+        """Instead of `Bars.add`."""
+
+        def call(this, values, *args):
+            kept = {
+                key: functools.reduce(
+                    lambda v, f: chosen(f[1], none(v), v), self.each("names", key), value
+                )
+                for key, value in values.items()
+            }
+            return right(this, kept, *args)
+
+        return call
+
+
+@contextlib.contextmanager
+def planted(faults):
+    """Kernels of derivatives that are made within have the faults."""
+    fault = Planted(faults)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (sweep, pair_sweep, reverse):
+            patch.setattr(module, "pull", fault.pull)
+        for owner, name in {key for f in faults.values() for key in f.methods}:
+            patch.setattr(owner, name, fault.method(owner, name))
+        patch.setattr(Bars, "add", fault.add(Bars.add))
+        start = reverse.ReverseStep.__init__
+
+        def prepare(self, *args):
+            start(self, *args)
+            fault.step = self
+
+        patch.setattr(reverse.ReverseStep, "__init__", prepare)
+        # Sound kernels must neither be found in the place of this one nor find it.
+        patch.setattr(cache, "sources", lambda *_: f"planted: {sorted(faults)}")
+        patch.setattr(cache, "kept", lambda name, build: build())
+        yield
+    assert fault.used == set(faults), set(faults) - fault.used
+
+
+class Checked(NamedTuple):
+    """What the tests look at: derivatives along the groups' directions.
+
+    Attributes:
+      names: Of the groups.
+      difference: Central differences.
+      sound: Of a sound world for two weights, one plus twice the other, and zero, (4, group).
+      wrong: Of the faults' worlds, (fault, group).
+      alone: All cotangents of a sound world, and those of the same world in other company.
+    """
+
+    names: list
+    difference: np.ndarray
+    sound: np.ndarray
+    wrong: np.ndarray
+    alone: tuple
+
+
+@functools.cache
+def checked():
+    """One kernel with all faults, whose other worlds are sound."""
+    with jax.enable_x64(True):
+        case = Case(
+            the_scene := small.pinch("box", links=2, **EVERYTHING),
+            curled(the_scene, 3, bend=1.4, height=0.055, seed=3),
+        )
+        first, second = (weights_of(case.start, seed) for seed in (0, 1))
+        both = type(first)(*(a + 2.0 * b for a, b in zip(first, second, strict=True)))
+        each = [first] * len(FAULTS) + [first, second, both, first.times(0.0)]
+        place = case.rows(1, "penetration").start
+        tables = case.many(len(each))
+        # Sound worlds stand between those of the faults in the other order.
+        orders = np.arange(len(each)), np.random.default_rng(2).permutation(len(each))
+        out, found = case.execute(tables), []
+        with planted(FAULTS):
+            for order in orders:
+                number = np.full(tables[1].shape[0] * case.program.block, 1e3)
+                number[: len(each)] = order
+                tables[1][:, place] = (DEEP + number).reshape(-1, case.program.block)
+                found.append(case.bars(tables, out, [each[k] for k in order]))
+        slopes = np.array([case.along(found[0], w) for w in range(len(each))])
+        difference, trace = case.differences(first, STEP)
+    assert (trace["moved"] == 1).all()
+    faults = len(FAULTS)
+    alone = tuple(
+        [[case.world(b, w) for b in bars[:6]] for w in np.argsort(order)[faults : faults + 3]]
+        for bars, order in zip(found, orders, strict=True)
+    )
+    names = [name for _, name in case.groups]
+    return Checked(names, difference, slopes[faults:], slopes[:faults], alone)
+
+
+def test_derivatives_by_every_group_equal_central_differences():
+    """Hull, contact between fingers, palm, wrist, softening: everything that a scene may have."""
+    c = checked()
+    slope, largest = c.sound[0], np.abs(c.sound[0]).max()
+    for name, *row in zip(c.names, slope, c.difference, strict=True):
+        print(name, *(f"{v:.6e}" for v in row))
+    cones = [abs(s) for n, s in zip(c.names, slope, strict=True) if n.startswith("cone.")]
+    cones += [abs(s) for n, s in zip(c.names, slope, strict=True) if n.startswith("palm_")]
+    assert len(cones) == 9 and min(cones) > 1e-6 * largest  # all bodies touch
+    assert np.abs(slope - c.difference).max() < BOUND * largest
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_differences_notice_a_fault(name):
+    """Some group's derivative is wrong by much more than the bound."""
+    c = checked()
+    wrong = c.wrong[list(FAULTS).index(name)]
+    error = np.abs(wrong - c.difference).max() / np.abs(c.difference).max()
+    print(f"{error:.1e}")
+    assert not error < 10 * BOUND
+
+
+def test_derivatives_are_linear_in_the_cotangents():
+    first, second, both, zero = checked().sound
+    largest = np.abs(first).max() + 2 * np.abs(second).max()
+    # Rounding of float64, and of what conjugate gradients leave of a direction: 1e-12 of it.
+    assert np.abs(first + 2 * second - both).max() < 1e-10 * largest
+    assert (zero == 0).all()
+
+
+def test_derivatives_do_not_depend_on_company():
+    """The same world between others, at another place: the same bits."""
+    for mine, other in zip(*checked().alone, strict=True):
+        for a, b in zip(mine, other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+# --- other scenes: what the quick tests' scene has not ------------------------------------------
+
+SCENES = {
+    "spheres": {"discretization__spheres_per_link": 2, "effects__finger_finger": True},
+    "full friction": {"effects__friction": "full", "effects__finger_finger": True},
+    "no friction": {"effects__friction": "none", "effects__surface": "hull"},
+    "rigid wrist": {"effects__wrist": False},
+    "bending alone": {"effects__twist": False, "effects__lateral_bending": False},
+    "no gravity, no table": {"effects__gravity": False, "effects__object_table": False},
+    "mesh": {},
+    "mesh and hull": {"effects__surface": "hull"},
+    "three fingers": {"effects__finger_finger": True},
+}
+
+
+def mixed(folder):
+    """A set of a mesh, which still trials take, and a primitive."""
+    text = (DATA / "sphere.toml").read_text()
+    mesh = f'''[[object]]
+name = "capsule"
+type = "mesh"
+file = "{Path(__file__).parents[1] / "objects/household/capsule.stl"}"
+unit = "mm"
+mass = 0.1
+friction = 0.8
+
+[[object]]'''
+    (path := folder / "mixed.toml").write_text(text.replace("[[object]]", mesh))
+    return path
+
+
+def loaded(hand, objects, settings):
+    overrides = {"discretization": {"links": 2}}
+    for key, value in settings.items():
+        table, name = key.split("__")
+        overrides.setdefault(table, {})[name] = value
+    return scene.load("paper_spheres", hand_name=hand, object_set=objects, overrides=overrides)
+
+
+@pytest.mark.slow  # quick: the scene with everything
+@pytest.mark.parametrize("name", SCENES)
+def test_derivatives_of_scenes(name, tmp_path):
+    """Each group as above; of two difference steps the one with the smaller error counts."""
+    settings = dict(SCENES[name])
+    if "hull" in settings.values():
+        settings |= {"discretization__hull_rings": 2, "discretization__hull_points": 4}
+    with jax.enable_x64(True):
+        if name.startswith("mesh"):
+            the_scene = loaded(DATA / "pinch.toml", mixed(tmp_path), settings)
+        elif name == "three fingers":
+            the_scene = loaded("tripod3", DATA / "sphere.toml", settings)
+        else:
+            the_scene = small.pinch("sphere", links=2, **settings)
+        case = Case(the_scene, curled(the_scene, 8))
+        errors, slopes = compared(case, (1e-6, 1e-7))
+        touching = [s for n, s in slopes.items() if n in ("cone.hand_object", "object_size")]
+        assert all(touching)
+        assert errors.max() < BOUND

@@ -26,7 +26,7 @@ import pytest
 
 from codesign_jax import scene as scenes
 from codesign_jax.engines.structured import StructuredEngine
-from scripts.shared import output, provenance, work
+from scripts.shared import gradients, output, provenance, work
 
 RATES: dict[str, dict[str, Any]] = {
     "spheres": {},
@@ -47,6 +47,11 @@ RATES: dict[str, dict[str, Any]] = {
 RATES |= {
     f"{name}, whole grasps": {**RATES[name], "whole": True, "worlds": 1728}
     for name in ("spheres", "hull", "hull and fingers", "household meshes")
+}
+RATES |= {
+    f"gradient, {name}, {worlds} worlds": {"scene": name, "gradient": worlds}
+    for name in ("paper_spheres", "paper")
+    for worlds in (60, 1728)
 }
 WORLDS, STEPS, DISTINCT = 16384, 50, 24
 REPETITIONS, ENOUGH_SECONDS = 5, 2.0
@@ -74,7 +79,7 @@ class Recorder:
 
 
 def rate(name: str, values: dict[str, Any], wait: Callable[[], Any]) -> dict[str, Any]:
-    """World-steps a second of short rollouts in contact, or of whole grasps.
+    """World-steps a second of short rollouts in contact or of whole grasps; the times of gradients.
 
     Args:
       name: Name of the case.
@@ -83,6 +88,9 @@ def rate(name: str, values: dict[str, Any], wait: Callable[[], Any]) -> dict[str
       wait: Called when everything is compiled; returns when the GPU is free.
     """
     values = dict(values)
+    if "gradient" in values:
+        found = gradients.cost(scenes.load(values["scene"]), values["gradient"], wait)
+        return {"case": name} | found
     dtype, worlds = values.pop("dtype", np.float32), values.pop("worlds", WORLDS)
     objects, whole = values.pop("objects", None), values.pop("whole", False)
     base, effects = values.pop("scene", "paper_spheres"), values.get("effects", {})
@@ -181,7 +189,8 @@ def main() -> int:
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     if arguments.case:
         values = dict(RATES[arguments.case])
-        values |= {"worlds": arguments.worlds} if arguments.worlds else {}
+        key = "gradient" if "gradient" in values else "worlds"
+        values |= {key: arguments.worlds} if arguments.worlds else {}
         print(json.dumps(rate(arguments.case, values, wait=sys.stdin.readline)))
         return 0
     return suite(arguments)

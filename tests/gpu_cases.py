@@ -14,7 +14,7 @@ from codesign_jax import cost, rollout
 from codesign_jax import scene as scenes
 from codesign_jax.engines.structured import StructuredEngine
 from scripts.shared import work
-from tests import quick_compile, small
+from tests import quick_compile, reverse, small
 
 STEPS = 230
 """Steps of a short grasp: through the approach and the first touch into the inflation."""
@@ -71,6 +71,16 @@ def short(name):
         return {k: np.asarray(getattr(trace, k)) for k in ("distance", "height", "qpos")}
 
 
+def slopes(name):
+    """Derivatives of eight steps of a curled hand by every group of numbers, in float64."""
+    with jax.enable_x64(True):
+        scene, backend = short_scene(name), jax.default_backend()
+        case = reverse.Case(scene, reverse.curled(scene, 8), backend=backend)
+        tables = case.many(1)
+        bars = case.bars(tables, case.execute(tables), [reverse.weights_of(case.start)])
+        return {"slopes": case.along(bars)}
+
+
 def paper(name):
     """The paper's scene with effects by name."""
     values = {key.split("__")[1]: value for key, value in WHOLE[name].items()}
@@ -90,7 +100,7 @@ def main(case, path):
     """Stores what one case finds."""
     quick_compile.use(quick_compile.OPTIMIZED)  # XLA compiles the model fields only
     kind, name = case.split("/", 1)
-    np.savez(path, **{"short": short, "whole": whole}[kind](name))
+    np.savez(path, **{"short": short, "slopes": slopes, "whole": whole}[kind](name))
 
 
 if __name__ == "__main__":

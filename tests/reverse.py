@@ -72,10 +72,10 @@ def weights_of(start, seed=0):
 class Case:
     """A scene's kernels and the tables of one world."""
 
-    def __init__(self, scene, start, width=8):
+    def __init__(self, scene, start, width=8, backend="cpu"):
         """Packs the world into tables; width: lanes of a block."""
         engine = StructuredEngine(scene, **EXACT)
-        self.program = AdjointProgram(scene, engine.limits, backend="cpu", width=width)
+        self.program = AdjointProgram(scene, engine.limits, backend=backend, width=width)
         self.start, (hand, state) = start, self._lanes(scene, engine, start)
         ctrl = jnp.asarray(start.ctrl)[None]
         self.tables = [np.array(x) for x in jax.jit(self.program.inputs)(hand, state, ctrl)]

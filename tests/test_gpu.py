@@ -69,6 +69,16 @@ def test_effects(on_cpu, name):
         np.testing.assert_array_less(np.abs(got[key] - value), tolerance, err_msg=key)
 
 
+@pytest.mark.parametrize("name", ["spheres", "fingers", "hull and fingers", "mesh"])
+def test_derivatives(on_cpu, name):
+    """The reverse pass in float64, by every group of numbers of the kernel's tables."""
+    read = on_cpu(f"slopes/{name}")
+    got, want = gpu_cases.slopes(name)["slopes"], read()["slopes"]
+    # Steps round differently by 1e-16, stiff contacts multiply it by up to seven in a step, and
+    # derivatives divide it by the depth of contacts, of 1e-4 m and more.
+    assert np.abs(got - want).max() < 1e-7 * np.abs(want).max()
+
+
 @pytest.mark.parametrize("name", gpu_cases.WHOLE)
 def test_verdicts(on_cpu, name):
     """Whole grasps in float32: kept on one device, kept on the other.

@@ -2,8 +2,8 @@
 
 import contextlib
 import functools
+import pathlib
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from codesign_jax import scene, sources
-from codesign_jax.compiler import cache
+from codesign_jax.compiler import cache, gpu, launch
+from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
     adjoint,
     pair_sweep,
@@ -21,7 +22,9 @@ from codesign_jax.engines.structured.kernel import (
     sweep,
     virtual,
 )
+from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Path
 from codesign_jax.engines.structured.kernel.bars import Bars
+from codesign_jax.engines.structured.kernel.program import Limits
 from codesign_jax.engines.structured.kernel.virtual import Virtual
 from codesign_jax.engines.structured.lanewise import lanewise
 from tests import small
@@ -331,7 +334,7 @@ def mixed(folder):
     mesh = f'''[[object]]
 name = "capsule"
 type = "mesh"
-file = "{Path(__file__).parents[1] / "objects/household/capsule.stl"}"
+file = "{pathlib.Path(__file__).parents[1] / "objects/household/capsule.stl"}"
 unit = "mm"
 mass = 0.1
 friction = 0.8
@@ -368,3 +371,88 @@ def test_derivatives_of_scenes(name, tmp_path):
         size = "grid_factor" if name.startswith("mesh") else "object_size"
         assert slopes["cone.hand_object"] and slopes[size]
         assert errors.max() < BOUND
+
+
+# --- on a GPU, in segments, of many worlds -------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["paper", pytest.param("paper_spheres", marks=pytest.mark.slow)])
+def test_the_kernel_is_valid_for_gpus(name):
+    """LLVM makes PTX of the reverse pass, without a stack in memory."""
+    the_scene = scene.load(name, overrides={"discretization": {"links": 3}})
+    program = AdjointProgram(the_scene, Limits(9, 9, 1e-6), backend="gpu", width=32)
+    blocks, steps = 1, 2
+
+    def shape(*sizes):
+        return jax.ShapeDtypeStruct((blocks, *sizes), np.float32)
+
+    rows, size, block = program.path_rows(states=True), program.size, program.block
+    hand, world = shape(program.hand.rows, size), shape(program.world.rows, block)
+    state = shape(rows[0], size), shape(rows[1], block)
+    inputs = hand, world, *state, shape(steps, 6, block), shape(steps, size)
+    ends = shape(1, rows[0], size), shape(1, rows[1], block)
+    whole = shape(steps, rows[0], size), shape(steps, rows[1], block)
+    path = Path(*whole, *ends, shape(1, 1, block))
+    given = program._arguments(inputs, path, Cotangents(*ends, shape(steps, 3, block)))
+    call, outputs = program._adjoint_call(given)
+    kernel = launch.Kernel("reverse", "gpu", size, scratch=(6, 7, 8))
+    code = gpu.device_code(
+        launch.kernel_jaxpr(call, list(given)), launch.describe(given, outputs, kernel)
+    )
+    assert ".target sm_80" in code and "shfl.sync.bfly.b32" in code and "__local_depot" not in code
+
+
+SHORT = {"effects__palm_object": False, "effects__palm_table": False, "effects__twist": False}
+
+
+def rollout_slopes(engine, fields, ctrl):
+    """Gradients of a weighted sum of everything that the trace shows."""
+
+    def value(fields, ctrl):
+        trace = engine.rollout(fields, ctrl, trajectory=True)
+        random = np.random.default_rng(0)
+        shown = trace.distance, trace.height, trace.speed, trace.qpos, trace.last
+        return sum((x * random.normal(size=x.shape).astype(x.dtype)).sum() for x in shown)
+
+    return jax.tree.map(np.asarray, jax.jit(jax.grad(value, (0, 1)))(fields, ctrl))
+
+
+@pytest.mark.slow  # four kernels; quick: the parts of a segment are those of the whole path
+def test_segments_have_the_bits_of_the_whole_path():
+    """Of worlds that fall and touch, one of which fails; truncated ones have others."""
+    the_scene = small.pinch("sphere", links=2, **SHORT)
+    fields, ctrl = small.batch_inputs(the_scene, *small.random_worlds(the_scene, 3, 3))
+    fields, ctrl = jax.tree.map(np.array, (fields, ctrl[:, 300:325]))
+    fields.start[:, 2] = 0.09
+    ctrl[:, :, 2], ctrl[2, 17:, 6] = 0.09, np.nan
+    whole = rollout_slopes(StructuredEngine(the_scene), fields, ctrl)
+    parts = rollout_slopes(StructuredEngine(the_scene, segment=10), fields, ctrl)
+    cut = rollout_slopes(StructuredEngine(the_scene, segment=10, truncate=True), fields, ctrl)
+    for a, b in zip(*map(jax.tree.leaves, (whole[1], parts[1])), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for a, b in zip(*map(jax.tree.leaves, (whole[0], parts[0])), strict=True):
+        # Sums over the steps of constants are added up segment by segment.
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * max(np.abs(a).max(), 1e-3))
+    assert np.isfinite(whole[1]).all() and (whole[1][2, 18:] == 0).all()
+    np.testing.assert_array_equal(cut[1][:, 20:], whole[1][:, 20:])
+    assert (cut[1][:2, :20] != whole[1][:2, :20]).any()
+
+
+def test_segments_are_asked_for_in_words():
+    the_scene = small.pinch("sphere", links=2)
+    with pytest.raises(ValueError, match="at least"):
+        StructuredEngine(the_scene, segment=0)
+    with pytest.raises(ValueError, match="needs segment"):
+        StructuredEngine(the_scene, truncate=True)
+    engines = [StructuredEngine(the_scene, segment=n) for n in (5, 5, 6)]
+    assert engines[0] == engines[1] != engines[2]
+
+
+@pytest.mark.slow
+def test_gradients_of_random_worlds_are_finite():
+    """2,000 worlds of the default scene in float32, a second each: through inflation and lift."""
+    the_scene, count = scene.load("paper"), 2000
+    fields, ctrl = small.batch_inputs(the_scene, *small.random_worlds(the_scene, 0, count))
+    engine = StructuredEngine(the_scene)
+    found = jax.jit(jax.grad(lambda c: engine.rollout(fields, c).distance.sum()))(ctrl[:, :420])
+    assert np.isfinite(found).all() and (np.abs(found).max((1, 2)) > 0).mean() > 0.99

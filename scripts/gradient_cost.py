@@ -1,0 +1,39 @@
+"""What a gradient of whole grasps costs on this device.
+
+python -m scripts.gradient_cost --scenes paper paper_spheres --worlds 60 --json runs/gradients.json
+
+The first call of a process compiles, unless the kernels are in the cache: `CODESIGN_CACHE=off` (see
+docs/reference.md) or an empty cache shows the one, a second run the other.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from codesign_jax import scene as scenes
+from scripts.shared import gradients, output, provenance
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenes", nargs="+", default=["paper_spheres", "paper"])
+    parser.add_argument("--worlds", nargs="+", type=int, default=[60])
+    parser.add_argument("--json", type=Path)
+    provenance.add_commit(parser)
+    arguments = parser.parse_args()
+    cases = []
+    for name in arguments.scenes:
+        for worlds in arguments.worlds:
+            cases.append({"scene": name} | gradients.cost(scenes.load(name), worlds))
+            print(json.dumps(cases[-1]), flush=True)
+    if arguments.json:
+        made = provenance.measurement(arguments.commit)
+        output.write_json(arguments.json, {"provenance": made, "cases": cases})
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

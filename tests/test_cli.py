@@ -1,5 +1,6 @@
 """The command line: wrong input is said in words and creates nothing; estimates; Ctrl-C."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -210,3 +211,20 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys):
     assert cli.main() == 130 and left == [130]
     assert time.monotonic() - start < 20  # of the 30 that the simulation goes on
     assert capsys.readouterr().err == "stopped\n"
+
+
+def test_ctrl_c_in_a_callback_of_the_garbage_collector_counts():
+    """Python ignores what is raised there, and JAX has such a callback."""
+
+    def collected(phase, info):
+        gc.callbacks.remove(collected)
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0)
+
+    def run():
+        gc.callbacks.append(collected)
+        gc.collect()
+        time.sleep(20)
+        return 0
+
+    assert status.of(run) == status.INTERRUPTED

@@ -30,7 +30,8 @@ def examples(program):
     """Arguments of every call of a program in the pages' code blocks, without comments."""
     found = []
     for page in PAGES:
-        blocks = re.findall(r"^```(?:bash|sh)?\n(.*?)^```", page.read_text(), re.S | re.M)
+        fenced = re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), re.S | re.M)
+        blocks = [text for language, text in fenced if language in ("", "bash", "sh")]
         for line in "".join(blocks).replace("\\\n", " ").splitlines():
             if not re.match(rf"([A-Z_]+=\S*\s+)*{program}\b", line):
                 continue  # a tree of folders, for example

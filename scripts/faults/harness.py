@@ -44,6 +44,9 @@ class Worker:
         """
         inherited = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "CODESIGN_"))}
         own = {"XDG_CACHE_HOME": str(folder.parent / "cache"), "OPENBLAS_NUM_THREADS": "1"}
+        # A cache of XLA's for GPUs, whose path would be a part of each program's key: programs
+        # would not be found in a copy of their folder.
+        own["JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES"] = "none"
         program = [sys.executable, "-m", "scripts.faults.worker"]
         program += ["--folder", str(folder), "--library", str(library)]
         with (folder / f"worker-{threading.get_ident()}.log").open("ab") as log:

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from codesign_jax import model, rollout
+from codesign_jax import files, model, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.report import sketch
 from codesign_jax.scene import Scene
@@ -147,10 +147,11 @@ def write_gif(
     # One palette for all frames: separate ones flicker and take more space.
     palette = _common_palette(images)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    path.parent.mkdir(parents=True, exist_ok=True)
     # GIF counts in hundredths of a second.
     duration = 10 * round(100 / frames_per_second)
-    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
+    every = {"save_all": True, "append_images": indexed[1:], "duration": duration, "loop": 0}
+    with files.atomically(path) as part:
+        indexed[0].save(part, "GIF", **every)
     return path
 
 
@@ -181,8 +182,9 @@ def write_strip(
     chosen = times or (0.0, p.approach, p.inflate, p.lift, p.disturb, scene.end_time)
     rows = [frames(scene, g, np.array(chosen), size=size) for g in grasps]
     picture = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(picture).quantize(128).save(path)
+    with files.atomically(path) as part:  # whose name does not say the kind of picture
+        kind = Image.registered_extensions().get(path.suffix.lower(), "PNG")
+        Image.fromarray(picture).quantize(128).save(part, kind)
     return path
 
 
@@ -272,14 +274,14 @@ def _render(
       CalledProcessError: If this way to OpenGL does not work.
     """
     with tempfile.TemporaryDirectory() as folder:
-        files = [str(Path(folder) / name) for name in ("model.mjb", "qpos.npy", "frames.npy")]
-        mujoco.mj_saveModel(compiled, files[0])
-        np.save(files[1], qpos)
+        places = [str(Path(folder) / name) for name in ("model.mjb", "qpos.npy", "frames.npy")]
+        mujoco.mj_saveModel(compiled, places[0])
+        np.save(places[1], qpos)
         numbers = [str(v) for v in (*size, *CAMERA)]
         subprocess.run(
-            [sys.executable, "-m", "codesign_jax.report.renderer", *files, *numbers],
+            [sys.executable, "-m", "codesign_jax.report.renderer", *places, *numbers],
             check=True,
             capture_output=True,
             env=os.environ | {"MUJOCO_GL": way, "PYOPENGL_PLATFORM": way},
         )
-        return np.load(files[2], allow_pickle=False)
+        return np.load(places[2], allow_pickle=False)

@@ -6,6 +6,7 @@ import matplotlib.figure
 import numpy as np
 from numpy.typing import ArrayLike
 
+from codesign_jax import files
 from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST
 from codesign_jax.report.landscape import Landscape
 
@@ -41,9 +42,7 @@ def cost_evolution(
     axes.set(xlabel="episode", ylabel="cost", title=title, xlim=(0, len(cost) + 1))
     axes.set_ylim(bottom=-0.05)
     axes.legend(loc="upper right", frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    return path
+    return _save(figure, path)
 
 
 def landscape(found: Landscape, path: Path) -> Path:
@@ -72,6 +71,11 @@ def landscape(found: Landscape, path: Path) -> Path:
         axes.legend(loc="upper left", fontsize=8)
     labels = [f"{n} [{u}]" for n, u in zip(found.names, found.units, strict=True)]
     axes.set(xlabel=labels[0], ylabel=labels[1])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    return _save(figure, path)
+
+
+def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
+    """Writes a figure as a whole or not at all."""
+    with files.atomically(path) as part:  # whose name does not say the kind of picture
+        figure.savefig(part, format=path.suffix.lstrip(".") or "png")
     return path

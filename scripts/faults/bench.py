@@ -1,6 +1,7 @@
 """What cases work with: scratch folders, and the command in this process and in others."""
 
 import contextlib
+import fcntl
 import gc
 import os
 import shutil
@@ -30,6 +31,11 @@ class Said(NamedTuple):
         """Whether an exception of Python's got out, or one was never fetched."""
         return "Traceback (most recent call last)" in self.text
 
+    @property
+    def refused(self) -> bool:
+        """Whether the command said in words that it does not do it."""
+        return self.code in (1, 2) and "error: " in self.text and not self.traceback
+
 
 class Hung(Exception):
     """A process did not end within its time; it was killed."""
@@ -49,6 +55,21 @@ class Bench:
         self.shim = shim.Shim(library)
         self.scratch_folders = Path(tempfile.mkdtemp(prefix="case-", dir=folder))
         self._log = self.scratch_folders / "output"
+
+    @contextlib.contextmanager
+    def making(self, path: Path) -> Iterator[bool]:
+        """Whether what all workers share has to be made; no other worker makes it meanwhile.
+
+        Args:
+          path: A file or folder that is there once it is made.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            yield False
+            return
+        with path.with_name(f"{path.name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield not path.exists()
 
     @contextlib.contextmanager
     def scratch(self) -> Iterator[Path]:

@@ -140,12 +140,13 @@ def cold(bench: Bench, number: int) -> Result:
 def _failure(bench: Bench) -> Path:
     """A file of a failed world, from a run in which all fail; made at first use."""
     path = bench.folder / "finished" / "failure.npz"
-    if not path.exists():
-        with bench.scratch() as scratch:
+    with bench.making(path) as new, bench.scratch() as scratch:
+        if new:
             words = ["optimize", *finished.SIZE, "--scene", "paper_spheres", *FAILING]
             bench.command(*words, "--episodes", "1", "--out", scratch / "run")
             found = sorted((scratch / "run" / "failures").glob("*.npz"))
-            shutil.copyfile(found[0], path)
+            shutil.copyfile(found[0], scratch / "part")
+            (scratch / "part").rename(path)
     return path
 
 
@@ -153,7 +154,7 @@ def _part(bench: Bench) -> Path:
     """The file from which a landscape that was killed goes on."""
     from codesign_jax import archives
 
-    path = bench.folder / "finished" / "part.npz"
+    path = bench.scratch_folders / "part.npz"
     if not path.exists():
         file = archives.Parts(path)
         for k in range(3):
@@ -165,7 +166,7 @@ def _grid(bench: Bench) -> Path:
     """A stored grid, of a mesh small enough to be read some thousand times."""
     from codesign_jax import archives
 
-    path = bench.folder / "finished" / "grid.npz"
+    path = bench.scratch_folders / "grid.npz"
     if not path.exists():
         values = np.random.default_rng(0).normal(size=(12, 12, 12)).astype(np.float32)
         archives.save(path, {"name": path.name, "values": values}, compressed=True)

@@ -40,13 +40,13 @@ def place(bench: Bench, kind: str) -> Path:
       RuntimeError: If the command does not end well without any fault.
     """
     folder = bench.folder / "finished" / kind
-    if not folder.exists():
-        part = bench.scratch_folders / "new"
-        said = bench.command(*arguments(kind), "--out", part)
-        if said.code or said.traceback:
-            raise RuntimeError(f"a run without faults failed: {said.text}")
-        folder.parent.mkdir(exist_ok=True)
-        part.rename(folder)
+    with bench.making(folder) as new:
+        if new:
+            part = bench.scratch_folders / "new"
+            said = bench.command(*arguments(kind), "--out", part)
+            if said.code or said.traceback:
+                raise RuntimeError(f"a run without faults failed: {said.text}")
+            part.rename(folder)
     return folder
 
 
@@ -58,13 +58,22 @@ def copy(bench: Bench, kind: str, to: Path) -> Path:
 def seconds(bench: Bench, kind: str) -> float:
     """Time that a run of a kind takes in a process of its own; measured at first use."""
     path = bench.folder / "finished" / f"{kind}.json"
-    if not path.exists():
-        place(bench, kind)  # programs are compiled and on disk
-        with bench.scratch() as scratch:
-            begin = time.monotonic()
-            bench.finish(bench.start(*arguments(kind), "--out", scratch / "run"))
-            path.write_text(json.dumps(time.monotonic() - begin))
+    with bench.making(path) as new:
+        if new:
+            place(bench, kind)  # programs are compiled and on disk
+            with bench.scratch() as scratch:
+                begin = time.monotonic()
+                bench.finish(bench.start(*arguments(kind), "--out", scratch / "run"))
+                took = time.monotonic() - begin
+            whole(path, json.dumps(took))
     return json.loads(path.read_text())
+
+
+def whole(path: Path, text: str) -> None:
+    """Writes a file that others see as a whole."""
+    part = path.with_suffix(".part")
+    part.write_text(text)
+    part.rename(path)
 
 
 def code_digest() -> str:
@@ -90,7 +99,7 @@ def differences(run: Path, finished: Path) -> list[str]:
     for name in (*TABLES, *SOURCES):
         if not _same_bytes(run / name, finished / name):
             found.append(name)
-    found += [f"checkpoint {n}" for n in _unequal(_steps(run), _steps(finished))]
+    found += [f"checkpoint {n}" for n in _unequal(_steps(run, finished), _steps(finished))]
     records = [runs.load_record(folder) for folder in (run, finished)]
     digests = [record and digest(to_arrays(record)) for record in records]
     if digests[0] is None or digests[0] != digests[1]:
@@ -108,15 +117,25 @@ def _same_bytes(a: Path, b: Path) -> bool:
     return a.read_bytes() == b.read_bytes()
 
 
-def _steps(run: Path) -> dict[str, str]:
-    """Digest of the arrays of each checkpoint, but for those that say whose it is."""
+def _steps(run: Path, like: Path | None = None) -> dict[str, str]:
+    """Digest of the arrays of each checkpoint, but for those that say whose it is.
+
+    Args:
+      run: The run folder.
+      like: A run; checkpoints older than all of its own are left out: a disk that fails when they
+        are to be deleted leaves them, and nobody reads them.
+    """
     import orbax.checkpoint as ocp
 
     from codesign_jax.runs.checkpoint import digest
 
     found = {}
     with ocp.StandardCheckpointer() as reader:
+        kept = (run if like is None else like) / "checkpoints"
+        oldest = min((int(p.stem) for p in kept.glob("*.sha256") if p.stem.isdigit()), default=0)
         for path in (run / "checkpoints").glob("*.sha256"):
+            if path.stem.isdigit() and int(path.stem) < oldest:
+                continue
             try:
                 place = (run / "checkpoints" / path.stem / "default").resolve()
                 arrays = dict(reader.restore(place))

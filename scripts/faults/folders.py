@@ -35,16 +35,11 @@ def changes(before: dict[str, bytes | None], run: Path) -> list[str]:
     return sorted(names | set(before) - set(after))
 
 
-def refused(said: Said) -> bool:
-    """Whether a command said that it does not do it, in words."""
-    return said.code in (1, 2) and "error: " in said.text and not said.traceback
-
-
 def _ended(bench: Bench, said: Said, run: Path, before: dict, what: str) -> Result:
     """The outcome of `optimize` on a folder that it either mends or leaves as it is."""
     if said.traceback:
         return Result("traceback", f"{what}: {said.text}")
-    if refused(said):
+    if said.refused:
         if changed := changes(before, run):
             return Result("lost", f"{what}: {changed}: {said.text}")
         return Result("refused")
@@ -100,7 +95,7 @@ def scenes(bench: Bench, number: int) -> Result:
         what = f"{name} {way}, {_READERS[command]}"
         if said.traceback:
             return Result("traceback", f"{what}: {said.text}")
-        if refused(said):
+        if said.refused:
             return Result("lost" if changes(before, run) else "refused", f"{what}: {said.text}")
         same = _same_scene(run, finished.place(bench, KIND))
         return Result("same scene" if same else "silent", f"{what}: {said.text}")
@@ -200,7 +195,7 @@ def permissions(bench: Bench, number: int) -> Result:
             place.chmod(before)
         if said.traceback:
             return Result("traceback", f"{what}: {said.text}")
-        if said.code and not refused(said):
+        if said.code and not said.refused:
             return Result("blocked", f"{what}: status {said.code}: {said.text}")
         again = bench.command(*finished.arguments(KIND), "--out", run)
         result = judged(again, run, finished.place(bench, KIND))

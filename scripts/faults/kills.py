@@ -72,12 +72,14 @@ def judged(said: Said, run: Path, whole: Path, tallies: dict[str, int] | None = 
 def _operations(bench: Bench) -> int:
     """File operations of an uninterrupted run, fewer than a few that vary."""
     path = bench.folder / "finished" / "operations"
-    if not path.exists():
-        finished.place(bench, "filter")
-        with bench.scratch() as scratch:
-            bench.shim.arm(scratch / "run")
-            bench.command(*finished.arguments("filter"), "--out", scratch / "run")
-            path.write_text(str(bench.shim.disarm()))
+    with bench.making(path) as new:
+        if new:
+            finished.place(bench, "filter")
+            with bench.scratch() as scratch:
+                bench.shim.arm(scratch / "run")
+                bench.command(*finished.arguments("filter"), "--out", scratch / "run")
+                count = bench.shim.disarm()
+            finished.whole(path, str(count))
     return int(path.read_text())
 
 

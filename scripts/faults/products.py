@@ -35,20 +35,25 @@ def _words(bench: Bench, name: str, out: Path) -> list[str]:
 def product(bench: Bench, name: str) -> Path:
     """What a command writes without any fault; made at first use, with its time and operations."""
     folder = bench.folder / "finished" / f"product-{name}"
-    if not folder.exists():
-        part = bench.scratch_folders / "product" / "out"
-        for _ in range(2):  # the first time compiles
-            shutil.rmtree(part.parent, ignore_errors=True)
-            part.parent.mkdir(parents=True)
-            bench.shim.arm(part.parent)
-            begin = time.monotonic()
-            said = bench.command(*_words(bench, name, part))
-            known = {"seconds": time.monotonic() - begin, "operations": bench.shim.disarm()}
-            if said.code or said.traceback:
-                raise RuntimeError(f"{name} without faults failed: {said.text}")
-        folder.with_suffix(".json").write_text(json.dumps(known))
-        part.rename(folder)
+    with bench.making(folder) as new:
+        if new:
+            _make(bench, name, folder)
     return folder
+
+
+def _make(bench: Bench, name: str, folder: Path) -> None:
+    part, known = bench.scratch_folders / "product" / "out", {}
+    for _ in range(2):  # the first time compiles
+        shutil.rmtree(part.parent, ignore_errors=True)
+        part.parent.mkdir(parents=True)
+        bench.shim.arm(part.parent)
+        begin = time.monotonic()
+        said = bench.command(*_words(bench, name, part))
+        known = {"seconds": time.monotonic() - begin, "operations": bench.shim.disarm()}
+        if said.code or said.traceback:
+            raise RuntimeError(f"{name} without faults failed: {said.text}")
+    folder.with_suffix(".json").write_text(json.dumps(known))
+    part.rename(folder)
 
 
 def _known(bench: Bench, name: str, what: str) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from scripts.faults import checkpoints, damage, finished
 from scripts.faults.bench import Bench
-from scripts.faults.folders import KIND, campaign, changes, refused, snapshot, words_of
+from scripts.faults.folders import KIND, campaign, changes, snapshot, words_of
 from scripts.faults.kills import judged
 from scripts.faults.store import Result
 
@@ -50,7 +50,7 @@ def whose(bench: Bench, number: int) -> Result:
         what = f"{_WHOSE[which].__name__}, {name}"
         if said.traceback:
             return Result("traceback", f"{what}: {said.text}")
-        if refused(said):
+        if said.refused:
             return Result("lost" if changes(before, run) else "refused", f"{what}: {said.text}")
         return Result("silent", f"{what}: {said.text}")
 
@@ -116,7 +116,7 @@ def foreign(bench: Bench, number: int) -> Result:
             return Result("lost", what)
         if said.traceback:
             return Result("traceback", what)
-        return Result("refused" if refused(said) else "accepted", what)
+        return Result("refused" if said.refused else "accepted", what)
 
 
 _OUTS: dict[str, Callable[[Path], str]] = {

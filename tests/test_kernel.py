@@ -64,7 +64,7 @@ def test_kernel_becomes_ptx(effects, monkeypatch):
     """Every operation of the kernel has its instruction; with effects in float64."""
     texts = []
 
-    def register(origin, trace, layout):
+    def register(origin, trace, layout, *, keep):
         texts.append(gpu.device_code(trace(), layout))
         return "registered"
 

@@ -20,10 +20,13 @@ from codesign_jax.engines import make_engine
 from codesign_jax.engines import mujoco as mujoco_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured import mesh as mesh_lanes
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kernel import Program
 from codesign_jax.report import sketch
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import objects, parameters, schema
 from codesign_jax.scene.meshes import surface
+from codesign_jax.types import Trace
 from tests import steps
 from tests.small import DATA, hand_world, nth, stack, still
 
@@ -200,7 +203,11 @@ def runner(the_scene):
     @jax.jit
     def run(params, trials):
         fields, ctrl = jax.vmap(world)(params, trials)
-        trace, path = engine.simulate(fields, ctrl, trajectory=True, states=True)
+        program = Program.here(the_scene, engine.limits, ctrl.dtype, len(ctrl))
+        hand, start = world_constants(the_scene, fields), engine.reset(fields)
+        found, _ = program.simulate(hand, start, ctrl, trajectory=True, states=True)
+        path = steps.Path(*(found[name] for name in ("qpos", "qvel", "acc", "distance")))
+        trace = Trace(*(found[name] for name in ("distance", "height", "speed", "qpos")))
         return trace, path, fields, ctrl
 
     return run
@@ -212,9 +219,8 @@ def unbalanced(the_scene, result, stride):
     Without its start: there an object stands on the table with no gap, and rounding decides whether
     it touches.
     """
-    trace, path, fields, ctrl = result
-    every = (path.qpos, path.qvel, path.acc, trace.distance)
-    found = steps.Path(*(v[:, 1:] for v in every))
+    _, path, fields, ctrl = result
+    found = steps.Path(*(v[:, 1:] for v in path))
     return steps.unbalanced(the_scene, fields, ctrl[:, 1:], found, stride)
 
 
@@ -261,7 +267,7 @@ def grasps(tmp_path_factory, household):
 def test_primitives_and_meshes_share_a_batch_and_a_program(grasps):
     """In the kernel's blocks of a few worlds, whose other worlds change no bit of a world."""
     assert grasps.compiled == 1
-    for a, b in zip(grasps.kernel, grasps.reverse, strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (grasps.kernel, grasps.reverse)), strict=True):
         np.testing.assert_array_equal(a[::-1], b)
 
 

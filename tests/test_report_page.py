@@ -155,7 +155,7 @@ def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
     shutil.copytree(run, empty)
     shutil.rmtree(empty / "checkpoints")
     assert cli.main(["report", str(empty)]) == 2
-    assert "has no finished episode yet" in capsys.readouterr().err
+    assert "has lost its checkpoints" in capsys.readouterr().err
     assert cli.main(["report", str(run), "--engine", "mujco"]) == 2
     assert "mujoco" in capsys.readouterr().err
     for name in ("codesign_jax.report.page", "codesign_jax.report.charts"):

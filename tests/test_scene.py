@@ -311,13 +311,13 @@ def test_inconsistent_hand(tmp_path, old, new, expected):
         ("\nwall = 5", "\nwall = [5, 5, 2.5, 5]", "120000 Pa is not below the limit of 100000 Pa"),
         ("\nspread = 45", "\nspread = [45]", "= [45] must be a number [deg]: the hand has one spr"),
         (
-            "default = 110",
+            "default = 80",
             "default = [60, 110]",
             "parameter length.default = [60.0, 110.0] must be a number [mm] for all fingers or 4, "
             "one for each, not 2",
         ),
-        ("default = 110", "default = [60, 9, 60, 60]", "length.default[1] = 9.0 is outside [10, 1"),
-        ("default = 110", "default = [60, true, 60, 60]", "default[1] = True must be a number"),
+        ("default = 80", "default = [60, 9, 60, 60]", "length.default[1] = 9.0 is outside [10, 1"),
+        ("default = 80", "default = [60, true, 60, 60]", "default[1] = True must be a number"),
         ("high = 7", "high = [7, 7, 9, 7]", "a height of 0.015 m leaves no air chamber"),
         ("high = 7", "high = [7, 7, 70, 7]", "wall.high[2] = 70.0 is outside [0.1, 50] mm"),
         ("low = 2\n", "low = [2, 2, 8, 2]\n", "parameter wall[2]: low 8 must be below high 7 mm"),
@@ -337,7 +337,7 @@ def test_numbers_of_fingers_that_do_not_fit_the_hand(tmp_path, old, new, expecte
 
 
 def test_bounds_of_fingers_that_share_nothing_cannot_be_tied(tmp_path):
-    table = "low = 10\nhigh = 180\ndefault = 110"
+    table = "low = 10\nhigh = 180\ndefault = 80"
     apart = "low = [10, 10, 10, 90]\nhigh = [80, 80, 80, 180]\ndefault = [60, 60, 60, 120]"
     shared = ("tied = true\nlow = 10\nhigh = 180", "tied = true")
     (problem,) = hand_problems(tmp_path, (table, apart), shared)

@@ -163,7 +163,9 @@ def test_what_cannot_be_written_in_the_end_is_said_in_words(capsys):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "grasp.gif")
 
     assert status.of(full) == 1
-    assert capsys.readouterr().err == "error: grasp.gif: No space left on device\n"
+    error = capsys.readouterr().err
+    assert error.startswith("error: grasp.gif: No space left on device; make room")
+    assert error.count("\n") == 1
 
 
 def test_landscape_has_every_point(run, monkeypatch, capsys):

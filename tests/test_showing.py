@@ -163,7 +163,8 @@ def test_what_cannot_be_written_in_the_end_is_said_in_words(capsys):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "grasp.gif")
 
     assert status.of(full) == 1
-    assert capsys.readouterr().err == "error: grasp.gif: No space left on device\n"
+    said = "error: grasp.gif: No space left on device; make room, and give the same command again"
+    assert capsys.readouterr().err.startswith(said)
 
 
 def test_landscape_has_every_point(run, monkeypatch, capsys):

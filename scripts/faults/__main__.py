@@ -30,6 +30,8 @@ def main() -> int:
     if options.again:
         bad = [p.campaign for p in store.parts if p.bad]
         print(f"{store.forget(lambda part: bool(part.bad))} parts again: {sorted(set(bad))}")
+    if options.forget:
+        print(f"{store.forget(lambda part: part.campaign in options.forget)} parts forgotten")
     chosen = [c for c in cases.CAMPAIGNS.values() if not options.only or c.name in options.only]
     counts = {c.name: options.cases.get(c.name, c.count) for c in chosen}
     left = {c.name: sum(map(len, store.left(c.name, counts[c.name], c.size))) for c in chosen}
@@ -85,6 +87,9 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--work", type=Path, default=Path("runs/faults/work"), help="caches, runs")
     parser.add_argument("--workers", type=int, default=1, help="processes that run cases")
     parser.add_argument("--again", action="store_true", help="once more what broke a promise")
+    parser.add_argument(
+        "--forget", nargs="+", metavar="NAME", help="begin these anew", choices=[*cases.CAMPAIGNS]
+    )
     parser.add_argument("--list", action="store_true", help="print the campaigns and stop")
     parser.add_argument("--page", action="store_true", help="write docs/faults.md and its data")
     parser.add_argument("--json", type=Path, default=DOCS / "data" / "faults.json")

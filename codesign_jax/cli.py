@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from codesign_jax import caches
-from codesign_jax.commands import flags, status
+from codesign_jax.commands import flags, mistyped, status
 from codesign_jax.commands.flags import (
     Count,
     File,
@@ -105,6 +105,10 @@ class Evaluate(RunOrDesign):
     """Trials, taking turns between the objects."""
     seed: int = 0
     """Root of the trials' noise."""
+    particle: Count = None
+    """With a run: a final particle, as in its tests.csv, instead of the one that tested best."""
+    out: File = None
+    """Write a table of the trials, with their noise and how they ended (.csv)."""
     render: File = None
     """Draw the first trial of each object: an animation (.gif) or a film strip (.png)."""
     dry_run: Flag = False
@@ -340,7 +344,7 @@ def main(arguments: list[str] | None = None) -> int:
     def run() -> int:
         if given == ["--version"]:
             return _version()
-        refuse(flags.text_problems(given))
+        refuse(flags.text_problems(given) or mistyped.problems(given, COMMANDS))
         command = tyro.cli(
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,

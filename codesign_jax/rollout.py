@@ -27,16 +27,18 @@ from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene, reach, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes, check
 from codesign_jax.start import invalid_start
-from codesign_jax.types import Outcome, Params, Trace, Trial, failed
+from codesign_jax.types import Outcome, Params, Status, Trace, Trial, failed
+from codesign_jax.verdict import as_bit
 
 CostFunction = Callable[[Scene, Trace, jax.Array], jax.Array]
 """A cost of one's own: from the scene, the trace of one world (arrays of shape (time,) and qpos of
 shape (time, nq)) and its controls (time, nu) to a number.
 
-Whether a world failed, and when it lost its object, is told by the scene's rule all the same; a
-failed trial shows the scene's `cost.maximum`, and `cost.particle_cost` leaves it out or scores it
-with that.  What the cost reads of the trace needs `trajectory=True`, or `trajectory=False` if it is
-meant to see a grasp up to the loss of the object only, see `cost.shown`.
+Whether a world failed, and when it lost its object, is told by the scene's rule all the same, and a
+trial whose cost is not a finite number has failed too (NONFINITE).  A failed trial shows the
+scene's `cost.maximum`, and `cost.particle_cost` leaves it out or scores it with that.  What the
+cost reads of the trace needs `trajectory=True`, or `trajectory=False` if it is meant to see a grasp
+up to the loss of the object only, see `cost.shown`.
 """
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
@@ -246,8 +248,9 @@ def _by_own(
     value = jnp.asarray(returned)
     if value.shape:
         raise ValueError(f"a cost is one number for each world, not an array {value.shape}")
-    value = jnp.where(failed(result.status), scene.cost.maximum, value)
-    return result._replace(cost=value.astype(result.cost.dtype))
+    status = result.status | as_bit(~jnp.isfinite(value), Status.NONFINITE)
+    value = jnp.where(failed(status), scene.cost.maximum, value)
+    return result._replace(cost=value.astype(result.cost.dtype), status=status)
 
 
 def evaluate(

@@ -2,12 +2,14 @@
 
 import gc
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
 import tomllib
+import typing
 from pathlib import Path
 
 import pytest
@@ -15,9 +17,40 @@ from command_runs import EPISODES, RUN, command, finished_run, own_workplace  # 
 from toy import TINY
 
 from codesign_jax import cli, codesign
-from codesign_jax.commands import preflight, status
+from codesign_jax.commands import mistyped, preflight, status
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.scene import effects
+
+MISTYPED = {
+    "optimise --preset 2d": "'optimise' is not a command; did you mean optimize?",
+    "optimzie": "'optimzie' is not a command; did you mean optimize?",
+    "judge": "'judge' is not a command; valid: optimize, evaluate, landscape,",
+    "evaluate --object mug": "evaluate has no --object; did you mean --objects?",
+    "evaluate --trails=12": "evaluate has no --trails; did you mean --trials?",
+    "evaluate --trials": "--trials needs a value",
+    "evaluate --trials --seed 1": "--trials needs a value",
+    "optimize --particles ten": "--particles 'ten' must be a whole number",
+    "optimize --seed=1.5": "--seed '1.5' must be a whole number",
+    "optimize --first body": "--first 'body' must be one of morphology, control",
+    "export --out part --draft flat": "--draft 'flat' must be a number",
+}
+
+
+@pytest.mark.parametrize("line", MISTYPED)
+def test_a_mistyped_command_is_answered_in_a_line(line, capsys):
+    assert cli.main(line.split()) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and len(said.err.splitlines()) == 1
+    assert said.err.startswith(f"error: {MISTYPED[line]}")
+
+
+@pytest.mark.parametrize("command", typing.get_args(cli.COMMANDS))
+def test_flags_that_are_looked_at_are_those_that_the_parser_has(command, capsys):
+    name = command.__name__.lower()
+    with pytest.raises(SystemExit):
+        cli.main([name, "--help"])
+    shown = re.findall(r"^[^\w-] (--[a-z][a-z-]*)", capsys.readouterr().out, re.M)
+    assert {*mistyped.flags(command)} == {*shown} - {"--help"}
 
 
 def test_help_imports_nothing_heavy():

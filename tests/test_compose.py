@@ -14,7 +14,7 @@ from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.optimize import schedule
 from codesign_jax.scene import parameters
-from codesign_jax.types import WARNINGS
+from codesign_jax.types import WARNINGS, Status
 from tests import small, toy
 
 # A grasp in 1.2 s with few contacts: what is tested here does not depend on them.
@@ -230,6 +230,10 @@ def test_failed_trials_do_not_ask_ones_own_cost():
     )
     result = evaluate(params, trial, lambda s, t, u: t.height[-1])
     np.testing.assert_array_equal(result.cost[:, 0], [0.5, scene.cost.maximum, 0.5])
+    # Nor is a trial whose cost is no number one that counts.
+    result = evaluate(params, trial, lambda s, t, u: jnp.log(-t.height[-1]))
+    np.testing.assert_array_equal(result.status, [[Status.NONFINITE]] * 3)
+    np.testing.assert_array_equal(result.cost, [[scene.cost.maximum]] * 3)
     with pytest.raises(ValueError, match="one number for each world"):
         evaluate(params, trial, lambda s, t, u: t.height)
 

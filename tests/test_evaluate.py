@@ -1,14 +1,18 @@
 """`codesign evaluate`: rows and verdict of a design, of its own or of a run."""
 
+import csv
+
+import jax
 import numpy as np
 import pytest
 from command_runs import command, finished_run, own_workplace  # noqa: F401
 from scipy import stats
 from toy import TINY
 
-from codesign_jax import codesign, cost, scene
+from codesign_jax import codesign, cost, rollout, runs, scene
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
+from codesign_jax.runs import columns
 from codesign_jax.types import Outcome, Status
 
 
@@ -18,6 +22,23 @@ def test_evaluate_prints_costs_of_each_object(capsys):
     output = capsys.readouterr().out
     assert "design: length=100 mm arm_z=-20 mm" in output
     assert "sphere: kept" in output and "all: kept" in output and "success" in output
+
+
+def test_what_is_not_given_is_said_to_be_a_default(capsys):
+    """One value for all fingers where the space has one for each."""
+    tiny = ["--scene", TINY, "--dry-run"]
+    assert command("evaluate", *tiny, "--design", "length=100") == 0
+    assert "not given, so the hand file's defaults: arm_z\n" in capsys.readouterr().out
+    assert command("evaluate", *tiny) == 0
+    assert "the hand file's default design; --design NAME=VALUE changes" in capsys.readouterr().out
+    every = ["--preset", "23d", "--design", "length=95", "arm_z=30"]
+    assert command("evaluate", "--dry-run", *every) == 0
+    shown = capsys.readouterr().out
+    assert "length[0]=95 mm length[1]=95 mm length[2]=95 mm length[3]=95 mm" in shown
+    assert "defaults: height, wall, spread, arm_roll" in shown and "explicit springs" in shown
+    twice = ["--preset", "23d", "--design", "length=95", "length[1]=90"]
+    assert command("evaluate", "--dry-run", *twice) == 2
+    assert "'length[1]' is given more than once: 95, 90" in capsys.readouterr().err
 
 
 def test_evaluate_takes_the_best_of_a_run(finished, capsys):
@@ -30,6 +51,32 @@ def test_evaluate_takes_the_best_of_a_run(finished, capsys):
     assert command("evaluate", finished, "--run", finished) == 2
     assert f"length={float(best[-2]):.4g} mm" in output
     assert "of 1, " in output and "% of grasps (95 % interval" in output
+
+
+def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
+    """Of any final particle: the noise is that of the seed, and endings add up to the verdict."""
+    rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
+    table, seed = tmp_path / "new" / "trials.csv", 4
+    asked = ["evaluate", finished, "--particle", "1", "--trials", "2", "--seed", seed]
+    assert command(*asked, "--out", table) == 0
+    output = capsys.readouterr().out
+    assert f"particle 1 of {finished}" in output and f"length={float(rows[1][-2]):.4g} mm" in output
+    with table.open(newline="") as file:
+        found = [*csv.DictReader(file)]
+    assert [*found[0]] == [*columns.MORE[columns.REFERENCE].columns]
+    drawn = rollout.sample_trials(runs.read_run(finished)[0], jax.random.key(seed), 2)
+    for row, x, mass in zip(found, drawn.position[:, 0], drawn.mass, strict=True):
+        assert float(row["noise_x_m"]) == pytest.approx(float(x), rel=1e-6)
+        assert float(row["noise_mass_factor"]) == pytest.approx(float(mass), rel=1e-6)
+    kept = sum(row["verdict"] == "kept" for row in found)
+    assert f"all: kept {kept} of 2, " in output
+    for wrong, words in (
+        ([finished, "--particle", "99"], "--particle = 99 is outside"),
+        (["--particle", "0"], "--particle is one of a run"),
+        (["--out", "trials.txt"], "--out trials.txt must end in .csv"),
+    ):
+        assert command("evaluate", *wrong) == 2
+        assert words in capsys.readouterr().err
 
 
 def test_evaluate_judges_a_run_on_other_objects_and_settings(finished, tmp_path, capsys):

@@ -182,10 +182,10 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     assert command(*run) == 1
     output = capsys.readouterr()
     assert "error: seed 5: no space left" in output.err
-    assert "resuming episode 3/3" in output.out and "of 2 runs have a particle" in output.out
+    assert "resuming episode 3/3" in output.out and "of 2 runs found a design" in output.out
     monkeypatch.setattr(Checkpoints, "save", save)
     assert command(*run) == 0
-    assert "of 3 runs have a particle" in capsys.readouterr().out
+    assert "of 3 runs found a design" in capsys.readouterr().out
     events, fetch, report = [], runs.loop.fetch, runs.loop.records.report
 
     def noted_fetch(tree):

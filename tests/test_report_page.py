@@ -117,7 +117,8 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
         low, high = stats.binomtest(3, 5).proportion_ci(0.95, method="wilson")
         text = page.read_text(encoding="utf-8")
         share = f"it keeps {100 * low:.0f} to {100 * high:.0f} % of grasps (95 % interval"
-        assert (share in text) == ("kept 3 of 5, 1 lost, 1 stuck (accuracy reference" in text)
+        assert (share in text) == words
+        assert ("kept 3 of 5, 1 lost, 1 stuck (accuracy reference" in text) == words
         assert ("1 of 5 trials failed (STUCK 1)" in text) == words
 
 

@@ -235,8 +235,11 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     """Here shortened to a few coarse steps, as everything else of the run is."""
     folder = shutil.copytree(finished, tmp_path / "run")
     assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
-    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("on 2 fresh"))
-    assert "accuracy reference (1 ms, 20 links): mean cost" in line and "95 % interval" in line
+    line = next(
+        x for x in capsys.readouterr().out.splitlines() if x.startswith("verdict, on fresh")
+    )
+    assert "of 2, " in line and "95 % interval" in line
+    assert "(accuracy reference, steps of 1 ms, 20 links a finger)" in line
 
     def never(*arguments):
         raise AssertionError("simulated again")

@@ -1,5 +1,6 @@
 """Programs: the evaluation of a population, one episode, and a whole optimisation."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from codesign_jax import rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
-from codesign_jax.optimize import Info, Optimizer, State
+from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
 from codesign_jax.programs import Program, shared
 from codesign_jax.scene import Constants, Scene, SceneError
 from codesign_jax.scene.parameters import DesignSpace
@@ -127,7 +128,32 @@ def make_episode(
       cost: As in `rollout.simulate`.
     """
     program = _episode(scene, engine, space, num_trials, trajectory, cost)
-    return Program(scene, program, optimizer)
+    return _joined(scene, program, optimizer, cost)
+
+
+def _joined(
+    scene: Scene, program: Callable, optimizer: Optimizer, cost: rollout.CostFunction | None
+) -> Program:
+    """A program with its optimiser, which warns where that does not see costs of one's own."""
+    weighs = cost is not None and isinstance(optimizer, ParticleFilter)
+    return (_Weighing if weighs else Program)(scene, program, optimizer)
+
+
+class _Weighing(Program):
+    """A program whose costs of one's own a particle filter weighs: negative ones count as 0."""
+
+    def __call__(self, first: Any, second: Any, constants: Constants | None = None) -> Any:
+        """As of `Program`; a warning if a particle's cost is negative, but for traced ones."""
+        found = super().__call__(first, second, constants)
+        costs = found[1].selection.cost
+        if not isinstance(costs, jax.core.Tracer) and (np.asarray(costs) < 0).any():
+            warnings.warn(
+                "a cost of your own is negative: the particle filter weighs by 1 / (alpha + cost) "
+                "and takes negative costs for 0, so that it does not tell them apart; add a "
+                "constant, or take an optimiser that compares, such as cma-es",
+                stacklevel=2,
+            )
+        return found
 
 
 @shared
@@ -201,7 +227,8 @@ def make_run(
       trajectory: As in `rollout.simulate`.
       cost: As in `rollout.simulate`.
     """
-    return Program(scene, _run(scene, engine, space, num_trials, trajectory, cost), optimizer)
+    program = _run(scene, engine, space, num_trials, trajectory, cost)
+    return _joined(scene, program, optimizer, cost)
 
 
 @shared

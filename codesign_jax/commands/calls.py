@@ -13,7 +13,7 @@ from rich.progress import Progress, TimeRemainingColumn
 from codesign_jax import archives, batch, codesign
 from codesign_jax.engines import Engine
 from codesign_jax.runs import outcomes, rates
-from codesign_jax.runs.progress import duration
+from codesign_jax.runs.progress import Ticker, duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome
@@ -73,15 +73,19 @@ class Meter:
             *columns, console=console, transient=True, disable=not console.is_terminal
         )
         self._task = self._bar.add_task(text, total=total)
+        self._ticker = Ticker(disable=console.is_terminal)
+        self._ticker.begin(text)
         self.done, self._since, self._told = 0, None, time.monotonic()
 
     def __enter__(self) -> "Meter":
         """Shows the bar."""
         self._bar.start()
+        self._ticker.__enter__()
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Removes it."""
+        self._ticker.__exit__()
         self._bar.stop()
 
     def found(self, grasps: int) -> None:
@@ -94,6 +98,7 @@ class Meter:
         self.done += grasps
         self._bar.update(self._task, completed=self.done, total=self.total)
         now = time.monotonic()
+        self._ticker.rename(f"{self._text}: {self.done} of {self.total} grasps")
         if self._since and not self._console.is_terminal and now - self._told >= SECONDS:
             start, before = self._since
             self._told, rate = now, (self.done - before) / max(now - start, 1e-9)
@@ -102,6 +107,7 @@ class Meter:
                 f"{self._text}: {self.done} of {self.total} grasps, {rate:.1f} grasps/s, "
                 f"about {left} left"
             )
+            self._ticker.spoke()
 
     def compiled(self) -> None:
         """Leaves the call before, which compiled, out of the rate."""

@@ -88,7 +88,7 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
 
     Args:
       space: The design space; parameters that are not named take its default.
-      pairs: The pairs.
+      pairs: The pairs; a name without an index, where the space has one for each finger, sets all.
 
     Returns:
       The design [SI units], shape (parameter,).
@@ -101,7 +101,9 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
     lows = dict(zip(space.names, space.in_units(np.array(space.low)), strict=True))
     highs = dict(zip(space.names, space.in_units(np.array(space.high)), strict=True))
     units = dict(zip(space.names, space.units, strict=True))
-    given = [pair.partition("=")[::2] for pair in pairs]
+    given = [pair.partition("=") for pair in pairs]
+    # A name without an index is all fingers' parameter: one value for each of them.
+    given = [(each, v) for name, _, v in given for each in _members(name, space)]
     problems = [
         f"--design {name!r} is given more than once: {', '.join(v for n, v in given if n == name)}"
         for name, count in Counter(name for name, _ in given).items()
@@ -123,6 +125,29 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
     if problems:
         raise SceneError(problems)
     return np.clip(space.from_units(np.array(list(values.values()))), space.low, space.high)
+
+
+def _members(name: str, space: DesignSpace) -> list[str]:
+    """The parameters that a name stands for: itself, or those of all fingers."""
+    each = [n for n in space.names if n.split("[")[0] == name]
+    return each if name not in space.names and each else [name]
+
+
+def by_default(space: DesignSpace, pairs: Sequence[str]) -> str:
+    """Says which parameters of a design are the hand file's defaults; empty if none is.
+
+    Args:
+      space: The design space.
+      pairs: What `parse_design` was given.
+    """
+    given = {each for pair in pairs for each in _members(pair.partition("=")[0], space)}
+    left = [name for name in space.names if name not in given]
+    if not left:
+        return ""
+    if not given:
+        return "the hand file's default design; --design NAME=VALUE changes it"
+    groups = dict.fromkeys(name.split("[")[0] for name in left)
+    return f"not given, so the hand file's defaults: {', '.join(groups)}"
 
 
 def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
@@ -206,21 +231,22 @@ def mesh_notes(scene: Scene) -> list[str]:
 
 
 def preflight_notes(
-    scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]
+    scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray], *, details: bool = False
 ) -> list[str]:
-    """Warnings and notes about designs that are about to be simulated.
+    """Warnings about designs that are about to be simulated, and notes if details are asked for.
 
     Args:
       scene: The scene.
       space: The design space.
       designs: Designs [SI units], each of shape (parameter,), by what to call them.
+      details: Whether to say what the steps do to the fingers' springs.
 
     Raises:
       SceneError: If a design must not be simulated.
     """
     stacked = np.array([*designs.values()], np.float32)
     params = params_of(space, stacked)
-    report = preflight.check(scene, params, [*designs])
+    report = preflight.check(scene, params, [*designs], details=details)
     if report.refusals:
         raise SceneError(report.refusals)
     return [f"warning: {text}" for text in report.warnings] + report.notes

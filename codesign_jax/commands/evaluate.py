@@ -15,7 +15,7 @@ from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.estimate import Part
 from codesign_jax.engines import make_engine
 from codesign_jax.report import verdicts
-from codesign_jax.runs import rates
+from codesign_jax.runs import choice, rates, tables
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
@@ -32,14 +32,20 @@ def main(options: "Evaluate") -> int:
       SceneError: If something is wrong with the input.
     """
     common.use_compilation_cache()
-    case = find_case(options)
+    case = _of_particle(find_case(options), options)
     _check(options, case.engine)
     engine = make_engine(case.engine, case.scene)
-    notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
+    designs = {"the design": case.design}
+    notes = common.preflight_notes(case.scene, case.space, designs, details=options.dry_run)
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
-        console.print(f"best final design of {options.run_folder}", markup=False)
+        which = "best final design" if options.particle is None else f"particle {options.particle}"
+        console.print(f"{which} of {options.run_folder}", markup=False)
     console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
+    if not options.run_folder:
+        pairs = [*chain.from_iterable(options.design)]
+        if note := common.by_default(case.space, pairs):
+            console.print(note, markup=False)
     for note in [*_untried(case, options), *notes, *common.mesh_notes(case.scene)]:
         console.print(note, markup=False)
     if options.dry_run:
@@ -49,6 +55,24 @@ def main(options: "Evaluate") -> int:
     if options.render:
         _render(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
+
+
+def _of_particle(case: Case, options: "Evaluate") -> Case:
+    """The case of the final particle that was asked for, if one was.
+
+    Raises:
+      SceneError: If there is no such particle.
+    """
+    if options.particle is None:
+        return case
+    if options.run_folder is None:
+        raise SceneError(["--particle is one of a run: give its folder, or leave it out"])
+    record = choice.read_record(options.run_folder)
+    particles = np.asarray(record.state.particles)
+    problem = schema.range_problem("--particle", options.particle, "", 0, len(particles) - 1)
+    if problem:
+        raise SceneError([problem])
+    return case._replace(design=particles[options.particle])
 
 
 def _check(options: "Evaluate", engine: str) -> None:
@@ -66,11 +90,14 @@ def _check(options: "Evaluate", engine: str) -> None:
         )
     if options.render and options.render.suffix not in (".gif", ".png"):
         problems.append(f"--render {options.render} must end in .gif or .png")
+    if options.out and options.out.suffix != ".csv":
+        problems.append(f"--out {options.out} must end in .csv")
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], engine)
     if problems:
         raise SceneError(problems)
-    if options.render:
-        common.check_place("--render", options.render)
+    for flag, path in (("--render", options.render), ("--out", options.out)):
+        if path:
+            common.check_place(flag, path)
 
 
 def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
@@ -103,6 +130,10 @@ def _evaluate(
     judged = verdicts.Judged(case.scene, one, options.accuracy)
     for line in [f"{'all':>12}: {judged}", *verdicts.warnings(judged)]:
         console.print(line, markup=False)
+    if options.out:
+        drawn = rollout.sample_trials(case.scene, jax.random.key(options.seed), options.trials)
+        tables.write_grasps(options.out, case.scene, jax.tree.map(np.asarray, drawn), one)
+        console.print(f"table: {options.out}", markup=False)
     return one
 
 
@@ -127,7 +158,8 @@ def _render(case: Case, engine: engines.Engine, options: "Evaluate", console: Co
     count = min(options.trials, len(case.scene.objects.object))
     trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
-    grasps = animation.replay(case.scene, engine, params, trials)
+    with Busy(console, "simulating what is drawn"):
+        grasps = animation.replay(case.scene, engine, params, trials)
     path: Path = options.render  # type: ignore[assignment]
     if path.suffix == ".gif":
         animation.write_gif(case.scene, grasps, path, notify=console.print)

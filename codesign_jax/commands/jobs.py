@@ -24,6 +24,8 @@ from rich.console import Console
 from codesign_jax import codesign, runs
 from codesign_jax.commands import common, slurm, status
 from codesign_jax.runs import RunResult
+from codesign_jax.runs.directory import EVENTS
+from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
 
@@ -187,17 +189,39 @@ def run(
         place.start(calls)
     results: dict[int, RunResult | None] = {}
     try:
-        while len(results) < len(folders):
-            for seed, job, state in place.ended():
-                problem = why(job, state)
-                results[seed] = None if problem else read(scene, folders[seed])
-                console.print(f"seed {seed}: {problem or 'done'}", markup=False)
-            time.sleep(POLL_SECONDS)
+        with Busy(console, _state(results, folders)) as busy:
+            while len(results) < len(folders):
+                for seed, job, state in place.ended():
+                    problem = why(job, state)
+                    results[seed] = None if problem else read(scene, folders[seed])
+                    console.print(f"seed {seed}: {problem or 'done'}", markup=False)
+                busy.say(_state(results, folders))
+                time.sleep(POLL_SECONDS)
     except KeyboardInterrupt:
         place.cancel()
         console.print("stopped: the jobs are cancelled; the same command resumes")
         raise
     return {seed: results[seed] for seed in folders}
+
+
+def _state(results: Mapping[int, RunResult | None], folders: Mapping[int, Path]) -> str:
+    """How many runs have ended, and how far the others are, by their logs."""
+    events = [_last_event(folders[seed] / EVENTS) for seed in folders if seed not in results]
+    busy = [event for event in events if event]
+    text = f"{len(results)} of {len(folders)} runs ended, {len(busy)} begun"
+    return f"{text}; the last words of one: {max(busy)[1]}" if busy else text
+
+
+def _last_event(log: Path) -> tuple[str, str] | None:
+    """Time and first words of a log's last line; None if there is none."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, log.stat().st_size - 1000))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError:
+        return None
+    when, _, words = (lines or [""])[-1].partition(" ")
+    return when, words.split("  ")[0][:60]
 
 
 class Processes:

@@ -132,14 +132,19 @@ def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
     unknown = [name for name in chosen if name not in known]
     if unknown:
         raise SceneError(
-            [
-                f"--parameters {name!r} is not a parameter; {schema.nearest(name, known)}"
-                for name in unknown
-            ]
+            [f"--parameters {name!r} is not a parameter; {_meant(name, known)}" for name in unknown]
         )
     if len(set(chosen)) != 2 or len(chosen) != 2:
         raise SceneError([f"--parameters must name two of {', '.join(known)}"])
     return known.index(chosen[0]), known.index(chosen[1])
+
+
+def _meant(name: str, known: tuple[str, ...]) -> str:
+    """The parameters that one may have meant."""
+    fingers = [n for n in known if n.split("[")[0] == name]
+    if fingers:
+        return f"there is one for each finger: {fingers[0]} to {fingers[-1]}"
+    return schema.nearest(name, known)
 
 
 def grid(case: Case, columns: tuple[int, int], points: int) -> Grid:

@@ -49,7 +49,7 @@ def main(options: "Optimize") -> int:
         runs.check_folder(folder, scene, own, fresh=options.fresh, sources=sources)
     if options.seeds is not None:
         seeds.check_table(folders)
-    notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
+    notes = [*_preflight(scene, settings, options.dry_run), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
         _dry_run(scene, settings, len(chosen), options)
@@ -165,7 +165,7 @@ def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
     return int(any(result is None for result in results.values()))
 
 
-def _preflight(scene: Scene, settings: Settings) -> list[str]:
+def _preflight(scene: Scene, settings: Settings, details: bool) -> list[str]:
     """Checks the ends of the design space, as every particle lies between them.
 
     Only the ends themselves are refused or warned about: what a particle is later, its status says.
@@ -178,7 +178,8 @@ def _preflight(scene: Scene, settings: Settings) -> list[str]:
     stacked = np.array([*ends.values()], np.float32)
     projected = np.asarray(jax.vmap(space.project)(stacked))
     names = [f"design of the space's {n}" for n in ends]
-    return common.preflight_notes(scene, space, dict(zip(names, projected, strict=True)))
+    designs = dict(zip(names, projected, strict=True))
+    return common.preflight_notes(scene, space, designs, details=details)
 
 
 def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") -> None:

@@ -101,13 +101,16 @@ def _ends(matrix: np.ndarray) -> np.ndarray:
     return np.array([values[-1], values[0]])
 
 
-def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Report:
+def check(
+    scene: Scene, designs: Params, names: list[str] | None = None, *, details: bool = True
+) -> Report:
     """Checks designs against the scene's limits; costs milliseconds and simulates nothing.
 
     Args:
       scene: The scene.
       designs: Parameters with leading axis (design,).
       names: What to call the designs; by default "design 0" and so on.
+      details: Whether the report has notes.
     """
     designs = Params(*(np.asarray(v, float) for v in designs))
     count = designs.length.shape[0]
@@ -127,7 +130,8 @@ def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Repo
         report.refusals.extend(
             _overlaps(scene, kept, [n for n, s in zip(names, sound, strict=True) if s])
         )
-        report.notes.append(_step_note(scene, kept))
+        if details:
+            report.notes.append(_step_note(scene, kept))
     return report
 
 

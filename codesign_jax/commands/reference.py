@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines
+from codesign_jax import codesign, engines, rollout
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.estimate import Part
 from codesign_jax.commands.flags import Subject
 from codesign_jax.engines import make_engine
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import RunResult, Settings, outcomes, rates, read_run
+from codesign_jax.runs import RunResult, Settings, columns, outcomes, rates, read_run, tables
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene, with_accuracy
@@ -83,6 +83,8 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
         with Busy(console, f"reference test, {trials} grasps", rates.seconds(work)):
             found = _simulate(case, settings, trials)
         outcomes.save(folder / FILE, found, key)
+        drawn = rollout.sample_trials(case.scene, _noise(settings), trials)
+        tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
     return found
 
 
@@ -147,6 +149,11 @@ def _simulate(case: Case, settings: Settings, trials: int) -> Outcome:
     evaluate = codesign.make_evaluate(
         case.scene, make_engine(case.engine, case.scene), case.space, trials
     )
-    key = codesign.stream_key(jax.random.key(settings.seed), STREAM_REFERENCE)
-    found = interruptible(evaluate, jnp.asarray(case.design, jnp.float32)[None], key)
+    population = jnp.asarray(case.design, jnp.float32)[None]
+    found = interruptible(evaluate, population, _noise(settings))
     return jax.tree.map(lambda v: np.asarray(v)[0], found)
+
+
+def _noise(settings: Settings) -> jax.Array:
+    """Key of the trials' noise."""
+    return codesign.stream_key(jax.random.key(settings.seed), STREAM_REFERENCE)

@@ -47,7 +47,8 @@ def main(options: "Sample") -> int:
         return 0
     dataset.refuse_other(options.out, question)
     design = question.space.default()
-    notes = common.preflight_notes(scene, question.space, {"the default design": design})
+    designs = {"the default design": design}
+    notes = common.preflight_notes(scene, question.space, designs, details=options.dry_run)
     for note in [*notes, *common.mesh_notes(scene)]:
         console.print(note, markup=False)
     console.print(f"{_amount(options)} in {question.shards(options.designs)} calls")

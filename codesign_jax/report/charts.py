@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 from codesign_jax.codesign import CONVERGED_COST
 from codesign_jax.runs.record import History
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import Status
+from codesign_jax.types import WARNINGS, Status
 
 _BLUE, _ORANGE, _GREY = "#2f6fab", "#e08a1e", "#5a6776"
 _LAYOUT = {
@@ -201,14 +201,14 @@ def _heatmap(found: Landscape) -> go.Heatmap:
 
 
 def failures(status: np.ndarray) -> go.Figure:
-    """How often each status bit is set in each episode.
+    """How often each cause of failure occurs in each episode.
 
     Args:
       status: Bits of `Status`, shape (episode, particle, trial).
     """
     number, figure = np.arange(1, len(status) + 1), go.Figure()
-    for bit in Status:
-        count = ((status & bit) != 0).sum((1, 2)) if bit else np.zeros(1)
+    for bit in (b for b in Status if b and b not in WARNINGS):
+        count = ((status & bit) != 0).sum((1, 2))
         if count.any():
             figure.add_bar(x=number, y=count, name=bit.name)
     figure.update_layout(barmode="stack", height=300, showlegend=True, **_LAYOUT)

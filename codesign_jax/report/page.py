@@ -14,7 +14,7 @@ from codesign_jax.report.of_run import Run
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Grasp
 from codesign_jax.runs.scene_files import NAMES
-from codesign_jax.types import MEANINGS
+from codesign_jax.types import MEANINGS, WARNINGS
 
 
 def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
@@ -166,7 +166,10 @@ def _failures(run: Run) -> str:
         else "count with the maximum"
     )
     note = f"{failed:,} of {total:,} trials failed ({100 * failed / total:.2f} %); they {rule}."
-    counts = {bit: int(((status & bit) != 0).sum()) for bit in MEANINGS}
+    bits = [bit for bit in MEANINGS if bit not in WARNINGS]
+    counts = {bit: int(((status & bit) != 0).sum()) for bit in bits}
+    if warned := tables.warning_counts(status):
+        note += f" Warnings, which fail no trial: {warned}."
     rows = [
         (b.name, f"{n:,}", f"{100 * n / total:.2f} %", MEANINGS[b]) for b, n in counts.items() if n
     ]

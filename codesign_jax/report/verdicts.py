@@ -101,7 +101,7 @@ class Judged(NamedTuple):
         found = tally(self.outcomes)
         if found.failed == found.total:
             causes = runs.failure_counts(self.outcomes.status)
-            return f"every trial failed ({causes}; {self.at}): none counts as kept or lost"
+            return f"every trial failed ({causes}): none counts as kept or lost ({self.at})"
         share = statistics.wilson(found.kept, found.total)
         bad = ", failed trials count as not kept" if found.stuck or found.failed else ""
         return (
@@ -151,7 +151,7 @@ def warnings(judged: Judged) -> list[str]:
     """Says in a line that many trials failed, and what may be done about it; no line if few did."""
     scene, found = judged.scene, tally(judged.outcomes)
     count = found.stuck + found.failed
-    if count <= MANY * found.total:
+    if count <= MANY * found.total or found.failed == found.total:
         return []
     causes = runs.failure_counts(judged.outcomes.status)
     text = f"warning: {count} of {found.total} trials failed ({causes})"

@@ -85,7 +85,8 @@ TABLES = {
             "segments [s]; inf if it was kept",
             "status": "OK, or the bits of `codesign_jax.types.Status` joined by +; "
             f"{Status(WARNINGS).name} is a warning, every other bit makes the trial a failed one",
-            "first_bad_step": "time step at which the trial failed, from 0; empty if it did not",
+            "first_bad_step": "time step at which the trial failed, from 0; empty if it did "
+            "not fail, and for STUCK, which is told by the end of the grasp",
         },
     ),
     "tests.csv": Table(
@@ -104,7 +105,7 @@ TABLES = {
     ),
 }
 
-SEEDS, LANDSCAPE = "seeds.csv", "landscape.csv"
+SEEDS, LANDSCAPE, REFERENCE = "seeds.csv", "landscape.csv", "reference.csv"
 
 MORE = {
     SEEDS: Table(
@@ -172,6 +173,17 @@ GRASPS = {
 """Columns of the Parquet file of `codesign sample`: type, unit and meaning, by name; those of the
 design follow."""
 
+MORE[REFERENCE] = Table(
+    "a fresh trial of the chosen design at accuracy `reference`; `codesign evaluate --out` writes "
+    "the same columns of its trials",
+    {
+        name: text + (f" [{unit}]" if unit and f"[{unit}]" not in text else "")
+        for name, (_, unit, text) in GRASPS.items()
+        if name != "design"
+    }
+    | {"trial": "index of the trial, from 0"},
+)
+
 FILES = {
     "scene.toml": "the scene as simulated, every value with its unit; it names the two files below",
     "hand.toml": "the hand",
@@ -190,6 +202,7 @@ FILES = {
     "landscape.part": "what is done of a landscape that was interrupted; the same command goes on",
     "reference.npz": "outcomes of the chosen design's fresh trials at accuracy `reference`, arrays "
     "of shape (trial,), and the digest of what determines them",
+    REFERENCE: "the same trials as a table, with their noise, see below",
     "replay.html": "a grasp in 3D, of `codesign replay`: opens in any browser, without a network",
     "report.html": "the report of `codesign report`: opens in any browser, without a network",
 }

@@ -28,7 +28,7 @@ from codesign_jax.runs.columns import DESIGNS, GRASPS
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.parquet import Column, Names
 from codesign_jax.runs.scene_files import contents, scene_texts
-from codesign_jax.runs.tables import design_columns, status_names
+from codesign_jax.runs.tables import design_columns, noise_values, status_names
 from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
@@ -273,16 +273,7 @@ def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[s
         "design": (shard * question.chunk + np.arange(question.chunk))[:, None],
         "trial": np.arange(question.trials),
         "object": Names(trials.shape, [s.name for s in question.scene.objects.object]),
-        "noise_x_m": trials.position[..., 0],
-        "noise_y_m": trials.position[..., 1],
-        "noise_yaw_rad": trials.yaw,
-        "noise_arm_roll_rad": trials.arm_tilt[..., 0],
-        "noise_arm_pitch_rad": trials.arm_tilt[..., 1],
-        "noise_mass_factor": trials.mass,
-        "noise_size_factor": trials.size,
-        "noise_friction_factor": trials.friction,
-        "noise_stiffness_factor": trials.stiffness,
-        "noise_hand_mass_factor": trials.hand_mass,
+        **noise_values(trials),
         "verdict": Names(verdicts(found), VERDICTS),
         "cost": found.cost,
         "lost_time_s": found.lost_time,

@@ -24,6 +24,8 @@ from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
 
+EVENTS = "events.log"
+"""Log of a run folder: what happened when, a line each."""
 _MOST_LINES = 16
 """Lines of a file's differences that an error shows."""
 
@@ -44,7 +46,7 @@ class RunDirectory:
     def log(self, message: str) -> None:
         """Appends a line with the time to events.log."""
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        path = self.path / "events.log"
+        path = self.path / EVENTS
         with files.naming(path), path.open("a", encoding="utf-8") as file:
             file.write(f"{now} {message}\n")
 

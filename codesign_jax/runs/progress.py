@@ -48,6 +48,10 @@ class Ticker:
         self._about = "" if expected is None else f" of about {duration(expected)}"
         self.spoke()
 
+    def rename(self, text: str) -> None:
+        """What goes on since `begin` has another name."""
+        self._text = text
+
     def spoke(self) -> None:
         """Something was said by somebody else."""
         self._spoken, self._gap = time.monotonic(), self.FIRST
@@ -81,7 +85,12 @@ class Busy:
             disable=not console.is_terminal,
         )
         about = "" if expected is None else f" (about {duration(expected)})"
-        self._bar.add_task(text + about, total=None)
+        self._task = self._bar.add_task(text + about, total=None)
+
+    def say(self, text: str) -> None:
+        """Says more precisely what goes on; its time goes on as well."""
+        self._ticker.rename(text)
+        self._bar.update(self._task, description=text)
 
     def __enter__(self) -> "Busy":
         """Shows it."""

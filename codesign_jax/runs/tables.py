@@ -8,16 +8,17 @@ import csv
 import io
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from codesign_jax import files, types
-from codesign_jax.codesign import FinalTest
-from codesign_jax.runs.columns import TABLES
+from codesign_jax.codesign import SUCCESS_COST, FinalTest
+from codesign_jax.runs.columns import MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import WARNINGS, Status
+from codesign_jax.types import WARNINGS, Outcome, Status, Trial
 
 TESTS = "tests.csv"
 
@@ -97,6 +98,53 @@ def episodes_in(folder: Path) -> int:
     """Number of episodes of which the tables in a run folder tell, whatever they hold."""
     content = _content(folder / "episodes.csv") or b""
     return max(content.count(b"\n") - 1, 0)
+
+
+def noise_values(trials: Trial) -> dict[str, Any]:
+    """The noise of trials by the names of its columns in `columns.GRASPS`; of any shape."""
+    return {
+        "noise_x_m": trials.position[..., 0],
+        "noise_y_m": trials.position[..., 1],
+        "noise_yaw_rad": trials.yaw,
+        "noise_arm_roll_rad": trials.arm_tilt[..., 0],
+        "noise_arm_pitch_rad": trials.arm_tilt[..., 1],
+        "noise_mass_factor": trials.mass,
+        "noise_size_factor": trials.size,
+        "noise_friction_factor": trials.friction,
+        "noise_stiffness_factor": trials.stiffness,
+        "noise_hand_mass_factor": trials.hand_mass,
+    }
+
+
+def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> None:
+    """Writes a design's trials with their noise and how they ended, a row each.
+
+    Args:
+      path: The file; its folder is made.
+      scene: The scene that was simulated.
+      trials: The trials, arrays with leading axis (trial,).
+      outcomes: Their outcomes, arrays of shape (trial,).
+    """
+    names, noise = [s.name for s in scene.objects.object], noise_values(trials)
+
+    def row(t: int) -> list:
+        one = Outcome(*(np.asarray(v)[t] for v in outcomes))
+        drawn = [_number(float(v[t])) for v in noise.values()]
+        numbers = [_number(float(one.cost)), _number(float(one.lost_time))]
+        bad_step = int(one.bad_step)
+        ending = [ended(one), *numbers, status_names(one.status)]
+        return [t, names[int(trials.shape[t])], *drawn, *ending, bad_step if bad_step >= 0 else ""]
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = (row(t) for t in range(len(outcomes.cost)))
+    _replace(path, _text([[*MORE[REFERENCE].columns], *rows]))
+
+
+def ended(outcome: Outcome) -> str:
+    """How a trial ended, in a word: kept, lost, stuck or failed; its entries are numbers."""
+    if types.failed(int(outcome.status)):
+        return "stuck" if int(outcome.status) & Status.STUCK else "failed"
+    return "kept" if float(outcome.cost) < SUCCESS_COST else "lost"
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:

@@ -47,12 +47,27 @@ def find(kind: str, name: str | Path) -> Path:
     built_in = available(kind)
     if str(name) in built_in:
         return built_in[str(name)]
+    if path.is_dir() or path.suffix:
+        raise schema.SceneError([f"{kind}: {schema.shown(str(path))} {_no_file(kind, path)}"])
     beside = path.with_name(path.name + ".toml") if path.name else path
     if is_file(beside):
         hint = f"did you mean the file {schema.shown(str(beside))}?"
     else:
         hint = schema.nearest(str(name), built_in)
     raise schema.SceneError([f"{kind}: {schema.shown(str(name))} unknown; {hint}"])
+
+
+def _no_file(kind: str, path: Path) -> str:
+    """Why a path that is no .toml file is none of a kind."""
+    if path.is_dir():
+        inside = sorted(path.glob("*.toml"))[:1]
+        return "is a folder" + (f"; did you mean {str(inside[0])!r}?" if inside else "")
+    if kind == "objects":
+        return (
+            "is no object file: a mesh is named in one, which ends in .toml and has its mass and "
+            "friction too (docs/meshes.md)"
+        )
+    return "must end in .toml"
 
 
 def is_file(path: Path) -> bool:

@@ -21,6 +21,7 @@ DIGEST = "digest"
 """Name of the array that holds the digest of the others."""
 MOST = 2**30
 """Most bytes of arrays that a file may unpack to."""
+_NUMBER = "number of the part"
 _HEAD = 8  # bytes of a part's length
 
 
@@ -63,7 +64,11 @@ class Parts:
         with contextlib.suppress(OSError, ArchiveError), path.open("rb") as file:
             while size := int.from_bytes(file.read(_HEAD), "little"):
                 content = file.read(size) if size <= MOST else b""
-                self.found.append(_unpacked(io.BytesIO(content), path))
+                part = _unpacked(io.BytesIO(content), path)
+                # A damaged length may reach over a whole part: a zip file is read from its end.
+                if part.pop(_NUMBER, None) != len(self.found):
+                    break
+                self.found.append(part)
                 self._ends.append(file.tell())
 
     def go_on(self, count: int) -> None:
@@ -76,7 +81,8 @@ class Parts:
         Raises:
           OSError: If the file cannot be written.
         """
-        content = _packed(arrays, compressed=False)
+        number = np.array(len(self._ends) - 1)
+        content = _packed({**arrays, _NUMBER: number}, compressed=False)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("r+b" if self._path.exists() else "wb") as file:
             file.truncate(self._ends[-1])  # without what a killed process began

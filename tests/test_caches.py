@@ -291,6 +291,13 @@ def test_a_failed_world_with_any_damage_is_refused_or_whole(tmp_path):
             failures.load(path)
 
 
+def over_two(content):
+    """Three parts of equal length, the second of which claims to reach to the end."""
+    third = len(content) // 3
+    length = (2 * third - 8).to_bytes(8, "little")
+    return content[:third] + length + content[third + 8 :]
+
+
 def test_parts_are_added_and_a_torn_one_is_left_out(tmp_path):
     path = tmp_path / "new" / "x.part"
     parts = archives.Parts(path)
@@ -305,6 +312,7 @@ def test_parts_are_added_and_a_torn_one_is_left_out(tmp_path):
         (content + b"\xff" * 9, 3),
         (flipped(content, third + third // 2), 1),
         (flipped(content, third + 7), 1),  # a length of many bytes
+        (over_two(content), 1),
         (b"", 0),
     ):
         path.write_bytes(other)

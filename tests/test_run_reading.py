@@ -48,7 +48,9 @@ def damage(path, how):
         path.write_bytes(content[: ends[how]])
     elif how == "older":
         older = str(path).replace(f"/{NEWEST}/", f"/{NEWEST - 1}/")
-        shutil.copy(older if os.path.exists(older) else path.parent / "manifest.ocdbt", path)
+        if not os.path.exists(older):  # data files are named anew in each step
+            older = f"{older.split(f'/{NEWEST - 1}/')[0]}/{NEWEST - 1}/default/manifest.ocdbt"
+        shutil.copy(older, path)
     else:
         path.unlink()
         if how == "rename":

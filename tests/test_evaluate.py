@@ -97,7 +97,7 @@ def test_an_evaluation_without_an_answer_is_no_success(finished, capsys):
     """Every trial fails, so that nothing is known of the design."""
     broken = ["--trials", "1", "--set", "limits.speed=1"]
     assert command("evaluate", "--run", finished, *broken) == 1
-    assert "every trial failed (SPEED 1;" in capsys.readouterr().out
+    assert "every trial failed (SPEED 1)" in capsys.readouterr().out
 
 
 def test_a_verdict_comes_with_its_interval():

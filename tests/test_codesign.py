@@ -1,6 +1,8 @@
 """Episodes, seeds and tests: what an optimisation does with an engine's outcomes."""
 
+import contextlib
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import pytest
 from toy import ToyEngine, tiny
 
 from codesign_jax import codesign
+from codesign_jax.codesign import episode as episodes
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import State, schedule
 from codesign_jax.optimize.schedule import NAMES
@@ -257,3 +260,17 @@ def test_episode_on_real_physics_is_repeatable():
     np.testing.assert_array_equal(once.particles, again.particles)
     assert (np.asarray(info.trials.status) == 0).all()
     assert ((np.asarray(info.trials.cost) >= 0) & (np.asarray(info.trials.cost) <= 3)).all()
+
+
+@pytest.mark.parametrize(("costs", "own"), [([-0.1, 2.0], True), ([0.0, 2.0], True), ([-1], False)])
+def test_negative_costs_of_ones_own_are_told(costs, own):
+    """The particle filter takes them for 0; optimisers that compare do not mind."""
+    the_scene, space, _ = tiny()
+    info = SimpleNamespace(selection=SimpleNamespace(cost=np.array(costs)))
+    cost = (lambda scene, trace, ctrl: 0.0) if own else None
+    program = episodes._joined(
+        the_scene, lambda *_: (None, info), codesign.make_filter(space), cost
+    )
+    warned = pytest.warns(UserWarning, match="cost of your own is negative")
+    with warned if own and min(costs) < 0 else contextlib.nullcontext():
+        assert program(0, 0) == (None, info)

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from test_browser import browser  # noqa: F401
+from test_browser import browser, launch  # noqa: F401
 
 from codesign_jax import model
 from scripts import reference_page, site_pages

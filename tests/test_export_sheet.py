@@ -1,5 +1,7 @@
 """Build sheet and tolerances: thresholds that are known are found, and the page says them."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -242,7 +244,7 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, by_toy, monkeypatch):
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys):
     now = iter([0.0, 20.0, 20.0, 25.0, 35.0])  # made, a call that compiled, and two more
-    monkeypatch.setattr(calls.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(calls, "time", SimpleNamespace(monotonic=lambda: next(now)))
     with Meter("tolerance", 100, Console(highlight=False, soft_wrap=True)) as meter:
         meter.advance(20)
         meter.compiled()

@@ -1,5 +1,6 @@
 """Finds and reads the TOML files of hands, objects, scenes and presets of accuracy."""
 
+import os
 import re
 import tomllib
 from collections.abc import Mapping
@@ -47,7 +48,7 @@ def find(kind: str, name: str | Path) -> Path:
     built_in = available(kind)
     if str(name) in built_in:
         return built_in[str(name)]
-    if path.is_dir() or path.suffix:
+    if os.path.isdir(path) or path.suffix:  # never raises, as of a name that is too long
         raise schema.SceneError([f"{kind}: {schema.shown(str(path))} {_no_file(kind, path)}"])
     beside = path.with_name(path.name + ".toml") if path.name else path
     if is_file(beside):
@@ -59,7 +60,7 @@ def find(kind: str, name: str | Path) -> Path:
 
 def _no_file(kind: str, path: Path) -> str:
     """Why a path that is no .toml file is none of a kind."""
-    if path.is_dir():
+    if os.path.isdir(path):
         inside = sorted(path.glob("*.toml"))[:1]
         return "is a folder" + (f"; did you mean {str(inside[0])!r}?" if inside else "")
     if kind == "objects":

@@ -42,12 +42,11 @@ def _tests(campaign: Any) -> str:
 def note(data: dict[str, Any]) -> str:
     """Of which code and on what machine the counts are."""
     starts = data["starts"]
-    commits = list(dict.fromkeys(str(s["commit"])[:12] for s in starts))
     total = sum(found["cases"] for found in data["campaigns"].values())
     hours = sum(found["seconds"] for found in data["campaigns"].values()) / 3600
     last = starts[-1]
     return (
-        f"{total:,} cases in {hours:.1f} h; commit {', '.join(commits)}, Python {last['python']}, "
+        f"{total:,} cases in {hours:.1f} h; Python {last['python']}, "
         f"jax {last['jax']}, {last['cpus']} cores of {last['cpu']}, {last['date'][:10]}."
     )
 

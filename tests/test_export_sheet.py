@@ -246,11 +246,11 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys)
     now = iter([0.0, 20.0, 20.0, 25.0, 35.0])  # made, a call that compiled, and two more
     monkeypatch.setattr(calls, "time", SimpleNamespace(monotonic=lambda: next(now)))
     with Meter("tolerance", 100, Console(highlight=False, soft_wrap=True)) as meter:
-        meter.advance(20)
-        meter.compiled()
-        meter.advance(20)
-        meter.total = 80  # a side ended
-        meter.advance(20)
+        for now[0], total in ((20.0, 100), (25.0, 100), (35.0, 80)):  # at last a side ended
+            meter.total = total
+            meter.advance(20)
+            if now[0] == 20.0:
+                meter.compiled()  # a call that compiled
     lines = capsys.readouterr().out.splitlines()
     assert lines == [
         "tolerance: 40 of 100 grasps, 4.0 grasps/s, about 0:15 left",

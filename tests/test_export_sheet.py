@@ -1,7 +1,5 @@
 """Build sheet and tolerances: thresholds that are known are found, and the page says them."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -243,8 +241,8 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, by_toy, monkeypatch):
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys):
-    now = iter([0.0, 20.0, 20.0, 25.0, 35.0])  # made, a call that compiled, and two more
-    monkeypatch.setattr(calls, "time", SimpleNamespace(monotonic=lambda: next(now)))
+    now = [0.0]
+    monkeypatch.setattr(calls.time, "monotonic", lambda: now[0])
     with Meter("tolerance", 100, Console(highlight=False, soft_wrap=True)) as meter:
         for now[0], total in ((20.0, 100), (25.0, 100), (35.0, 80)):  # at last a side ended
             meter.total = total

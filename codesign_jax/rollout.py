@@ -159,6 +159,57 @@ def simulate(
         finger is so high that its contacts begin farther from a mesh than distances reach; of
         traced ones no values are known.
     """
+    constants = _checked(scene, engine, params, trials, constants)
+    fields, ctrl, initial = prepare(scene, params, trials, constants)
+    trace = engine.rollout(fields, ctrl, trajectory=bool(trajectory))
+    judged = judge(scene, trace, ctrl, initial, trials, constants, trajectory=trajectory, cost=cost)
+    return judged, trace
+
+
+def grasp(
+    scene: Scene,
+    engine: Engine,
+    params: Params,
+    trial: Trial,
+    *,
+    steps: int | None = None,
+    trajectory: bool = False,
+    constants: Constants | None = None,
+) -> Trace:
+    """Simulates one world, or the beginning of it; `jax.vmap` makes a batch of it.
+
+    Args:
+      scene: The scene.
+      engine: The engine.
+      params: Parameters of one hand.
+      trial: One trial.
+      steps: How many time steps are simulated; None for the whole grasp.
+      trajectory: As in `simulate`.
+      constants: Numbers instead of the scene's, leaves of shape ().
+
+    Returns:
+      Trace of shape (steps,).
+
+    Raises:
+      SceneError: As `simulate`, or if there are no such steps.
+    """
+    if steps is not None and not 0 < steps <= scene.num_steps:
+        raise schema.SceneError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
+    worlds = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
+    constants = _checked(scene, engine, *worlds, constants)
+    fields, ctrl, _ = prepare(scene, *worlds, constants)
+    trace = engine.rollout(fields, ctrl[:, :steps], trajectory=trajectory)
+    return jax.tree.map(lambda v: v[0], trace)
+
+
+def _checked(
+    scene: Scene, engine: Engine, params: Params, trials: Trial, constants: Constants | None
+) -> Constants:
+    """The numbers of a batch of worlds that is as `simulate` asks for.
+
+    Raises:
+      SceneError: See `simulate`.
+    """
     axes.refuse_other(scene, engine)
     constants = numbers(scene, constants)
     axes.refuse(scene, params, trials, ("world", "world"))
@@ -166,10 +217,7 @@ def simulate(
     unit_slips.refuse(params)
     if not isinstance(params.height, jax.core.Tracer):
         reach.refuse(scene.objects, float(np.asarray(params.height).max()) / 2)
-    fields, ctrl, initial = prepare(scene, params, trials, constants)
-    trace = engine.rollout(fields, ctrl, trajectory=bool(trajectory))
-    judged = judge(scene, trace, ctrl, initial, trials, constants, trajectory=trajectory, cost=cost)
-    return judged, trace
+    return constants
 
 
 def prepare(

@@ -63,9 +63,8 @@ trials = rollout.sample_trials(grasping, jax.random.key(0), 2)
 # %%
 def distance(design, trial):
     """Distance of object and hand when the object is lifted [m]."""
-    one = jax.tree.map(lambda v: v[None], (space.params(design), trial))
-    _, trace = rollout.simulate(grasping, engine, *one, trajectory=True)
-    return trace.at(grasping, "lift").distance[0]
+    trace = rollout.grasp(grasping, engine, space.params(design), trial, trajectory=True)
+    return trace.at(grasping, "lift").distance
 
 
 designs = jnp.asarray([[0.09, 0.03], [0.11, 0.05], [0.13, 0.07]])

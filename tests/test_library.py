@@ -38,8 +38,7 @@ def short(monkeypatch):
 
 
 def test_the_front_page_and_the_library_show_the_same_optimisation():
-    [front] = blocks("README.md")
-    assert front == blocks("docs/library.md")[0]
+    assert blocks("README.md")[0] == blocks("docs/library.md")[0]
 
 
 def test_an_optimisation_as_on_the_front_page(short, capsys, monkeypatch):
@@ -53,6 +52,51 @@ def test_an_optimisation_as_on_the_front_page(short, capsys, monkeypatch):
     assert names["state"].particles.shape == (10, 2)
 
 
+class ArmEngine:
+    """Its distance is the arm's height."""
+
+    def rollout(self, fields, ctrl, *, trajectory=False):
+        """See `Engine.rollout`."""
+        height = ctrl[:, :, 2]
+        return Trace(height, height, height, jnp.zeros((*height.shape, 0)))
+
+
+def front_page(last_line):
+    """Namespace of the front page's first example up to a line, and then of its second one."""
+    names, (first, second) = {}, blocks("README.md")
+    exec(first[: first.index(last_line)], names)
+    return names, second
+
+
+def test_the_derivative_on_the_front_page(monkeypatch, only_heights):
+    """Of an engine whose derivative is known."""
+    monkeypatch.setattr(engines, "make_engine", lambda name, scene: ArmEngine())
+    names, second = front_page("optimizer =")
+    names["poor"] = names["space"].from_units(np.array([130.0, 150.0]))
+    exec(second, names)
+    np.testing.assert_allclose(names["value"], 0.15, rtol=1e-6)  # m, of the poor design
+    np.testing.assert_allclose(names["slope"], [0.0, 1.0], rtol=1e-6)
+
+
+@pytest.mark.slow  # three kernels of the whole scene; the test above has the idea
+def test_the_derivative_on_the_front_page_by_differences():
+    """Over 2 mm, which lose 1e-7 m to rounding, 1e-4 of a slope of one."""
+    names, second = front_page("state =")
+    exec(second, names)
+    run = jax.jit(jax.vmap(names["distance"]))
+    sides = [np.asarray(run(names["poor"] + sign * 1e-3 * jnp.eye(2))) for sign in (1, -1)]
+    np.testing.assert_allclose(names["slope"], (sides[0] - sides[1]) / 2e-3, rtol=0.01)
+
+
+def test_steps_of_a_grasp_are_checked(short):
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "2d")
+    world = space.params(space.default()), rollout.nominal_trial(the_scene)
+    for steps in (0, the_scene.num_steps + 1):
+        with pytest.raises(scene.SceneError, match=f"steps = {steps}: the grasp has 1 to"):
+            rollout.grasp(the_scene, ArmEngine(), *world, steps=steps)
+
+
 @pytest.mark.slow
 def test_every_example_of_the_library(short, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the last example writes a table
@@ -62,7 +106,7 @@ def test_every_example_of_the_library(short, tmp_path, monkeypatch):
     assert names["table"].shape == (2, 3)
     assert names["infos"].selection.mean_cost.shape == (5, 4)
     assert names["best"].shape == (2,) and np.isfinite(names["info"].selection.cost).all()
-    assert names["by_design"].shape == (2,) and np.isfinite(names["by_design"]).all()
+    assert names["slope"].shape == (2,) and np.isfinite(names["slope"]).all()
     assert names["outcome"].cost.shape == (2,)
     assert pyarrow.parquet.read_metadata("grasps.parquet").num_rows == 600
 

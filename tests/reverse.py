@@ -173,7 +173,8 @@ class Case:
             taken = program.by_block(trace["moved"].sum(1)[:, None, None, None])
             rows = Cotangents(*program.rows_of_end(last), entries[..., None], program.rows_of(qpos))
             rows = jax.tree.map(program.by_block, rows)
-            return program.adjoint(tables, recorded(out, taken), rows)
+            hand, world, *rest = program.adjoint(tables, recorded(out, taken), rows)
+            return hand, program.summed(world), *rest
 
         tables = tuple(map(jnp.asarray, tables))
         return [np.asarray(x) for x in jax.jit(run)(tables, out, last, entries, qpos)]

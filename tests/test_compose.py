@@ -140,6 +140,20 @@ def test_a_trajectory_changes_no_outcome(decided, name):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("name", ["mujoco", pytest.param("structured", marks=pytest.mark.slow)])
+def test_a_rollout_begins_where_another_ended(batch, name):
+    """Positions and velocities of `last` go on as if nothing had been between; the hands move."""
+    scene, fields, ctrl = batch
+    run = jax.jit(engines(scene)[name].rollout)
+    whole, first = run(fields, ctrl[:, :50]), run(fields, ctrl[:, :25])  # before a verdict
+    rest = run(fields._replace(start=first.last), ctrl[:, 25:50])
+    assert np.abs(whole.speed[:, 25]).min() > 0.1
+    for series in ("distance", "height", "speed"):
+        # `last` is rounded to float32, and the solver's warm start is another one.
+        got, want = getattr(rest, series), getattr(whole, series)[:, 25:]
+        np.testing.assert_allclose(got, want, atol=1e-4, err_msg=series)
+
+
 # --- a whole optimisation as one program ---------------------------------------------------------
 
 

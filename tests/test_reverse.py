@@ -428,11 +428,8 @@ def test_segments_have_the_bits_of_the_whole_path():
     whole = rollout_slopes(StructuredEngine(the_scene), fields, ctrl)
     parts = rollout_slopes(StructuredEngine(the_scene, segment=10), fields, ctrl)
     cut = rollout_slopes(StructuredEngine(the_scene, segment=10, truncate=True), fields, ctrl)
-    for a, b in zip(*map(jax.tree.leaves, (whole[1], parts[1])), strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (whole, parts)), strict=True):
         np.testing.assert_array_equal(a, b)
-    for a, b in zip(*map(jax.tree.leaves, (whole[0], parts[0])), strict=True):
-        # Sums over the steps of constants are added up segment by segment.
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * max(np.abs(a).max(), 1e-3))
     assert np.isfinite(whole[1]).all() and (whole[1][2, 18:] == 0).all()
     np.testing.assert_array_equal(cut[1][:, 20:], whole[1][:, 20:])
     assert (cut[1][:2, :20] != whole[1][:2, :20]).any()

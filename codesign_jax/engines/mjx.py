@@ -57,7 +57,7 @@ class MjxEngine(Equal):
 
     def reset(self, fields: ModelFields) -> mjx.Data:
         """Returns the start state of one world."""
-        return self.data.replace(qpos=fields.start)
+        return self.data.replace(qpos=fields.qpos, qvel=jnp.asarray(fields.qvel))
 
     def step(self, fields: ModelFields, data: mjx.Data, ctrl: jax.Array) -> mjx.Data:
         """Advances one world by one time step under controls of shape (nu,)."""
@@ -76,7 +76,8 @@ class MjxEngine(Equal):
 
         def start(fields: ModelFields) -> _Carry:
             zero = jnp.zeros(self.template.nv, ctrl.dtype)
-            return _Carry(fields.start, zero, zero, jnp.zeros((), ctrl.dtype), jnp.array(True))
+            velocity = zero + fields.qvel
+            return _Carry(fields.qpos, velocity, zero, jnp.abs(velocity).max(), jnp.array(True))
 
         def body(carry: _Carry, x: tuple[jax.Array, jax.Array]) -> tuple[_Carry, Trace]:
             step = jax.vmap(partial(self._advance, trajectory), in_axes=(0, 0, 0, None))

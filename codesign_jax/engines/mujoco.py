@@ -99,7 +99,7 @@ class MujocoEngine(Equal):
             np.zeros((worlds, steps, nq * trajectory)),
         )
         series = (distance, height, speed, qpos, status)
-        last = np.concatenate([fields.start, np.zeros((worlds, self.template.nv))], 1)
+        last = np.concatenate([fields.qpos, fields.qvel], 1)
         bounds = verdict.Bounds(*(v[:, None] for v in bounds))
         going = np.arange(worlds)
         chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
@@ -248,7 +248,7 @@ def _apply_softening(
 def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:
     """Gives every simulation of a batch its model fields and start state."""
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
-    batch.bind("qpos")[:] = fields.start
+    batch.bind("qpos")[:], batch.bind("qvel")[:] = fields.qpos, fields.qvel
     for name, value in fields.of_model.items():
         batch.expand(name)[:] = value
     batch.bind("qacc_warmstart")[:] = 0.0

@@ -30,11 +30,11 @@ class ModelFields(NamedTuple):
     """The fields of mjModel that depend on parameters, trial and constants, and the start state.
 
     Every array has MuJoCo's name and shape for one world, `gravity` and `impratio` those of
-    mjOption, but for three: `start` is the initial qpos, shape (nq,); `section` has height, wall,
-    segment length and width of the fingers [m], shape (finger, 4), with the effect `neo_hookean` or
-    the surface "hull", None without; and `constants` are the world's numbers with the trial's
-    factors, from which engines take what MuJoCo has no field for: limits, the cost's window, and
-    friction by pair of bodies.
+    mjOption, but for three: `start` is the initial qpos, shape (nq,), or qpos and qvel, (nq + nv,),
+    as `Trace.last` has them; `section` has height, wall, segment length and width of the fingers
+    [m], shape (finger, 4), with the effect `neo_hookean` or the surface "hull", None without; and
+    `constants` are the world's numbers with the trial's factors, from which engines take what
+    MuJoCo has no field for: limits, the cost's window, and friction by pair of bodies.
     """
 
     body_pos: jax.Array
@@ -62,6 +62,17 @@ class ModelFields(NamedTuple):
     start: jax.Array
     constants: Constants
     section: jax.Array | None = None
+
+    @property
+    def qpos(self) -> jax.Array:
+        """Generalized positions at the start, shape (..., nq)."""
+        return self.start[..., : self.dof_damping.shape[-1] + 1]
+
+    @property
+    def qvel(self) -> Any:
+        """Generalized velocities at the start, shape (..., nv); zero unless `start` has them."""
+        given = self.start[..., self.dof_damping.shape[-1] + 1 :]
+        return given if given.shape[-1] else np.zeros(self.dof_damping.shape, self.start.dtype)
 
     @property
     def of_model(self) -> dict[str, jax.Array]:

@@ -10,8 +10,8 @@ from codesign_jax.scene import Scene
 
 def reset(scene: Scene, fields: ModelFields) -> State:
     """Start states of a batch, fields with leading axis (world,)."""
-    rest = jnp.zeros((fields.start.shape[0], fields.start.shape[1] - 1), fields.start.dtype)
-    return make(scene, fields.start, rest, rest)
+    qvel = jnp.asarray(fields.qvel)
+    return make(scene, fields.qpos, qvel, jnp.zeros_like(qvel))
 
 
 def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> State:

@@ -2,6 +2,8 @@
 
 The steps of a segment are simulated once more from its first state, by the kernel that simulated
 them before: their bits are the same, as a block's step depends on nothing but its state.
+The cotangents of the constants are handed on from segment to segment, so that the order of their
+sums is that of the whole path.
 """
 
 from typing import TYPE_CHECKING
@@ -41,7 +43,8 @@ def reverse(
       trajectory: As in `Engine.rollout`.
     """
     if engine.segment is None:
-        return program.adjoint(inputs, path, bars)
+        hand_bar, world_bar, *rest = program.adjoint(inputs, path, bars)
+        return hand_bar, program.summed(world_bar), *rest
     size, (hand, world, _, _, arm, pressure, *grid) = engine.segment, inputs
     steps, count = arm.shape[1], path.finger.shape[1]
     again = Program(engine.scene, engine.limits, backend=program.backend, width=program.size)
@@ -58,19 +61,21 @@ def reverse(
         own = (hand, moved, *start, *commands, *grid)
         out = again.execute(own, trajectory=trajectory, states=1)
         here = recorded(out, taken)
-        cotangents = Cotangents(ends[0], ends[1], shown[0], shown[1:])
-        hand_bar, world_bar, *state, arm_bar, pressure_bar = program.adjoint(own, here, cotangents)[
-            :6
-        ]
-        state = [jnp.zeros_like(x) if engine.truncate else x for x in state]
-        return tuple(x[:, None] for x in state), (hand_bar, world_bar, arm_bar, pressure_bar)
+        *ends, hand_bar, world_bar = ends
+        cotangents = Cotangents(*ends, shown[0], shown[1:])
+        found = program.adjoint(own, here, cotangents, (hand_bar, world_bar))
+        hand_bar, world_bar, *state, arm_bar, pressure_bar = found[:6]
+        state = [(jnp.zeros_like(x) if engine.truncate else x)[:, None] for x in state]
+        return (*state, hand_bar, world_bar), (arm_bar, pressure_bar)
 
     every = jnp.arange(count, dtype=arm.dtype)
     starts = tuple(jnp.moveaxis(x, 1, 0) for x in path[:2])
     shown = tuple(split(x) for x in (bars.trace, *bars.path))
     given = every, starts, (split(arm), split(pressure)), shown
-    ends, found = jax.lax.scan(segment, (bars.finger, bars.world), given, reverse=True)
-    hand_bar, world_bar, *commands = found
+    sums = program.no_sums(arm.shape[0], arm.dtype)
+    (*ends, hand_bar, world_bar), commands = jax.lax.scan(
+        segment, (bars.finger, bars.world, *sums), given, reverse=True
+    )
 
     def join(x: jax.Array) -> jax.Array:
         """Inverse of `split`."""
@@ -78,7 +83,7 @@ def reverse(
 
     state = (x[:, 0] for x in ends)
     none = [jnp.zeros_like(x) for x in grid]
-    return hand_bar.sum(0), world_bar.sum(0), *state, *map(join, commands), *none
+    return hand_bar, program.summed(world_bar), *state, *map(join, commands), *none
 
 
 def _later(program: Program, world: jax.Array, step: jax.Array, taken: jax.Array) -> jax.Array:

@@ -84,15 +84,21 @@ class AdjointProgram(Program):
         self.scratch = MemoryLayout.by_item(True, **(self.scratch.groups | more))
         self.world_bars = MemoryLayout(True, **self.world.groups)
 
-    def adjoint(self, inputs: tuple, path: Path, bars: Cotangents) -> tuple:
+    def adjoint(
+        self, inputs: tuple, path: Path, bars: Cotangents, sums: tuple | None = None
+    ) -> tuple:
         """Cotangents of `Program.inputs`; where a world took no step they need not be numbers.
 
         Args:
           inputs: As in `Program.execute`.
           path: The steps, as tables of blocks.
           bars: Cotangents of the results, as tables of blocks.
+          sums: What is added to the cotangents of the constants, see `no_sums`; None for nothing.
+
+        Returns:
+          The cotangents, those of the worlds' constants for each of their fingers, see `summed`.
         """
-        given = self._arguments(inputs, path, bars)
+        given = self._arguments(inputs, path, bars, sums)
         call, outputs = self._adjoint_call(given)
         if self.backend == "interpreter":
             found = call(*given)[:6]
@@ -102,11 +108,17 @@ class AdjointProgram(Program):
             shared = (len(given) - 1,) if self.meshes else ()
             kernel = Kernel(origin, self.backend, self.size, shared, scratch=(6, 7, 8))
             found = launch(call, given, outputs, kernel)[:6]
-        hand, world, *rest = cast("list[jax.Array]", found)
-        # A number of a world has a cotangent on each of its fingers' lanes.
-        world = world.reshape(*world.shape[:2], self.fingers, self.block).sum(2)
         grid = (jnp.zeros_like(inputs[-1]),) if self.meshes else ()
-        return hand, world, *rest, *grid
+        return (*cast("list[jax.Array]", found), *grid)
+
+    def no_sums(self, blocks: int, dtype: Any) -> tuple:
+        """Cotangents of the constants before the last step: those of the hand, and the worlds'."""
+        rows = self.hand.rows, self.world_bars.rows
+        return tuple(jnp.zeros((blocks, n, self.size), dtype) for n in rows)
+
+    def summed(self, world: jax.Array) -> jax.Array:
+        """Cotangents of the worlds' constants, of those on each of the fingers' lanes."""
+        return world.reshape(*world.shape[:2], self.fingers, self.block).sum(2)
 
     def sound(self, bars: tuple, taken: jax.Array) -> tuple:
         """Cotangents of the inputs, zero for worlds that took no step; `taken` of blocks."""
@@ -121,10 +133,13 @@ class AdjointProgram(Program):
         given = self._arguments(inputs, path, bars)
         return kernel_jaxpr(self._adjoint_call(given)[0], list(given))
 
-    @staticmethod
-    def _arguments(inputs: tuple, path: Path, bars: Cotangents) -> tuple:
+    def _arguments(
+        self, inputs: tuple, path: Path, bars: Cotangents, sums: tuple | None = None
+    ) -> tuple:
         hand, world, _, _, arm, pressure, *grid = inputs
-        ends = bars.finger, bars.world, bars.trace, *bars.path
+        if sums is None:
+            sums = self.no_sums(hand.shape[0], hand.dtype)
+        ends = bars.finger, bars.world, *sums, bars.trace, *bars.path
         return (hand, world, arm, pressure, *path, *ends, *grid)
 
     def _adjoint_call(self, given: tuple) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
@@ -141,7 +156,7 @@ class AdjointProgram(Program):
             (blocks, self.finger_state.rows, self.size),
             (blocks, self.world_state.rows, self.block),
         ]
-        trajectory = len(given) - int(self.meshes) > 12
+        trajectory = len(given) - int(self.meshes) > 14
         outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
         call = pl.pallas_call(
             partial(self._adjoint_kernel, steps, trajectory),
@@ -156,8 +171,8 @@ class AdjointProgram(Program):
 
     def _adjoint_kernel(self, steps: int, trajectory: bool, *refs: Any) -> None:
         hand, world, arm, pressure, *rest = refs
-        *states, taken, finger_seed, world_seed, trace = rest[:8]
-        rest = rest[8:]
+        *states, taken, finger_seed, world_seed, hand_sum, world_sum, trace = rest[:10]
+        rest = rest[10:]
         path = [rest.pop(0), rest.pop(0)] if trajectory else []
         grid = rest.pop(0) if self.meshes else None
         hand_bar, world_bar, finger_bar, state_bar, arm_bar, pressure_bar, *rest = rest
@@ -167,7 +182,8 @@ class AdjointProgram(Program):
         bars = Bars(self, block, (hand_bar, world_bar, finger_bar, state_bar), scratch)
         tables = hand, world, finger_state, world_state, scratch, grid
         step = ReverseStep(self, block, tables, bars)
-        bars.clear()
+        copy_rows((0, self.hand.rows), lambda k: hand_sum[(k,)], hand_bar)
+        copy_rows((0, self.world_bars.rows), lambda k: world_sum[(k,)], world_bar)
         copy_rows((0, self.finger_state.rows), lambda k: finger_seed[(0, k)], finger_bar)
         copy_rows((0, self.world_state.rows), lambda k: world_seed[0, k, own], state_bar, own)
         count = taken[0, 0, own]

@@ -33,19 +33,6 @@ class Bars:
         self.hand, self.world, self.finger_state, self.world_state = refs
         self.like = jnp.zeros((program.size,), scratch.dtype)
 
-    def clear(self) -> None:
-        """Sets the constants' cotangents to zero."""
-
-        def rows(ref: Any, count: int) -> None:
-            def one(k: jax.Array, x: jax.Array) -> jax.Array:
-                ref[(k, slice(None))] = self.like
-                return x
-
-            jax.lax.fori_loop(0, count, one, jnp.int32(0))
-
-        rows(self.hand, self.p.hand.rows)
-        rows(self.world, self.p.world_bars.rows)
-
     def begin(self) -> None:
         """Sets to zero what belongs to one step."""
         for name, shape in STEP.items():

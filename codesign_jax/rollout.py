@@ -195,9 +195,9 @@ def grasp(
     """
     if steps is not None and not 0 < steps <= scene.num_steps:
         raise schema.SceneError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
-    worlds = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
-    constants = _checked(scene, engine, *worlds, constants)
-    fields, ctrl, _ = prepare(scene, *worlds, constants)
+    params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
+    constants = _checked(scene, engine, params, trial, constants)
+    fields, ctrl, _ = prepare(scene, params, trial, constants)
     trace = engine.rollout(fields, ctrl[:, :steps], trajectory=trajectory)
     return jax.tree.map(lambda v: v[0], trace)
 

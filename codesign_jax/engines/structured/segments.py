@@ -61,9 +61,9 @@ def reverse(
         own = (hand, moved, *start, *commands, *grid)
         out = again.execute(own, trajectory=trajectory, states=1)
         here = recorded(out, taken)
-        *ends, hand_bar, world_bar = ends
-        cotangents = Cotangents(*ends, shown[0], shown[1:])
-        found = program.adjoint(own, here, cotangents, (hand_bar, world_bar))
+        finger_bar, state_bar, *sums = ends
+        cotangents = Cotangents(finger_bar, state_bar, shown[0], shown[1:])
+        found = program.adjoint(own, here, cotangents, tuple(sums))
         hand_bar, world_bar, *state, arm_bar, pressure_bar = found[:6]
         state = [(jnp.zeros_like(x) if engine.truncate else x)[:, None] for x in state]
         return (*state, hand_bar, world_bar), (arm_bar, pressure_bar)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy import integrate
 
 from codesign_jax.model import morphology
+from codesign_jax.scene import primitives
 
 repeatable = settings(max_examples=100, deadline=None, derandomize=True)
 heights, walls = st.floats(0.015, 0.025), st.floats(0.002, 0.007)
@@ -141,7 +142,7 @@ def test_iso_curvature_of_the_pressure_limit(height, wall):
 
 
 def test_block_inertia():
-    ix, iy, iz = morphology.block_inertia(2.0, 0.3, 0.2, 0.1)
+    ix, iy, iz = primitives.block_inertia(2.0, 0.3, 0.2, 0.1)
     assert (ix, iy, iz) == pytest.approx((0.1 / 12, 0.2 / 12, 0.26 / 12))
 
 

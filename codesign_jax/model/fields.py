@@ -23,6 +23,7 @@ from codesign_jax.model.layout import (
 from codesign_jax.model.spec import SOLIMP, compile_template, palm_inertia
 from codesign_jax.scene import Constants, Scene, by_structure
 from codesign_jax.scene.constants import with_trial
+from codesign_jax.scene.primitives import block_inertia
 from codesign_jax.types import Params, Trial
 
 
@@ -267,7 +268,7 @@ def _extents(segment: jax.Array, lay: Layout) -> jax.Array:
 def _link_inertia(scene: Scene, params: Params, masses: jax.Array, extents: jax.Array) -> jax.Array:
     """Inertia of each link as the block extent x width x height, shape (finger, N + 1, 3)."""
     width, height = jnp.asarray(scene.hand.section.width), params.height[:, None]
-    return jnp.stack(morphology.block_inertia(masses, extents, width, height), -1)
+    return jnp.stack(block_inertia(masses, extents, width, height), -1)
 
 
 def _subtree_mass(lay: Layout, palm: Any, masses: jax.Array, object_mass: jax.Array) -> list[tuple]:
@@ -307,7 +308,7 @@ def _geom_fields(
         boxes.append(((where, slice(3, None)), jnp.asarray(radius)[..., None]))
     for i, shape in enumerate(scene.objects.object):
         g = lay.object_geoms[i]
-        radius, half = geom_bounds(shape.type, size[i])
+        radius, half = geom_bounds(shape, size[i])
         sizes.append((g, size[i]))
         radii.append((g, radius))
         boxes.append(((g, slice(3, None)), half))

@@ -116,10 +116,3 @@ def softening(
     second_moment = (width * height**3 - chamber * (inner**3 - wall**3)) / 3
     lacking = width * missing(height) - chamber * (missing(inner) - missing(wall))
     return lacking / (4 * second_moment)
-
-
-def block_inertia(
-    mass: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array
-) -> tuple[jax.Array, ...]:
-    """Principal inertia of a solid block with edges x, y, z [m] about its centre [kg m^2]."""
-    return mass * (y**2 + z**2) / 12, mass * (x**2 + z**2) / 12, mass * (x**2 + y**2) / 12

@@ -29,16 +29,8 @@ from codesign_jax.scene import Constants, Scene, by_structure, schema
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet
+from codesign_jax.scene.primitives import PRIMITIVES, block_inertia
 from codesign_jax.types import Params, Trial
-
-_GEOM = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    # MuJoCo's meshes are convex and of one size in all worlds: a model carries the bounding box
-    # instead, and engines that collide by MuJoCo's geoms refuse meshes (engines/base.py).
-    "mesh": mujoco.mjtGeom.mjGEOM_BOX,
-}
 
 
 @by_structure
@@ -163,8 +155,7 @@ def _hinge(
 def palm_inertia(scene: Scene) -> list[Any]:
     """Principal inertia of the palm, a disc, about its centre [kg m^2]."""
     p = scene.hand.palm
-    across = p.mass * (p.radius**2 / 4 + p.thickness**2 / 12)
-    return [across, across, p.mass * p.radius**2 / 2]
+    return [p.mass * v for v in PRIMITIVES["cylinder"].inertia((p.radius, p.thickness / 2))]
 
 
 def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
@@ -224,7 +215,7 @@ def _add_finger(
         extent = segment / 2 if i in (0, lay.links) else segment
         body.explicitinertial, body.mass = True, beam.line_density * extent
         body.ipos = [extent / 2, 0, height / 2]
-        body.inertia = np.array(morphology.block_inertia(body.mass, extent, width, height))
+        body.inertia = np.array(block_inertia(body.mass, extent, width, height))
         if visual and scene.effects.surface == "spheres":
             kind, half = mujoco.mjtGeom.mjGEOM_BOX, [extent / 2, width / 2, height / 2]
             name = f"finger_{f}_block_{i}"
@@ -291,7 +282,10 @@ def _add_object(
     for i, shape in enumerate(scene.objects.object):
         active = i == int(trial.shape)
         color = _COLORS["object"] if active or not visual else (0, 0, 0, 0)
-        geom = body.add_geom(name=f"object_{i}", type=_GEOM[shape.type], rgba=color, **_PASSIVE)
+        # MuJoCo's meshes are convex and of one size in all worlds: a model carries the bounding box
+        # instead, and engines that collide by MuJoCo's geoms refuse meshes (engines/base.py).
+        kind = getattr(mujoco.mjtGeom, shape.primitive.geom)
+        geom = body.add_geom(name=f"object_{i}", type=kind, rgba=color, **_PASSIVE)
         geom.size = np.asarray(sizes[i])
         if shape.mesh and active and visual:
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"object_{i}"

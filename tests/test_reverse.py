@@ -325,6 +325,7 @@ SCENES = {
     "mesh": {},
     "mesh and hull": {"effects__surface": "hull"},
     "three fingers": {"effects__finger_finger": True},
+    "capsule": {},
 }
 
 
@@ -365,9 +366,12 @@ def test_derivatives_of_scenes(name, tmp_path):
         elif name == "three fingers":
             the_scene = loaded("tripod3", DATA / "sphere.toml", settings)
         else:
-            the_scene = small.pinch("sphere", links=2, **settings)
+            shape = "capsule" if name == "capsule" else "sphere"
+            the_scene = small.pinch(shape, links=2, **settings)
         case = Case(the_scene, curled(the_scene, 8))
-        errors, slopes = compared(case, (1e-6, 1e-7))
+        # Of a wrist's angle, by which a capsule is touched at both caps, the differences err by
+        # 2e-6 at a step of 1e-6, and 100 times less at a tenth of it, until rounding ends that.
+        errors, slopes = compared(case, (1e-7, 2e-8) if name == "capsule" else (1e-6, 1e-7))
         size = "grid_factor" if name.startswith("mesh") else "object_size"
         assert slopes["cone.hand_object"] and slopes[size]
         assert errors.max() < BOUND

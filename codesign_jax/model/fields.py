@@ -308,7 +308,7 @@ def _geom_fields(
         boxes.append(((where, slice(3, None)), jnp.asarray(radius)[..., None]))
     for i, shape in enumerate(scene.objects.object):
         g = lay.object_geoms[i]
-        radius, half = geom_bounds(shape, size[i])
+        radius, half = geom_bounds(shape.type, size[i])
         sizes.append((g, size[i]))
         radii.append((g, radius))
         boxes.append(((g, slice(3, None)), half))

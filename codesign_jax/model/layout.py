@@ -13,6 +13,7 @@ import numpy as np
 from codesign_jax.scene import Scene, by_structure
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet, Shape
+from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.types import Trial
 
 # An object body carries one geom for each shape of the set; those that a trial does not use shrink
@@ -205,6 +206,7 @@ def _unit_inertia(shape: Shape, size: jax.Array, factor: jax.Array) -> jax.Array
     return jnp.stack(shape.primitive.inertia(size))
 
 
-def geom_bounds(shape: Shape, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def geom_bounds(kind: str, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Bounding radius () and axis-aligned half extents (3,) of a geom; a mesh's is a box."""
-    return shape.primitive.radius(size), jnp.stack(shape.primitive.half_extents(size))
+    found = PRIMITIVES["box" if kind == "mesh" else kind]
+    return found.radius(size), jnp.stack(found.half_extents(size))

@@ -29,7 +29,7 @@ from codesign_jax.scene import Constants, Scene, by_structure, schema
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet
-from codesign_jax.scene.primitives import PRIMITIVES, block_inertia
+from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.types import Params, Trial
 
 
@@ -109,8 +109,7 @@ def build_spec(
         np.asarray, _numbers(bodies.hand, bodies.objects, *concrete)
     )
     for f in range(scene.num_fingers):
-        beam = Beam(*(float(v[f]) for v in beams))
-        _add_finger(scene, spec, params, f, beam, (place[0][f], place[1][f]), visual)
+        _add_finger(scene, spec, concrete[1], f, beams, (place[0][f], place[1][f]), visual)
     _add_object(scene, spec, trial, solid, quat, visual)
     _add_pairs(scene, spec)
     return spec
@@ -196,26 +195,27 @@ def _add_finger(
     spec: mujoco.MjSpec,
     params: Params,
     f: int,
-    beam: Beam,
+    beams: Beam,
     mount: tuple[np.ndarray, np.ndarray],
     visual: bool,
 ) -> None:
     lay, width, h = layout(scene), scene.hand.section.width, scene.discretization.timestep
     length, height = float(params.length[f]), float(params.height[f])
-    segment = length / lay.links
+    links = morphology.segments(scene.hand, params, beams, lay.links)
+    springs = morphology.joint_springs(scene.hand, params, beams, lay.links, lay.axes)
+    spheres = morphology.sphere_places(links.extent, lay.spheres.shape[2])
     tendon = spec.add_tendon(name=f"chamber_{f}")
     body = spec.body("palm")
-    by_axis = {"bend": beam.bending, "lateral": beam.lateral, "twist": beam.torsion}
     for i in range(lay.links + 1):
         body = body.add_body(name=f"finger_{f}_link_{i}")
         if i == 0:
             body.pos, body.quat = mount
         else:
-            body.pos = [segment / 2 if i == 1 else segment, 0, 0]
-        extent = segment / 2 if i in (0, lay.links) else segment
-        body.explicitinertial, body.mass = True, beam.line_density * extent
+            body.pos = [links.offset[f, i - 1], 0, 0]
+        extent = links.extent[f, i]
+        body.explicitinertial, body.mass = True, links.mass[f, i]
         body.ipos = [extent / 2, 0, height / 2]
-        body.inertia = np.array(block_inertia(body.mass, extent, width, height))
+        body.inertia = links.inertia[f, i]
         if visual and scene.effects.surface == "spheres":
             kind, half = mujoco.mjtGeom.mjGEOM_BOX, [extent / 2, width / 2, height / 2]
             name = f"finger_{f}_block_{i}"
@@ -224,9 +224,7 @@ def _add_finger(
             )
         if i == 0:
             continue
-        for name in lay.axes:
-            stiffness = by_axis[name] / segment
-            own = scene.hand.material.damping_time * stiffness
+        for name, stiffness, own in zip(lay.axes, *(v[f] for v in springs), strict=True):
             implicit = implicit_damping(scene, stiffness, own)
             joint = f"finger_{f}_{name}_{i}"
             _hinge(
@@ -238,15 +236,14 @@ def _add_finger(
                 armature=h * implicit,
             )
         tendon.wrap_joint(f"finger_{f}_bend_{i}", 1.0)
-        for j in range(lay.spheres.shape[2]):
-            x = extent * (j + 0.5) / lay.spheres.shape[2]
+        for j, x in enumerate(spheres[f, i - 1]):
             _sphere(body, f"finger_{f}_sphere_{i}_{j}", [x, 0, height / 2], height / 2)
     actuator = spec.add_actuator(
         name=f"pressure_{f}", target=f"chamber_{f}", trntype=mujoco.mjtTrn.mjTRN_TENDON
     )
     # Pressure [Pa] in, bending moment [N m] at every joint out: a constant torque, not a moving
     # rest angle.
-    actuator.gainprm[0] = beam.moment_per_pressure
+    actuator.gainprm[0] = beams.moment_per_pressure[f]
     if visual and scene.effects.surface == "hull":
         _add_skin(scene, spec, f, length, height)
 

@@ -105,7 +105,7 @@ class Segments(NamedTuple):
 
 
 def segments(hand: Hand, params: Params, beams: Beam, links: int) -> Segments:
-    """Returns the bodies of every finger, in NumPy if that is what the parameters are in.
+    """Returns the bodies of every finger, in NumPy if that is what the beams are in.
 
     Args:
       hand: The hand.
@@ -113,7 +113,7 @@ def segments(hand: Hand, params: Params, beams: Beam, links: int) -> Segments:
       beams: Of `finger_beams`.
       links: Links N of a finger.
     """
-    numpy = params.height.__array_namespace__()
+    numpy = beams.line_density.__array_namespace__()  # traced if any number is
     factor = np.ones(links + 1)
     factor[[0, -1]] = 0.5
     segment = params.length[:, None] / links
@@ -144,7 +144,7 @@ def joint_springs(
     Returns:
       Stiffness [N m/rad] and damping [N m s/rad] of each finger's joints, shape (finger, axis).
     """
-    numpy = params.length.__array_namespace__()
+    numpy = beams.bending.__array_namespace__()
     by_axis = {"bend": beams.bending, "lateral": beams.lateral, "twist": beams.torsion}
     stiffness = numpy.stack([by_axis[name] / (params.length / links) for name in axes], -1)
     return stiffness, hand.material.damping_time * stiffness

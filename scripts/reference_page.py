@@ -17,7 +17,16 @@ from codesign_jax import types as data
 from codesign_jax.export import tables as exported
 from codesign_jax.model.layout import AXES, WRIST, joint_axes, layout
 from codesign_jax.optimize import ParticleFilter
-from codesign_jax.scene import Accuracy, Effects, Scene, description, effects, hand, objects
+from codesign_jax.scene import (
+    Accuracy,
+    Effects,
+    Scene,
+    description,
+    effects,
+    hand,
+    objects,
+    primitives,
+)
 from codesign_jax.scene import load as load_scene
 
 PAGE = Path(__file__).parent.parent / "docs" / "reference.md"
@@ -82,6 +91,8 @@ def page() -> str:
         parts += _tables(schema, "")
         if schema is hand.Hand:
             parts.append(_parameters())
+        if schema is objects._ObjectSetFile:
+            parts.append(_primitives())
     parts += [_state(load_scene("paper")), _cost(), _status(), _exported(), _named()]
     return "\n\n".join(parts) + "\n"
 
@@ -196,6 +207,12 @@ def _parameters() -> str:
     head += "SI units. A row's own unit is one of those of its quantity: "
     head += ", ".join(f"`{unit}`" for unit in hand.UNITS) + ".\n\n"
     return head + _table(("parameter", "one for each", "SI unit", "range", "meaning"), rows)
+
+
+def _primitives() -> str:
+    """The values of an object's `size`, by its type."""
+    rows = [(f"`{name}`", ", ".join(p.sizes)) for name, p in primitives.PRIMITIVES.items()]
+    return "### Sizes of primitives\n\n" + _table(("type", "values of `size` [m]"), rows)
 
 
 def qpos(scene: Scene) -> list[tuple[str, str, int, str]]:

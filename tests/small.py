@@ -13,8 +13,8 @@ from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Trial
 
 DATA = Path(__file__).parent / "data"
-# Shapes of the paper's object set, which are also the names of the one-object sets in data/.
-SHAPES = ("box", "cylinder", "sphere")
+# The primitives, which are also the names of the one-object sets in data/.
+SHAPES = ("box", "cylinder", "capsule", "sphere")
 
 
 @functools.cache

@@ -47,10 +47,12 @@ def test_objects_have_their_size(name):
     """Volume of the drawn mesh against the solid's; round ones are polyhedra inside it."""
     the_scene = small.pinch(name)
     a, b, c = the_scene.objects.object[0].half_sizes
+    ball = 4 / 3 * np.pi * a**3
     solid = {
         "box": 8 * a * b * c,
         "cylinder": 2 * np.pi * a**2 * b,
-        "sphere": 4 / 3 * np.pi * a**3,
+        "capsule": 2 * np.pi * a**2 * b + ball,
+        "sphere": ball,
     }
     mesh = trimesh.Trimesh(*bodies.object_mesh(the_scene, 0))
     assert mesh.is_watertight

@@ -10,7 +10,7 @@ from codesign_jax import model
 from tests.small import SHAPES, hand_world, pinch
 
 MASS, GRAVITY, MU = 0.1, 9.81, 0.5
-CORNERS = {"box": 4, "cylinder": 3, "sphere": 1}  # contact points of a resting object
+CORNERS = {"box": 4, "cylinder": 3, "capsule": 2, "sphere": 1}  # contact points of a resting object
 
 
 class Table:
@@ -183,7 +183,7 @@ def test_finger_contact_has_the_declared_stiffness(shape):
     mujoco.mj_kinematics(compiled, data)
     sphere = lay.spheres[0, 0, 0]
     radius, centre = compiled.geom_size[sphere, 0], data.geom_xpos[sphere]
-    reach = {"box": 0.03, "cylinder": 0.036, "sphere": 0.03}[shape]
+    reach = {"box": 0.03, "cylinder": 0.036, "capsule": 0.024, "sphere": 0.03}[shape]
     data.qpos[-7:-4] = centre - [0, 0, radius + reach - 1e-4]
     force = 0.5
     for _ in range(300):

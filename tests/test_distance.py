@@ -8,12 +8,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import scene
 from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured.lanes import Stages
 from tests import small
 
-SIZES = {"box": (0.030, 0.022, 0.041), "cylinder": (0.030, 0.036, 0.0), "sphere": (0.030, 0.0, 0.0)}
+SIZES = {
+    "box": (0.030, 0.022, 0.041),
+    "cylinder": (0.030, 0.036, 0.0),
+    "capsule": (0.024, 0.020, 0.0),
+    "sphere": (0.030, 0.0, 0.0),
+}
 RADIUS, POSES = 0.010, 4000
 
 
@@ -60,12 +64,11 @@ def engine_contacts(kind, position, quat, centre):
     for i in range(POSES):
         mujoco.mju_quat2Mat(columns[i], quat[i])
     with jax.enable_x64(True):
-        paper = scene.load("paper_spheres")
-        index = [s.type for s in paper.objects.object].index(kind)
+        alone = small.pinch(kind)
         size = np.broadcast_to(np.array(SIZES[kind])[:, None, None], (3, 1, POSES))
         hand = SimpleNamespace(
             object_size=jnp.asarray(size),
-            object_id=jnp.full((1, POSES), index, jnp.int32),
+            object_id=jnp.zeros((1, POSES), jnp.int32),
             cones=SimpleNamespace(hand_object=None),
         )
         frames = columns.reshape(POSES, 3, 3).transpose(2, 1, 0)[
@@ -73,7 +76,7 @@ def engine_contacts(kind, position, quat, centre):
         ]  # column, row, 1, world
         kin = SimpleNamespace(object=jnp.asarray(frames))
         return collision.spheres_on_object(
-            paper, hand, kin, Stages(), jnp.asarray((centre - position).T[:, None]), RADIUS
+            alone, hand, kin, Stages(), jnp.asarray((centre - position).T[:, None]), RADIUS
         )
 
 

@@ -253,6 +253,25 @@ def test_a_rigid_wrist_leaves_the_binary_model_alone(tmp_path):
     assert errors(states, trace, 0).max() < 1e-3
 
 
+def test_a_capsule_is_a_capsule_in_the_files(tmp_path):
+    """It lies, and is grasped, in plain MuJoCo as in the engine."""
+    the_scene = pinch("capsule", **HURRIED)
+    params, trial = hand_world(the_scene, length=0.10, pressure=1.9e5)
+    params = params._replace(arm=np.array([0, 0, 0.03, 0, 0, 0]))
+    found = grasps.grasp(the_scene, params, trial)
+    list(tables.write_grasps(tmp_path, the_scene, [("capsule", trial)], [found]))
+    with jax.enable_x64(True):
+        worlds = stack((params, trial))
+    trace, judged = by_engine(the_scene, *worlds)
+    for ending, load in (("xml", "from_xml_path"), ("mjb", "from_binary_path")):
+        loaded = getattr(mujoco.MjModel, load)(str(tmp_path / f"capsule.{ending}"))
+        assert mujoco.mjtGeom.mjGEOM_CAPSULE in loaded.geom_type
+        when, _, states = play(loaded, found.controls)
+        assert when == judged.lost_time[0]
+        # As above, before rounding has grown: of the approach and the closing of the hand.
+        assert errors(states, trace, 0).max() < 1e-7
+
+
 def test_a_grasp_that_mujoco_warns_of_has_failed(tmp_path, monkeypatch):
     """Its key frames end where MuJoCo refused the numbers: of a pressure that is no number."""
     monkeypatch.chdir(tmp_path)  # where MuJoCo logs its warnings

@@ -9,7 +9,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import integrate
 
+from codesign_jax import scene
 from codesign_jax.model import morphology
+from codesign_jax.scene import primitives
+from codesign_jax.types import Params
 
 repeatable = settings(max_examples=100, deadline=None, derandomize=True)
 heights, walls = st.floats(0.015, 0.025), st.floats(0.002, 0.007)
@@ -141,8 +144,36 @@ def test_iso_curvature_of_the_pressure_limit(height, wall):
 
 
 def test_block_inertia():
-    ix, iy, iz = morphology.block_inertia(2.0, 0.3, 0.2, 0.1)
+    ix, iy, iz = primitives.block_inertia(2.0, 0.3, 0.2, 0.1)
     assert (ix, iy, iz) == pytest.approx((0.1 / 12, 0.2 / 12, 0.26 / 12))
+
+
+@pytest.mark.parametrize("links", [1, 2, 7])
+def test_segments_are_a_finger_cut_in_pieces(links):
+    """Mass, centre and inertia about the base of one block as long; its springs in series."""
+    hand = scene.load("paper").hand
+    params = Params(*np.array([[0.09, 0.13], [0.018, 0.021], [0.004, 0.005]]), 0.0, None, None)
+    beams = morphology.finger_beams(hand, params)
+    found = morphology.segments(hand, params, beams, links)
+    length, height, mass = params.length, params.height, beams.line_density * params.length
+    joint = np.cumsum(found.offset, 1)
+    # A joint stands in the middle of each segment.
+    np.testing.assert_allclose(joint, np.outer(length, (np.arange(links) + 0.5) / links))
+    start = np.concatenate([0 * joint[:, :1], joint], 1)
+    np.testing.assert_allclose(start[:, 1:], (start + found.extent)[:, :-1], rtol=1e-12)
+    centre = start + found.extent / 2
+    np.testing.assert_allclose(found.mass.sum(1), mass)
+    np.testing.assert_allclose((found.mass * centre).sum(1), mass * length / 2)
+    about = (found.inertia[..., 1] + found.mass * centre**2).sum(1)
+    np.testing.assert_allclose(about, mass * (length**2 / 3 + height**2 / 12))
+    for name, rigidity in (("bend", "bending"), ("lateral", "lateral"), ("twist", "torsion")):
+        stiffness, damping = morphology.joint_springs(hand, params, beams, links, (name,))
+        np.testing.assert_allclose(links / stiffness[:, 0], length / getattr(beams, rigidity))
+        np.testing.assert_allclose(damping, hand.material.damping_time * stiffness)
+    spheres = morphology.sphere_places(found.extent, 3)
+    assert spheres.shape == (2, links, 3)
+    np.testing.assert_allclose(spheres.mean(2), found.extent[:, 1:] / 2)
+    np.testing.assert_allclose(np.diff(spheres, axis=2).max(2), found.extent[:, 1:] / 3)
 
 
 def test_beams_differentiate():

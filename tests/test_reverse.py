@@ -325,6 +325,7 @@ SCENES = {
     "mesh": {},
     "mesh and hull": {"effects__surface": "hull"},
     "three fingers": {"effects__finger_finger": True},
+    "capsule": {},
 }
 
 
@@ -365,9 +366,12 @@ def test_derivatives_of_scenes(name, tmp_path):
         elif name == "three fingers":
             the_scene = loaded("tripod3", DATA / "sphere.toml", settings)
         else:
-            the_scene = small.pinch("sphere", links=2, **settings)
+            shape = "capsule" if name == "capsule" else "sphere"
+            the_scene = small.pinch(shape, links=2, **settings)
         case = Case(the_scene, curled(the_scene, 8))
-        errors, slopes = compared(case, (1e-6, 1e-7))
+        # With the capsule the differences by the wrist's start err by 2e-6 at a step of 1e-6, by a
+        # hundredth at a tenth of it, and by 7e-10 at 2e-8; below that rounding grows.
+        errors, slopes = compared(case, (1e-7, 2e-8) if name == "capsule" else (1e-6, 1e-7))
         size = "grid_factor" if name.startswith("mesh") else "object_size"
         assert slopes["cone.hand_object"] and slopes[size]
         assert errors.max() < BOUND

@@ -10,7 +10,6 @@ import numpy as np
 from codesign_jax import model, rollout
 from codesign_jax.model.layout import palm_points
 from codesign_jax.scene import Constants, Scene
-from codesign_jax.scene.objects import Shape
 from codesign_jax.start import depth
 from codesign_jax.types import Params
 
@@ -26,7 +25,7 @@ def overlaps(scene: Scene, designs: Params) -> np.ndarray:
       designs: Parameters with leading axis (design,), NumPy arrays.
     """
     shapes = scene.objects.object
-    top = max(_height(shape) for shape in shapes)
+    top = max(shape.height for shape in shapes)
     low = [lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
     if min(low) >= top:
         return np.zeros((len(shapes), len(low)))
@@ -106,15 +105,6 @@ def lowest_point(scene: Scene, params: Params) -> float:
     palm_low = (np.asarray(palm_points(scene)) @ up).min() - palm.contact_radius
     lowest = min(float((ends + np.minimum(skin, spheres)).min()), float(palm_low))
     return scene.arm.start_height + lowest
-
-
-def _height(shape: Shape) -> float:
-    """Height of an object on the table [m]."""
-    if shape.mesh:
-        w, x, y, z = shape.mesh.upright
-        up = [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)]
-        return shape.mesh.rest_height + float((shape.mesh.vertices @ up).max())
-    return 2 * shape.half_sizes[{"box": 2, "cylinder": 1, "sphere": 0}[shape.type]]
 
 
 def _about(axis: int, angle: float) -> np.ndarray:

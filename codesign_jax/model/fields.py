@@ -85,20 +85,18 @@ class ModelFields(NamedTuple):
 def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     """Returns physical stiffness [N m/rad] and damping [N m s/rad] of every dof, (nv,) each.
 
-    Finger joints have k = EI / l and GJ / l for a segment of length l and damping beta k
-    (Kelvin-Voigt); the six wrist dofs those of the hand file; the object's are free.
+    Finger joints have those of `morphology.joint_springs`, the six wrist dofs those of the hand
+    file; the object's are free.
     """
     lay, hand = layout(scene), scene.hand
-    beam = morphology.finger_beams(hand, params)
-    segment = params.length / lay.links
-    by_axis = {"bend": beam.bending, "lateral": beam.lateral, "twist": beam.torsion}
-    finger = jnp.stack([by_axis[name] / segment for name in lay.axes], -1)
-    finger = jnp.broadcast_to(finger[:, None, :], lay.dofs.shape).reshape(-1)
+    beams = morphology.finger_beams(hand, params)
+    each = morphology.joint_springs(hand, params, beams, lay.links, lay.axes)
+    finger, own = (jnp.broadcast_to(v[:, None, :], lay.dofs.shape).reshape(-1) for v in each)
     springs = wrist_springs(scene)
     wrist, wrist_damping = (jnp.stack([jnp.asarray(x, finger.dtype) for x in v]) for v in springs)
     free = jnp.zeros(6, finger.dtype)
     stiffness = jnp.concatenate([wrist, finger, free])
-    return stiffness, jnp.concatenate([wrist_damping, hand.material.damping_time * finger, free])
+    return stiffness, jnp.concatenate([wrist_damping, own, free])
 
 
 def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
@@ -116,15 +114,11 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     def filled(name: str, *parts: tuple[Any, Any]) -> jax.Array:
         return _filled(getattr(template, name), dtype, *parts)
 
-    segment = params.length / lay.links
-    extents = _extents(segment, lay)
-    masses = beam.line_density[:, None] * extents
+    links = morphology.segments(scene.hand, params, beam, lay.links)
+    extents, masses = links.extent, links.mass
     size, object_mass, object_inertia, rest = object_size(scene.objects, trial)
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
     mount_pos, mount_quat = mounts(scene.hand, params.spread)
-    offsets = jnp.concatenate(
-        [segment[:, None] / 2, jnp.broadcast_to(segment[:, None], masses[:, 2:].shape)], 1
-    )
     palm = scene.hand.palm
     h = scene.discretization.timestep
     stiffness, damping = joint_springs(scene, params)
@@ -132,7 +126,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     geom_size, rbound, aabb = _geom_fields(scene, params, size, filled)
     friction, solref, solimp = _pairs(scene, dtype)
     return ModelFields(
-        body_pos=filled("body_pos", (lay.stubs, mount_pos), ((lay.bodies, 0), offsets)),
+        body_pos=filled("body_pos", (lay.stubs, mount_pos), ((lay.bodies, 0), links.offset)),
         body_quat=filled("body_quat", (lay.stubs, mount_quat)),
         body_ipos=filled(
             "body_ipos",
@@ -144,7 +138,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         body_subtreemass=filled("body_subtreemass", *_subtree_mass(lay, palm, masses, object_mass)),
         body_inertia=filled(
             "body_inertia",
-            (bodies, _link_inertia(scene, params, masses, extents)),
+            (bodies, links.inertia),
             (lay.object, object_inertia),
             (1, jnp.stack(palm_inertia(scene))),
         ),
@@ -268,19 +262,6 @@ def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
     return stiffness * angles * morphology.softening(angles / segment, height, wall, width=width)
 
 
-def _extents(segment: jax.Array, lay: Layout) -> jax.Array:
-    """Length of each body of a finger, shape (finger, N + 1): half segments at both ends."""
-    factor = np.ones(lay.links + 1)
-    factor[[0, -1]] = 0.5
-    return segment[:, None] * factor
-
-
-def _link_inertia(scene: Scene, params: Params, masses: jax.Array, extents: jax.Array) -> jax.Array:
-    """Inertia of each link as the block extent x width x height, shape (finger, N + 1, 3)."""
-    width, height = jnp.asarray(scene.hand.section.width), params.height[:, None]
-    return jnp.stack(morphology.block_inertia(masses, extents, width, height), -1)
-
-
 def _subtree_mass(lay: Layout, palm: Any, masses: jax.Array, object_mass: jax.Array) -> list[tuple]:
     """Places and masses of what hangs on each body: fingers, world, palm and object."""
     tails = jnp.cumsum(masses[:, ::-1], 1)[:, ::-1]
@@ -295,8 +276,7 @@ def _sphere_positions(scene: Scene, params: Params, extents: jax.Array) -> list[
     parts: list[tuple] = [(lay.palm, palm_points(scene))] if lay.palm.size else []
     if not lay.spheres.size:
         return parts
-    k = lay.spheres.shape[2]
-    along = extents[:, 1:, None] * (np.arange(k) + 0.5) / k
+    along = morphology.sphere_places(extents, lay.spheres.shape[2])
     up = params.height[:, None, None] / 2
     return [*parts, ((lay.spheres, 0), along), ((lay.spheres, 2), up)]
 

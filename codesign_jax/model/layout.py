@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.model import morphology
 from codesign_jax.scene import Scene, by_structure
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet, Shape
+from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.types import Trial
 
 # An object body carries one geom for each shape of the set; those that a trial does not use shrink
@@ -187,45 +187,26 @@ def object_size(
     mass = trial.mass * jnp.stack([jnp.asarray(s.mass) for s in shapes])[trial.shape]
     unit = jnp.stack([_unit_inertia(s, size[i], trial.size) for i, s in enumerate(shapes)])
     unit = unit[trial.shape]
-    height = trial.size * jnp.stack([jnp.asarray(_rest_height(s)) for s in shapes])[trial.shape]
+    height = trial.size * jnp.stack([jnp.asarray(s.rest_height) for s in shapes])[trial.shape]
     active = jnp.arange(len(shapes)) == trial.shape
     return jnp.where(active[:, None], size, INACTIVE * size), mass, mass * unit, height
 
 
 def object_quat(objects: ObjectSet, trial: Trial) -> jax.Array:
-    """Start orientation, shape (4,): upright, a mesh as in its file, turned by the yaw."""
-    upright = [s.mesh.upright if s.mesh else (1.0, 0.0, 0.0, 0.0) for s in objects.object]
-    w, x, y, z = jnp.array(upright)[trial.shape]
+    """Start orientation, shape (4,): upright, see `Shape.upright`, turned by the yaw."""
+    w, x, y, z = jnp.array([s.upright for s in objects.object])[trial.shape]
     c, s = jnp.cos(trial.yaw / 2), jnp.sin(trial.yaw / 2)
     return jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
 
 
-def _rest_height(shape: Shape) -> Any:
-    """Height of an object's centre on the table [m]."""
-    if shape.mesh:
-        return shape.mesh.rest_height
-    return shape.half_sizes[{"box": 2, "cylinder": 1, "sphere": 0}[shape.type]]
-
-
 def _unit_inertia(shape: Shape, size: jax.Array, factor: jax.Array) -> jax.Array:
     """Principal inertia per mass of a solid [m^2], shape (3,)."""
-    kind = shape.type
     if shape.mesh:
         return jnp.array(shape.mesh.inertia) * factor**2
-    if kind == "box":
-        return jnp.stack(
-            morphology.block_inertia(jnp.ones(()), 2 * size[0], 2 * size[1], 2 * size[2])
-        )
-    if kind == "cylinder":
-        across = size[0] ** 2 / 4 + size[1] ** 2 / 3
-        return jnp.stack([across, across, size[0] ** 2 / 2])
-    return jnp.full((3,), 0.4) * size[0] ** 2
+    return jnp.stack(shape.primitive.inertia(size))
 
 
 def geom_bounds(kind: str, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Bounding radius () and axis-aligned half extents (3,) of a geom; a mesh's is a box."""
-    if kind in ("box", "mesh"):
-        return jnp.linalg.norm(size), size
-    if kind == "cylinder":
-        return jnp.hypot(size[0], size[1]), jnp.stack([size[0], size[0], size[1]])
-    return size[0], jnp.full((3,), 1.0) * size[0]
+    found = PRIMITIVES["box" if kind == "mesh" else kind]
+    return found.radius(size), jnp.stack(found.half_extents(size))

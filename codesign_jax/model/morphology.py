@@ -10,8 +10,10 @@ they model the actuator of Deimel and Brock (2016) that the paper refers to as [
 from typing import NamedTuple
 
 import jax
+import numpy as np
 
 from codesign_jax.scene.hand import Hand
+from codesign_jax.scene.primitives import block_inertia
 from codesign_jax.types import Params
 
 
@@ -86,6 +88,68 @@ def finger_beams(hand: Hand, params: Params) -> Beam:
     )
 
 
+class Segments(NamedTuple):
+    """Numbers of the bodies of fingers: N equal segments, cut in their middles by the joints.
+
+    Attributes:
+      offset: Place of each link's joint along the body that carries it [m], shape (finger, N).
+      extent: Length of each body, half a segment at both ends [m], shape (finger, N + 1).
+      mass: Their masses [kg], shape (finger, N + 1).
+      inertia: Of solid blocks as large, principal [kg m^2], shape (finger, N + 1, 3).
+    """
+
+    offset: jax.Array
+    extent: jax.Array
+    mass: jax.Array
+    inertia: jax.Array
+
+
+def segments(hand: Hand, params: Params, beams: Beam, links: int) -> Segments:
+    """Returns the bodies of every finger, in NumPy if that is what the beams are in.
+
+    Args:
+      hand: The hand.
+      params: Parameters.
+      beams: Of `finger_beams`.
+      links: Links N of a finger.
+    """
+    numpy = beams.line_density.__array_namespace__()  # traced if any number is
+    factor = np.ones(links + 1)
+    factor[[0, -1]] = 0.5
+    segment = params.length[:, None] / links
+    extent, offset = segment * factor, segment * factor[:-1]
+    mass = beams.line_density[:, None] * extent
+    width, height = numpy.asarray(hand.section.width), params.height[:, None]
+    inertia = numpy.stack(block_inertia(mass, extent, width, height), -1)
+    return Segments(offset, extent, mass, inertia)
+
+
+def sphere_places(extent: jax.Array, count: int) -> jax.Array:
+    """Places along each moving link of spheres that are spread evenly [m], (finger, N, count)."""
+    return extent[:, 1:, None] * (np.arange(count) + 0.5) / count
+
+
+def joint_springs(
+    hand: Hand, params: Params, beams: Beam, links: int, axes: tuple[str, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """Stiffness k = EI / l or GJ / l of a segment's length l, and damping beta k (Kelvin-Voigt).
+
+    Args:
+      hand: The hand.
+      params: Parameters.
+      beams: Of `finger_beams`.
+      links: Links of a finger.
+      axes: Axes of a joint, as in `Layout`.
+
+    Returns:
+      Stiffness [N m/rad] and damping [N m s/rad] of each finger's joints, shape (finger, axis).
+    """
+    numpy = beams.bending.__array_namespace__()
+    by_axis = {"bend": beams.bending, "lateral": beams.lateral, "twist": beams.torsion}
+    stiffness = numpy.stack([by_axis[name] / (params.length / links) for name in axes], -1)
+    return stiffness, hand.material.damping_time * stiffness
+
+
 def softening(
     curvature: jax.Array, height: jax.Array, wall: jax.Array, *, width: float
 ) -> jax.Array:
@@ -116,10 +180,3 @@ def softening(
     second_moment = (width * height**3 - chamber * (inner**3 - wall**3)) / 3
     lacking = width * missing(height) - chamber * (missing(inner) - missing(wall))
     return lacking / (4 * second_moment)
-
-
-def block_inertia(
-    mass: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array
-) -> tuple[jax.Array, ...]:
-    """Principal inertia of a solid block with edges x, y, z [m] about its centre [kg m^2]."""
-    return mass * (y**2 + z**2) / 12, mass * (x**2 + z**2) / 12, mass * (x**2 + y**2) / 12

@@ -29,16 +29,8 @@ from codesign_jax.scene import Constants, Scene, by_structure, schema
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet
+from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.types import Params, Trial
-
-_GEOM = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    # MuJoCo's meshes are convex and of one size in all worlds: a model carries the bounding box
-    # instead, and engines that collide by MuJoCo's geoms refuse meshes (engines/base.py).
-    "mesh": mujoco.mjtGeom.mjGEOM_BOX,
-}
 
 
 @by_structure
@@ -117,8 +109,7 @@ def build_spec(
         np.asarray, _numbers(bodies.hand, bodies.objects, *concrete)
     )
     for f in range(scene.num_fingers):
-        beam = Beam(*(float(v[f]) for v in beams))
-        _add_finger(scene, spec, params, f, beam, (place[0][f], place[1][f]), visual)
+        _add_finger(scene, spec, concrete[1], f, beams, (place[0][f], place[1][f]), visual)
     _add_object(scene, spec, trial, solid, quat, visual)
     _add_pairs(scene, spec)
     return spec
@@ -163,8 +154,7 @@ def _hinge(
 def palm_inertia(scene: Scene) -> list[Any]:
     """Principal inertia of the palm, a disc, about its centre [kg m^2]."""
     p = scene.hand.palm
-    across = p.mass * (p.radius**2 / 4 + p.thickness**2 / 12)
-    return [across, across, p.mass * p.radius**2 / 2]
+    return [p.mass * v for v in PRIMITIVES["cylinder"].inertia((p.radius, p.thickness / 2))]
 
 
 def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
@@ -205,26 +195,27 @@ def _add_finger(
     spec: mujoco.MjSpec,
     params: Params,
     f: int,
-    beam: Beam,
+    beams: Beam,
     mount: tuple[np.ndarray, np.ndarray],
     visual: bool,
 ) -> None:
     lay, width, h = layout(scene), scene.hand.section.width, scene.discretization.timestep
     length, height = float(params.length[f]), float(params.height[f])
-    segment = length / lay.links
+    links = morphology.segments(scene.hand, params, beams, lay.links)
+    springs = morphology.joint_springs(scene.hand, params, beams, lay.links, lay.axes)
+    spheres = morphology.sphere_places(links.extent, lay.spheres.shape[2])
     tendon = spec.add_tendon(name=f"chamber_{f}")
     body = spec.body("palm")
-    by_axis = {"bend": beam.bending, "lateral": beam.lateral, "twist": beam.torsion}
     for i in range(lay.links + 1):
         body = body.add_body(name=f"finger_{f}_link_{i}")
         if i == 0:
             body.pos, body.quat = mount
         else:
-            body.pos = [segment / 2 if i == 1 else segment, 0, 0]
-        extent = segment / 2 if i in (0, lay.links) else segment
-        body.explicitinertial, body.mass = True, beam.line_density * extent
+            body.pos = [links.offset[f, i - 1], 0, 0]
+        extent = links.extent[f, i]
+        body.explicitinertial, body.mass = True, links.mass[f, i]
         body.ipos = [extent / 2, 0, height / 2]
-        body.inertia = np.array(morphology.block_inertia(body.mass, extent, width, height))
+        body.inertia = links.inertia[f, i]
         if visual and scene.effects.surface == "spheres":
             kind, half = mujoco.mjtGeom.mjGEOM_BOX, [extent / 2, width / 2, height / 2]
             name = f"finger_{f}_block_{i}"
@@ -233,9 +224,7 @@ def _add_finger(
             )
         if i == 0:
             continue
-        for name in lay.axes:
-            stiffness = by_axis[name] / segment
-            own = scene.hand.material.damping_time * stiffness
+        for name, stiffness, own in zip(lay.axes, *(v[f] for v in springs), strict=True):
             implicit = implicit_damping(scene, stiffness, own)
             joint = f"finger_{f}_{name}_{i}"
             _hinge(
@@ -247,15 +236,14 @@ def _add_finger(
                 armature=h * implicit,
             )
         tendon.wrap_joint(f"finger_{f}_bend_{i}", 1.0)
-        for j in range(lay.spheres.shape[2]):
-            x = extent * (j + 0.5) / lay.spheres.shape[2]
+        for j, x in enumerate(spheres[f, i - 1]):
             _sphere(body, f"finger_{f}_sphere_{i}_{j}", [x, 0, height / 2], height / 2)
     actuator = spec.add_actuator(
         name=f"pressure_{f}", target=f"chamber_{f}", trntype=mujoco.mjtTrn.mjTRN_TENDON
     )
     # Pressure [Pa] in, bending moment [N m] at every joint out: a constant torque, not a moving
     # rest angle.
-    actuator.gainprm[0] = beam.moment_per_pressure
+    actuator.gainprm[0] = beams.moment_per_pressure[f]
     if visual and scene.effects.surface == "hull":
         _add_skin(scene, spec, f, length, height)
 
@@ -291,7 +279,10 @@ def _add_object(
     for i, shape in enumerate(scene.objects.object):
         active = i == int(trial.shape)
         color = _COLORS["object"] if active or not visual else (0, 0, 0, 0)
-        geom = body.add_geom(name=f"object_{i}", type=_GEOM[shape.type], rgba=color, **_PASSIVE)
+        # MuJoCo's meshes are convex and of one size in all worlds: a model carries the bounding box
+        # instead, and engines that collide by MuJoCo's geoms refuse meshes (engines/base.py).
+        kind = getattr(mujoco.mjtGeom, shape.primitive.geom)
+        geom = body.add_geom(name=f"object_{i}", type=kind, rgba=color, **_PASSIVE)
         geom.size = np.asarray(sizes[i])
         if shape.mesh and active and visual:
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"object_{i}"

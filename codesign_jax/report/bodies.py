@@ -13,9 +13,9 @@ from codesign_jax import model
 from codesign_jax.model import hull
 from codesign_jax.report.animation import Replay
 from codesign_jax.scene import Scene
+from codesign_jax.scene.primitives import PRIMITIVES
 
 FINGER, OBJECT, PALM = (0.36, 0.57, 0.80), (0.95, 0.58, 0.20), (0.36, 0.38, 0.43)
-_SEGMENTS = 64  # of round objects
 _MOST_FACES = 40_000
 """Faces of an object's mesh above which a coarser one is drawn: pages are to stay small."""
 
@@ -58,9 +58,7 @@ def parts(scene: Scene, grasp: Replay) -> list[Part]:
     """Meshes of fingers, palm and object; bodies are numbered as in MuJoCo's model."""
     lay, palm = model.layout(scene), scene.hand.palm
     found = [_finger(scene, grasp, f, lay) for f in range(scene.num_fingers)]
-    import trimesh  # takes a while to import
-
-    disc = trimesh.creation.cylinder(palm.radius, palm.thickness, sections=_SEGMENTS)
+    disc = PRIMITIVES["cylinder"].triangles((palm.radius, palm.thickness / 2))
     disc.apply_translation([0, 0, palm.thickness / 2])
     found.append(_rigid("palm", PALM, disc.vertices, disc.faces, 1))
     vertices, faces = object_mesh(scene, int(grasp.trial.shape))
@@ -97,18 +95,10 @@ def object_mesh(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:
     Returns:
       Vertices [m], shape (vertex, 3), and triangles, shape (face, 3).
     """
-    import trimesh
-
     shape = scene.objects.object[index]
     if shape.mesh:
         return _coarse(shape.mesh.vertices, shape.mesh.faces)
-    size = shape.half_sizes
-    if shape.type == "sphere":
-        body = trimesh.creation.icosphere(4, size[0])
-    elif shape.type == "cylinder":
-        body = trimesh.creation.cylinder(size[0], 2 * size[1], sections=_SEGMENTS)
-    else:
-        body = trimesh.creation.box(2 * np.asarray(size))
+    body = shape.primitive.triangles(shape.half_sizes)
     return np.asarray(body.vertices), np.asarray(body.faces)
 
 

@@ -61,22 +61,10 @@ def _frame(axes, scene: Scene, data: mujoco.MjData, outline: list[np.ndarray]) -
 
 def _outline(scene: Scene, model: mujoco.MjModel, shape: int) -> list[np.ndarray]:
     """Lines of the object in its own frame [m], each of shape (point, 3)."""
-    size = model.geom(f"object_{shape}").size
-    turn = np.linspace(0, 2 * np.pi, 25)
-    circle = np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
-    kind = scene.objects.object[shape].type
-    if kind == "mesh":
+    found = scene.objects.object[shape]
+    if found.mesh:
         return [_wires(model, f"object_{shape}")]
-    if kind == "sphere":
-        return [size[0] * np.roll(circle, k, axis=1) for k in range(3)]
-    if kind == "cylinder":
-        flat, top = circle * size[0], np.array([0, 0, size[1]])
-        sides = [np.stack([p - top, p + top]) for p in flat[::6]]
-        return [flat - top, flat + top, *sides]
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    ring = np.column_stack([square, np.zeros(5)]) * size
-    top = np.array([0, 0, size[2]])
-    return [ring - top, ring + top, *(np.stack([p - top, p + top]) for p in ring[:4])]
+    return found.primitive.outline(model.geom(f"object_{shape}").size)
 
 
 def _wires(model: mujoco.MjModel, name: str) -> np.ndarray:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from codesign_jax.scene import keypaths, library, schema
+from codesign_jax.scene.primitives import PRIMITIVES, Primitive
 from codesign_jax.scene.schema import choice, quantity
 
 if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitives need neither
@@ -19,7 +20,6 @@ if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitive
 
 MOST_BYTES = 1 << 25
 """Largest size of a set's mesh files together; those of the set household have 0.4 MB."""
-SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
 _MESH_KEYS = ("file", "unit", "density", "repair", "voxel_error")
 _MASS, _SIZE = ("kg", 0.001, 10.0), ("m", 0.002, 0.25)
 
@@ -71,7 +71,7 @@ class _ShapeFile:
       name: Name, unique in the set.
       type: A primitive or "mesh".
       friction: Coulomb coefficient of the hand on it.
-      size: Half sizes of a box; radius and half height of a cylinder; radius of a sphere.
+      size: Radii and half lengths of a primitive, in the order of the table "Sizes of primitives".
       mass: Mass; a mesh may give `density` instead.
       density: Density of a mesh.
       file: Mesh file, beside the object file if the path is relative.
@@ -81,7 +81,7 @@ class _ShapeFile:
     """
 
     name: str
-    type: str = choice(*SIZES, "mesh")
+    type: str = choice(*PRIMITIVES, "mesh")
     friction: float = quantity("", 0, 5)
     size: tuple[float, ...] | None = quantity(*_SIZE, default=None)
     mass: float | None = quantity(*_MASS, default=None)
@@ -108,7 +108,31 @@ class Shape(_ShapeFile):
     @property
     def radius(self) -> float:
         """Distance of the farthest point from the centre [m]."""
-        return self.mesh.radius if self.mesh else sum(v**2 for v in self.half_sizes) ** 0.5
+        return self.mesh.radius if self.mesh else self.primitive.radius(self.half_sizes)
+
+    @property
+    def primitive(self) -> Primitive:
+        """What is known of its kind; a mesh's is that of its bounding box."""
+        return PRIMITIVES["box" if self.mesh else self.type]
+
+    @property
+    def upright(self) -> tuple[float, ...]:
+        """Orientation on the table before the trial's yaw, a unit quaternion (w, x, y, z)."""
+        return self.mesh.upright if self.mesh else self.primitive.upright
+
+    @property
+    def rest_height(self) -> float:
+        """Height of its centre on the table [m]."""
+        return self.mesh.rest_height if self.mesh else self.primitive.rest_height(self.half_sizes)
+
+    @property
+    def height(self) -> float:
+        """Height of its highest point on the table [m]."""
+        if not self.mesh:
+            return 2 * self.rest_height  # half a turn about x changes no primitive
+        w, x, y, z = self.upright
+        up = [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)]
+        return self.rest_height + float((self.mesh.vertices @ up).max())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,9 +227,11 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     else:
         missing = [k for k in ("size", "mass") if getattr(given, k) is None]
         foreign = [k for k in _MESH_KEYS if getattr(given, k) is not None]
-        if given.size is not None and len(given.size) != SIZES[kind]:
+        sizes = PRIMITIVES[kind].sizes
+        if given.size is not None and len(given.size) != len(sizes):
             problems.append(
-                f"{where}: size of a {kind} has {SIZES[kind]} values, not {len(given.size)}"
+                f"{where}: size of a {kind} has {len(sizes)} values, not {len(given.size)}"
+                f" ({', '.join(sizes)})"
             )
     problems += [f"{where}: {key} of a {kind} is missing" for key in missing]
     problems += [f"{where}: a {kind} has no {key}" for key in foreign]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from codesign_jax.engines.structured.constants import WorldConstants, apply_colu
 from codesign_jax.engines.structured.contact import Cone, Contacts
 from codesign_jax.engines.structured.kinematics import Kinematics
 from codesign_jax.engines.structured.lanes import Stages, cross, dot
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, primitives
 
 _TINY = 1e-12
 
@@ -131,8 +131,7 @@ def primitive_distance(
       shape: Index of each world's object, shape (1, world).
       local: Points, shape (3, ...).
     """
-    functions: dict[str, Callable] = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
-    return _by_kind(scene, shape, {k: partial(f, size, local) for k, f in functions.items()})
+    return _by_kind(scene, shape, {k: partial(s.distance, size, local) for k, s in SHAPES.items()})
 
 
 def _by_kind(scene: Scene, shape: jax.Array, functions: dict[str, Callable]) -> Any:
@@ -184,6 +183,11 @@ def _cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(is_out, length, jnp.maximum(side, cap)), gradient
 
 
+def _capsule(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+    nearest = jnp.maximum(jnp.minimum(p[2], size[1]), -size[1])  # on the segment within
+    return _sphere(size, jnp.stack([p[0], p[1], p[2] - nearest]))
+
+
 def object_on_table(
     run: Stages, scene: Scene, hand: WorldConstants, kin: Kinematics, height: jax.Array
 ) -> Contacts:
@@ -191,7 +195,8 @@ def object_on_table(
 
     The points are the four lower corners of a box; the lower rim's lowest point, its upper
     counterpart and two more on the lower rim, 120 degrees apart, of a cylinder; the lowest point of
-    a sphere (one slot); four spread-out ones among the lowest support points of a mesh.
+    each cap of a capsule (two slots); that of a sphere (one); four spread-out ones among the lowest
+    support points of a mesh.
     """
 
     def points(size: jax.Array, columns: jax.Array, height: jax.Array):
@@ -219,8 +224,7 @@ def primitive_points(
       shape: Index of each world's object, shape (1, world).
       columns: Columns of the object's orientation, shape (3, 3, world).
     """
-    functions = {"box": _box_corners, "cylinder": _rim_points, "sphere": _lowest_point}
-    return _by_kind(scene, shape, {k: partial(f, size, columns) for k, f in functions.items()})
+    return _by_kind(scene, shape, {k: partial(s.points, size, columns) for k, s in SHAPES.items()})
 
 
 def on_table(arms: jax.Array, height: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -271,3 +275,32 @@ def _lowest_point(size: jax.Array, columns: jax.Array) -> jax.Array:
     lowest = jnp.stack([zero, zero, -size[0]])
     away = jnp.stack([zero, zero, zero + _AWAY])
     return jnp.stack([lowest, away, away, away], 1)
+
+
+def _cap_points(size: jax.Array, columns: jax.Array) -> jax.Array:
+    """The lowest point of each cap of a capsule, shape (3, 4, world)."""
+    lowest, end = _lowest_point(size, columns), size[1] * columns[2]
+    return jnp.stack([lowest[:, 0] + end, lowest[:, 0] - end, lowest[:, 2], lowest[:, 3]], 1)
+
+
+class ShapeFunctions(NamedTuple):
+    """Functions of a primitive's sizes, for lanes: see `primitive_distance`, `primitive_points`.
+
+    Attributes:
+      distance: Sizes (3, 1, world) and points (3, ...) of the object's frame to the signed
+        distance (...) and its unit gradient (3, ...).
+      points: Sizes (3, world) and columns of the orientation (3, 3, world) to the up to four points
+        that can touch the table, from the centre (3, 4, world); unused ones are `_AWAY`.
+    """
+
+    distance: Callable
+    points: Callable
+
+
+SHAPES = {
+    "box": ShapeFunctions(_box, _box_corners),
+    "cylinder": ShapeFunctions(_cylinder, _rim_points),
+    "capsule": ShapeFunctions(_capsule, _cap_points),
+    "sphere": ShapeFunctions(_sphere, _lowest_point),
+}
+primitives.check("distances", SHAPES)

@@ -1,0 +1,173 @@
+"""Primitive shapes of objects: all that is known of one but its distance, a record by name.
+
+`engines/structured/collision.py` has the distances, by the same names.
+
+The functions of a record take the three sizes of a shape [m], those it lacks zero, as numbers or
+arrays.  A shape's frame is MuJoCo's: the origin is the centre, which half a turn about any axis
+leaves in place, and an axis of revolution is z.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+_SEGMENTS = 64  # of drawn circles
+_TURN = np.linspace(0, 2 * np.pi, 25)
+_CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN), 0 * _TURN], -1)
+
+
+class Primitive(NamedTuple):
+    """A shape of objects.
+
+    Attributes:
+      sizes: What each number of its `size` is.
+      geom: Name of MuJoCo's geom type.
+      upright: Orientation on the table before the trial's yaw, as a unit quaternion (w, x, y, z).
+      rest_height: Height of its centre on the table [m], a function of its sizes.
+      radius: Distance of its farthest point from the centre [m], a function of its sizes.
+      half_extents: Of its bounding box in its own frame [m], three numbers, likewise.
+      inertia: Principal inertia of the solid per mass [m^2], three numbers, likewise.
+      outline: Lines of a sketch in its own frame [m], arrays (point, 3), likewise.
+      triangles: Its surface as a trimesh.Trimesh, likewise.
+    """
+
+    sizes: tuple[str, ...]
+    geom: str
+    upright: tuple[float, float, float, float]
+    rest_height: Callable[[Any], Any]
+    radius: Callable[[Any], Any]
+    half_extents: Callable[[Any], tuple]
+    inertia: Callable[[Any], tuple]
+    outline: Callable[[Any], list[np.ndarray]]
+    triangles: Callable[[Any], Any]
+
+
+def block_inertia(mass: Any, x: Any, y: Any, z: Any) -> tuple:
+    """Principal inertia of a solid block with edges x, y, z [m] about its centre [kg m^2]."""
+    return mass * (y**2 + z**2) / 12, mass * (x**2 + z**2) / 12, mass * (x**2 + y**2) / 12
+
+
+def _cylinder_inertia(size: Any) -> tuple:
+    across = size[0] ** 2 / 4 + size[1] ** 2 / 3
+    return across, across, size[0] ** 2 / 2
+
+
+def _capsule_inertia(size: Any) -> tuple:
+    """Cylinder and two half balls, whose centres of mass lie 3/8 r beyond the cylinder's ends."""
+    radius, half = size[0], size[1]
+    ball = 4 * radius / (6 * half + 4 * radius)  # share of the mass
+    side, _, along = _cylinder_inertia(size)
+    tips = 2 / 5 * radius**2 + half**2 + 3 / 4 * radius * half
+    across = (1 - ball) * side + ball * tips
+    return across, across, (1 - ball) * along + ball * 2 / 5 * radius**2
+
+
+def _box_outline(size: Any) -> list[np.ndarray]:
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    ring = np.column_stack([square, np.zeros(5)]) * size
+    top = np.array([0, 0, size[2]])
+    return [ring - top, ring + top, *(np.stack([p - top, p + top]) for p in ring[:4])]
+
+
+def _cylinder_outline(size: Any) -> list[np.ndarray]:
+    flat, top = _CIRCLE * size[0], np.array([0, 0, size[1]])
+    return [flat - top, flat + top, *(np.stack([p - top, p + top]) for p in flat[::6])]
+
+
+def _capsule_outline(size: Any) -> list[np.ndarray]:
+    """Both rims of the cylinder, and the whole outline in two planes through the axis."""
+    flat, top = _CIRCLE * size[0], np.array([0, 0, size[1]])
+    half = flat[:13, [0, 2, 1]]  # from x over z to -x
+    plane = np.concatenate([half + top, -half - top, half[:1] + top])
+    return [flat - top, flat + top, plane, plane[:, [1, 0, 2]]]
+
+
+def _sphere_outline(size: Any) -> list[np.ndarray]:
+    return [size[0] * np.roll(_CIRCLE, k, axis=1) for k in range(3)]
+
+
+def _box_triangles(size: Any) -> Any:
+    import trimesh  # takes a while to import
+
+    return trimesh.creation.box(2 * np.asarray(size))
+
+
+def _cylinder_triangles(size: Any) -> Any:
+    import trimesh
+
+    return trimesh.creation.cylinder(size[0], 2 * size[1], sections=_SEGMENTS)
+
+
+def _capsule_triangles(size: Any) -> Any:
+    import trimesh
+
+    return trimesh.creation.capsule(2 * size[1], size[0], count=[_SEGMENTS, _SEGMENTS])
+
+
+def _sphere_triangles(size: Any) -> Any:
+    import trimesh
+
+    return trimesh.creation.icosphere(4, size[0])
+
+
+_STANDING = (1.0, 0.0, 0.0, 0.0)
+
+PRIMITIVES = {
+    "box": Primitive(
+        sizes=("half length in x", "half length in y", "half height"),
+        geom="mjGEOM_BOX",
+        upright=_STANDING,
+        rest_height=lambda size: size[2],
+        radius=lambda size: (size[0] ** 2 + size[1] ** 2 + size[2] ** 2) ** 0.5,
+        half_extents=lambda size: (size[0], size[1], size[2]),
+        inertia=lambda size: block_inertia(1.0, *(2 * v for v in size)),
+        outline=_box_outline,
+        triangles=_box_triangles,
+    ),
+    "cylinder": Primitive(
+        sizes=("radius", "half height"),
+        geom="mjGEOM_CYLINDER",
+        upright=_STANDING,
+        rest_height=lambda size: size[1],
+        radius=lambda size: (size[0] ** 2 + size[1] ** 2) ** 0.5,
+        half_extents=lambda size: (size[0], size[0], size[1]),
+        inertia=_cylinder_inertia,
+        outline=_cylinder_outline,
+        triangles=_cylinder_triangles,
+    ),
+    "capsule": Primitive(
+        sizes=("radius", "half length without the caps"),
+        geom="mjGEOM_CAPSULE",
+        # It lies along x: on its tip it would fall over.
+        upright=(0.5**0.5, 0.0, 0.5**0.5, 0.0),
+        rest_height=lambda size: size[0],
+        radius=lambda size: size[0] + size[1],
+        half_extents=lambda size: (size[0], size[0], size[0] + size[1]),
+        inertia=_capsule_inertia,
+        outline=_capsule_outline,
+        triangles=_capsule_triangles,
+    ),
+    "sphere": Primitive(
+        sizes=("radius",),
+        geom="mjGEOM_SPHERE",
+        upright=_STANDING,
+        rest_height=lambda size: size[0],
+        radius=lambda size: size[0],
+        half_extents=lambda size: (size[0],) * 3,
+        inertia=lambda size: (0.4 * size[0] ** 2,) * 3,
+        outline=_sphere_outline,
+        triangles=_sphere_triangles,
+    ),
+}
+
+
+def check(kind: str, names: Any) -> None:
+    """Raises an error if what is given by name is not given for exactly the primitives.
+
+    Args:
+      kind: What it is, for the message.
+      names: The names that it is given for.
+    """
+    if wrong := set(names) ^ set(PRIMITIVES):
+        raise TypeError(f"{kind} and primitives have other names: {', '.join(sorted(wrong))}")

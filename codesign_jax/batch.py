@@ -53,6 +53,7 @@ class _Packed(NamedTuple):
       initial: Bits of `Status` that the worlds start with, shape (world,).
       blocks: See `engines.base.Staged`.
       common: See `engines.base.Staged`.
+      ctrl: Controls of the worlds, where a cost of one's own reads them.
     """
 
     population: jax.Array
@@ -60,6 +61,7 @@ class _Packed(NamedTuple):
     initial: jax.Array
     blocks: tuple
     common: tuple
+    ctrl: jax.Array | None = None
 
 
 class _Launched(NamedTuple):
@@ -101,6 +103,8 @@ class Batch:
         *,
         devices: int | None = None,
         limit: int = LIMIT,
+        trajectory: bool | None = None,
+        cost: rollout.CostFunction | None = None,
     ):
         """Compiles nothing yet.
 
@@ -112,11 +116,14 @@ class Batch:
           num_trials: Trials of each particle in an episode.
           devices: Number of devices that simulate; None for all of this process.
           limit: Most worlds of one device in one call.
+          trajectory: As in `rollout.simulate`, for a cost of one's own.
+          cost: As in `rollout.simulate`.
 
         Raises:
           ValueError: If there are fewer devices.
         """
         self._how = scene, engine, space, num_trials
+        self._own = trajectory, cost
         self._optimizer, self._parts = optimizer, None
         self._joins, self._trials, self._limit = staged(engine).joins, num_trials, limit
         self.devices = take(devices)
@@ -182,7 +189,7 @@ class Batch:
         if self._parts is None:
             (scene, engine, *_), joined = self._how, min(runs, self._group(request))
             worlds = -(-joined * self._worlds(request) // len(self.devices))
-            how = *self._how, block_lanes(engine, worlds), None
+            how = *self._how, block_lanes(engine, worlds), *self._own
             draw, before, after = (
                 Program(scene, make(*how), self._optimizer) for make in (_draw, _before, _after)
             )
@@ -256,7 +263,13 @@ class Batch:
 
 @shared
 def _draw(
-    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, lanes: int | None, _: None
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    num_trials: int,
+    lanes: int | None,
+    trajectory: bool | None,
+    cost: rollout.CostFunction | None,
 ) -> Callable:
     """Draws an episode's trials."""
 
@@ -268,7 +281,13 @@ def _draw(
 
 @shared
 def _before(
-    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, lanes: int | None, _: None
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    num_trials: int,
+    lanes: int | None,
+    trajectory: bool | None,
+    cost: rollout.CostFunction | None,
 ) -> Callable:
     """Moves a run's particles and prepares their worlds."""
 
@@ -277,21 +296,34 @@ def _before(
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         worlds = rollout.crossed(jax.vmap(space.params)(population), noise)
         fields, ctrl, initial = rollout.prepare(scene, *worlds, constants)
-        return _Packed(population, worlds[1], initial, *staged(engine, lanes).pack(fields, ctrl))
+        blocks = staged(engine, lanes).pack(fields, ctrl)
+        return _Packed(population, worlds[1], initial, *blocks, None if cost is None else ctrl)
 
     return before
 
 
 @shared
 def _launch(
-    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, lanes: int | None, _: None
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    num_trials: int,
+    lanes: int | None,
+    trajectory: bool | None,
+    cost: rollout.CostFunction | None,
 ) -> Callable:
-    return staged(engine, lanes).launch
+    return staged(engine, lanes, trajectory=bool(trajectory)).launch
 
 
 @shared
 def _after(
-    scene: Scene, engine: Engine, space: DesignSpace, num_trials: int, lanes: int | None, _: None
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    num_trials: int,
+    lanes: int | None,
+    trajectory: bool | None,
+    cost: rollout.CostFunction | None,
 ) -> Callable:
     """Judges a run's worlds and tells its optimiser."""
 
@@ -303,8 +335,10 @@ def _after(
     ) -> tuple[State, EpisodeInfo]:
         (state, packed), (mask, out) = asked, found
         shape = packed.population.shape[0], num_trials
-        trace = staged(engine, lanes).unpack(out, shape[0] * shape[1])
-        outcome = rollout.judge(scene, trace, None, packed.initial, packed.trials, constants)
+        parts = staged(engine, lanes, trajectory=bool(trajectory))
+        trace = parts.unpack(out, shape[0] * shape[1])
+        judged = trace, packed.ctrl, packed.initial, packed.trials, constants
+        outcome = rollout.judge(scene, *judged, trajectory=trajectory, cost=cost)
         trials, last = rollout.grid((outcome, trace.last), shape)
         costs = particle_cost(scene.with_constants(constants), trials)
         new, selection = optimizer.tell(state, packed.population, costs, mask)

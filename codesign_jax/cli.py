@@ -48,7 +48,10 @@ class Optimize:
     """Domain of the first episode with single and switch-K."""
     optimizer: str = "particle-filter"
     """Optimiser: particle-filter (the paper's), cma-es, pso or random, all on one budget of grasps
-    (what differs: docs/command_line.md)."""
+    (what differs: docs/command_line.md); or MODULE:CLASS, one of your own."""
+    cost: Text = None
+    """MODULE:FUNCTION, a cost of your own instead of the scene's: a number from scene, trace and
+    controls of a grasp (docs/command_line.md)."""
     engine: Text = None
     """Engine that simulates: structured (ours, the default), mujoco (C, float64) or mjx (stock)."""
     particles: Count = None

@@ -22,6 +22,7 @@ axes model control verdict
 engines cost
 start
 rollout
+own
 programs
 codesign fit sampling
 batch

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from codesign_jax import optimize
+from codesign_jax import optimize, own
 from codesign_jax.optimize import Optimizer, ParticleFilter, Space
 from codesign_jax.scene.parameters import DesignSpace
 
@@ -31,17 +31,20 @@ def make_filter(space: DesignSpace, *, sigma: float = 0.05, alpha: float = 0.2) 
     return ParticleFilter(_box(space), sigma=sigma, alpha=alpha)
 
 
-def make_optimizer(name: str, space: DesignSpace) -> Optimizer:
+def make_optimizer(name: str, space: DesignSpace, *, num_particles: int | None = None) -> Optimizer:
     """Returns an optimiser over a design space; see `optimize.make_optimizer`.
 
     Args:
-      name: One of `optimize.NAMES`.
+      name: One of `optimize.NAMES`, or MODULE:NAME of a class of your own.
       space: Free parameters with bounds and pressure limit.
+      num_particles: Particles of a run, with which one of your own is tried.
 
     Raises:
-      ValueError: If there is no such optimiser.
+      ValueError: If there is no such optimiser, or your own is not as `optimize.Optimizer` says.
       ModuleNotFoundError: If it needs evosax, which is not installed.
     """
+    if own.is_own(name):
+        return own.make_optimizer(name, _box(space), num_particles)
     return optimize.make_optimizer(name, _box(space))
 
 

@@ -47,6 +47,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         episodes=options.episodes,
         test_trials=options.test_trials,
         optimizer=options.optimizer,
+        cost=options.cost or runs.SCENE_COST,
     )
     if scene is not None and options.episodes is None and not options.fresh:
         try:
@@ -115,8 +116,8 @@ def folder(options: "Optimize", scene: Scene, settings: Settings, seed: int) -> 
     if options.out is not None:
         return options.out if options.seeds is None else options.out / f"seed-{seed}"
     names = [scene.hand.name, settings.preset, settings.schedule, str(seed)]
-    if settings.optimizer != optimize.DEFAULT:
-        names.insert(3, settings.optimizer)
+    others = (settings.optimizer, optimize.DEFAULT), (settings.cost, runs.SCENE_COST)
+    names[3:3] = [asked.replace(":", ".") for asked, usual in others if asked != usual]
     name = "-".join(names)
     if name[0] in ".-~" or "/" in name or "\\" in name or len(os.fsencode(name)) > _LONGEST:
         given = schema.shown(name)

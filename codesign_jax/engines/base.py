@@ -71,19 +71,20 @@ def block_lanes(engine: Engine, worlds: int) -> int | None:
     return None if own is None else own(worlds)
 
 
-def staged(engine: Engine, lanes: int | None = None) -> Staged:
+def staged(engine: Engine, lanes: int | None = None, *, trajectory: bool = False) -> Staged:
     """The engine's own parts, or the whole rollout as the middle one.
 
     Args:
       engine: The engine.
       lanes: Lanes of its blocks, see `block_lanes`; None for the engine's default.
+      trajectory: As in `Engine.rollout`.
     """
     own: Any = getattr(engine, "staged", None)
     if own is not None:
-        return own(lanes)
+        return own(lanes, trajectory=trajectory)
     return Staged(
         pack=lambda fields, ctrl: ((fields, ctrl), ()),
-        launch=lambda blocks, common: engine.rollout(*blocks),
+        launch=lambda blocks, common: engine.rollout(*blocks, trajectory=trajectory),
         unpack=lambda trace, worlds: trace,
         joins=False,
     )

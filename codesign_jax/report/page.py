@@ -11,7 +11,7 @@ from codesign_jax import codesign, files, types
 from codesign_jax.report import charts, chosen, landscape, markup, verdicts, viewer
 from codesign_jax.report.animation import Replay
 from codesign_jax.report.of_run import Run
-from codesign_jax.runs import choice, tables
+from codesign_jax.runs import SCENE_COST, choice, tables
 from codesign_jax.runs.choice import Grasp
 from codesign_jax.runs.scene_files import NAMES
 from codesign_jax.types import MEANINGS, WARNINGS
@@ -65,6 +65,7 @@ def _summary(run: Run) -> str:
         ("design space", f"{s.preset}: {run.space.num_parameters} free parameters"),
         ("strategy", s.schedule),
         ("optimizer", s.optimizer),
+        ("cost", "the scene's" if s.cost == SCENE_COST else f"{s.cost}, of the user's own"),
         ("engine", f"{s.engine}, time step {1000 * scene.discretization.timestep:g} ms"),
         ("grasps", f"{record.done * s.particles * s.trials:,} ({sizes})"),
         ("seed", s.seed),
@@ -75,6 +76,8 @@ def _summary(run: Run) -> str:
 
 
 def _converged(run: Run) -> str:
+    if run.settings.cost != SCENE_COST:
+        return "not said of a cost of the user's own"
     episode = codesign.convergence_episode(run.history.cost.mean(1))
     limit = codesign.CONVERGED_COST
     if episode is None:

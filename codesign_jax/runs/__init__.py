@@ -13,12 +13,13 @@ from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.loop import Plan, RunResult, prepare, with_seed
 from codesign_jax.runs.reading import load_record, read_run
 from codesign_jax.runs.record import History, Record
-from codesign_jax.runs.settings import Settings, check, make_settings
+from codesign_jax.runs.settings import SCENE_COST, Settings, check, make_settings
 from codesign_jax.runs.tables import describe, failure_counts, status_names, warning_counts
 from codesign_jax.runs.together import FAILURES, Results, optimize
 
 __all__ = [
     "FAILURES",
+    "SCENE_COST",
     "AllFailed",
     "History",
     "Plan",

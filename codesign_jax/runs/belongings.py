@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from hashlib import sha256
 from pathlib import Path
 
-from codesign_jax import files
+from codesign_jax import files, own
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.manifest import PROVENANCE, digests
 from codesign_jax.runs.scene_files import MESHES, NAMES
@@ -24,6 +24,7 @@ LOCK, MARKER = ".lock", ".start.json"
 _OURS = {*FILES, *TABLES, LOCK, MARKER}
 _MESH = re.compile(r"object_[0-9]+\.[a-z0-9.]+")
 _INSIDE = {
+    own.FOLDER: re.compile(r"[A-Za-z_][\w.]*\.py"),
     "checkpoints": re.compile(r"[0-9]+(\.sha256|\.orbax-checkpoint-tmp.*)?"),
     "failures": re.compile(r"episode-[0-9]+-particle-[0-9]+-trial-[0-9]+\.npz"),
     "figures": re.compile(r"(cost_evolution|landscape)\.png"),

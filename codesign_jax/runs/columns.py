@@ -189,8 +189,9 @@ FILES = {
     "hand.toml": "the hand",
     "objects.toml": "the objects",
     "meshes": "mesh files of the objects, if there are any",
+    "code": "modules of the user's own optimiser and cost (`--optimizer`, `--cost`), if any",
     "provenance.json": "the run's identity, settings, command lines of start, resumptions and "
-    "extensions, versions of code and packages, machine, SHA-256 digests of the scene's files",
+    "extensions, versions of code and packages, machine, SHA-256 digests of the files above",
     "checkpoints": "state after each of the last episodes, with SHA-256 digests and the run's "
     "identity",
     "events.log": "what happened when, with the wall time of each episode",

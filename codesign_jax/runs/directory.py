@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax import files
+from codesign_jax import files, own
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment
 from codesign_jax.runs import belongings, manifest, reading, scene_files
@@ -88,7 +88,7 @@ def open_run(
         # Again: another process may have been here.
         check_folder(path, scene, settings, fresh=fresh, sources=sources)
         if fresh and (path / PROVENANCE).exists():
-            contents = scene_files.contents(scene)
+            contents = _contents(scene, settings)
             belongings.delete_run(path)
         else:
             contents = None
@@ -199,11 +199,16 @@ def _create(
     contents: Mapping[str, bytes] | None,
 ) -> None:
     """Makes a run: its marker first and provenance.json last, which makes the folder a run."""
-    contents = scene_files.contents(scene) if contents is None else contents
+    contents = _contents(scene, settings) if contents is None else contents
     belongings.begin(path, contents)
     scene_files.write_scene(scene, path, contents)
     manifest.write(path, manifest.new(settings, contents, command))
     belongings.tidy(path)
+
+
+def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
+    """Files that a run is made from: the scene's, and the user's own code."""
+    return scene_files.contents(scene) | own.contents((settings.optimizer, settings.cost))
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
@@ -222,6 +227,8 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
             old = (path / name).read_text(encoding="utf-8").splitlines()
             diff = difflib.unified_diff(old, text.splitlines(), f"run/{name}", f"asked/{name}", n=0)
             problems += _beginning([*diff])
+    if not problems:
+        problems = _other_code(path, settings, stored)
     if problems:
         head = f"--out {path} holds another run; choose another folder, or --fresh to delete it"
         shown = [head, *_own_command(stored), *(p.rstrip() for p in problems + extension)]
@@ -229,6 +236,18 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
     if extension:
         hint = "leave out --episodes to go on with it, or choose another folder"
         raise SceneError([f"--out {path}: {problem}; {hint}" for problem in extension])
+
+
+def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[str]:
+    """How the user's own optimiser and cost differ from those that the run was made with."""
+    found = []
+    for name, content in own.contents((settings.optimizer, settings.cost)).items():
+        if manifest.digests({name: content})[name] != stored.get("files", {}).get(name):
+            old, new = (path / name).read_text("utf-8"), content.decode()
+            ends = f"run/{name}", f"now/{name}"
+            diff = difflib.unified_diff(old.splitlines(), new.splitlines(), *ends, n=0)
+            found += [f"{Path(name).stem} was changed since the run was made:", *diff]
+    return _beginning(found)
 
 
 def _own_command(stored: dict[str, Any]) -> list[str]:

@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import codesign, types
+from codesign_jax import codesign, own, types
 from codesign_jax.batch import Request
 from codesign_jax.codesign import EpisodeInfo, FinalTest
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.optimize import NoSeed, Optimizer, State, translated
+from codesign_jax.rollout import CostFunction
 from codesign_jax.runs import failures, reading, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints, Restored
@@ -28,7 +29,7 @@ from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.interrupts import Stopped
 from codesign_jax.runs.progress import Progress, Stopwatch
 from codesign_jax.runs.record import History, Record
-from codesign_jax.runs.settings import Settings, masks_of
+from codesign_jax.runs.settings import SCENE_COST, Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.types import Outcome, Status
@@ -68,6 +69,8 @@ class Plan(NamedTuple):
     optimizer: Optimizer
     mask: np.ndarray
     key: jax.Array
+    cost: CostFunction | None = None
+    trajectory: bool | None = None
 
 
 class RunResult(NamedTuple):
@@ -89,15 +92,19 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
 
     Args:
       scene: The scene.
-      settings: Settings without `settings.problems`.
+      settings: Settings without `settings.check`'s problems.
+
+    Raises:
+      SceneError: If an optimiser or a cost of the user's own is none; see `own`.
     """
     space, mask = design_space(scene.hand, settings.preset), masks_of(scene, settings)
-    engine, optimizer = (
-        make_engine(settings.engine, scene),
-        codesign.make_optimizer(settings.optimizer, space),
-    )
+    engine = make_engine(settings.engine, scene)
+    n = settings.particles
+    optimizer = codesign.make_optimizer(settings.optimizer, space, num_particles=n)
+    mine = settings.cost != SCENE_COST
+    cost, trajectory = own.make_cost(settings.cost, scene) if mine else (None, None)
     key = jax.random.key(settings.seed)
-    return Plan(scene, settings, engine, space, optimizer, mask, key)
+    return Plan(scene, settings, engine, space, optimizer, mask, key, cost, trajectory)
 
 
 def with_seed(plan: Plan, seed: int) -> Plan:
@@ -196,8 +203,10 @@ class Loop:
     def _seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Record]:
         """Finds the seed particle and saves it as step 0."""
         plan, settings = self.plan, self.plan.settings
-        batch = settings.particles
-        search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, batch=batch)
+        # A cost of one's own has a scale of its own: the first candidate is poor enough.
+        limit = codesign.SEED_COST if plan.cost is None else -np.inf
+        how = {"batch": settings.particles, "threshold": limit}
+        search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, **how)
         with self.progress.busy("looking for a poor seed") as watch:
             try:
                 seed, cost, drawn = yield from self._evaluated(search)

@@ -12,7 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from codesign_jax import files
+from codesign_jax import files, own
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs import scene_files
@@ -222,7 +222,8 @@ def _is_id(text: str) -> bool:
 
 def _is_inside(name: str) -> bool:
     """Whether a name is of a file that a run has, and nowhere else."""
-    return name in scene_files.NAMES or name.split("/")[:-1] == [scene_files.MESHES]
+    folders = ([scene_files.MESHES], [own.FOLDER])
+    return name in scene_files.NAMES or name.split("/")[:-1] in folders
 
 
 def _are_settings(given: dict[str, Any]) -> bool:

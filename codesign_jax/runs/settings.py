@@ -5,11 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax import engines, optimize
+from codesign_jax import engines, optimize, own
 from codesign_jax.optimize import MAX_PARTICLES, schedule
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.parameters import DesignSpace, design_space
+
+SCENE_COST = "scene"
+"""Name of the scene's own cost."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +30,8 @@ class Settings:
       seed: Root of all random draws.
       test_trials: Further trials in which the final particles are tested, in whole rounds of
         `trials`; 0 for no test.
-      optimizer: One of `optimize.NAMES`.
+      optimizer: One of `optimize.NAMES`, or MODULE:NAME of one of the user's own.
+      cost: `SCENE_COST`, or MODULE:NAME of a cost of the user's own.
     """
 
     preset: str
@@ -40,6 +44,7 @@ class Settings:
     seed: int
     test_trials: int
     optimizer: str = optimize.DEFAULT
+    cost: str = SCENE_COST
 
     @property
     def grasps(self) -> int:
@@ -77,13 +82,14 @@ def make_settings(
     episodes: int | None = None,
     test_trials: int | None = None,
     optimizer: str = optimize.DEFAULT,
+    cost: str = SCENE_COST,
 ) -> Settings:
     """Fills sizes that are not given with the paper's: those of 2D for "2d", of 23D otherwise."""
     sizes = _SIZES.get(preset, _SIZES_OTHERWISE)
     asked = (particles, trials, episodes, test_trials)
     chosen = (s if a is None else a for a, s in zip(asked, sizes, strict=True))
     n, t, e, test = chosen
-    return Settings(preset, schedule, first, engine, n, t, e, seed, test, optimizer)
+    return Settings(preset, schedule, first, engine, n, t, e, seed, test, optimizer, cost)
 
 
 def masks_of(scene: Scene, settings: Settings) -> np.ndarray:
@@ -113,8 +119,13 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     if settings.engine not in engines.NAMES:
         hint = schema.nearest(settings.engine, engines.NAMES)
         found.append(f"--engine = {settings.engine!r} is not valid; {hint}")
-    if problem := optimize.problem(settings.optimizer, max(settings.particles, 0) or None):
-        found.append(f"--optimizer: {problem}")
+    if own.is_own(settings.optimizer):
+        problem = own.problem(settings.optimizer)
+    else:
+        problem = optimize.problem(settings.optimizer, max(settings.particles, 0) or None)
+    found += [f"--optimizer: {problem}"] if problem else []
+    if settings.cost != SCENE_COST and (problem := own.problem(settings.cost)):
+        found.append(f"--cost: {problem}")
     space = None
     if hand is not None:
         try:

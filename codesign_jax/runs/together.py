@@ -139,7 +139,9 @@ def _group(
 def _batch(plan: Plan, devices: int | None, chunk: int | None) -> Batch:
     """What simulates the runs' episodes."""
     how = plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
-    return Batch(*how, devices=devices, limit=LIMIT if chunk is None else chunk)
+    most = LIMIT if chunk is None else chunk
+    judged = {"trajectory": plan.trajectory, "cost": plan.cost}
+    return Batch(*how, devices=devices, limit=most, **judged)
 
 
 class _Together:

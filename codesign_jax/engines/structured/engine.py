@@ -180,7 +180,7 @@ class StructuredEngine(Equal):
         """See `base.block_lanes`: a GPU with few worlds is faster with narrow blocks."""
         return lanes_here(self.scene, jnp.result_type(float), worlds)
 
-    def staged(self, lanes: int | None = None) -> Staged:
+    def staged(self, lanes: int | None = None, *, trajectory: bool = False) -> Staged:
         """See `base.staged`: the kernel's blocks, which hold a few worlds each."""
 
         def program(width: int) -> Program:
@@ -197,14 +197,16 @@ class StructuredEngine(Equal):
         # The last axis of the first table, in and out, are the lanes of a block.
         def launch(blocks: tuple, common: tuple) -> tuple:
             try:
-                return tuple(program(blocks[0].shape[-1]).execute((*blocks, *common)))
+                here, inputs = program(blocks[0].shape[-1]), (*blocks, *common)
+                return tuple(here.execute(inputs, trajectory=trajectory))
             except KernelUnavailable as error:
                 raise _unavailable(str(error)) from error
 
         def unpack(out: tuple, worlds: int) -> Trace:
             here = program(out[0].shape[-1])
-            found, end = jax.lax.optimization_barrier(here.outputs(out, worlds))
-            return self._trace(found, end, trajectory=False)
+            outputs = here.outputs(out, worlds, trajectory=trajectory)
+            found, end = jax.lax.optimization_barrier(outputs)
+            return self._trace(found, end, trajectory)
 
         return Staged(pack, launch, unpack, joins=True)
 

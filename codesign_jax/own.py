@@ -1,0 +1,252 @@
+"""An optimiser or a cost of the user's own, named on the command line as `module:name`.
+
+The module is looked for in the working directory first, then among the installed packages.  It is
+imported for a command line that names it and for nothing else: no file can ask for it.
+"""
+
+import importlib
+import inspect
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import rollout
+from codesign_jax.optimize import Optimizer, Space, State
+from codesign_jax.rollout import CostFunction
+from codesign_jax.scene import Scene, SceneError
+from codesign_jax.scene.parameters import design_space
+from codesign_jax.types import Outcome, Params, Trace
+
+FOLDER = "code"
+"""Folder of a run with the modules that it was made with."""
+_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+
+
+def is_own(name: str) -> bool:
+    """Whether a name is one of the user's own, and none of this package's."""
+    return ":" in name
+
+
+def problem(name: str) -> str | None:
+    """What is wrong with the name itself, in words; nothing is imported."""
+    if _NAME.fullmatch(name):
+        return None
+    return f"{name!r} must be MODULE:NAME, such as mine:Search for the class Search of mine.py"
+
+
+def contents(names: Iterable[str]) -> dict[str, bytes]:
+    """The modules of these names by the names of their files in a run folder.
+
+    They are the file that each name's module was read from, and the one that defines the object
+    where that is another; what these import is not among them.
+
+    Raises:
+      SceneError: If a module cannot be imported, or has no file of Python code.
+    """
+    found = {}
+    for name in filter(is_own, names):
+        thing = _load(name)
+        for module in {name.partition(":")[0], getattr(thing, "__module__", None)} & {*sys.modules}:
+            found[f"{FOLDER}/{module}.py"] = _source(name, module).read_bytes()
+    return found
+
+
+def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
+    """Imports a cost and tries it on arrays without values.
+
+    Args:
+      name: Its name.
+      scene: The scene whose grasps it is to judge.
+
+    Returns:
+      The function and whether it sees a whole grasp (`trajectory`): it does unless it has an
+      attribute `trajectory` that is False, with which a grasp ends where the object is lost.
+
+    Raises:
+      SceneError: If it is no function of scene, trace and controls that returns one number.
+    """
+    flag, cost = f"--cost {name}", _load(name, "--cost")
+    _refuse_signature(flag, cost, ("scene", "trace", "ctrl"))
+    trajectory = getattr(cost, "trajectory", True)
+    if not isinstance(trajectory, bool):
+        raise SceneError([f"{flag}: its attribute trajectory must be True or False"])
+
+    constants = scene.constants()
+
+    def judge(trace: Trace, params: Params, trials: Any) -> Outcome:
+        _, ctrl, initial = rollout.prepare(scene, params, trials, constants)
+        how = {"trajectory": trajectory, "cost": cost}
+        return rollout.judge(scene, trace, ctrl, initial, trials, constants, **how)
+
+    one = jax.tree.map(lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene)))
+    fields, _, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t, constants), *one)
+    series = jax.ShapeDtypeStruct((1, scene.num_steps), float)
+    qpos = (1, scene.num_steps, fields.start.shape[-1] if trajectory else 0)
+    trace = Trace(series, series, series, jax.ShapeDtypeStruct(qpos, float))
+    _tried(flag, cost, lambda: jax.eval_shape(judge, trace, *one))
+    return cost, trajectory
+
+
+def make_optimizer(name: str, space: Space, num_particles: int | None = None) -> Optimizer:
+    """Imports an optimiser's class, or whatever makes one from a space.
+
+    Args:
+      name: Its name.
+      space: Bounds and constraint of the parameters.
+      num_particles: Particles of a run, with which its functions are tried on a cost of zero.
+
+    Raises:
+      SceneError: If it is none as `optimize.Optimizer` describes them.
+    """
+    flag, make = f"--optimizer {name}", _load(name, "--optimizer")
+    _refuse_signature(flag, make, ("space",))
+    made = _tried(flag, make, lambda: make(space))
+    missing = [n for n in ("space", "keeps_best", "init", "ask", "tell") if not hasattr(made, n)]
+    if missing:
+        raise SceneError([f"{flag}: it lacks {', '.join(missing)} of optimize.Optimizer"])
+    if any(leaf is made for leaf in jax.tree.leaves(made)):
+        raise SceneError(
+            [
+                f"{flag}: it is no pytree: make it a dataclass and register that with "
+                "jax.tree_util.register_dataclass"
+            ]
+        )
+    if num_particles is not None:
+        _try(flag, make, made, num_particles)
+    return made
+
+
+def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
+    """Refuses an optimiser that gives or takes other arrays than it should."""
+    low, high = np.asarray(made.space.low), np.asarray(made.space.high)
+    seed, mask = jnp.asarray((low + high) / 2, float), np.ones(low.shape, bool)
+    state = _tried(flag, make, lambda: made.init(jax.random.key(0), seed, n))
+    if not isinstance(state, State) or np.shape(state.particles) != (n, low.size):
+        raise SceneError(
+            [f"{flag}: init must return an optimize.State with particles ({n}, {low.size})"]
+        )
+
+    def episode(state: State) -> tuple[jax.Array, Any]:
+        population = made.ask(state, mask)
+        return population, made.tell(state, population, jnp.zeros(n), mask)
+
+    population, told = _tried(flag, make, lambda: jax.eval_shape(episode, state))
+    if population.shape != (n, low.size):
+        raise SceneError([f"{flag}: ask returns {population.shape}, not ({n}, {low.size})"])
+    if not (isinstance(told, tuple) and len(told) == 2 and _same(state, told[0])):
+        raise SceneError(
+            [
+                f"{flag}: tell must return a state, with the arrays of init's in shape and type, "
+                "and an optimize.Info (`optimize.protocol.summarize` makes one)"
+            ]
+        )
+
+
+def _same(before: Any, after: Any) -> bool:
+    """Whether two trees have the same arrays in shape and type."""
+    like = jax.eval_shape(lambda: before)
+    if jax.tree.structure(like) != jax.tree.structure(after):
+        return False
+    pairs = zip(jax.tree.leaves(like), jax.tree.leaves(after), strict=True)
+    return all((a.shape, a.dtype) == (b.shape, b.dtype) for a, b in pairs)
+
+
+def _hand(scene: Scene) -> Params:
+    """Parameters of the hand, whatever their values: its whole table at its defaults."""
+    space = design_space(scene.hand)
+    return space.params(space.default())
+
+
+def _load(name: str, flag: str = "") -> Any:
+    """The object of a name.
+
+    Raises:
+      SceneError: If there is none, or its module cannot be imported.
+    """
+    begin = f"{flag} {name}".strip()
+    if words := problem(name):
+        raise SceneError([f"{flag}: {words}".removeprefix(": ")])
+    module, _, attribute = name.partition(":")
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        importlib.invalidate_caches()
+        imported = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise SceneError([f"{begin}: {_where(error, None)}"]) from error
+        raise SceneError(
+            [f"{begin}: there is no module {module!r} in {here} or among the installed packages"]
+        ) from error
+    except (Exception, SystemExit) as error:
+        raise SceneError([f"{begin}: importing it fails: {_where(error, None)}"]) from error
+    finally:
+        sys.path.remove(here)
+    if not hasattr(imported, attribute):
+        place = getattr(imported, "__file__", None) or module
+        raise SceneError([f"{begin}: {place} has no {attribute!r}"])
+    return getattr(imported, attribute)
+
+
+def _source(name: str, module: str) -> Path:
+    """File of Python code that a module was read from.
+
+    Raises:
+      SceneError: If there is none, such as of a module in C.
+    """
+    try:
+        return Path(inspect.getsourcefile(sys.modules[module]) or "").resolve(strict=True)
+    except (TypeError, OSError) as error:
+        raise SceneError(
+            [f"{name}: module {module} has no file of Python code, which a run keeps a copy of"]
+        ) from error
+
+
+def _refuse_signature(flag: str, function: Any, arguments: tuple[str, ...]) -> None:
+    """Refuses what cannot be called with so many arguments.
+
+    Raises:
+      SceneError: With the arguments that it gets.
+    """
+    wanted = f"a function of ({', '.join(arguments)})"
+    if not callable(function):
+        raise SceneError([f"{flag}: it is {type(function).__name__}, not {wanted}"])
+    try:
+        inspect.signature(function).bind(*arguments)
+    except ValueError:  # it does not tell
+        pass
+    except TypeError as error:
+        raise SceneError([f"{flag}: it must be {wanted}: {error}"]) from error
+
+
+def _tried(flag: str, code: Any, call: Callable[[], Any]) -> Any:
+    """Returns what the user's code returns.
+
+    Raises:
+      SceneError: With the error that it raises, and its line.
+    """
+    try:
+        return call()
+    except Exception as error:
+        raise SceneError([f"{flag}: {_where(error, code)}"]) from error
+
+
+def _where(error: BaseException, code: Any) -> str:
+    """An error with the line of the user's code that it comes from; of its last line if no code."""
+    words = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    try:
+        own = None if code is None else inspect.getsourcefile(code)
+    except TypeError:
+        own = None
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [
+        f for f in frames if f.filename == own or (own is None and "importlib" not in f.filename)
+    ]
+    return f"{words} ({lines[-1].filename}, line {lines[-1].lineno})" if lines else words

@@ -1,0 +1,225 @@
+"""`--optimizer module:Class` and `--cost module:function`: what runs do with a user's own code."""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from command_runs import assert_same_run, snapshot
+from toy import TINY
+
+from codesign_jax import cli, codesign, make_engine, own, parameters, runs, scene
+
+MINE = '''
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.optimize import Space, State
+from codesign_jax.optimize.protocol import episode_key, summarize
+
+no_function, PRIVATE = 3, "not a space"
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Climber:
+    """Moves the best design so far."""
+
+    keeps_best = True
+    space: Space
+
+    def init(self, key, seed_particle, num_particles):
+        seed = jnp.asarray(seed_particle, float)
+        memory = {"best": seed, "cost": jnp.inf * jnp.ones(())}
+        return State(jnp.tile(seed, (num_particles, 1)), jnp.int32(0), key, memory)
+
+    def ask(self, state, mask):
+        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        noise = jax.random.normal(episode_key(state, 1), state.particles.shape)
+        moved = jnp.clip(state.memory["best"] + 0.2 * (high - low) * noise, low, high)
+        return jnp.where(mask, moved, state.particles)
+
+    def tell(self, state, population, cost, mask=True):
+        best = jnp.argmin(cost)
+        better = cost[best] < state.memory["cost"]
+        memory = {
+            "best": jnp.where(better, population[best], state.memory["best"]),
+            "cost": jnp.minimum(cost[best], state.memory["cost"]),
+        }
+        order = jnp.argsort(cost).astype(jnp.int32)
+        new = State(population[order], state.episode + 1, state.key, memory)
+        return new, summarize(cost, jnp.ones_like(cost), order)
+
+
+class NoTree(Climber):
+    pass
+
+
+class NoTell:
+    keeps_best = True
+
+    def __init__(self, space):
+        self.space, self.init, self.ask = space, None, None
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Forgetful(Climber):
+    def tell(self, state, population, cost, mask=True):
+        new, info = Climber.tell(self, state, population, cost, mask)
+        return new._replace(memory=None), info
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fewer(Climber):
+    def ask(self, state, mask):
+        return Climber.ask(self, state, mask)[:2]
+
+
+def low(scene, trace, ctrl):
+    """Depth below 0.2 m at the end of the shaking, and the way of the lift [m]."""
+    lift = ctrl[:, 2].max() - ctrl[:, 2].min()
+    return jnp.abs(0.2 - trace.at(scene, "disturb").height) + lift
+
+
+def turned(scene, trace, ctrl):
+    return jnp.abs(trace.at(scene, "disturb").qpos[3])
+
+
+def until_lost(scene, trace, ctrl):
+    return trace.distance.mean()
+
+
+until_lost.trajectory = False
+
+
+def reads_too_much(scene, trace, ctrl):
+    return trace.qpos.mean()
+
+
+reads_too_much.trajectory = False
+
+
+def of_two(scene, trace):
+    return 0.0
+
+
+def series(scene, trace, ctrl):
+    return trace.distance
+
+
+def nothing(scene, trace, ctrl):
+    trace.distance.mean()
+
+
+def misspelt(scene, trace, ctrl):
+    return trace.hight.mean()
+'''
+RUN = [
+    *("optimize", "--scene", str(TINY), "--particles", "4", "--trials", "2", "--test-trials", "2"),
+    *("--reference-trials", "0", "--seed", "3"),
+]
+OWN = [*RUN, "--optimizer", "mine:Climber", "--cost", "mine:low"]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A working directory with a module of the user's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    (tmp_path / "mine.py").write_text(MINE)
+    before = [*sys.path]
+    yield tmp_path
+    assert sys.path == before
+    sys.modules.pop("mine", None)
+
+
+def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
+    assert cli.main([*OWN, "--episodes", "3", "--out", "long"]) == 0
+    assert cli.main([*OWN, "--episodes", "1", "--out", "grown"]) == 0
+    assert cli.main([*OWN, "--episodes", "3", "--out", "grown"]) == 0
+    assert_same_run(here / "grown", here / "long")
+    seeds = [*OWN[:-6], "--seeds", "3,4", *OWN[-4:], "--episodes", "3", "--out", "many"]
+    assert cli.main(seeds) == 0
+    assert_same_run(here / "many" / "seed-3", here / "long")
+    said = capsys.readouterr().out
+    assert "lowest mean cost of an episode, by mine:low" in said and "converged from" not in said
+    assert (here / "long" / "code" / "mine.py").read_text() == MINE
+    noted = json.loads((here / "long" / "provenance.json").read_text())
+    assert [noted["settings"][name] for name in ("optimizer", "cost")] == OWN[-3::2]
+    # The costs of the run are those of the library, whose program is another.
+    the_scene, record = scene.load(TINY), runs.load_record(here / "long")
+    space = parameters.design_space(the_scene.hand, "2d")
+    assert record is not None
+    low = sys.modules["mine"].low
+    how = the_scene, make_engine("structured", the_scene), space, 2
+    evaluate = codesign.make_evaluate(*how, trajectory=True, cost=low)
+    noise = codesign.stream_key(jax.random.key(3), codesign.STREAM_TRIAL, 1)
+    again = evaluate(jnp.asarray(record.history.population[1]), noise)
+    # Two programs round model fields differently, and 0.3 s of contact let that grow.
+    np.testing.assert_allclose(again.cost, record.history.trials.cost[1], rtol=1e-3, atol=1e-5)
+    assert np.ptp(again.cost) > 0.01
+
+
+def test_changed_code_is_refused_with_what_changed(here, capsys):
+    assert cli.main([*OWN, "--episodes", "1", "--out", "run"]) == 0
+    before = snapshot(here / "run")
+    (here / "mine.py").write_text(MINE.replace("0.2 - trace", "0.3 - trace"))
+    sys.modules.pop("mine")  # as in another process
+    assert cli.main([*OWN, "--episodes", "2", "--out", "run"]) == 2
+    said = capsys.readouterr().err
+    assert "mine was changed since the run was made" in said
+    assert "-    return jnp.abs(0.2 - trace" in said and "+    return jnp.abs(0.3 - trace" in said
+    assert cli.main([*OWN[:-1], "mine:until_lost", "--out", "run"]) == 2
+    assert "--cost: the run has mine:low, asked for is mine:until_lost" in capsys.readouterr().err
+    # What is the run's is not imported for whoever reads it, or asks for nothing.
+    (here / "mine.py").unlink()
+    sys.modules.pop("mine")
+    assert cli.main([*RUN, "--out", "run"]) == 2
+    assert "mine" not in sys.modules
+    assert runs.load_record(here / "run") is not None
+    assert snapshot(here / "run") == before
+
+
+WRONG = {
+    "--cost low": "'low' must be MODULE:NAME",
+    "--cost mine:": "'mine:' must be MODULE:NAME",
+    "--cost nobodys:low": "there is no module 'nobodys' in ",
+    "--cost mine:lower": "mine.py has no 'lower'",
+    "--cost mine:no_function": "it is int, not a function of (scene, trace, ctrl)",
+    "--cost mine:of_two": "it must be a function of (scene, trace, ctrl): too many",
+    "--cost mine:series": "ValueError: a cost is one number for each world, not an array",
+    "--cost mine:nothing": "a cost is one number for each world, not None",
+    "--cost mine:misspelt": "AttributeError: 'Trace' object has no attribute 'hight' (",
+    "--cost mine:reads_too_much": "ValueError: a cost reads trace.qpos",
+    "--cost broken:low": "importing it fails: ZeroDivisionError: division by zero (",
+    "--optimizer mine:NoTree": "it is no pytree",
+    "--optimizer mine:NoTell": "it lacks tell of optimize.Optimizer",
+    "--optimizer mine:Forgetful": "tell must return a state, with the arrays of init's",
+    "--optimizer mine:Fewer": "ask returns (2, 2), not (4, 2)",
+    "--optimizer mine:low": "it must be a function of (space): ",
+}
+
+
+@pytest.mark.parametrize("asked", WRONG)
+def test_what_is_wrong_is_said_before_anything_is_created(asked, here, capsys):
+    (here / "broken.py").write_text("1 / 0\n")
+    before = snapshot(here)
+    assert cli.main([*RUN, *asked.split(), "--episodes", "1", "--out", "run"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: {asked.split()[0]}") and WRONG[asked] in said, said
+    sys.modules.pop("broken", None)
+    assert {k: v for k, v in snapshot(here).items() if "__pycache__" not in str(k)} == before
+
+
+def test_costs_see_as_much_of_a_grasp_as_they_say(here):
+    the_scene = scene.load(TINY)
+    assert own.make_cost("mine:turned", the_scene)[1] is True
+    assert own.make_cost("mine:until_lost", the_scene)[1] is False
+    with pytest.raises(scene.SceneError, match="builtins has no file of Python code"):
+        own.contents(["scene", "builtins:pow"])

@@ -131,7 +131,7 @@ def primitive_distance(
       shape: Index of each world's object, shape (1, world).
       local: Points, shape (3, ...).
     """
-    functions: dict[str, Callable] = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
+    functions: dict[str, Callable] = {"box": _box, "cylinder": cylinder, "sphere": _sphere}
     return _by_kind(scene, shape, {k: partial(f, size, local) for k, f in functions.items()})
 
 
@@ -169,7 +169,8 @@ def _box(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(is_out, length, deepest), sign * gradient
 
 
-def _cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+def cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Signed distance of points (3, ...) from a cylinder of radius and half height, and gradient."""
     radial = jnp.sqrt(p[0] ** 2 + p[1] ** 2 + _TINY**2)
     sign = jnp.where(p[2] < 0, -1.0, 1.0).astype(p.dtype)
     side, cap = radial - size[0], jnp.abs(p[2]) - size[1]

@@ -7,7 +7,8 @@ the other's along the row.  Lane by lane, see `fingers`.
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import apply_columns
+from codesign_jax.engines.structured import collision
+from codesign_jax.engines.structured.constants import apply_columns, apply_rows
 from codesign_jax.engines.structured.kernel import hull
 from codesign_jax.engines.structured.lanes import dot, total
 
@@ -35,6 +36,51 @@ def between(a: jax.Array, b: jax.Array) -> tuple[tuple, tuple]:
     point = (a[:3] - normal * (a[3] + 0.5 * gap))[:, None]
     gap, normal = gap[None, None], normal[:, None]
     return (point, normal, gap), (point, -normal, gap)
+
+
+def ball_on_palm(ball: jax.Array, palm: tuple) -> tuple[tuple, tuple]:
+    """Point, normal and gap of a ball (centre, radius) on the palm, on either side.
+
+    Args:
+      ball: Centre and radius, shape (4, ...).
+      palm: See `palm_distance`.
+    """
+    distance, normal = palm_distance(ball[:3], palm)
+    gap = distance - ball[3]
+    point = (ball[:3] - normal * (ball[3] + 0.5 * gap))[:, None]
+    gap, normal = gap[None, None], normal[:, None]
+    return (point, normal, gap), (point, -normal, gap)
+
+
+def palm_distance(point: jax.Array, palm: tuple) -> tuple[jax.Array, jax.Array]:
+    """Signed distance of a point from the palm's disc, and its gradient.
+
+    Args:
+      point: The point, shape (3, ...).
+      palm: Place of the palm's frame, which is on the disc's underside, columns of its orientation,
+        and radius and half the thickness of the disc.
+    """
+    place, frame, size = palm
+    local = apply_rows(frame, point - place)
+    distance, slope = collision.cylinder(size, jnp.stack([local[0], local[1], local[2] - size[1]]))
+    return distance, apply_columns(frame, slope)
+
+
+def on_palm(vertex, own: tuple, palm: tuple) -> tuple[tuple, tuple]:
+    """Point, normal, gap, lever and share of a vertex on the palm, on either side.
+
+    Args:
+      vertex: Place, weight and share of the vertex.
+      own: Joint of its row, and frames of the links before and behind it.
+      palm: See `palm_distance`.
+    """
+    point, image, weight, share = hull.placed(vertex, *own)
+    gap, normal = palm_distance(point[:, 0], palm)
+    to_contact = -0.5 * gap * normal
+    lever = weight * (image[:, 0] + to_contact)
+    at, gap = (point[:, 0] + to_contact)[:, None], gap[None, None]
+    mine = at, normal[:, None], gap, lever[:, None], share
+    return mine, (at, -normal[:, None], gap, jnp.zeros_like(lever)[:, None], share)
 
 
 def separated(own: tuple, own_size, theirs: tuple, size, last) -> jax.Array:

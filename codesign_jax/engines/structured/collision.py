@@ -170,7 +170,7 @@ def _box(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Signed distance of points (3, ...) from a cylinder of radius and half height, and gradient."""
+    """Signed distance of points (3, ...) from a cylinder (radius, half height), and gradient."""
     radial = jnp.sqrt(p[0] ** 2 + p[1] ** 2 + _TINY**2)
     sign = jnp.where(p[2] < 0, -1.0, 1.0).astype(p.dtype)
     side, cap = radial - size[0], jnp.abs(p[2]) - size[1]

@@ -20,7 +20,7 @@ class Cones(NamedTuple):
       hand_table: Fingers, hull or palm on the table.
       object_table: The object on the table.
       finger_finger: Fingers on one another.
-      finger_palm: Fingers on the palm.
+      finger_palm: Fingers on the palm's disc.
     """
 
     hand_object: Cone | None

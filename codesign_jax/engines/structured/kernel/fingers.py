@@ -1,4 +1,4 @@
-"""Finds where fingers touch each other and the palm: spheres, or the hull's vertices and other fingers' sections.
+"""Finds where fingers touch each other and the palm: spheres, or the hull's vertices.
 
 A vertex of the hull touches another finger's row (the stretch between the middles of two links)
 where it stands inside the row's section, whose frame turns from one link's to the other's along

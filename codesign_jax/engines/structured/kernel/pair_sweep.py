@@ -191,9 +191,7 @@ class PairSweep:
             number = (first + k).astype(jnp.int32)
             return number, self.hand("vertex", number, self.lane)
 
-        one, other = (
-            RowSide(*(self._chain(n, r) for n in RowSide._fields)) for r in (row, behind)
-        )
+        one, other = (RowSide(*(self._chain(n, r) for n in RowSide._fields)) for r in (row, behind))
         return vertex, count, behind, (one, other)
 
     def _sums(self, count: int, sums_of: Callable) -> Lanes:

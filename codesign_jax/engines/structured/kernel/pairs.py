@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured import contact
 from codesign_jax.engines.structured.contact import Contacts
-from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, cone_of, zeros
+from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.hull import across
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop, solid
 from codesign_jax.engines.structured.kernel.pairing import Pairing
@@ -81,9 +81,13 @@ class PairSet(HullSet):
 
     def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; one cone between fingers and one on the palm, if there are both."""
-        e, (shape,) = self.scene.effects, super().cone_rows().values()
-        names = {"finger_finger": e.finger_finger, "finger_palm": e.finger_palm}
-        return {f"cone.{name}": shape for name, on in names.items() if on}
+        (shape,) = super().cone_rows().values()
+        return {f"cone.{name}": shape for name in self._names()}
+
+    def _names(self) -> list[str]:
+        e = self.scene.effects
+        on = {"finger_finger": e.finger_finger, "finger_palm": e.finger_palm}
+        return [name for name in on if on[name]]
 
     @property
     def components(self) -> int:
@@ -109,8 +113,7 @@ class PairSet(HullSet):
 
     def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundPairs":
         """See `ContactSet`."""
-        friction = self.scene.effects.friction
-        cones = {n.removeprefix("cone."): cone_of(friction, read(n)) for n in self.cone_rows()}
+        cones = {name: self.cone(read, name) for name in self._names()}
         return BoundPairs(self, table, ref, cones)
 
 

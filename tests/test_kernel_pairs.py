@@ -69,11 +69,14 @@ def test_accelerations_equal_mujoco_on_curled_hands(friction):
 
 
 class Dense(oracle.Dense):
-    """A step's problem with the contacts of the hulls of different fingers."""
+    """A step's problem with the contacts of the hulls of different fingers, and of the palm."""
 
     def __init__(self, scene, model, data, hand):
         super().__init__(scene, model, data, hand)
-        self.pairs = self.merged = 0
+        self.pairs = self.merged = self.on_palm = 0
+        if scene.effects.finger_palm:
+            for f in range(scene.num_fingers):
+                self._add_palm(scene, model, data, hand, f)
         for f, other in np.ndindex(scene.num_fingers, scene.num_fingers):
             if f != other:
                 self._add_rows(scene, model, data, hand, f, other)
@@ -94,7 +97,37 @@ class Dense(oracle.Dense):
                     ends = [self._jac(model, data, [at + arm], (body,), 1.0) for body in behind]
                     found.append((share, -gap, normal, jac - weight * (ends[1] - ends[0])))
             if found:
-                self._add_resultant(scene, data, found)
+                c = scene.contact
+                rest = c.finger_finger_friction, c.finger_finger_friction_ratio, c.impedance
+                self._add_resultant(scene, data, found, *rest)
+                self.pairs += 1
+                self.merged = max(self.merged, len(found))
+
+    def _add_palm(self, scene, model, data, hand, f):
+        """Resultants of the vertices of a finger's rows in the palm's disc, from a quarter on."""
+        c, links, palm = scene.contact, scene.discretization.links, data.body("palm")
+        frame, disc = palm.xmat.reshape(3, 3), scene.hand.palm
+        stiffer = c.finger_palm_stiffness / c.normal_stiffness
+        impedance = 1 - (1 - c.impedance) / stiffer
+        for row in range(int(np.ceil(links / 4)), links + 1):
+            found = []
+            for k in range(hull.slots(scene).along.shape[1]):
+                point, jac_at, share = self._vertex(scene, model, data, hand, f, row, k)
+                x, y, z = (point - palm.xpos) @ frame
+                depth, normal = min(
+                    (disc.radius - np.hypot(x, y), (*np.array([x, y]) / np.hypot(x, y), 0)),
+                    (z, (0, 0, -1)),
+                    (disc.thickness - z, (0, 0, 1)),
+                )
+                if depth > 0:
+                    normal = frame @ normal
+                    arm = normal * depth / 2
+                    jac = jac_at(arm) - self._jac(model, data, [point + arm], (palm.id,), 1.0)
+                    found.append((2 * share, depth, normal, jac))
+            if found:
+                rest = c.finger_palm_friction, c.finger_finger_friction_ratio, impedance
+                self._add_resultant(scene, data, found, *rest)
+                self.on_palm += 1
 
     def _vertex(self, scene, model, data, hand, f, row, k):
         """Place of a vertex, its Jacobian as a function of an offset, and its share."""
@@ -117,27 +150,16 @@ class Dense(oracle.Dense):
 
         return point, jac_at, 0.5 * area / width**2
 
-    def _add_resultant(self, scene, data, found):
+    def _add_resultant(self, scene, data, found, friction, ratio, impedance):
         """One contact of all vertices of a row in another row, weighted by their forces."""
         share, depth = (np.array([v[k] for v in found]) for k in (0, 1))
         force = share * depth / (share @ depth)
         normal, jac = (np.tensordot(force, [v[k] for v in found], 1) for k in (2, 3))
         length = np.linalg.norm(normal)
         gap = -length * (share @ depth) / share.sum()
-        c = scene.contact
         self._add(
-            scene,
-            data,
-            jac,
-            normal / length,
-            gap,
-            c.finger_finger_friction,
-            share.sum(),
-            2,
-            c.finger_finger_friction_ratio,
+            scene, data, jac, normal / length, gap, friction, share.sum(), 2, ratio, impedance
         )
-        self.pairs += 1
-        self.merged = max(self.merged, len(found))
 
     @staticmethod
     def _section(scene, data, hand, f, row, point):

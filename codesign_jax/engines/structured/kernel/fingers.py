@@ -105,7 +105,7 @@ class Search:
 
         def one(j: Any) -> None:
             number, ball = j + first, self.read("sphere", j + first)
-            mine = lanewise(lambda b, palm: sections.ball_on_palm(b, palm)[0], ball, self.palm)
+            mine, _ = lanewise(sections.ball_on_palm, ball, self.palm)
             row = jax.lax.div(number, jnp.asarray(self.p.k, number.dtype)) + 1
             self._enter_on_palm(mine, row, number)
 
@@ -130,7 +130,7 @@ class Search:
                 sums = loop(count, add, zeros((sections.SUMS,), self.like), self.block.size)
                 self._enter_on_palm(lanewise(sections.pressure, sums)[0], row)
 
-            near = lanewise(lambda b, palm: sections.ball_on_palm(b, palm)[0][2], ball, self.palm)
+            (_, _, near), _ = lanewise(sections.ball_on_palm, ball, self.palm)
             any_of(near.lane < 0, vertices)
 
         each(self.p.links + 1 - first, one)

@@ -261,7 +261,7 @@ def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, w
       numbers: Numbers of the cone.
       which: Number of the sphere on the link.
     """
-    ball = sphere_ball(*mine, which)
+    ball = sphere_ball(mine[0], mine[1], mine[2], which)
     cone = cone_of(scene.effects.friction, numbers)
     found = sections.ball_on_palm(ball, (*palm[:2], size))
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in found]

@@ -253,11 +253,10 @@ class Search:
           other: Links of their partners' row, its size, and whether it is the last one.
           rows: Numbers of both rows.
         """
-        d = self.p.scene.discretization
-        count, (links, kind), (theirs, size, last) = d.hull_rings * d.hull_points, own, other
+        count, (links, kind), (theirs, size, last) = hull.pair_points(self.p.scene), own, other
 
         def add(k: Any, sums: Lanes) -> Lanes:
-            vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
+            vertex = self.p.hand.read(self.step.hand, "pair_vertex", kind * count + k)
             end = lanes([last], (), wide=True)
             ends = lanewise(sections.inside, vertex, links, theirs, size, end)
             return lanewise(sections.add_vertex, sums, *ends)

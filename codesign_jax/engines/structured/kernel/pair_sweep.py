@@ -99,7 +99,9 @@ class PairSweep:
 
     def _row_on_palm(self, item: Any, row: jax.Array, live: Lanes) -> None:
         """Adds the cotangents of a row of the hull and of the palm."""
-        vertex, count, behind, ends = self._row(row)
+        d = self.p.scene.discretization
+        count = d.hull_rings * d.hull_points
+        vertex, behind, ends = self._row(row, "vertex", count)
         mine = self._chain("origin", behind), *(side.frame for side in ends)
         palm, disc = self._palm()
         body = (palm.origin, palm.frame, disc)
@@ -118,7 +120,7 @@ class PairSweep:
             return own, tuple(bodies)
 
         empty = ((3,), (3, 3), (3, 3)), ((3,), (3, 3), (2,))
-        own, theirs = self._back(count, vertex, live, sums_of, one, empty)
+        own, theirs = self._back(count, "vertex", vertex, live, sums_of, one, empty)
         (joint, *frames), (origin, frame, size) = own, theirs
         self.bars.add({"palm_disc": size})
         moved = plus(first, second)
@@ -142,7 +144,8 @@ class PairSweep:
     def _rows(self, item: Any, pairing: Pairing, row: jax.Array, live: Lanes) -> None:
         """Adds the cotangents of a row of the hull and of the other finger's row."""
         p, links = self.p, jnp.int32(self.p.links)
-        vertex, count, behind, ends = self._row(row)
+        count = hull.pair_points(p.scene)
+        vertex, behind, ends = self._row(row, "pair_vertex", count)
         size = p.hand.read(self.sweep.step.hand, "section_box")
         mine = self._chain("origin", behind), *(side.frame for side in ends), size
         last = lanes([jnp.where(row == links - 1, self.like + 1.0, self.like)], (), wide=True)
@@ -162,7 +165,7 @@ class PairSweep:
             return own, tuple(sides)
 
         side = ((3,), (3, 3), (3, 3), (3,))
-        own, swapped = self._back(count, vertex, live, sums_of, one, (side, side))
+        own, swapped = self._back(count, "pair_vertex", vertex, live, sums_of, one, (side, side))
         swapped, their_moves = pairing.swap((swapped, moves[1]))
         (joint, *frames, box), moves = plus(own, swapped), plus(moves[0], their_moves)
         self.bars.add({"section_box": box})
@@ -181,18 +184,19 @@ class PairSweep:
         which = (number - link * self.p.k).astype(self.like.dtype)
         return link, lanes([which], (), wide=True)
 
-    def _row(self, row: jax.Array) -> tuple[Callable, int, jax.Array, tuple[RowSide, RowSide]]:
-        """Vertices of a row by number, how many there are, the row behind it, and its sides."""
-        d = self.p.scene.discretization
-        count, behind = d.hull_rings * d.hull_points, jnp.minimum(row + 1, self.p.links)
+    def _row(
+        self, row: jax.Array, table: str, count: int
+    ) -> tuple[Callable, jax.Array, tuple[RowSide, RowSide]]:
+        """Points of a row by number, of a table with so many a row; the row behind; both sides."""
+        behind = jnp.minimum(row + 1, self.p.links)
         first = hull.kind_of(row, self.p.links) * count
 
         def vertex(k: Any) -> tuple[jax.Array, Lanes]:
             number = (first + k).astype(jnp.int32)
-            return number, self.hand("vertex", number, self.lane)
+            return number, self.hand(table, number, self.lane)
 
         one, other = (RowSide(*(self._chain(n, r) for n in RowSide._fields)) for r in (row, behind))
-        return vertex, count, behind, (one, other)
+        return vertex, behind, (one, other)
 
     def _sums(self, count: int, sums_of: Callable) -> Lanes:
         """What all vertices of a row add to `sections.pressure`."""
@@ -202,6 +206,7 @@ class PairSweep:
     def _back(
         self,
         count: int,
+        table: str,
         vertex: Callable,
         live: Lanes,
         sums_of: Callable,
@@ -216,7 +221,7 @@ class PairSweep:
             def compute() -> tuple:
                 number, place = vertex(k)
                 own, sides = one(number, place)
-                self.bars.add({"vertex": own}, number, self.lane)
+                self.bars.add({table: own}, number, self.lane)
                 return plus(carry, sides)
 
             return choose(anywhere(pushes.lane > 0), compute, carry, self.p.size)

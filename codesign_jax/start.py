@@ -7,16 +7,19 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured.assembly import contacts
 from codesign_jax.engines.structured.constants import (
     WorldConstants,
     apply_columns,
+    apply_rows,
     world_constants,
 )
 from codesign_jax.engines.structured.coordinates import reset
 from codesign_jax.engines.structured.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
+from codesign_jax.model.layout import first_on_palm
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status
 
@@ -35,6 +38,7 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     """
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
     deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
+    deep = jnp.maximum(deep, depth_in_palm(scene, fields))
     bad = ~(deep <= fields.constants.limits.penetration)
     # Constants in their ranges have a finite sum, for which XLA writes one loop; as rows of an
     # array they would be one loop each.
@@ -95,6 +99,33 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
         reach = up[:, None, a] + up[None, :, b]
         deepest.append((reach - jnp.sqrt((away**2).sum(0))).reshape(-1, worlds).max(0))
     return jnp.stack(deepest).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of a straight finger with the palm's disc [m], shape (world,).
+
+    By the edges of the hull, or by spheres around the links' middles, see `depth_between`; of the
+    links that may touch the palm.
+    """
+    if not scene.effects.finger_palm:
+        return jnp.full((fields.start.shape[0],), -jnp.inf, fields.start.dtype)
+    hand, kin, _ = _straight(scene.structure, fields)
+    first = first_on_palm(scene.discretization.links) - 1
+    point, radius = hand.centre[:, None], hand.centre[2]
+    if scene.effects.surface == "hull":
+        assert hand.section is not None
+        across = jnp.array([-0.5, 0.5, -0.5, 0.5])[:, None, None, None] * hand.section[3]
+        up = jnp.array([0.0, 0.0, 2.0, 2.0])[:, None, None, None] * hand.centre[2]
+        point = jnp.stack([0.0 * up, across + 0.0 * up, up])
+        radius = jnp.zeros_like(radius)
+    point = kin.origin[:, None] + apply_columns(kin.link[:, :, None], point)
+    local = apply_rows(kin.palm[:, :, None, None], point - kin.place[:, None, None])
+    assert hand.palm_disc is not None
+    above = jnp.stack([local[0], local[1], local[2] - hand.palm_disc[1]])
+    distance, _ = collision.cylinder(hand.palm_disc[:, None, None], above)
+    deepest = (radius - distance)[:, first:]
+    return deepest.reshape(-1, deepest.shape[-1]).max(0)
 
 
 @partial(jax.jit, static_argnums=0)

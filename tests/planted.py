@@ -75,21 +75,14 @@ def chosen(mine, wrong, right, *, wide=True):
     return lanewise(lambda m, w, r: jax.tree.map(partial(jnp.where, m), w, r), mask, wrong, right)
 
 
-class Named(NamedTuple):
-    """What `ContactSet.cone` reads of a set of contacts."""
-
-    scene: object
-    name: str
-
-
 def cone_of(name, other):
     """Contacts of a pair of bodies have the friction cone of another pair."""
 
-    def cone(right, mine, self, read):
-        found = right(self, read)
-        if self.name != name:
+    def cone(right, mine, self, read, pair=""):
+        found = right(self, read, pair)
+        if (pair or self.name) != name:
             return found
-        return chosen(mine, right(Named(self.scene, other), read), found, wide=False)
+        return chosen(mine, right(self, read, other), found, wide=False)
 
     return Fault({}, methods={(ContactSet, "cone"): cone})
 

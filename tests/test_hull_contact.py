@@ -187,12 +187,14 @@ class Dense:
             total = total + w * jac
         return total
 
-    def _add(self, scene, data, jac, normal, gap, friction, share, bodies, ratio=None):
+    def _add(
+        self, scene, data, jac, normal, gap, friction, share, bodies, ratio=None, impedance=None
+    ):
         c = scene.contact
         ratio = c.friction_ratio if ratio is None else ratio
         frame = np.linalg.svd(normal[None])[2]
         frame[0] = normal
-        jac, d = frame @ jac, c.impedance
+        jac, d = frame @ jac, c.impedance if impedance is None else impedance
         r = (1 - d) / d * model.contact_invweight(scene) * bodies / share
         reference = -2 / (d * c.time_constant) * (jac @ data.qvel)
         reference[0] -= gap * d / (d * c.time_constant) ** 2

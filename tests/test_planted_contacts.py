@@ -237,7 +237,7 @@ SPHERES = {
     **PAIRS,
 }
 SURFACES = {"hull": HULL, "spheres": SPHERES}
-STATES = {"main": (1, 1.2, 0.06), "overflow hull": (0, 0.1, 0.04)}
+STATES = {"main": (27, 1.2, 0.06), "overflow hull": (0, 0.1, 0.04)}
 STATES |= {"overflow finger_finger": (0, 1.2, 0.06)}
 """Arguments of `curled`: seed, bend and height [m]. Contacts of every kind, with the hull more than
 `SLOTS` of one kind in the others."""

@@ -1,5 +1,7 @@
 """Preflight: what it refuses without simulating, and that an ordinary start costs no program."""
 
+import dataclasses
+
 import jax
 import mujoco
 import numpy as np
@@ -77,6 +79,34 @@ def test_fingers_overlap_as_deep_as_engines_find():
     found = clearance.between_fingers(the_scene, designs)
     np.testing.assert_allclose(found, exact, atol=1e-12)
     assert np.ptp(found) > 0.003
+
+
+@pytest.mark.parametrize("surface", ["hull", "spheres"])
+def test_fingers_are_as_deep_in_the_palm_as_engines_find(surface):
+    """`start.depth_in_palm`, of random hands with a finger that is mounted into the palm."""
+    overrides = {"effects": {"finger_palm": True, "surface": surface}}
+    overrides["limits"] = {"penetration": 0.002}
+    the_scene = scene.load("paper_spheres", overrides=overrides)
+    inwards = dataclasses.replace(the_scene.hand.finger[0], azimuth=180.0, tilt=-20.0)
+    fingers = (inwards, *the_scene.hand.finger[1:])
+    the_scene = dataclasses.replace(
+        the_scene, hand=dataclasses.replace(the_scene.hand, finger=fingers)
+    )
+    designs = hands(the_scene, 8)
+
+    @jax.jit
+    def depths(designs):
+        fields = jax.vmap(lambda p: model.model_fields(the_scene, p, still()))(designs)
+        return start.depth_in_palm(the_scene, fields), start.invalid_start(the_scene, fields)
+
+    with jax.enable_x64(True):
+        exact, invalid = depths(designs)
+    np.testing.assert_allclose(clearance.in_palm(the_scene, designs), exact, atol=1e-12)
+    exact, invalid = np.asarray(exact), np.asarray(invalid)
+    np.testing.assert_array_equal(invalid != 0, exact > 0.002)
+    report = preflight.check(the_scene, designs, details=False)
+    refused = sum("inside the palm" in line for line in report.refusals)
+    assert refused == (exact > 0.002).sum() > 0
 
 
 def test_an_ordinary_start_needs_no_program(monkeypatch):

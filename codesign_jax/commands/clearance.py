@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model, rollout
-from codesign_jax.model.layout import palm_points
+from codesign_jax.model.layout import first_on_palm, palm_points
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.start import depth
 from codesign_jax.types import Params
@@ -47,21 +47,61 @@ def between_fingers(scene: Scene, designs: Params) -> np.ndarray:
     return np.array([_between(scene, Params(*one)) for one in zip(*designs, strict=True)])
 
 
-def _between(scene: Scene, params: Params) -> float:
-    """`between_fingers` of one design."""
-    links, fingers = scene.discretization.links, scene.hand.finger
+def in_palm(scene: Scene, designs: Params) -> np.ndarray:
+    """Deepest overlap of a finger with the palm's disc at each design's start [m], (design,).
+
+    As `start.depth_in_palm` has it; arguments as in `between_fingers`.
+    """
+    if not scene.effects.finger_palm:
+        return np.zeros(designs.length.shape[0])
+    return np.array([_in_palm(scene, Params(*one)) for one in zip(*designs, strict=True)])
+
+
+def _in_palm(scene: Scene, params: Params) -> float:
+    """`in_palm` of one design."""
+    palm, links = scene.hand.palm, scene.discretization.links
+    point, radius = _middles(scene, params), 0.5 * params.height[:, None]
+    if scene.effects.surface == "hull":
+        base, ahead, across, back = _frames(scene, params)
+        along = np.multiply.outer(params.length, (np.arange(links) + 0.5) / links)
+        axis = base[:, None] + along[..., None] * ahead[:, None]
+        half, up = scene.hand.section.width / 2 * across, params.height[:, None] * back
+        corners = [axis + (s * half + t * up)[:, None] for s in (-1, 1) for t in (0, 1)]
+        point, radius = np.stack(corners), 0.0
+    point = point[..., first_on_palm(links) - 1 :, :]
+    beside = np.hypot(point[..., 0], point[..., 1]) - palm.radius
+    above = np.abs(point[..., 2] - palm.thickness / 2) - palm.thickness / 2
+    outside = np.hypot(np.maximum(beside, 0.0), np.maximum(above, 0.0))
+    distance = outside + np.minimum(np.maximum(beside, above), 0.0)
+    return float((radius - distance).max())
+
+
+def _frames(scene: Scene, params: Params) -> tuple[np.ndarray, ...]:
+    """Base points, and directions along, across and back of the fingers, shape (finger, 3) each."""
+    fingers = scene.hand.finger
     azimuth, tilt = _directions(scene, params)
     cosine, sine = np.cos(azimuth), np.sin(azimuth)
     points = [f.base_point(c, s) for f, c, s in zip(fingers, cosine, sine, strict=True)]
     base = np.column_stack([np.array(points), np.zeros(len(points))])
     ahead = np.stack([np.cos(tilt) * cosine, np.cos(tilt) * sine, -np.sin(tilt)], -1)
     back = np.stack([np.sin(tilt) * cosine, np.sin(tilt) * sine, np.cos(tilt)], -1)
+    return base, ahead, np.stack([-sine, cosine, 0.0 * sine], -1), back
+
+
+def _middles(scene: Scene, params: Params) -> np.ndarray:
+    """Middles of the links of straight fingers in the palm's frame [m], (finger, link, 3)."""
+    links = scene.discretization.links
+    base, ahead, _, back = _frames(scene, params)
     # The last link is half as long as the others.
     place = (np.arange(1, links + 1) - 0.25 * (np.arange(links) == links - 1)) / links
     along = np.multiply.outer(params.length, place)[..., None] * ahead[:, None]
-    middle = (base + 0.5 * params.height[:, None] * back)[:, None] + along
-    deepest = -np.inf
-    for a, b in itertools.combinations(range(len(fingers)), 2):
+    return (base + 0.5 * params.height[:, None] * back)[:, None] + along
+
+
+def _between(scene: Scene, params: Params) -> float:
+    """`between_fingers` of one design."""
+    middle, deepest = _middles(scene, params), -np.inf
+    for a, b in itertools.combinations(range(scene.num_fingers), 2):
         away = np.linalg.norm(middle[a][:, None] - middle[b][None], axis=-1)
         deepest = max(deepest, 0.5 * (params.height[a] + params.height[b]) - away.min())
     return float(deepest)

@@ -221,6 +221,13 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
                 f"(limits.penetration = {1e3 * limit:g} mm); spread them, mount them further "
                 "apart, or set effects.finger_finger = false"
             )
+    for name, deep in zip(names, clearance.in_palm(scene, designs), strict=True):
+        if not deep <= limit:
+            found.append(
+                f"{name}: a finger starts {1e3 * deep:.0f} mm inside the palm "
+                f"(limits.penetration = {1e3 * limit:g} mm); mount it further out or tilt it "
+                "further down, or set effects.finger_palm = false"
+            )
     return found
 
 

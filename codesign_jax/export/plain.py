@@ -129,7 +129,7 @@ def _absorb(scene: Scene, pair: mujoco.MjsPair, ratio: float) -> bool:
       pair: The pair.
       ratio: Declared over compiled inverse weight.
     """
-    d, tau = scene.contact.impedance, scene.contact.time_constant
+    d, tau = float(pair.solimp[0]), scene.contact.time_constant
     softness = (1 - d) / d * ratio
     if not _SOFTNESS[0] <= softness <= _SOFTNESS[1]:
         return False

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from codesign_jax.model import hull
+from codesign_jax.model.layout import first_on_palm, palm_impedance
 from codesign_jax.model.spec import SOLIMP
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
@@ -94,6 +95,10 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
             _pair(scene, spec, (name, "object_0"), scene.objects.object[0].friction)
         if e.finger_table:
             _pair(scene, spec, ("table", name), c.finger_table_friction)
+        row = int(name.split("_")[3])
+        if e.finger_palm and row >= first_on_palm(scene.discretization.links):
+            how = (name, "palm_disc"), c.finger_palm_friction, palm_impedance(scene)
+            _pair(scene, spec, *how)
     if e.finger_finger:
         _boxes(scene, spec, params)
     return shares
@@ -119,10 +124,17 @@ def _boxes(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
             _pair(scene, spec, (first, second), scene.contact.finger_finger_friction)
 
 
-def _pair(scene: Scene, spec: mujoco.MjSpec, geoms: tuple[str, str], friction: float) -> None:
+def _pair(
+    scene: Scene,
+    spec: mujoco.MjSpec,
+    geoms: tuple[str, str],
+    friction: float,
+    impedance: float | None = None,
+) -> None:
     """A contact pair as `model.build_spec` has them; the hull has no torsional friction."""
     c = scene.contact
+    d = c.impedance if impedance is None else impedance
     condim = 1 if scene.effects.friction == "none" else 3
     pair = spec.add_pair(geomname1=geoms[0], geomname2=geoms[1], condim=condim)
     pair.friction = [friction, friction, c.torsional_friction, *[c.rolling_friction] * 2]
-    pair.solref, pair.solimp = [c.time_constant, 1.0], [c.impedance, c.impedance, *SOLIMP]
+    pair.solref, pair.solimp = [c.time_constant, 1.0], [d, d, *SOLIMP]

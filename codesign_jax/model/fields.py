@@ -17,6 +17,7 @@ from codesign_jax.model.layout import (
     mounts,
     object_quat,
     object_size,
+    palm_impedance,
     palm_points,
     wrist_springs,
 )
@@ -218,16 +219,18 @@ def _pair_kinds(scene: Scene) -> np.ndarray:
         touched = np.isin(lay.object_geoms, pair)
         if 0 in pair:  # the table
             kinds[i] = shapes if touched.any() else shapes + 1
+        elif np.isin(lay.disc, pair).any():
+            kinds[i] = shapes + 3
         else:
             kinds[i] = np.argmax(touched) if touched.any() else shapes + 2
     return kinds
 
 
 def _frictions(scene: Scene) -> jax.Array:
-    """Coefficients of the hand on each shape, table on object, table on hand, between fingers."""
+    """Coefficients of the hand on each shape; table on object and on hand; fingers, and on palm."""
     shapes, c = [shape.friction for shape in scene.objects.object], scene.contact
     rest = [scene.objects.table.friction, c.finger_table_friction, c.finger_finger_friction]
-    return jnp.stack([*shapes, *rest])
+    return jnp.stack([*shapes, *rest, c.finger_palm_friction])
 
 
 def _pairs(scene: Scene, dtype: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -236,8 +239,11 @@ def _pairs(scene: Scene, dtype: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
     slide = _frictions(scene)[kinds]
     spin, roll = (v + 0 * slide for v in (c.torsional_friction, c.rolling_friction))
     solref = jnp.stack([c.time_constant, jnp.ones((), dtype)])
-    solimp = jnp.stack([c.impedance, c.impedance, *(jnp.asarray(v, dtype) for v in SOLIMP)])
-    solref, solimp = (jnp.broadcast_to(v, (len(kinds), v.size)) for v in (solref, solimp))
+    solref = jnp.broadcast_to(solref, (len(kinds), 2))
+    on_palm = kinds == len(scene.objects.object) + 3
+    impedance = jnp.where(on_palm, palm_impedance(scene), c.impedance)
+    rest = [jnp.broadcast_to(jnp.asarray(v, dtype), len(kinds)) for v in SOLIMP]
+    solimp = jnp.stack([impedance, impedance, *rest], -1)
     return jnp.stack([slide, slide, spin, roll, roll], -1), solref, solimp
 
 
@@ -274,6 +280,8 @@ def _sphere_positions(scene: Scene, params: Params, extents: jax.Array) -> list[
     """Spheres spread evenly over each moving link, tangent to the bottom layer, and the palm's."""
     lay = layout(scene)
     parts: list[tuple] = [(lay.palm, palm_points(scene))] if lay.palm.size else []
+    if lay.disc.size:
+        parts.append(((lay.disc, 2), jnp.asarray(scene.hand.palm.thickness) / 2))
     if not lay.spheres.size:
         return parts
     along = morphology.sphere_places(extents, lay.spheres.shape[2])
@@ -289,17 +297,24 @@ def _geom_fields(
     sizes: list[tuple] = []
     radii: list[tuple] = []
     boxes: list[tuple] = []
-    spheres = [(lay.palm, scene.hand.palm.contact_radius)] if lay.palm.size else []
+    palm = scene.hand.palm
+    spheres = [(lay.palm, palm.contact_radius)] if lay.palm.size else []
     if lay.spheres.size:
         spheres.append((lay.spheres, params.height[:, None, None] / 2))
     for where, radius in spheres:
         sizes.append(((where, 0), radius))
         radii.append((where, radius))
         boxes.append(((where, slice(3, None)), jnp.asarray(radius)[..., None]))
-    for i, shape in enumerate(scene.objects.object):
-        g = lay.object_geoms[i]
-        radius, half = geom_bounds(shape.type, size[i])
-        sizes.append((g, size[i]))
+    solids = [
+        (g, s.type, size[i])
+        for i, (g, s) in enumerate(zip(lay.object_geoms, scene.objects.object, strict=True))
+    ]
+    if lay.disc.size:
+        disc = jnp.stack([jnp.asarray(v) for v in (palm.radius, palm.thickness / 2, 0.0)])
+        solids.append((lay.disc[0], "cylinder", disc))
+    for g, kind, extent in solids:
+        radius, half = geom_bounds(kind, extent)
+        sizes.append((g, extent))
         radii.append((g, radius))
         boxes.append(((g, slice(3, None)), half))
     return filled("geom_size", *sizes), filled("geom_rbound", *radii), filled("geom_aabb", *boxes)

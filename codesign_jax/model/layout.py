@@ -4,6 +4,7 @@ Both ways to a model use it: `spec` compiles one hand with MuJoCo, `fields` comp
 them.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -39,6 +40,7 @@ class Layout(NamedTuple):
       spheres: Geom ids of the finger spheres, shape (finger, N, k); empty without finger contacts.
       object_geoms: Geom ids of the object's shapes, shape (shape,).
       palm: Geom ids of the palm's contact spheres, shape (sphere,); empty without palm contacts.
+      disc: Geom id of the palm's disc, which fingers touch, shape (1,); empty without that effect.
       centre_weights: Weight of each body in the hand centre, the mean position of the segments,
         (nbody,).
     """
@@ -52,6 +54,7 @@ class Layout(NamedTuple):
     spheres: np.ndarray
     object_geoms: np.ndarray
     palm: np.ndarray
+    disc: np.ndarray
     centre_weights: np.ndarray
 
 
@@ -69,10 +72,12 @@ def layout(scene: Scene) -> Layout:
     bodies = stubs[:, None] + 1 + np.arange(links)
     dofs = 6 + np.arange(n * links * len(axes)).reshape(n, links, len(axes))
     e = scene.effects
-    touching = e.surface == "spheres" and (e.finger_object or e.finger_table or e.finger_finger)
+    own = e.finger_object or e.finger_table or e.finger_finger or e.finger_palm
+    touching = e.surface == "spheres" and own
     k = scene.discretization.spheres_per_link if touching else 0
     palm = 1 + np.arange(len(_PALM_RING) if palm_touches(scene) else 0)
-    first = 1 + len(palm)
+    disc = 1 + len(palm) + np.arange(int(e.finger_palm))
+    first = 1 + len(palm) + len(disc)
     spheres = first + np.arange(n * links * k).reshape(n, links, k)
     shapes = first + n * links * k + np.arange(len(scene.objects.object))
     weights = np.zeros(3 + n * (links + 1))
@@ -81,10 +86,10 @@ def layout(scene: Scene) -> Layout:
     last = len(weights) - 1
     # One width in every precision: JAX keeps what it made of a NumPy array, and an array of int64
     # that was met with jax_enable_x64 is an error without.
-    stubs, bodies, dofs, spheres, shapes, palm = (
-        v.astype(np.int32) for v in (stubs, bodies, dofs, spheres, shapes, palm)
+    stubs, bodies, dofs, spheres, shapes, palm, disc = (
+        v.astype(np.int32) for v in (stubs, bodies, dofs, spheres, shapes, palm, disc)
     )
-    return Layout(links, axes, stubs, bodies, last, dofs, spheres, shapes, palm, weights)
+    return Layout(links, axes, stubs, bodies, last, dofs, spheres, shapes, palm, disc, weights)
 
 
 # Implicit inertia of a wrist joint without compliance [kg, kg m^2]: forces of the hand, of at most
@@ -144,9 +149,29 @@ def contact_invweight(scene: Scene) -> Any:
     return 1.0 / ((1.0 - c.impedance) * c.time_constant**2 * 2.0 * c.normal_stiffness)
 
 
+def palm_impedance(scene: Scene) -> Any:
+    """Impedance d_p at which contacts of fingers with the palm have a stiffness of their own.
+
+    With the declared weights and the time constant of all contacts the normal stiffness is
+    proportional to 1 / (1 - d), see `contact_invweight`.
+    """
+    c = scene.contact
+    return 1.0 - (1.0 - c.impedance) * c.normal_stiffness / c.finger_palm_stiffness
+
+
 def palm_touches(scene: Scene) -> bool:
     """Whether an effect calls for the palm's contact spheres."""
     return scene.effects.palm_object or scene.effects.palm_table
+
+
+PALM_FROM = 0.25
+"""Share of a finger's length from its base that is not tested against the palm, to which it is
+fixed."""
+
+
+def first_on_palm(links: int) -> int:
+    """The first of a finger's links that may touch the palm; link 0 is the half one at its base."""
+    return math.ceil(PALM_FROM * links)
 
 
 _PALM_RING = ((0, 0), (1, 0), (0, 1), (-1, 0), (0, -1))

@@ -15,11 +15,13 @@ from codesign_jax.model.layout import (
     RIGID,
     WRIST,
     contact_invweight,
+    first_on_palm,
     implicit_damping,
     layout,
     mounts,
     object_quat,
     object_size,
+    palm_impedance,
     palm_points,
     palm_touches,
     wrist_springs,
@@ -177,7 +179,7 @@ def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
     if palm_touches(scene):
         for i, point in enumerate(np.asarray(palm_points(scene))):
             _sphere(body, f"palm_{i}", point, p.contact_radius)
-    if visual:
+    if visual or scene.effects.finger_palm:
         kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, [p.radius, p.thickness / 2, 0]
         pos = [0, 0, p.thickness / 2]
         body.add_geom(
@@ -299,12 +301,12 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
     palm = [f"palm_{i}" for i in range(len(lay.palm))]
     condim = {"none": 1, "coulomb": 3, "full": 6}[e.friction]
 
-    def add(first: str, second: str, friction: float) -> None:
+    def add(first: str, second: str, friction: float, impedance: float = c.impedance) -> None:
         pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim)
         spin, roll = c.torsional_friction, c.rolling_friction
         pair.friction = [friction, friction, spin, roll, roll]
         pair.solref = [c.time_constant, 1.0]
-        pair.solimp = [c.impedance, c.impedance, *SOLIMP]
+        pair.solimp = [impedance, impedance, *SOLIMP]
 
     for i, shape in enumerate(scene.objects.object):
         if e.object_table:
@@ -317,3 +319,7 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
         for first, second in itertools.combinations(fingers, 2):
             if first.split("_")[1] != second.split("_")[1]:
                 add(first, second, c.finger_finger_friction)
+    if e.finger_palm:
+        for name in fingers:
+            if int(name.split("_")[3]) >= first_on_palm(lay.links):
+                add(name, "palm_disc", c.finger_palm_friction, palm_impedance(scene))

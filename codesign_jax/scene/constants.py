@@ -127,7 +127,7 @@ def with_trial(scene: Scene, trial: Trial) -> Scene:
 def _with_friction(c: Constants, factor: Any) -> Constants:
     shapes = tuple(_scaled(shape, factor, "friction") for shape in c.objects.object)
     table = _scaled(c.objects.table, factor, "friction")
-    names = "finger_table_friction", "finger_finger_friction"
+    names = "finger_table_friction", "finger_finger_friction", "finger_palm_friction"
     contact = _scaled(c.contact, factor, *names)
     return c._replace(objects=c.objects._replace(object=shapes, table=table), contact=contact)
 

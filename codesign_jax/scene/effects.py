@@ -46,6 +46,7 @@ EFFECTS: Mapping[str, Effect] = {
     "palm_table": Effect("the palm touches the table"),
     "object_table": Effect("the object rests on the table"),
     "finger_finger": Effect("fingers touch one another"),
+    "finger_palm": Effect("fingers touch the palm's disc"),
     "surface": Effect(
         "the fingers' contact points: spheres, or the vertices of the skinned hull",
         {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},

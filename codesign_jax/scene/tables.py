@@ -25,6 +25,7 @@ class Effects:
     palm_table: bool = True
     object_table: bool = True
     finger_finger: bool = False
+    finger_palm: bool = False
     surface: str = choice("spheres", "hull", default="spheres")
     friction: str = choice("none", "coulomb", "full", default="coulomb")
     disturb: bool = True
@@ -116,8 +117,11 @@ class Contact:
         `effects.friction = "full"`.
       finger_finger_friction: Coulomb coefficient of fingers on fingers, only with
         `effects.finger_finger`.
-      finger_finger_friction_ratio: `friction_ratio` of the hulls of fingers on one another; spheres
-        have that of all contacts.
+      finger_finger_friction_ratio: `friction_ratio` of the hulls of fingers on one another and on
+        the palm; spheres have that of all contacts.
+      finger_palm_friction: Coulomb coefficient of fingers on the palm, only with
+        `effects.finger_palm`.
+      finger_palm_stiffness: As `normal_stiffness`, of fingers on the palm.
     """
 
     normal_stiffness: float = quantity("N/m", 10, 1e6)
@@ -129,6 +133,8 @@ class Contact:
     rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
     finger_finger_friction: float = quantity("", 0, 5, default=0.8)
     finger_finger_friction_ratio: float = quantity("", 0.01, 1000, default=1.0)
+    finger_palm_friction: float = quantity("", 0, 5, default=0.8)
+    finger_palm_stiffness: float = quantity("N/m", 10, 1e6, default=20e3)
 
 
 @dataclasses.dataclass(frozen=True)

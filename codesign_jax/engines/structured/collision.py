@@ -168,7 +168,8 @@ def _box(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(is_out, length, deepest), sign * gradient
 
 
-def _cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+def cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Signed distance of points (3, ...) from a cylinder (radius, half height), and gradient."""
     radial = jnp.sqrt(p[0] ** 2 + p[1] ** 2 + _TINY**2)
     sign = jnp.where(p[2] < 0, -1.0, 1.0).astype(p.dtype)
     side, cap = radial - size[0], jnp.abs(p[2]) - size[1]
@@ -299,7 +300,7 @@ class ShapeFunctions(NamedTuple):
 
 SHAPES = {
     "box": ShapeFunctions(_box, _box_corners),
-    "cylinder": ShapeFunctions(_cylinder, _rim_points),
+    "cylinder": ShapeFunctions(cylinder, _rim_points),
     "capsule": ShapeFunctions(_capsule, _cap_points),
     "sphere": ShapeFunctions(_sphere, _lowest_point),
 }

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.contact import Cone
 from codesign_jax.model import contact_invweight
+from codesign_jax.model.layout import palm_impedance
 from codesign_jax.scene import Scene
 
 
@@ -19,12 +20,14 @@ class Cones(NamedTuple):
       hand_table: Fingers, hull or palm on the table.
       object_table: The object on the table.
       finger_finger: Fingers on one another.
+      finger_palm: Fingers on the palm's disc.
     """
 
     hand_object: Cone | None
     hand_table: Cone | None
     object_table: Cone | None
     finger_finger: Cone | None
+    finger_palm: Cone | None
 
 
 def which_cone(pair: str) -> str:
@@ -34,7 +37,9 @@ def which_cone(pair: str) -> str:
     return "hand_object" if pair.endswith("_object") else "hand_table"
 
 
-def make_cone(scene: Scene, friction: Any, *, bodies: int, impratio: Any = None) -> Cone:
+def make_cone(
+    scene: Scene, friction: Any, *, bodies: int, impratio: Any = None, impedance: Any = None
+) -> Cone:
     """MuJoCo's contact parameters for constant impedance (its Computation chapter).
 
     Args:
@@ -42,15 +47,18 @@ def make_cone(scene: Scene, friction: Any, *, bodies: int, impratio: Any = None)
       friction: Coulomb coefficient.
       bodies: Bodies other than the world in the contact, whose declared inverse weights add.
       impratio: MuJoCo's impratio, by default `contact.friction_ratio`.
+      impedance: By default `contact.impedance`.
     """
     c = scene.contact
     impratio = c.friction_ratio if impratio is None else impratio
-    regularizer = (1.0 - c.impedance) / c.impedance * contact_invweight(scene) * bodies
+    impedance = c.impedance if impedance is None else impedance
+    regularizer = (1.0 - impedance) / impedance * contact_invweight(scene) * bodies
+    reference = _reference(scene, impedance)
     if scene.effects.friction == "none":
-        return Cone(1.0 / regularizer, None, None, None, *_reference(scene))
+        return Cone(1.0 / regularizer, None, None, None, *reference)
     ratio = friction / jnp.sqrt(impratio)
     tangent = impratio / regularizer
-    cone = Cone(1.0 / regularizer, tangent, friction, ratio, *_reference(scene))
+    cone = Cone(1.0 / regularizer, tangent, friction, ratio, *reference)
     if scene.effects.friction != "full":
         return cone
     least = jnp.maximum(friction, 1e-5)  # MuJoCo's mjMINMU
@@ -76,11 +84,15 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
         hand_table=one(c.finger_table_friction) if e.finger_table or e.palm_table else None,
         object_table=one(scene.objects.table.friction) if e.object_table else None,
         finger_finger=two(c.finger_finger_friction, impratio=between) if e.finger_finger else None,
+        finger_palm=(
+            two(c.finger_palm_friction, impratio=between, impedance=palm_impedance(scene))
+            if e.finger_palm
+            else None
+        ),
     )
 
 
-def _reference(scene: Scene) -> tuple[Any, Any]:
+def _reference(scene: Scene, impedance: Any) -> tuple[Any, Any]:
     """Spring and damper coefficients of aref."""
-    c = scene.contact
-    spring = 1.0 / (c.impedance * c.time_constant) ** 2 * c.impedance
-    return spring, 2.0 / (c.impedance * c.time_constant)
+    time = scene.contact.time_constant
+    return 1.0 / (impedance * time) ** 2 * impedance, 2.0 / (impedance * time)

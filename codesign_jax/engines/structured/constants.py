@@ -40,6 +40,8 @@ class WorldConstants(NamedTuple):
       palm_point: Centres of the palm's contact spheres in the palm frame, shape (3, sphere, world);
         empty without palm contacts.
       palm_radius: Their radii, shape (sphere, world).
+      palm_disc: Radius and half the thickness of the palm's disc, shape (2, 1, world); None without
+        the effect `finger_palm`.
       wrist_stiffness: Stiffness of the wrist's springs, shape (6, 1, world).
       wrist_damping: Damping with the implicit term, shape (6, 1, world).
       wrist_armature: Armature with the implicit terms, shape (6, 1, world).
@@ -85,6 +87,7 @@ class WorldConstants(NamedTuple):
     bounds: Bounds
     gravity: jax.Array | None = None
     section: jax.Array | None = None
+    palm_disc: jax.Array | None = None
 
 
 def rotation_columns(quat: jax.Array) -> jax.Array:
@@ -190,6 +193,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
         bounds=bounds(numbers),
         gravity=-fields.gravity[None, :, 2] if scene.effects.gravity else None,
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
+        palm_disc=last(fields.geom_size[:, lay.disc[0], :2])[:, None] if lay.disc.size else None,
     )
 
 

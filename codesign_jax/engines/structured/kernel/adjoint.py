@@ -81,6 +81,8 @@ class AdjointProgram(Program):
         more |= {f"bar.{k}": (1, shape) for k, shape in STEP.items()}
         if any(isinstance(s, PairSet) for s in self.sets):
             more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in Place._fields}
+        if self.scene.effects.finger_palm:
+            more |= {f"palmbar.{k}": (1, getattr(SHAPES, k)) for k in Place._fields}
         self.scratch = MemoryLayout.by_item(True, **(self.scratch.groups | more))
         self.world_bars = MemoryLayout(True, **self.world.groups)
 

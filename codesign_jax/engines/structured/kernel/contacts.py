@@ -85,9 +85,9 @@ class ContactSet:
         """The set's part of the table of the worlds' constants."""
         return {f"cone.{which_cone(self.name)}": (1, (len(CONE[self.scene.effects.friction]),))}
 
-    def cone(self, read: Callable[[str], Lanes]) -> Cone:
-        """Contact parameters, lanes of a world each; `read` as in `bind`."""
-        numbers = read(f"cone.{which_cone(self.name)}")
+    def cone(self, read: Callable[[str], Lanes], pair: str = "") -> Cone:
+        """Contact parameters of the set's pair of bodies or another, lanes of a world each."""
+        numbers = read(f"cone.{which_cone(pair or self.name)}")
         return cone_of(self.scene.effects.friction, numbers)
 
     @staticmethod

@@ -130,7 +130,7 @@ class Coupling:
             fields = {"first": change, "left": left, "along": none, "moved": none, "sum": none}
             for field, value in fields.items():
                 pairs.write(field, value, item)
-            pairs.load(item, own, left)
+            pairs.load(item, own, left, pairing)
 
         pairs.do(store)
 
@@ -148,12 +148,11 @@ class Coupling:
             answer = pairs.relative(item, pairing)
             pairs.write("answer", answer, item)
 
-            def both(sums, left, answer, force):
-                # A contact lies on two lanes: each counts half of it.
-                product, stiff = (0.5 * sum_axis(dot(v, answer), 0) for v in (left, force))
+            def both(sums, half, left, answer, force):
+                product, stiff = (half * sum_axis(dot(v, answer), 0) for v in (left, force))
                 return [sums[0] + product, sums[1] + product + stiff]
 
-            return lanewise(both, sums, left, answer, pairs.stiff(hessian, answer))
+            return lanewise(both, sums, pairing.half, left, answer, pairs.stiff(hessian, answer))
 
         sums = pairs.each(add, [zeros((), self.problem.like)] * 2)
         size, bent = (self.block.fold(v.lane, jnp.add) for v in sums)
@@ -186,8 +185,12 @@ class Coupling:
             left = lanewise(lambda a, r, f: r - a * f, alpha, left, stiff)
             for name, value in zip(("left", *names[2:]), (left, along, moved, total_), strict=True):
                 pairs.write(name, value, item)
-            pairs.load(item, own, left)
-            return lanewise(lambda g, a, b: g + 0.5 * sum_axis(dot(a, b), 0), gain, along, first)
+            pairs.load(item, own, left, pairing)
+
+            def add(gain, half, along, first):
+                return gain + half * sum_axis(dot(along, first), 0)
+
+            return lanewise(add, gain, pairing.half, along, first)
 
         gain = pairs.each(store, zeros((), self.problem.like))
         return self.block.fold(gain.lane, jnp.add)
@@ -199,7 +202,7 @@ class Coupling:
 
         def store(item: Any, pairing: Pairing) -> None:
             value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, pairs.read("sum", item))
-            pairs.load(item, pairs.own_side(item), value)
+            pairs.load(item, pairs.own_side(item), value, pairing)
 
         pairs.do(store)
         return self.again()

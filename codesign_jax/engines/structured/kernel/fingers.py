@@ -1,10 +1,10 @@
-"""Finds where fingers touch: spheres, or the hull's vertices and other fingers' sections.
+"""Finds where fingers touch each other and the palm: spheres, or the hull's vertices.
 
 A vertex of the hull touches another finger's row (the stretch between the middles of two links)
 where it stands inside the row's section, whose frame turns from one link's to the other's along
 the row: rows neither overlap nor leave gaps, however the finger bends.  Both fingers' vertices
 are tried, each with half its share of the surface.  All vertices of a row that stand in the same
-row of another finger are one contact, see `sections.pressure`.
+row of another finger are one contact, see `sections.pressure`; so are those in the palm's disc.
 """
 
 from collections.abc import Callable
@@ -21,6 +21,7 @@ from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.model.layout import first_on_palm
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
@@ -37,9 +38,12 @@ def fields(links: int, spheres: int) -> dict[str, tuple[int, tuple[int, ...]]]:
 class Search:
     """Gives a slot to each contact between fingers."""
 
-    def __init__(self, step: "Step", pairs: BoundPairs):
-        """Takes a step's memory."""
+    def __init__(self, step: "Step", pairs: BoundPairs, at: dict[str, Any]):
+        """Takes a step's memory and geometry, see `Step`."""
         self.step, self.pairs, self.p = step, pairs, step.p
+        self.moves, self.palm = (at["now"].palm_motion, at["vel"]), ()
+        if pairs.set.palm:
+            self.palm = at["place"], at["frame"], step.constant("palm_disc")
         self.scratch, self.ref, self.block = step.p.scratch, step.scratch, step.block
         self.like = jnp.zeros((step.p.size,), step.finger_state.dtype)
 
@@ -70,16 +74,18 @@ class Search:
             self.write("sphere", lanewise(ball, origin, frame, sphere, radius), i * self.p.k + a)
 
     def _side(self, row: Any, motion: Lanes, vel: Lanes, frame: Lanes, joint: Lanes) -> None:
-        self.pairs.put("motion", motion, row)
-        self.pairs.put("vel", vel, row)
+        for name, value, palm in zip(("motion", "vel"), (motion, vel), self.moves, strict=True):
+            self.pairs.put(name, self.pairs.beside_palm(value, palm), row)
         if not self.p.k:
             self.write("frame", frame, row)
             self.write("joint", joint, row)
 
     def find(self) -> None:
-        """Looks at all pairs of fingers."""
+        """Looks at all pairs of fingers, and at the palm."""
         if not self.p.k:
             self._balls()
+        if self.palm:
+            (self._spheres_on_palm if self.p.k else self._rows_on_palm)()
 
         def pairing(row: jax.Array, x: jax.Array) -> jax.Array:
             pairing = self.pairs.pairing(row)
@@ -89,7 +95,60 @@ class Search:
             (self._spheres if self.p.k else self._rows)(row, pairing, there, first)
             return x
 
-        jax.lax.fori_loop(0, self.pairs.set.rows, pairing, jnp.int32(0))
+        jax.lax.fori_loop(int(self.pairs.set.palm), self.pairs.set.rows, pairing, jnp.int32(0))
+
+    # The palm
+
+    def _spheres_on_palm(self) -> None:
+        """Enters contacts of spheres."""
+        first = (first_on_palm(self.p.links) - 1) * self.p.k
+
+        def one(j: Any) -> None:
+            number, ball = j + first, self.read("sphere", j + first)
+            mine, _ = lanewise(sections.ball_on_palm, ball, self.palm)
+            row = jax.lax.div(number, jnp.asarray(self.p.k, number.dtype)) + 1
+            self._enter_on_palm(mine, row, number)
+
+        each(self.p.links * self.p.k - first, one)
+
+    def _rows_on_palm(self) -> None:
+        """Enters one contact of all vertices of a row."""
+        first, d = first_on_palm(self.p.links), self.p.scene.discretization
+        count = d.hull_rings * d.hull_points
+
+        def one(i: Any) -> None:
+            row, ball = i + first, self.read("ball", i + first)
+
+            def vertices() -> None:
+                links, kind = self._links(row), hull.kind_of(row, self.p.links)
+
+                def add(k: Any, sums: Lanes) -> Lanes:
+                    vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
+                    ends = lanewise(sections.on_palm, vertex, links, self.palm)
+                    return lanewise(sections.add_vertex, sums, *ends)
+
+                sums = loop(count, add, zeros((sections.SUMS,), self.like), self.block.size)
+                self._enter_on_palm(lanewise(sections.pressure, sums)[0], row)
+
+            (_, _, near), _ = lanewise(sections.ball_on_palm, ball, self.palm)
+            any_of(near.lane < 0, vertices)
+
+        each(self.p.links + 1 - first, one)
+
+    def _enter_on_palm(self, place: tuple, row: Any, sphere: Any = 0) -> None:
+        """Gives a slot to a contact with the palm, whose motion the sides' are relative to."""
+        pairs = self.pairs
+        which = (place[2].lane < 0) & (self.block.finger < self.p.num_fingers)
+
+        def enter() -> None:
+            moves = [pairs.side(name, row) for name in ("motion", "vel")]
+            with pairs.with_cone(0):
+                fields = pairs.begin(place, *moves)
+            number = lanes([self.like + jnp.asarray(row, self.like.dtype)], (1, 1), wide=True)
+            fields |= {"row": number} | pairs.remembered({"owner": 1.0, "sphere": sphere})
+            pairs.add(0, which, fields, self.block.lane)
+
+        any_of(which, enter)
 
     # Spheres
 
@@ -194,11 +253,10 @@ class Search:
           other: Links of their partners' row, its size, and whether it is the last one.
           rows: Numbers of both rows.
         """
-        d = self.p.scene.discretization
-        count, (links, kind), (theirs, size, last) = d.hull_rings * d.hull_points, own, other
+        count, (links, kind), (theirs, size, last) = hull.pair_points(self.p.scene), own, other
 
         def add(k: Any, sums: Lanes) -> Lanes:
-            vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
+            vertex = self.p.hand.read(self.step.hand, "pair_vertex", kind * count + k)
             end = lanes([last], (), wide=True)
             ends = lanewise(sections.inside, vertex, links, theirs, size, end)
             return lanewise(sections.add_vertex, sums, *ends)
@@ -249,7 +307,8 @@ class Search:
             value = relative(motion) - a.reference(relative(vel))
             return value, -value, jnp.zeros_like(value)
 
-        mine, theirs, none = lanewise(jar, ends[0], ends[1], pairs.cone, moves[0], moves[1])
+        cone = pairs.of_row(row)
+        mine, theirs, none = lanewise(jar, ends[0], ends[1], cone, moves[0], moves[1])
         kept = [
             dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
             for place, value in zip(ends, (mine, theirs), strict=True)

@@ -16,6 +16,7 @@ from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, any_of
 from codesign_jax.engines.structured.lanes import contract, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.model import hull as mesh
 from codesign_jax.scene import Scene
 
 if TYPE_CHECKING:
@@ -43,7 +44,77 @@ class Side(NamedTuple):
 def fields(scene: Scene) -> dict[str, tuple[int, tuple[int, ...]]]:
     """The hull's part of the hand's table: vertices (place, weight, share) and balls."""
     k = scene.discretization.hull_rings * scene.discretization.hull_points
-    return {"vertex": (KINDS * k, (5,)), "ball": (KINDS, (2,)), "section_box": (1, (3,))}
+    found = {"vertex": (KINDS * k, (5,)), "ball": (KINDS, (2,)), "section_box": (1, (3,))}
+    if scene.effects.finger_finger:
+        found["pair_vertex"] = (KINDS * pair_points(scene), (8,))
+    return found
+
+
+def pair_points(scene: Scene) -> int:
+    """Points of a row that are tried in other fingers: twice as many a ring as the mesh has."""
+    return 2 * scene.discretization.hull_rings * scene.discretization.hull_points
+
+
+RIM = 2.0**-0.25
+"""Where the tip's cap is as steep as it is flat, in units of half a segment and half a section."""
+
+
+def pair_vertices(scene: Scene, section: jax.Array) -> jax.Array:
+    """Points on the outline that fingers have for one another, see `sections.inside`.
+
+    Rings of points in the directions of the hull's outline, on |y/a|^4 + |z/b|^4 = 1 about the
+    section's middle, with a and b half the width and the height; towards the tip + |x/c|^4 over the
+    last half segment c.
+
+    Args:
+      scene: The scene.
+      section: Height, wall, segment and width, shape (4, finger, world).
+
+    Returns:
+      Place, outward normal, weight and share of the surface, shape (KINDS * k, 8, finger, world).
+    """
+    rings, points = scene.discretization.hull_rings, 2 * scene.discretization.hull_points
+    outline, _ = mesh.outline(points)
+    unit = 2.0 * outline - np.array([0.0, 1.0])
+    unit = unit / (unit**4).sum(1, keepdims=True) ** 0.25
+    height, _, segment, width = section
+    half = jnp.stack([width, height]) / 2.0
+    around = unit[..., None, None] * half
+    ahead = jnp.roll(around, -1, 0) - around
+    side = jnp.sqrt(ahead[:, 0] ** 2 + ahead[:, 1] ** 2)
+    arc = 0.5 * (side + jnp.roll(side, 1, 0))
+    area = 0.5 * (around[:, 0] * ahead[:, 1] - around[:, 1] * ahead[:, 0]).sum(0)
+    weight = np.arange(1, rings + 1) / rings
+    # Places from the joint in half segments: of a link, of the last one, and of the tip's rings.
+    cap = np.where(weight > 0.5, np.minimum(2 * weight - 1, RIM), 2 * weight - 1)
+    cap[-1] = RIM
+    scale = RIM * np.arange(rings, -1, -1) / rings
+    bounds = np.concatenate([scale[:1], (scale[:-1] + scale[1:]) / 2, [0.0]]) ** 2
+    band = (bounds[:-1] - bounds[1:]) / points
+    reach = (1.0 - scale[1:] ** 4) ** 0.25
+    ends = np.concatenate([[-1 / rings - 1 if rings == 1 else 2 / rings - 1 - 2 / rings], cap])
+    gaps = np.diff(ends)
+    length = np.append((gaps[:-1] + gaps[1:]) / 2, gaps[-1] / 2)
+    shrunk = (1.0 - np.maximum(cap, 0.0) ** 4) ** 0.25
+    kinds = (
+        (2 * weight - 1, weight, 1.0 + 0 * weight, 2.0 / rings + 0 * weight, 0 * weight),
+        (cap, (cap + 1) / 2, shrunk, length, np.where(weight == 1, band[0], 0.0)),
+        (reach, 0 * weight, scale[1:], 0 * weight, band[1:]),
+    )
+    found = []
+    for number, kind in enumerate(kinds):
+        for at, follows, size, along, share in zip(*kind, strict=True):
+            steep = max(at, 0.0) ** 3 if number else 0.0
+            across, up = size * around[:, 0], size * around[:, 1]
+            one = jnp.ones_like(across)
+            normal = [one * steep / segment * 2.0]
+            normal += [(size * unit[:, i, None, None]) ** 3 / half[i] for i in (0, 1)]
+            long = jnp.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+            surface = size * arc * along * segment / 2.0 + one * share * area
+            place = [one * at * segment / 2.0, across, up + half[1]]
+            rest = [n / long for n in normal]
+            found.append(jnp.stack([*place, *rest, one * follows, surface / width**2], 1))
+    return jnp.concatenate(found)
 
 
 def pack(scene: Scene, hand: WorldConstants) -> dict[str, jax.Array]:
@@ -65,7 +136,10 @@ def pack(scene: Scene, hand: WorldConstants) -> dict[str, jax.Array]:
     assert hand.section is not None
     height, _, segment, width = hand.section
     box = 0.5 * jnp.stack([width, height, segment])
-    return {"vertex": vertex, "ball": ball, "section_box": box[None]}
+    found = {"vertex": vertex, "ball": ball, "section_box": box[None]}
+    if scene.effects.finger_finger:
+        found["pair_vertex"] = pair_vertices(scene, hand.section)
+    return found
 
 
 def kind_of(row: Any, links: int) -> Any:

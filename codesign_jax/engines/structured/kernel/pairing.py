@@ -6,19 +6,27 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.memory import Block, solid
+from codesign_jax.engines.structured.lanewise import lanes
 
 
 class Pairing:
-    """Fingers in pairs: those whose numbers differ by an exclusive or with the row's number + 1.
+    """Fingers in pairs: those whose numbers differ by an exclusive or with the pairing's number.
+
+    Each finger is its own partner in the pairing 0, which is for contacts with the palm.
 
     Attributes:
       lane: Lane of the finger that each lane's finger is paired with, shape (lane,).
+      palm: Whether the number is 0, on the lanes; None if it never is.
+      half: The share of a contact that a lane counts: two fingers' is on two lanes.
     """
 
-    def __init__(self, block: Block, row: Any):
-        """Takes the row, a scalar."""
+    def __init__(self, block: Block, number: Any, dtype: Any, *, palm: bool):
+        """Takes the number, a scalar, and the type of shares; palm: whether it may be 0."""
         self.block = block
-        self.number = (jnp.zeros_like(block.finger) + (row + 1)).astype(jnp.int32)
+        self.number = (jnp.zeros_like(block.finger) + number).astype(jnp.int32)
+        alone, one = self.number == 0, jnp.ones_like(block.finger, dtype)
+        self.palm = lanes([alone], (), wide=True) if palm else None
+        self.half = lanes([jnp.where(alone, one, 0.5 * one) if palm else 0.5 * one], (), wide=True)
         other = jax.lax.bitwise_xor(block.finger, self.number)
         self.lane = other * block.worlds + block.world
 

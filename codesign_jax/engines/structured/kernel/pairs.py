@@ -6,9 +6,14 @@ pair; a row of slots belongs to one such number.  Both lanes of a pair put the s
 same slot, so that they process it at the same time and exchange numbers in registers.  The side of
 a contact is a joint's row as in `codesign_jax.engines.structured.hull`; a sphere follows the link
 before that joint.
+
+Contacts of fingers with the palm are a row of slots as well, with the number 0: they are on the
+finger's lane alone.  The sides' motions are relative to the palm's then, which changes nothing
+between two fingers, as a rigid body's velocity is affine in the point.
 """
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +25,7 @@ from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, ze
 from codesign_jax.engines.structured.kernel.hull import across
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop, solid
 from codesign_jax.engines.structured.kernel.pairing import Pairing
-from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet, any_of
 from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -59,7 +64,10 @@ class PairSet(HullSet):
           remembers: As in `SlotSet`.
         """
         fingers, worlds = block
-        how = "finger_finger", fingers - 1, slots, fingers * worlds
+        e = scene.effects
+        self.palm, self.first = e.finger_palm, int(not e.finger_palm)
+        rows = fingers - self.first if e.finger_finger else 1
+        how = "finger_finger", rows, slots, fingers * worlds
         super().__init__(scene, *how, gathers=gathers, remembers=remembers)
         self.block, self.links = block, links
         self.skin = scene.effects.surface == "hull"
@@ -70,6 +78,16 @@ class PairSet(HullSet):
         self.more |= {f: n for f in ("first", "left", "answer", "along", "moved", "sum")}
         if self.skin:
             self.more |= HullSet.more
+
+    def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+        """See `ContactSet`; one cone between fingers and one on the palm, if there are both."""
+        (shape,) = super().cone_rows().values()
+        return {f"cone.{name}": shape for name in self._names()}
+
+    def _names(self) -> list[str]:
+        e = self.scene.effects
+        on = {"finger_finger": e.finger_finger, "finger_palm": e.finger_palm}
+        return [name for name in on if on[name]]
 
     @property
     def components(self) -> int:
@@ -95,7 +113,8 @@ class PairSet(HullSet):
 
     def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundPairs":
         """See `ContactSet`."""
-        return BoundPairs(self, table, ref, self.cone(read))
+        cones = {name: self.cone(read, name) for name in self._names()}
+        return BoundPairs(self, table, ref, cones)
 
 
 class OwnSide(NamedTuple):
@@ -120,14 +139,30 @@ class BoundPairs(BoundSlots):
 
     set: PairSet  # type: ignore[assignment]
 
-    def __init__(self, of: PairSet, table: MemoryLayout, ref: Any, cone: contact.Cone):
-        """See `ContactSet.bind`."""
-        super().__init__(of, table, ref, cone)
-        self.block = Block(*of.block)
+    def __init__(self, of: PairSet, table: MemoryLayout, ref: Any, cones: dict[str, contact.Cone]):
+        """See `ContactSet.bind`; the cones by name."""
+        super().__init__(of, table, ref, next(iter(cones.values())))
+        self.block, self._cones = Block(*of.block), cones
+        self._palm: Lanes | None = None
 
     def pairing(self, row: Any) -> Pairing:
         """A row's pairing of the fingers."""
-        return Pairing(self.block, row)
+        return Pairing(self.block, row + self.set.first, self.ref.dtype, palm=self.set.palm)
+
+    def of_row(self, row: Any) -> contact.Cone:
+        """The cone of a row's contacts."""
+        if len(self._cones) == 1:
+            return self.cone
+        here = lanes([jnp.full((self.set.size,), jnp.equal(row, 0))], (), wide=False)
+        between, palm = (self._cones[name] for name in ("finger_finger", "finger_palm"))
+        return lanewise(_where, here, palm, between)
+
+    @contextlib.contextmanager
+    def with_cone(self, row: Any) -> Iterator[None]:
+        """Within this context contacts have the cone of a row's."""
+        before, self.cone = self.cone, self.of_row(row)
+        yield
+        self.cone = before
 
     def side(self, name: str, row: Any) -> Lanes:
         """Motion of a row, (6 or 9, ...): of the link before a joint, and the joint's turning."""
@@ -142,16 +177,21 @@ class BoundPairs(BoundSlots):
         """Stores what a row's link before its joint does; row 0 is the palm's."""
         self.table.write(self.ref, f"side.{name}", value, row)
 
+    def beside_palm(self, motion: Lanes, palm: Lanes | None) -> Lanes:
+        """A motion relative to the palm's, where contacts with the palm need it."""
+        return motion if palm is None or not self.set.palm else lanewise(_minus, motion, palm)
+
     def put_palm(self, motion: Lanes) -> None:
         """Stores the palm's motion along a step; the tip, which has no joint, does not turn."""
-        self.put("motion", motion, 0)
+        self._palm = motion
+        self.put("motion", self.beside_palm(motion, motion), 0)
         if self.set.skin:
             like = jnp.zeros((self.set.size,), self.ref.dtype)
             self.put("turn", zeros((3,), like), self.set.links)
 
     def put_link(self, i: Any, before: Lanes, motion: Lanes) -> None:
         """Stores a link's motion along a step, and how the joint between it and `before` turns."""
-        self.put("motion", motion, i + 1)
+        self.put("motion", self.beside_palm(motion, self._palm), i + 1)
         if self.set.skin:
             self.put("turn", lanewise(lambda a, b: b[:3] - a[:3], before, motion), i)
 
@@ -194,7 +234,8 @@ class BoundPairs(BoundSlots):
 
         def of_row(row: Any, carry: Any) -> Any:
             pairing = self.pairing(row)
-            return self.fold(row, lambda item, c: body(item, pairing, c), carry)
+            with self.with_cone(row):
+                return self.fold(row, lambda item, c: body(item, pairing, c), carry)
 
         return loop(self.set.rows, of_row, start, self.set.size)
 
@@ -227,7 +268,9 @@ class BoundPairs(BoundSlots):
             return contacts(place, cone).relative(jnp.concatenate(parts)[:, None])
 
         own = lanewise(moved, self.place(item), self.cone, parts)
-        return lanewise(jnp.subtract, own, pairing.swap(own))
+        if pairing.palm is None:
+            return lanewise(jnp.subtract, own, pairing.swap(own))
+        return lanewise(_without, pairing.palm, own, pairing.swap(own))
 
     def _on_rows(self, item: Any, names: tuple[str, ...]) -> list[Lanes]:
         """What sides have at the rows of a slot's lanes; zeros where nothing touches."""
@@ -283,14 +326,16 @@ class BoundPairs(BoundSlots):
         wrench = self.table.gather(self.ref, "side.push", row, self.block.lane)
         return OwnSide(self.place(item), row, wrench)
 
-    def load(self, item: Any, own: OwnSide, force: Lanes) -> None:
-        """Adds a slot's force to its own side's wrench."""
+    def load(self, item: Any, own: OwnSide, force: Lanes, pairing: Pairing) -> None:
+        """Adds a slot's force to its own side's wrench, and the opposite one to the palm's."""
         contacts = self.set.contacts
 
         def wrench(place, cone, force):
             return sum_axis(contact.contact_wrench(contacts(place, cone), force), 1)
 
         more = lanewise(wrench, own.place, self.cone, force)
+        if pairing.palm is not None:
+            any_of(pairing.palm.lane, lambda: self._push_palm(item, more))
         if own.row is not None and own.wrench is not None:
             sums = lanewise(jnp.add, own.wrench, more)
             self.table.scatter(self.ref, "side.push", sums, own.row, self.block.lane)
@@ -302,6 +347,17 @@ class BoundPairs(BoundSlots):
             return nothing
 
         self._each_row(item, add, [])
+
+    def _push_palm(self, item: Any, wrench: Lanes) -> None:
+        """Takes a slot's wrench from the palm, where the slot touches."""
+        touches = lanes([self.read("gap", item).lane < 0], (), wide=True)
+        rest = self.set.components - 6
+
+        def take(touches, sums, wrench):
+            away = jnp.where(touches, wrench[:6], 0.0)
+            return sums - jnp.concatenate([away, jnp.zeros((rest, *away.shape[1:]), away.dtype)])
+
+        self.put("push", lanewise(take, touches, self.pushed(0), wrench), 0)
 
     # Newton's method
 
@@ -320,7 +376,7 @@ class BoundPairs(BoundSlots):
             self.write("jar", jar, item)
             hessian, force = lanewise(response, own.place, self.cone, jar)
             self.write("hessian", hessian, item)
-            self.load(item, own, force)
+            self.load(item, own, force, pairing)
 
         self.do(store)
 
@@ -334,7 +390,7 @@ class BoundPairs(BoundSlots):
 
         def add(item: Any, pairing: Pairing, sums: Lanes) -> Lanes:
             slope = self.line(item, self.relative(item, pairing))
-            return lanewise(lambda s, f: s + 0.5 * f, sums, slope)  # both lanes have it
+            return lanewise(lambda s, h, f: s + h * f, sums, pairing.half, slope)
 
         return self.each(add, self._zeros(())[0])
 
@@ -343,11 +399,21 @@ class BoundPairs(BoundSlots):
 
         def add(item: Any, pairing: Pairing, sums: list[Lanes]) -> list[Lanes]:
             new = self._slopes(item, alpha)
-            return lanewise(
-                lambda a, b: [x + 0.5 * y for x, y in zip(a, b, strict=True)], sums, new
-            )
+            return lanewise(tree_add_scaled, pairing.half, sums, new)
 
         return self.each(add, sums)
+
+
+def _minus(motion, palm):
+    return motion - palm
+
+
+def _without(palm, own, theirs):
+    return own - jnp.where(palm, 0.0, theirs)
+
+
+def _where(mask, one, other):
+    return jax.tree.map(lambda a, b: jnp.where(mask, a, b), one, other)
 
 
 def _add_where(chosen, sums, more):

@@ -250,6 +250,36 @@ def between_spheres(
     return _between(ends, mine[0][2:], theirs[0][2:])
 
 
+def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, which) -> jax.Array:
+    """Power of a finger's sphere on the palm.
+
+    Args:
+      scene: The scene.
+      mine: Link, and centres and radii of its spheres.
+      palm: The palm.
+      size: Radius and half the thickness of its disc.
+      numbers: Numbers of the cone.
+      which: Number of the sphere on the link.
+    """
+    ball = sphere_ball(mine[0], mine[1], mine[2], which)
+    cone = cone_of(scene.effects.friction, numbers)
+    found = sections.ball_on_palm(ball, (*palm[:2], size))
+    ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in found]
+    return _between(ends, mine[0][2:], palm[2:])
+
+
+def palm_sums(vertex, mine: tuple, palm: tuple) -> jax.Array:
+    """What a vertex of a row adds to `sections.pressure` of the palm.
+
+    Args:
+      vertex: Place, weight and share of the vertex.
+      mine: Joint of its row, and frames of the links before and behind it.
+      palm: See `sections.palm_distance`.
+    """
+    none = jnp.zeros((sections.SUMS, *mine[0].shape[1:]), mine[0].dtype)
+    return sections.add_vertex(none, *sections.on_palm(vertex, mine, palm))
+
+
 def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
     """What a vertex of the own row adds to `sections.pressure` of another finger's row.
 

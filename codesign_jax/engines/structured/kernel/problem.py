@@ -114,7 +114,7 @@ class Problem:
     def add_first(self, r: Lanes) -> Lanes:
         """Adds the contacts between fingers that act on the palm, those of the first joints."""
         assert self.pairs is not None
-        if not self.pairs.set.skin:
+        if not self.pairs.set.skin and not self.pairs.set.palm:
             return r
         return lanewise(jnp.add, r, self.pairs.pushed(0)[:6])
 

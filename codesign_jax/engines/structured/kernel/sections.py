@@ -1,19 +1,24 @@
 """Where fingers meet: balls, and a vertex of one finger's hull in a section of another finger.
 
-A row's section is its box between the middles of two links, whose frame turns from one link's to
-the other's along the row.  Lane by lane, see `fingers`.
+A row's section lies between the middles of two links; its frame turns from one link's to the
+other's along the row.  It is the superellipse phi = (|y/a|^4 + |z/b|^4)^(1/4) < 1, with a cap over
+the last half segment.  A point on one finger's outline is as deep in the other's section as
+(1 - phi)/|grad phi|, to first order the distance to the outline, and is pushed against its own
+outward normal, as by a pressure: the sum over the surface is then the pressure's buoyancy, which
+for shallow overlaps is the overlap's volume and grows with the depth up to the axis, where no
+direction flips.  Lane by lane, see `fingers`.
 """
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import apply_columns
+from codesign_jax.engines.structured import collision
+from codesign_jax.engines.structured.constants import apply_columns, apply_rows
 from codesign_jax.engines.structured.kernel import hull
 from codesign_jax.engines.structured.lanes import dot, total
 
-ROUND = 0.5
-"""Radius of a section's edges to other fingers, over half its smaller side: vertices that stand
-less deep than that have a normal that turns with their place."""
+AXIS = 1e-3
+"""Distance from a section's axis, over half its sides, below which the depth is constant."""
 
 
 def apart(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -35,6 +40,51 @@ def between(a: jax.Array, b: jax.Array) -> tuple[tuple, tuple]:
     point = (a[:3] - normal * (a[3] + 0.5 * gap))[:, None]
     gap, normal = gap[None, None], normal[:, None]
     return (point, normal, gap), (point, -normal, gap)
+
+
+def ball_on_palm(ball: jax.Array, palm: tuple) -> tuple[tuple, tuple]:
+    """Point, normal and gap of a ball (centre, radius) on the palm, on either side.
+
+    Args:
+      ball: Centre and radius, shape (4, ...).
+      palm: See `palm_distance`.
+    """
+    distance, normal = palm_distance(ball[:3], palm)
+    gap = distance - ball[3]
+    point = (ball[:3] - normal * (ball[3] + 0.5 * gap))[:, None]
+    gap, normal = gap[None, None], normal[:, None]
+    return (point, normal, gap), (point, -normal, gap)
+
+
+def palm_distance(point: jax.Array, palm: tuple) -> tuple[jax.Array, jax.Array]:
+    """Signed distance of a point from the palm's disc, and its gradient.
+
+    Args:
+      point: The point, shape (3, ...).
+      palm: Place of the palm's frame, which is on the disc's underside, columns of its orientation,
+        and radius and half the thickness of the disc.
+    """
+    place, frame, size = palm
+    local = apply_rows(frame, point - place)
+    distance, slope = collision.cylinder(size, jnp.stack([local[0], local[1], local[2] - size[1]]))
+    return distance, apply_columns(frame, slope)
+
+
+def on_palm(vertex, own: tuple, palm: tuple) -> tuple[tuple, tuple]:
+    """Point, normal, gap, lever and share of a vertex on the palm, on either side.
+
+    Args:
+      vertex: Place, weight and share of the vertex.
+      own: Joint of its row, and frames of the links before and behind it.
+      palm: See `palm_distance`.
+    """
+    point, image, weight, share = hull.placed(vertex, *own)
+    gap, normal = palm_distance(point[:, 0], palm)
+    to_contact = -0.5 * gap * normal
+    lever = weight * (image[:, 0] + to_contact)
+    at, gap = (point[:, 0] + to_contact)[:, None], gap[None, None]
+    mine = at, normal[:, None], gap, lever[:, None], share
+    return mine, (at, -normal[:, None], gap, jnp.zeros_like(lever)[:, None], share)
 
 
 def separated(own: tuple, own_size, theirs: tuple, size, last) -> jax.Array:
@@ -73,19 +123,22 @@ def separated(own: tuple, own_size, theirs: tuple, size, last) -> jax.Array:
 
 
 def inside(vertex, own: tuple, theirs: tuple, size, last) -> tuple[tuple, tuple]:
-    """Point, normal, gap, lever and share of a vertex in another finger's row, on either side.
+    """Point, normal, gap, lever and share of a point in another finger's row, on either side.
 
     Args:
-      vertex: Place, weight and share of the vertex.
+      vertex: Place, normal, weight and share of the point, see `hull.pair_vertices`.
       own: Joint of its row, and frames of the links before and behind it.
       theirs: The same of the other row.
       size: Half the width, the height and a segment of the other finger.
-      last: Whether the other row is the last one, which ends at the tip's face.
+      last: Whether the other row is the last one, which ends in the tip's cap.
     """
-    point, image, weight, share = hull.placed(vertex, *own)
-    point, image = point[:, 0], image[:, 0]
+    place = jnp.concatenate([vertex[:3], vertex[6:]])
+    point, image, weight, share = hull.placed(place, *own)
+    point, image, (_, *links) = point[:, 0], image[:, 0], own
+    before, after = (apply_columns(link, vertex[3:6]) for link in links)
+    normal = -((1.0 - weight) * before + weight * after)
     joint, before, after = theirs
-    half_width, half_height, half = size[0], size[1], size[2]
+    half = size[2]
     away = point - joint
     first, second = (jnp.stack([dot(f[k], away) for k in range(3)]) for f in (before, after))
     # Between the planes across the middles of the two links.
@@ -94,21 +147,17 @@ def inside(vertex, own: tuple, theirs: tuple, size, last) -> tuple[tuple, tuple]
     along = jnp.where(whole > 0, start / jnp.where(whole > 0, whole, 1.0), 2.0)
     along = jnp.minimum(jnp.maximum(along, 0.0), 1.0)
     local = first + along * (second - first)
-    turned = before + along * (after - before)
-    edge = ROUND * jnp.minimum(half_width, half_height)
-    depth = [
-        jnp.abs(local[1]) - half_width + edge,
-        jnp.abs(local[2] - half_height) - half_height + edge,
-        jnp.where(last > 0, -end, -half) + edge,
+    ahead = jnp.where(last > 0, jnp.maximum(second[0], 0.0), 0.0)
+    sides = zip((ahead, local[1], local[2] - size[1]), (half, size[0], size[1]), strict=True)
+    units = [
+        (jnp.maximum(jnp.abs(x) / s, floor), s)
+        for (x, s), floor in zip(sides, (0, AXIS, AXIS), strict=True)
     ]
-    signs = [_sign(local[1]), _sign(local[2] - half_height), jnp.ones_like(along)]
-    distance, slope = _rounded(depth)
-    gap = distance - edge
-    within = (start >= 0) & ((end > 0) | (last > 0)) & (whole > 0)
-    gap = jnp.where(within, gap, 1.0)
-    axes = (turned[1], turned[2], turned[0])
-    normal = total([s * g * a for s, g, a in zip(signs, slope, axes, strict=True)])
-    normal = normal / jnp.sqrt(jnp.maximum(dot(normal, normal), 1e-12))
+    fourth = total([u * u * u * u for u, _ in units])
+    phi = jnp.sqrt(jnp.sqrt(fourth))
+    slope = jnp.sqrt(total([(u * u * u / s) ** 2 for u, s in units]))
+    within = (start >= 0) & ((end > 0) | (last > 0)) & (whole > 0) & (phi < 1)
+    gap = jnp.where(within, (phi - 1.0) * (phi * phi * phi / slope), 1.0)
     to_contact = -0.5 * gap * normal  # from the point on the skin
     lever = weight * (image + to_contact)
     behind = along * (apply_columns(after, local) + to_contact)
@@ -150,22 +199,3 @@ def pressure(sums: jax.Array) -> tuple[tuple, tuple]:
     point, lever, behind = ((sums[k : k + 3] / whole)[:, None] for k in (5, 8, 11))
     normal, share = normal[:, None], share[None, None]
     return (point, normal, gap, lever, share), (point, -normal, gap, behind, share)
-
-
-def _sign(x: jax.Array) -> jax.Array:
-    return jnp.where(x < 0, -1.0, 1.0).astype(x.dtype)
-
-
-def _rounded(depth: list[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
-    """Distance to a box from the depths behind its faces, and the slope in each of them."""
-    outside = [jnp.maximum(d, 0.0) for d in depth]
-    square = total([d * d for d in outside])
-    is_out = square > 0
-    length = jnp.sqrt(jnp.where(is_out, square, 1.0))
-    deepest = jnp.maximum(jnp.maximum(depth[0], depth[1]), depth[2])
-    nearest = [depth[0] >= deepest]
-    nearest.append(~nearest[0] & (depth[1] >= deepest))
-    nearest.append(~nearest[0] & ~nearest[1])
-    faces = [n.astype(square.dtype) for n in nearest]
-    slope = [jnp.where(is_out, d / length, f) for d, f in zip(outside, faces, strict=True)]
-    return jnp.where(is_out, length, deepest), slope

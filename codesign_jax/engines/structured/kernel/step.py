@@ -176,7 +176,7 @@ class Step:
         )
 
         pairs = m.contacts.get("finger_finger")
-        search = Search(self, pairs) if isinstance(pairs, BoundPairs) else None
+        search = Search(self, pairs, at) if isinstance(pairs, BoundPairs) else None
         if search:
             search.start(motion, vel, frame, origin)
         spheres = Spheres(self, at, m, thing)

@@ -107,6 +107,10 @@ class Sweep:
         base = loop(tips, link, after, p.size, reverse=True)
         return self._mount(base, centre_bar)
 
+    def none(self, name: str) -> Lanes:
+        """No cotangent of what a link hands on, by name."""
+        return zeros(getattr(SHAPES, name), self.like)
+
     def more(self, bars: Chain, i: Any) -> Chain:
         """Adds what contacts between fingers have left for a link."""
         if "pairbar.origin" not in self.p.scratch.groups:
@@ -164,6 +168,9 @@ class Sweep:
         place = Place(
             at["place"], at["frame"], at["vel"], now.palm_motion, self.virtual.palm_motion
         )
+        if "palmbar.origin" in self.p.scratch.groups:
+            read = partial(self.p.scratch.read, self.step.scratch)
+            base = _add(base, **{n: read(f"palmbar.{n}") for n in Place._fields})
         for i in range(self.p.palm_groups if names else 0):
             for name in names:
                 new = self.spheres(name, i, place, ("palm_point", "palm_radius"))
@@ -188,7 +195,7 @@ class Sweep:
             self.bars.add(shared)
             return found
 
-        empty = Place(*(zeros(getattr(SHAPES, n), self.like) for n in Place._fields))
+        empty = Place(*(self.none(n) for n in Place._fields))
         return choose(self.m.contacts[name].touching(i), compute, empty, self.p.size)
 
     def row(self, slots: BoundSlots, i: Any) -> tuple[Lanes, RowSide, RowSide]:

@@ -58,7 +58,8 @@ class Tables:
         on = {"hull_object": e.finger_object, "hull_table": e.finger_table}
         if e.surface == "hull":
             sets += [self._skin(name) for name in on if on[name]]
-        if e.finger_finger and self.num_fingers > 1:
+        between = e.finger_finger and self.num_fingers > 1
+        if between or e.finger_palm:
             block, slots = (self.fingers, self.block), pair_slots(self.scene)
             how = {"gathers": self.backend in GATHERING, "remembers": self.remembers["pairs"]}
             sets.append(PairSet(self.scene, block, self.links, slots, **how))
@@ -110,6 +111,8 @@ class Tables:
             some |= {"gravity": (1, one)}
         if self.scene.effects.wrist:
             some |= {"wrist_stiffness": (1, (6,))}
+        if self.scene.effects.finger_palm:
+            some |= {"palm_disc": (1, (2,))}
         self.world = MemoryLayout(
             False,
             palm_mass=(1, one),

@@ -1,0 +1,132 @@
+"""Contact of fingers with the palm, in float64: MuJoCo C, a dense solve and planted faults."""
+
+import functools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from codesign_jax.engines.structured.kernel.pairs import BoundPairs
+from codesign_jax.engines.structured.lanewise import lanes, lanewise
+from tests import small
+from tests import test_kernel_pairs as oracle
+from tests.planted import Fault, cone_of, planted, simulate
+from tests.test_finger_pairs import curled
+
+BOUND = 1e-8
+"""As in test_kernel_pairs.py."""
+STATE = (3, 1.9, 0.045)
+"""Arguments of `curled`: fingers on the palm, on one another and on the object."""
+SETTINGS = {
+    "effects__finger_finger": True,
+    "effects__finger_palm": True,
+    "contact__finger_finger_friction": 0.6,  # neither the object's nor the palm's
+    "contact__finger_palm_friction": 0.4,
+}
+
+
+def flipped(right, *args):
+    """Both sides of a contact with the palm are pushed the wrong way."""
+    mine, other = right(*args)
+    return (mine[0], -mine[1], *mine[2:]), (other[0], -other[1], *other[2:])
+
+
+def not_pushed(right, mine, self, item, wrench):
+    """The palm does not feel the contact."""
+    left = jnp.where(mine, 0.0, 1.0)
+    right(self, item, lanewise(lambda w, k: w * k, wrench, lanes([left], (), wide=True)))
+
+
+def moving(right, mine, self, motion, palm):
+    """Motions that contacts with the palm see are not relative to it."""
+    found = right(self, motion, palm)
+    return lanewise(lambda m, a, b: jnp.where(m, a, b), lanes([mine], (), wide=True), motion, found)
+
+
+ON_PALM = {"hull": "on_palm", "spheres": "ball_on_palm"}
+FAULTS = {
+    surface: {
+        "the palm pulls": Fault({stage: flipped}),
+        "the palm does not feel fingers": Fault(
+            {}, methods={(BoundPairs, "_push_palm"): not_pushed}
+        ),
+        "contacts move with the palm": Fault({}, methods={(BoundPairs, "beside_palm"): moving}),
+        "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
+    }
+    for surface, stage in ON_PALM.items()
+}
+
+
+def scene_of(surface):
+    density = {"discretization__hull_rings": 2, "discretization__hull_points": 4}
+    density = density if surface == "hull" else {"discretization__spheres_per_link": 2}
+    return small.pinch("sphere", links=2, effects__surface=surface, **SETTINGS, **density)
+
+
+def accelerations(scene, model, data):
+    """By MuJoCo C, with the hull by a dense solve; all kinds of contacts are there."""
+    mujoco.mj_forward(model, data)
+    if scene.effects.surface == "hull":
+        with jax.enable_x64(True):
+            hand, _ = small.hand_world(scene, length=0.1)
+        dense = oracle.Dense(scene, model, data, hand)
+        assert dense.on_palm > 2 and dense.pairs > 3 and dense.num_hull > 20
+        return dense.solve()
+    assert on_palm(model, data) > 0
+    return data.qacc.copy()
+
+
+def on_palm(model, data):
+    """Number of contacts with the palm's disc."""
+    return int((data.contact.geom == model.geom("palm_disc").id).any(1).sum())
+
+
+@functools.cache
+def simulated(surface):
+    """Relative errors of a step's accelerations, of each fault's world and of a sound one."""
+    with jax.enable_x64(True):
+        scene, faults = scene_of(surface), FAULTS[surface]
+        state = curled(scene, *STATE)
+        each = [state] * (len(faults) + 1)
+        fields, qpos, qvel, ctrl = oracle.batched(each)
+        with planted(faults):
+            run = jax.jit(partial(simulate, scene, iterations=30))
+            ctrl = jnp.asarray(np.repeat(ctrl[:, None], 2, 1))
+            found = run(fields, (qpos, qvel), ctrl, np.arange(len(each)))
+        expected = accelerations(scene, *state[:2])
+    acc = (np.asarray(found["qvel"])[:, 1] - qvel) / scene.discretization.timestep
+    return np.linalg.norm(acc - expected, axis=1) / np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("surface", FAULTS)
+def test_accelerations_equal_the_oracle(surface):
+    assert simulated(surface)[-1] < BOUND
+
+
+@pytest.mark.parametrize(("surface", "name"), [(s, n) for s in FAULTS for n in FAULTS[s]])
+def test_a_planted_fault_is_noticed(surface, name):
+    """By a hundred times the bound."""
+    error = simulated(surface)[[*FAULTS[surface]].index(name)]
+    assert not error < 100 * BOUND
+
+
+@pytest.mark.slow  # quick: one state of hulls and of spheres above
+@pytest.mark.parametrize("friction", ["coulomb", "none", "full"])
+@pytest.mark.parametrize("between", [True, False])
+def test_spheres_equal_mujoco_on_curled_hands(friction, between):
+    """Up to eight spheres on the palm, with and without contact between fingers."""
+    settings = SETTINGS | {"effects__finger_finger": between, "effects__friction": friction}
+    with jax.enable_x64(True):
+        scene = small.pinch("sphere", discretization__spheres_per_link=2, **settings)
+        bends = (1.3, 1.5, 1.6, 1.2, 1.8, 0.3)
+        worlds = [curled(scene, s, bend, height=0.12) for s, bend in enumerate(bends)]
+        inputs = oracle.batched(worlds)
+        qvel, _ = oracle.one_step(scene)(*inputs)
+        acc = (np.asarray(qvel) - inputs[2]) / scene.discretization.timestep
+        for mine, (model, data, _), bend in zip(acc, worlds, bends, strict=True):
+            mujoco.mj_forward(model, data)
+            assert (on_palm(model, data) > 1) == (bend > 1)
+            assert np.linalg.norm(mine - data.qacc) < BOUND * np.linalg.norm(data.qacc)

@@ -92,8 +92,7 @@ def pair_vertices(scene: Scene, section: jax.Array) -> jax.Array:
     bounds = np.concatenate([scale[:1], (scale[:-1] + scale[1:]) / 2, [0.0]]) ** 2
     band = (bounds[:-1] - bounds[1:]) / points
     reach = (1.0 - scale[1:] ** 4) ** 0.25
-    ends = np.concatenate([[-1 / rings - 1 if rings == 1 else 2 / rings - 1 - 2 / rings], cap])
-    gaps = np.diff(ends)
+    gaps = np.diff(cap, prepend=-1.0)
     length = np.append((gaps[:-1] + gaps[1:]) / 2, gaps[-1] / 2)
     shrunk = (1.0 - np.maximum(cap, 0.0) ** 4) ** 0.25
     kinds = (

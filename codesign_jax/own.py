@@ -87,9 +87,10 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
 
     one = jax.tree.map(lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene)))
     fields, _, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t, constants), *one)
-    series = jax.ShapeDtypeStruct((1, scene.num_steps), float)
+    dtype = jnp.result_type(float)
+    series = jax.ShapeDtypeStruct((1, scene.num_steps), dtype)
     qpos = (1, scene.num_steps, fields.start.shape[-1] if trajectory else 0)
-    trace = Trace(series, series, series, jax.ShapeDtypeStruct(qpos, float))
+    trace = Trace(series, series, series, jax.ShapeDtypeStruct(qpos, dtype))
     _tried(flag, cost, lambda: jax.eval_shape(judge, trace, *one))
     return cost, trajectory
 

@@ -237,7 +237,8 @@ SPHERES = {
     **PAIRS,
 }
 SURFACES = {"hull": HULL, "spheres": SPHERES}
-STATES = {"main": (27, 1.2, 0.06), "overflow hull": (0, 0.1, 0.04)}
+MAIN = {"hull": (27, 1.2, 0.06), "spheres": (1, 1.2, 0.06)}
+STATES = {"main": MAIN["hull"], "overflow hull": (0, 0.1, 0.04)}
 STATES |= {"overflow finger_finger": (0, 1.2, 0.06)}
 """Arguments of `curled`: seed, bend and height [m]. Contacts of every kind, with the hull more than
 `SLOTS` of one kind in the others."""
@@ -286,7 +287,8 @@ def simulated(surface):
         patch.setattr(tables, "pair_slots", lambda _: SLOTS)
         if surface == "hull":  # as on a GPU; spheres, and the slow tests' hulls, as on this CPU
             patch.setattr(tables, "GATHERING", ("cpu", "gpu"))
-        states = {name: curled(scene, *state) for name, state in STATES.items()}
+        chosen = STATES | {"main": MAIN[scene.effects.surface]}
+        states = {name: curled(scene, *state) for name, state in chosen.items()}
         kinds = [f.check if f.check in states else "main" for f in faults.values()]
         each = [states[kind] for kind in [*kinds, *states]]
         fields, qpos, qvel, ctrl = oracle.batched(each)

@@ -56,7 +56,7 @@ def finger_scene(links: int) -> Scene:
     )
     # The dead load's own stiffness is explicit: a short step keeps it stable.
     sizes = {"discretization": {"links": links, "timestep": 0.002}}
-    off = off | {"surface": "spheres", "finger_finger": False}
+    off = off | {"surface": "spheres", "finger_finger": False, "finger_palm": False}
     scene = load("paper", overrides=merge(sizes, {"effects": off}))
     mount = hand.Finger(azimuth=0.0, spread=0.0, radius=0.0, tilt=0.0)
     wrist = hand.Wrist(1e5, 1e4, 1e3, 1e2)

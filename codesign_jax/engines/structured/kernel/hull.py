@@ -45,7 +45,7 @@ def fields(scene: Scene) -> dict[str, tuple[int, tuple[int, ...]]]:
     """The hull's part of the hand's table: vertices (place, weight, share) and balls."""
     k = scene.discretization.hull_rings * scene.discretization.hull_points
     found = {"vertex": (KINDS * k, (5,)), "ball": (KINDS, (2,)), "section_box": (1, (3,))}
-    if scene.effects.finger_finger:
+    if scene.effects.finger_finger or scene.effects.finger_palm:
         found["pair_vertex"] = (KINDS * pair_points(scene), (8,))
     return found
 
@@ -136,7 +136,7 @@ def pack(scene: Scene, hand: WorldConstants) -> dict[str, jax.Array]:
     height, _, segment, width = hand.section
     box = 0.5 * jnp.stack([width, height, segment])
     found = {"vertex": vertex, "ball": ball, "section_box": box[None]}
-    if scene.effects.finger_finger:
+    if scene.effects.finger_finger or scene.effects.finger_palm:
         found["pair_vertex"] = pair_vertices(scene, hand.section)
     return found
 

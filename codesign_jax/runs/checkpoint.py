@@ -318,13 +318,18 @@ def _silence() -> None:
     and tensorstore finds the tasks' event loop closed. Some come long after the save, so that this
     is for the rest of the process.
     """
-    before = sys.unraisablehook
+    unraisable, printed = sys.unraisablehook, sys.excepthook
 
     def hook(event: Any) -> None:
         if str(event.exc_value) != "Event loop is closed":
-            before(event)
+            unraisable(event)
 
-    sys.unraisablehook = hook
+    def print_hook(kind: Any, error: BaseException, trace: Any) -> None:
+        """Threads of newer tensorstores print an error as the main thread does."""
+        if str(error) != "Event loop is closed":
+            printed(kind, error, trace)
+
+    sys.unraisablehook, sys.excepthook = hook, print_hook
     for name in ("absl", "asyncio"):
         logging.getLogger(name).addFilter(_is_news)
 

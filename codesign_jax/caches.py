@@ -15,7 +15,6 @@ Environment variables, which the commands check before they do anything:
 import atexit
 import contextlib
 import os
-import shutil
 import time
 from pathlib import Path
 
@@ -141,13 +140,3 @@ def use_compilation_cache() -> None:
         jax.config.update("jax_compilation_cache_dir", str(place))
         # Small programs too, of which a command has dozens: JAX keeps those that take a second.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
-def clear_place(path: Path) -> None:
-    """Deletes a folder that lies where a file of a cache belongs: nothing could be kept there.
-
-    Raises:
-      OSError: If it cannot be deleted.
-    """
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)

@@ -85,3 +85,13 @@ def whole_folder(path: Path, keep: str) -> Iterator[Path]:
     except OSError:
         shutil.copytree(part, path, dirs_exist_ok=True)
         shutil.rmtree(part)
+
+
+def clear_place(path: Path) -> None:
+    """Deletes a folder that lies where a file of a cache belongs: nothing could be kept there.
+
+    Raises:
+      OSError: If it cannot be deleted.
+    """
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)

@@ -11,7 +11,7 @@ import json
 import zlib
 from pathlib import Path
 
-from codesign_jax import caches, files
+from codesign_jax import files
 
 ENDING = "-cache"
 """How the names of JAX's files end."""
@@ -40,7 +40,7 @@ def _sweep(folder: Path, *, again: bool) -> None:
     with contextlib.suppress(OSError):  # no folder, a read-only one, or a full disk: no matter
         for path in folder.glob(f"*{ENDING}"):
             with contextlib.suppress(OSError):  # another process deletes as well
-                caches.clear_place(path)
+                files.clear_place(path)
                 if path.name in known and not again:
                     found[path.name] = known[path.name]
                     continue

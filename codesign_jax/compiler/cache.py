@@ -34,7 +34,7 @@ def kept(name: str, build: Callable[[], bytes]) -> bytes:
     if code is None:
         code = build()
         with contextlib.suppress(OSError):
-            caches.clear_place(path)
+            files.clear_place(path)
             with files.atomically(path) as part:
                 part.write_bytes(_digest(path, code) + code)
             caches.evict(folder, _SUFFIX, caches.limit(caches.KERNELS), path)

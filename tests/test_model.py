@@ -344,3 +344,40 @@ def test_explicit_springs_are_not_stable(tmp_path, monkeypatch):
     explicit.dof_damping[:], explicit.dof_armature[:] = damping, 0.0
     speeds, _ = wobble(explicit, 900, ctrl)
     assert not np.abs(speeds[-100:, :-6]).max() < 1e3  # measured: not a number
+
+
+def test_every_kind_of_pair_has_its_own_numbers():
+    """By the names of what touches, with a number of its own for each kind."""
+    values = {
+        "contact__finger_table_friction": 0.31,
+        "contact__finger_finger_friction": 0.41,
+        "contact__finger_palm_friction": 0.51,
+        "contact__finger_palm_stiffness": 5000.0,
+        "contact__torsional_friction": 0.003,
+        "contact__rolling_friction": 0.0004,
+    }
+    on = {f"effects__{name}": True for name in ("finger_finger", "finger_palm", "palm_object")}
+    the_scene = pinch("capsule", links=4, effects__friction="full", **on, **values)
+    compiled = model.compile_model(the_scene, *hand_world(the_scene))
+    want = {
+        ("object", "table"): the_scene.objects.table.friction,
+        ("finger", "object"): the_scene.objects.object[0].friction,
+        ("object", "palm"): the_scene.objects.object[0].friction,
+        ("finger", "table"): 0.31,
+        ("palm", "table"): 0.31,
+        ("finger", "finger"): 0.41,
+        ("finger", "palm"): 0.51,
+    }
+    c, found = the_scene.contact, set()
+    for i in range(compiled.npair):
+        pair = compiled.pair_geom1[i], compiled.pair_geom2[i]
+        kind = tuple(sorted(compiled.geom(g).name.split("_")[0] for g in pair))
+        friction = [want[kind]] * 2 + [0.003, 0.0004, 0.0004]
+        np.testing.assert_allclose(compiled.pair_friction[i], friction, rtol=1e-12)
+        # Normal stiffness is proportional to 1 / (1 - d), see contact_invweight.
+        stiffness = 5000.0 if kind == ("finger", "palm") else c.normal_stiffness
+        soft = (1 - c.impedance) / (1 - compiled.pair_solimp[i, :2])
+        np.testing.assert_allclose(soft, stiffness / c.normal_stiffness, rtol=1e-9)
+        np.testing.assert_allclose(compiled.pair_solref[i], [c.time_constant, 1.0], rtol=1e-12)
+        found.add(kind)
+    assert found == set(want)

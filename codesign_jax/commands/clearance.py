@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model, rollout
-from codesign_jax.model.layout import first_on_palm, palm_points
+from codesign_jax.model.layout import first_on_palm, mount_points, palm_points
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.start import depth
 from codesign_jax.types import Params
@@ -78,11 +78,8 @@ def _in_palm(scene: Scene, params: Params) -> float:
 
 def _frames(scene: Scene, params: Params) -> tuple[np.ndarray, ...]:
     """Base points, and directions along, across and back of the fingers, shape (finger, 3) each."""
-    fingers = scene.hand.finger
-    azimuth, tilt = _directions(scene, params)
+    base, azimuth, tilt = mount_points(scene.hand, float(params.spread), np)
     cosine, sine = np.cos(azimuth), np.sin(azimuth)
-    points = [f.base_point(c, s) for f, c, s in zip(fingers, cosine, sine, strict=True)]
-    base = np.column_stack([np.array(points), np.zeros(len(points))])
     ahead = np.stack([np.cos(tilt) * cosine, np.cos(tilt) * sine, -np.sin(tilt)], -1)
     back = np.stack([np.sin(tilt) * cosine, np.sin(tilt) * sine, np.cos(tilt)], -1)
     return base, ahead, np.stack([-sine, cosine, 0.0 * sine], -1), back
@@ -107,14 +104,6 @@ def _between(scene: Scene, params: Params) -> float:
     return float(deepest)
 
 
-def _directions(scene: Scene, params: Params) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuths and tilts of the fingers in the palm's frame [rad], shape (finger,)."""
-    fingers = scene.hand.finger
-    azimuth = np.deg2rad([f.azimuth for f in fingers])
-    azimuth = azimuth + np.array([f.spread for f in fingers]) * float(params.spread)
-    return azimuth, np.deg2rad([f.tilt for f in fingers])
-
-
 def lowest_point(scene: Scene, params: Params) -> float:
     """Lower bound on the height above the table of any point of the hand at its start [m].
 
@@ -126,18 +115,11 @@ def lowest_point(scene: Scene, params: Params) -> float:
       scene: The scene.
       params: One design, NumPy arrays.
     """
-    fingers, section, palm = scene.hand.finger, scene.hand.section, scene.hand.palm
+    section, palm = scene.hand.section, scene.hand.palm
     roll, pitch, yaw = (float(v) for v in params.arm[3:])
     # Heights only: the last row of the palm's orientation.
     up = (_about(0, roll) @ _about(2, yaw) @ _about(1, -pitch))[2]
-    azimuth, tilt = _directions(scene, params)
-    cosine, sine = np.cos(azimuth), np.sin(azimuth)
-    outwards = cosine * up[0] + sine * up[1]
-    across = -sine * up[0] + cosine * up[1]
-    along = np.cos(tilt) * outwards - np.sin(tilt) * up[2]
-    back = np.sin(tilt) * outwards + np.cos(tilt) * up[2]
-    points = [f.base_point(c, s) for f, c, s in zip(fingers, cosine, sine, strict=True)]
-    base = np.array(points) @ up[:2]
+    base, along, across, back = (v @ up for v in _frames(scene, params))
     ends = np.minimum(base, base + params.length * along)
     # The skin is a box between the layer that bends and the back; contact spheres fill its height.
     skin = np.minimum(params.height * back, 0.0) - section.width / 2 * np.abs(across)

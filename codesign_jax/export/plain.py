@@ -23,7 +23,7 @@ import numpy as np
 
 from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
-from codesign_jax.model.spec import SOLIMP
+from codesign_jax.model.pairs import SOLIMP
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trial
 

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from codesign_jax.model import hull
-from codesign_jax.model.layout import first_on_palm, palm_impedance
-from codesign_jax.model.spec import SOLIMP
+from codesign_jax.model import hull, pairs
+from codesign_jax.model.layout import first_on_palm
+from codesign_jax.model.spec import add_pair
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -89,16 +89,15 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
             body = spec.body(f"finger_{f}_link_{point.link}")
             body.add_geom(name=point.name, pos=point.place, size=[RADIUS, 0, 0], **_PASSIVE)
             shares[point.name] = point.share
-    e, c = scene.effects, scene.contact
+    e = scene.effects
     for name in shares:
         if e.finger_object:
-            _pair(scene, spec, (name, "object_0"), scene.objects.object[0].friction)
+            add_pair(scene, spec, name, "object_0", 0)
         if e.finger_table:
-            _pair(scene, spec, ("table", name), c.finger_table_friction)
+            add_pair(scene, spec, "table", name, pairs.HAND_TABLE)
         row = int(name.split("_")[3])
         if e.finger_palm and row >= first_on_palm(scene.discretization.links):
-            how = (name, "palm_disc"), c.finger_palm_friction, palm_impedance(scene)
-            _pair(scene, spec, *how)
+            add_pair(scene, spec, name, "palm_disc", pairs.PALM)
     if e.finger_finger:
         _boxes(scene, spec, params)
     return shares
@@ -121,20 +120,4 @@ def _boxes(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
         names.append((f, f"finger_{f}_box_{i}"))
     for (f, first), (g, second) in itertools.combinations(names, 2):
         if f != g:
-            _pair(scene, spec, (first, second), scene.contact.finger_finger_friction)
-
-
-def _pair(
-    scene: Scene,
-    spec: mujoco.MjSpec,
-    geoms: tuple[str, str],
-    friction: float,
-    impedance: float | None = None,
-) -> None:
-    """A contact pair as `model.build_spec` has them; the hull has no torsional friction."""
-    c = scene.contact
-    d = c.impedance if impedance is None else impedance
-    condim = 1 if scene.effects.friction == "none" else 3
-    pair = spec.add_pair(geomname1=geoms[0], geomname2=geoms[1], condim=condim)
-    pair.friction = [friction, friction, c.torsional_friction, *[c.rolling_friction] * 2]
-    pair.solref, pair.solimp = [c.time_constant, 1.0], [d, d, *SOLIMP]
+            add_pair(scene, spec, first, second, pairs.FINGERS)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.model import morphology
+from codesign_jax.model import morphology, pairs
 from codesign_jax.model.layout import (
     Layout,
     contact_invweight,
@@ -17,11 +17,10 @@ from codesign_jax.model.layout import (
     mounts,
     object_quat,
     object_size,
-    palm_impedance,
     palm_points,
     wrist_springs,
 )
-from codesign_jax.model.spec import SOLIMP, compile_template, palm_inertia
+from codesign_jax.model.spec import compile_template, palm_inertia
 from codesign_jax.scene import Constants, Scene, by_structure
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.types import Params, Trial
@@ -211,40 +210,29 @@ def _section(scene: Scene, params: Params) -> jax.Array | None:
 
 @by_structure
 def _pair_kinds(scene: Scene) -> np.ndarray:
-    """Which friction each of the template's contact pairs has, an index into `_frictions`."""
+    """Kind of each of the template's contact pairs, see `pairs`, counted from the first."""
     template, lay = compile_template(scene), layout(scene)
     shapes = len(scene.objects.object)
     kinds = np.zeros(template.npair, np.int32)  # see layout: one width in every precision
     for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
         touched = np.isin(lay.object_geoms, pair)
         if 0 in pair:  # the table
-            kinds[i] = shapes if touched.any() else shapes + 1
+            kinds[i] = pairs.OBJECT_TABLE if touched.any() else pairs.HAND_TABLE
         elif np.isin(lay.disc, pair).any():
-            kinds[i] = shapes + 3
+            kinds[i] = pairs.PALM
         else:
-            kinds[i] = np.argmax(touched) if touched.any() else shapes + 2
-    return kinds
+            kinds[i] = np.argmax(touched) if touched.any() else pairs.FINGERS
+    return np.where(kinds < 0, kinds + shapes + 4, kinds).astype(np.int32)
 
 
-def _frictions(scene: Scene) -> jax.Array:
-    """Coefficients of the hand on each shape; table on object and on hand; fingers, and on palm."""
-    shapes, c = [shape.friction for shape in scene.objects.object], scene.contact
-    rest = [scene.objects.table.friction, c.finger_table_friction, c.finger_finger_friction]
-    return jnp.stack([*shapes, *rest, c.finger_palm_friction])
-
-
-def _pairs(scene: Scene, dtype: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _pairs(scene: Scene, dtype: Any) -> list[jax.Array]:
     """MuJoCo's friction (pair, 5), solref (pair, 2) and solimp (pair, 5) of the contact pairs."""
-    c, kinds = scene.contact, _pair_kinds(scene)
-    slide = _frictions(scene)[kinds]
-    spin, roll = (v + 0 * slide for v in (c.torsional_friction, c.rolling_friction))
-    solref = jnp.stack([c.time_constant, jnp.ones((), dtype)])
-    solref = jnp.broadcast_to(solref, (len(kinds), 2))
-    on_palm = kinds == len(scene.objects.object) + 3
-    impedance = jnp.where(on_palm, palm_impedance(scene), c.impedance)
-    rest = [jnp.broadcast_to(jnp.asarray(v, dtype), len(kinds)) for v in SOLIMP]
-    solimp = jnp.stack([impedance, impedance, *rest], -1)
-    return jnp.stack([slide, slide, spin, roll, roll], -1), solref, solimp
+    kinds, found = _pair_kinds(scene), (pairs.frictions(scene), pairs.impedances(scene))
+    own = (jnp.stack([jnp.asarray(v, dtype) for v in values])[kinds] for values in found)
+    return [
+        jnp.stack([jnp.broadcast_to(jnp.asarray(v, dtype), len(kinds)) for v in row], -1)
+        for row in pairs.numbers(scene, *own)
+    ]
 
 
 def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:

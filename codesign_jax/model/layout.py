@@ -184,18 +184,29 @@ def palm_points(scene: Scene) -> jax.Array:
     return jnp.stack([jnp.stack([x * ring, y * ring, up]) for x, y in _PALM_RING])
 
 
+def mount_points(hand: Hand, spread: Any, numpy: Any = jnp) -> tuple[Any, Any, Any]:
+    """Base points (finger, 3) [m], azimuths and tilts (finger,) [rad] in the palm frame.
+
+    Args:
+      hand: The hand.
+      spread: Spread between the finger pairs [rad].
+      numpy: What computes, `jax.numpy` or NumPy.
+    """
+
+    def each(name: str) -> Any:
+        return numpy.stack([numpy.asarray(getattr(f, name)) for f in hand.finger])
+
+    azimuth = numpy.deg2rad(each("azimuth")) + each("spread") * spread
+    around = zip(numpy.cos(azimuth), numpy.sin(azimuth), strict=True)
+    points = [f.base_point(c, s) for f, (c, s) in zip(hand.finger, around, strict=True)]
+    x, y = (numpy.stack([numpy.asarray(p[i], azimuth.dtype) for p in points]) for i in (0, 1))
+    position = numpy.stack([x, y, numpy.zeros_like(azimuth)], -1)
+    return position, azimuth, numpy.deg2rad(each("tilt"))
+
+
 def mounts(hand: Hand, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Base position (finger, 3) and orientation (finger, 4) of the fingers in the palm frame."""
-
-    def each(name: str) -> jax.Array:
-        return jnp.stack([jnp.asarray(getattr(f, name)) for f in hand.finger])
-
-    azimuth = jnp.deg2rad(each("azimuth")) + each("spread") * spread
-    tilt = jnp.deg2rad(each("tilt"))
-    around = zip(jnp.cos(azimuth), jnp.sin(azimuth), strict=True)
-    points = [f.base_point(c, s) for f, (c, s) in zip(hand.finger, around, strict=True)]
-    x, y = (jnp.stack([jnp.asarray(p[i], azimuth.dtype) for p in points]) for i in (0, 1))
-    position = jnp.stack([x, y, jnp.zeros_like(azimuth)], -1)
+    position, azimuth, tilt = mount_points(hand, spread)
     # Rotation about z by the azimuth, then about y by the tilt: x leaves the palm outwards and
     # down.
     ca, sa, ct, st = (f(a / 2) for a in (azimuth, tilt) for f in (jnp.cos, jnp.sin))

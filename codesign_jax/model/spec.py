@@ -9,7 +9,7 @@ import jax
 import mujoco
 import numpy as np
 
-from codesign_jax.model import hull, morphology
+from codesign_jax.model import hull, morphology, pairs
 from codesign_jax.model.layout import (
     AXES,
     RIGID,
@@ -21,7 +21,6 @@ from codesign_jax.model.layout import (
     mounts,
     object_quat,
     object_size,
-    palm_impedance,
     palm_points,
     palm_touches,
     wrist_springs,
@@ -117,8 +116,6 @@ def build_spec(
     return spec
 
 
-SOLIMP = (0.001, 0.5, 2.0)
-"""Width, midpoint and power of MuJoCo's impedance, which is constant here: they do not matter."""
 _PASSIVE = {"contype": 0, "conaffinity": 0}  # contacts come from explicit pairs only
 _COLORS = {
     "object": (0.85, 0.55, 0.2, 1),
@@ -294,32 +291,40 @@ def _add_object(
             )
 
 
+def add_pair(scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: int) -> None:
+    """Adds a contact pair.
+
+    Args:
+      scene: The scene.
+      spec: The spec.
+      first: Name of a geom.
+      second: Name of the other.
+      kind: What they are, see `pairs`.
+    """
+    condim = {"none": 1, "coulomb": 3, "full": 6}[scene.effects.friction]
+    pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim)
+    own = pairs.frictions(scene)[kind], pairs.impedances(scene)[kind]
+    pair.friction, pair.solref, pair.solimp = pairs.numbers(scene, *own)
+
+
 def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
     """Explicit contact pairs: the contact list is the scene's, not a filter's."""
-    e, c, lay = scene.effects, scene.contact, layout(scene)
+    e, lay = scene.effects, layout(scene)
     fingers = [f"finger_{f}_sphere_{i + 1}_{j}" for f, i, j in np.ndindex(lay.spheres.shape)]
     palm = [f"palm_{i}" for i in range(len(lay.palm))]
-    condim = {"none": 1, "coulomb": 3, "full": 6}[e.friction]
-
-    def add(first: str, second: str, friction: float, impedance: float = c.impedance) -> None:
-        pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim)
-        spin, roll = c.torsional_friction, c.rolling_friction
-        pair.friction = [friction, friction, spin, roll, roll]
-        pair.solref = [c.time_constant, 1.0]
-        pair.solimp = [impedance, impedance, *SOLIMP]
-
-    for i, shape in enumerate(scene.objects.object):
+    add = functools.partial(add_pair, scene, spec)
+    for i in range(len(scene.objects.object)):
         if e.object_table:
-            add("table", f"object_{i}", scene.objects.table.friction)
+            add("table", f"object_{i}", pairs.OBJECT_TABLE)
         for name in (fingers if e.finger_object else []) + (palm if e.palm_object else []):
-            add(name, f"object_{i}", shape.friction)
+            add(name, f"object_{i}", i)
     for name in (fingers if e.finger_table else []) + (palm if e.palm_table else []):
-        add("table", name, c.finger_table_friction)
+        add("table", name, pairs.HAND_TABLE)
     if e.finger_finger:
         for first, second in itertools.combinations(fingers, 2):
             if first.split("_")[1] != second.split("_")[1]:
-                add(first, second, c.finger_finger_friction)
+                add(first, second, pairs.FINGERS)
     if e.finger_palm:
         for name in fingers:
             if int(name.split("_")[3]) >= first_on_palm(lay.links):
-                add(name, "palm_disc", c.finger_palm_friction, palm_impedance(scene))
+                add(name, "palm_disc", pairs.PALM)

@@ -1,0 +1,39 @@
+"""MuJoCo's numbers of the contact pairs, for single models and for fields.
+
+A pair has a kind: what touches the object with index i has kind i, and the others have the kinds
+below, which count from the last of `frictions`.
+"""
+
+from typing import Any
+
+from codesign_jax.model.layout import palm_impedance
+from codesign_jax.scene import Scene
+
+OBJECT_TABLE, HAND_TABLE, FINGERS, PALM = -4, -3, -2, -1
+SOLIMP = (0.001, 0.5, 2.0)
+"""Width, midpoint and power of MuJoCo's impedance, which is constant here: they do not matter."""
+
+
+def frictions(scene: Scene) -> list[Any]:
+    """Coulomb coefficient of each kind of pair."""
+    c = scene.contact
+    others = [c.finger_table_friction, c.finger_finger_friction, c.finger_palm_friction]
+    return [*(s.friction for s in scene.objects.object), scene.objects.table.friction, *others]
+
+
+def impedances(scene: Scene) -> list[Any]:
+    """Impedance of each kind of pair."""
+    return [scene.contact.impedance] * (len(scene.objects.object) + 3) + [palm_impedance(scene)]
+
+
+def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, list]:
+    """MuJoCo's friction (5), solref (2) and solimp (5) of a pair.
+
+    Args:
+      scene: The scene.
+      friction: Its Coulomb coefficient.
+      impedance: Its impedance.
+    """
+    c = scene.contact
+    turning = [c.torsional_friction, c.rolling_friction, c.rolling_friction]
+    return [friction, friction, *turning], [c.time_constant, 1.0], [impedance] * 2 + [*SOLIMP]

@@ -1,7 +1,10 @@
 """The default engine under JAX's transformations, and what a trace means on every engine."""
 
 import functools
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +19,8 @@ from codesign_jax.optimize import schedule
 from codesign_jax.scene import parameters
 from codesign_jax.types import WARNINGS, Status
 from tests import small, toy
+
+ROOT = Path(__file__).parents[1]
 
 # A grasp in 1.2 s with few contacts: what is tested here does not depend on them.
 SHORT = {
@@ -366,6 +371,64 @@ def test_gradients_by_the_kernel_equal_central_differences(slopes):
     assert np.isfinite(slope).all() and (np.abs(slope) > 1e-3).all()
     # A step of 1e-5 loses 1e-10 to truncation and 1e-11 to rounding.
     np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_gradients_through_the_air_supply():
+    """By lag and rate of the supply, and by the pressure that it is to reach."""
+    scene = small.pinch("sphere", **FREE, effects__pressure_dynamics=True)
+    engine = StructuredEngine(scene, iterations=60, tolerance=1e-22)
+    hand, trial = small.hand_world(scene, pressure=50e3)
+
+    def value(x):
+        numbers = scene.constants()
+        air = numbers.pneumatics
+        numbers = numbers._replace(
+            pneumatics=air._replace(lag=x[0] * air.lag, rate=x[1] * air.rate)
+        )
+        params = hand._replace(pressure=x[2] * hand.pressure)
+        trace = rollout.grasp(scene, engine, params, trial, steps=70, constants=numbers)
+        return trace.last @ np.random.default_rng(0).normal(size=trace.last.shape)
+
+    with jax.enable_x64(True):
+        x = jnp.array([1.0, 0.2, 1.0])  # 80 kPa/s: the rate limits the pressure's rise
+        slope = jax.jit(jax.grad(value))(x)
+        sides = jax.jit(jax.vmap(value))(x + 1e-5 * jnp.concatenate([jnp.eye(3), -jnp.eye(3)]))
+    assert (np.abs(slope) > 1e-3).all()
+    # As above; where the rate ceases to limit, a step later, there is a kink.
+    np.testing.assert_allclose(slope, (sides[:3] - sides[3:]) / 2e-5, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_checkpoints_and_devices_change_no_bit_of_a_gradient():
+    """`jax.checkpoint`, and `jax.shard_map` over two CPU devices; in a process that has two."""
+    program = """
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_num_cpu_devices", 2)
+from jax.sharding import Mesh, PartitionSpec
+from codesign_jax.engines.structured import StructuredEngine
+from tests import small, test_compose
+scene = small.pinch("sphere", **test_compose.FREE)
+engine, world = StructuredEngine(scene), small.hand_world(scene, pressure=50e3)
+broken = jnp.array([False, True, False, False])
+x = jnp.asarray(np.random.default_rng(0).uniform(0.9, 1.1, (4, 3)), jnp.float32)
+def value(x, broken):
+    return test_compose.bent(scene, engine, world, x, broken).sum()
+plain = jax.grad(value)
+kept = jax.grad(jax.checkpoint(value))
+part = PartitionSpec("device")
+mesh = Mesh(np.array(jax.devices()), ("device",))
+shared = jax.shard_map(plain, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
+want = np.asarray(jax.jit(plain)(x, broken))
+assert len(jax.devices()) == 2 and (np.abs(want) > 1e-3).all()
+for name, other in {"checkpoint": kept, "shard_map": shared}.items():
+    found = jax.jit(other)(x, broken)
+    print(name, np.abs(found - want).max() / np.abs(want).max())
+    np.testing.assert_array_equal(found, want)
+assert len(found.sharding.device_set) == 2
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_what_has_no_derivative_says_so():

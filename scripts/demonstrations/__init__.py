@@ -1,0 +1,1 @@
+"""What gradients of short windows are good for: three problems with and without them."""

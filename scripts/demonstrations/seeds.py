@@ -1,0 +1,111 @@
+"""First particles of a search by the shape of the closed hand: the check before a study.
+
+A hand is simulated without any contact to the end of the inflation, where its hull should lie
+on the object: the mean squared distance of its vertices from the object's surface, over the
+trials, is smooth in the design.  Adam moves drawn particles down its gradient.  They are of use
+only if whole grasps cost less with them than with the drawn ones, and by more than the gradients.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from codesign_jax import rollout
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.structured import collision, coordinates, hull
+from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.kinematics import kinematics
+from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.model import layout
+from codesign_jax.scene import Scene, load, parameters
+from codesign_jax.types import Trial, failed
+from scripts.demonstrations import windows
+
+PARTICLES, TRIALS, STEPS, RATE = 60, 6, 60, 0.02
+"""Particles and trials of a 23D run; steps of Adam, and its rate in fractions of the ranges."""
+DEPTH = 3e-3
+"""How deep in the object a hand without contact should stand, as one with contact presses [m]."""
+WITHOUT = ("finger_object", "palm_object", "finger_table", "palm_table", "finger_finger")
+
+
+def gaps(scene: Scene, fields: Any, qpos: jax.Array) -> jax.Array:
+    """Signed distances of the hull's vertices from the object [m], (vertex, world)."""
+    hand = world_constants(scene, fields)
+    state = coordinates.reset(scene, fields._replace(start=qpos))
+    kin = kinematics(Stages(), hand, layout(scene).axes, state)
+    point = hull.vertices(scene, hand, kin).point
+    local = collision.in_object(kin.object[:, :, None, None], point)
+    return collision.signed_distance(scene, hand, local)[0].reshape(-1, qpos.shape[0])
+
+
+class Surrogate:
+    """The distance of closed hands from objects, in a scene without contact."""
+
+    def __init__(self, scene_name: str, trials: Trial, preset: str):
+        """Prepares it; the trials are those of all particles."""
+        off = {"effects": dict.fromkeys(WITHOUT, False)}
+        self.scene = load(scene_name, overrides=off)
+        self.engine = make_engine("structured", self.scene)
+        self.space = parameters.design_space(self.scene.hand, preset)
+        self.trials = trials
+        self.steps = round(self.scene.phases.inflate / self.scene.discretization.timestep)
+        self.low, self.range = self.space.low, np.asarray(self.space.high) - self.space.low
+        self.slopes = jax.jit(jax.value_and_grad(self._total, has_aux=True))
+
+    def _total(self, units: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Sum and values [cm^2] of particles in fractions of the ranges."""
+        designs = self.low + units * self.range
+        worlds = rollout.crossed(jax.vmap(self.space.params)(designs), self.trials)
+        fields, ctrl, _ = rollout.prepare(self.scene, *worlds, self.scene.constants())
+        last = self.engine.rollout(fields, ctrl[:, : self.steps]).last
+        assert last is not None
+        gap = gaps(self.scene, fields, last[:, : fields.qpos.shape[1]]) + DEPTH
+        each = (1e4 * gap**2).mean(0).reshape(len(units), -1).mean(1)
+        return each.sum(), each
+
+    def descend(self, designs: jax.Array) -> tuple[np.ndarray, list[float], float]:
+        """Designs after Adam's steps, the mean values on the way, and the seconds."""
+        units = jnp.asarray((designs - self.low) / self.range, jnp.float32)
+        adam = optax.adam(RATE)
+        state, values, seconds = adam.init(units), [], 0.0
+        for _ in range(STEPS):
+            ((_, each), slope), used = windows.timed(self.slopes, units)
+            seconds += used
+            values.append(float(each.mean()))
+            move, state = adam.update(slope, state)
+            units = jnp.clip(optax.apply_updates(units, move), 0.0, 1.0)
+        project = jax.jit(jax.vmap(self.space.project))
+        return np.asarray(project(self.low + units * self.range)), values, seconds
+
+
+def run(scene: Scene, preset: str = "23d", seed: int = 0) -> dict[str, Any]:
+    """Costs of whole grasps of drawn particles, and of those by shape; seconds of processor."""
+    engine = make_engine("structured", scene)
+    keys = jax.random.split(jax.random.key(seed), 3)
+    surrogate = Surrogate(scene.name, rollout.sample_trials(scene, keys[0], TRIALS), preset)
+    space = surrogate.space
+    drawn = np.asarray(space.sample(keys[1], PARTICLES))
+    moved, values, seconds = surrogate.descend(drawn)
+    fresh = rollout.sample_trials(scene, keys[2], TRIALS)
+    judge = jax.jit(lambda d: rollout.evaluate(scene, engine, jax.vmap(space.params)(d), fresh))
+    found: dict[str, Any] = {"preset": preset, "values": values, "seconds": seconds}
+    found["gradients"] = STEPS * PARTICLES * TRIALS
+    for name, designs in {"drawn": drawn, "by shape": moved}.items():
+        outcome, used = windows.timed(judge, designs)
+        good = ~failed(np.asarray(outcome.status))
+        cost = np.where(good, outcome.cost, np.nan)
+        kept = np.isinf(np.asarray(outcome.lost_time)) & good
+        found[name] = {
+            "cost": float(np.nanmean(cost)),
+            "deviation": float(np.nanstd(np.nanmean(cost, 1)) / np.sqrt(PARTICLES)),
+            "best": float(np.nanmin(np.nanmean(cost, 1))),
+            "kept": float(kept.mean()),
+            "failed": float((~good).mean()),
+        }
+        _, again = windows.timed(judge, designs)
+        found["seconds_of_grasps"] = again
+        print(name, found[name], flush=True)
+    return found

@@ -1,13 +1,15 @@
 """Arrays in files that are known to be what was written: .npz with a digest of all that they hold.
 
 The checksums of zip leave out names and lengths, and what reads them has an error of its own for
-each damage; here there is one.
+each damage; here there is one.  Results that another process may go on from say as well of which
+case they are, by which code and in which layout: `head`, `Store`.
 """
 
 import contextlib
 import hashlib
 import io
 import os
+import uuid
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,12 +17,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from codesign_jax import files
+from codesign_jax import files, sources
 
 DIGEST = "digest"
 """Name of the array that holds the digest of the others."""
 MOST = 2**30
 """Most bytes of arrays that a file may unpack to."""
+SCHEMA = 1
+"""Layout of results, in which their arrays have names and shapes."""
 _NUMBER = "number of the part"
 _HEAD = 8  # bytes of a part's length
 
@@ -91,6 +95,60 @@ class Parts:
             file.flush()
             os.fsync(file.fileno())
         self._ends.append(self._ends[-1] + _HEAD + len(content))
+
+
+def head(key: str) -> dict[str, np.ndarray]:
+    """Arrays that say whose results are; see `refusal`.
+
+    Args:
+      key: What determines the results, beside code, versions and device.
+    """
+    # Results of code that is not known are nobody's: nothing is equal to this.
+    code = sources.digest() or f"unknown {uuid.uuid4()}"
+    return {"key": np.array(key), "code": np.array(code), "schema": np.array(SCHEMA)}
+
+
+def refusal(arrays: Mapping[str, np.ndarray], key: str) -> str:
+    """Why results must not be taken for those of a key, with the file as subject; else nothing.
+
+    Args:
+      arrays: Arrays, among which a `head` is wanted.
+      key: The key.
+    """
+    found = {name: str(arrays.get(name)) for name in ("key", "code", "schema")}
+    if found["schema"] == str(SCHEMA) and found["key"] != key:
+        return "is of another case"
+    same = found["schema"] == str(SCHEMA) and found["code"] == sources.digest()
+    return "" if same else "is of another version of the code"
+
+
+class Store(Parts):
+    """Results of a case that grow part by part, and are found again by the same case and code.
+
+    Attributes:
+      found: As of `Parts`: the results.
+      refused: Why results that are there are not taken, with the file as subject; empty if they
+        are. The next part then takes their place.
+    """
+
+    def __init__(self, path: Path, key: str):
+        """Reads what is there; a file that cannot be read counts as none.
+
+        Args:
+          path: The file.
+          key: See `head`.
+        """
+        super().__init__(path)
+        self._key, self.refused = key, refusal(self.found[0], key) if self.found else ""
+        if self.refused:
+            self.go_on(0)
+        self.found = self.found[1:]
+
+    def append(self, arrays: Mapping[str, Any]) -> None:
+        """As of `Parts`."""
+        if len(self._ends) == 1:
+            super().append(head(self._key))
+        super().append(arrays)
 
 
 def _packed(arrays: Mapping[str, Any], compressed: bool) -> bytes:

@@ -43,9 +43,11 @@ class Optimize:
     and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
     schedule: str = "concurrent"
-    """Strategy: concurrent, single, switch-K (K switches), morphology or control."""
-    first: Literal["morphology", "control"] = "morphology"
-    """Domain of the first episode with single and switch-K."""
+    """Strategy: concurrent, single, switch-K (K switches), morphology or control. Several, such as
+    single,switch-4,concurrent: runs of each, simulated in one batch, and a comparison."""
+    first: Literal["morphology", "control", "alternate"] = "morphology"
+    """Domain of the first episode with single and switch-K; alternate: morphology for even seeds,
+    control for odd ones, as in the paper's experiments."""
     optimizer: str = "particle-filter"
     """Optimiser: particle-filter (the paper's), cma-es, pso or random, all on one budget of grasps
     (what differs: docs/command_line.md); or MODULE:CLASS, one of your own."""
@@ -72,8 +74,8 @@ class Optimize:
     """Several seeds, such as 0-9 or 1,3,5: a run of each, simulated in one batch, and a
     comparison. Each is the run that it would be alone."""
     jobs: Count = None
-    """With --seeds: each run in a process of its own, so many at a time: SLURM jobs where there is
-    SLURM, else local processes."""
+    """With --seeds or several --schedule: each run in a process of its own, so many at a time:
+    SLURM jobs where there is SLURM, else local processes."""
     job_set: JobParameters = ()
     devices: Count = None
     """Devices that share the batch; default: every GPU of this host. Results do not depend on
@@ -87,7 +89,7 @@ class Optimize:
     or MPI, or ADDRESS:PORT,PROCESSES,INDEX. The folder must be one that all see."""
     out: File = None
     """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED, with the optimiser before the seed if
-    it is another. With --seeds a folder of run folders."""
+    it is another. With --seeds or several --schedule a folder of run folders."""
     fresh: Flag = False
     """Delete an earlier run in the folder and start anew."""
     dry_run: Flag = False

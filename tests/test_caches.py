@@ -4,6 +4,7 @@ import os
 import warnings
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from codesign_jax import archives, caches, cli, files, kept_programs
+from codesign_jax.archives import Store
 from codesign_jax.compiler import cache
 from codesign_jax.runs import failures, rates
 from codesign_jax.scene.meshes import grid
@@ -325,6 +327,35 @@ def test_parts_are_added_and_a_torn_one_is_left_out(tmp_path):
     again.go_on(1)
     again.append({"k": np.array(8)})
     assert [int(p["k"]) for p in archives.Parts(path).found] == [0, 8]
+
+
+def test_results_are_those_of_one_case_and_one_code(tmp_path, monkeypatch):
+    path = tmp_path / "x.part"
+
+    def found(key="a"):
+        store = Store(path, key)
+        assert not (store.found and store.refused)
+        return [int(part["k"]) for part in store.found], store.refused
+
+    store = Store(path, "a")
+    for k in range(2):
+        store.append({"k": np.array(k)})
+    assert found() == ([0, 1], "")
+    assert found("b") == ([], "is of another case")
+    for name, value in (("SCHEMA", 0), ("sources", SimpleNamespace(digest=lambda: "other"))):
+        with monkeypatch.context() as patch:
+            patch.setattr(archives, name, value)
+            assert found() == ([], "is of another version of the code")
+    with monkeypatch.context() as patch:  # code that is not known is nobody's, not even its own
+        patch.setattr(archives, "sources", SimpleNamespace(digest=lambda: None))
+        Store(tmp_path / "y.part", "a").append({"k": np.array(0)})
+        assert Store(tmp_path / "y.part", "a").refused
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    assert found() == ([0], ""), "the last part is torn"
+    path.write_bytes(content)
+    Store(path, "b").append({"k": np.array(7)})
+    assert found("b") == ([7], "")
 
 
 def test_two_writers_of_one_file_do_not_share_a_temporary_file(tmp_path):

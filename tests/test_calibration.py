@@ -14,6 +14,7 @@ import scipy.interpolate
 from toy import ToyEngine, tiny
 
 from codesign_jax import codesign, rollout, scene
+from codesign_jax.archives import Store
 from codesign_jax.codesign import stream_key
 from codesign_jax.optimize import State, candidates, schedule
 from codesign_jax.scene import parameters, schema
@@ -21,9 +22,7 @@ from codesign_jax.types import Status
 from scripts.calibration import __main__ as calibrate
 from scripts.calibration import files, report, score, sets, summary, surrogate
 from scripts.calibration.wave import Size, Wave, keep, trial_costs
-from scripts.experiments import Stop, drive
 from scripts.experiments.landscape import STREAM_GRID
-from scripts.shared.record import StateError
 
 AXIS = np.arange(12.0)
 
@@ -159,17 +158,18 @@ SIZE = Size(points=4, trials=2, chunk=70)
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A wave of five sets, two a call, driven in one go, and its engine."""
+    """A wave of five sets, two a call, its engine, and what its steps found."""
     the_scene, space, engine = sensitive()
     wave = Wave(the_scene, engine, space, UNITS, SIZE, seed=7)
-    path = tmp_path_factory.mktemp("wave") / "state.npz"
-    return wave, engine, drive(wave, path, {"of": "toy"}, say=quiet).record
+    store = Store(tmp_path_factory.mktemp("wave") / "toy.part", "toy")
+    assert wave.run(store, quiet) == wave.size.worlds * len(UNITS)
+    return wave, engine, store.found
 
 
 def test_a_wave_is_one_program_and_has_the_costs_of_each_set_alone(whole):
-    wave, engine, record = whole
+    wave, engine, parts = whole
     assert engine.traced == 1 and wave.steps == 3
-    kept = keep(wave, record)
+    kept = keep(wave, parts)
     costs = trial_costs(kept)
     assert costs.shape == (5, 4, 4, 2)
     the_scene, space, alone = sensitive()
@@ -191,28 +191,21 @@ def test_a_wave_is_one_program_and_has_the_costs_of_each_set_alone(whole):
 
 def test_a_wave_that_is_cut_off_goes_on(whole, tmp_path):
     wave, _, expected = whole
-    path, settings = tmp_path / "state.npz", {"of": "toy"}
-    cut = drive(wave, path, settings, stop=Stop(every=1, minutes=0.0), say=quiet)
-    assert not cut.finished and int(cut.record["step"]) == 0
-    record = dict(cut.record)
-    wave.step(record)
-    assert len(keep(wave, record)["units"]) == 2
-
-    class Killed(Exception):
-        pass
+    path = tmp_path / "toy.part"
 
     def dies(line):
         if line.lstrip().startswith("2/"):
-            raise Killed
+            raise KeyboardInterrupt
 
-    with pytest.raises(Killed):
-        drive(wave, path, settings, stop=Stop(every=1), say=dies)
-    done = drive(wave, path, settings, say=quiet)
-    assert done.finished and done.processes == 3
+    with pytest.raises(KeyboardInterrupt):
+        wave.run(Store(path, "toy"), dies)
+    again = Store(path, "toy")
+    assert len(again.found) == 2 and len(keep(wave, again.found)["units"]) == 4
+    assert wave.run(again, quiet) == wave.size.worlds, "one set is left"
+    whole, found = keep(wave, expected), keep(wave, again.found)
     for name in ("lost_step", "status", "units"):
-        np.testing.assert_array_equal(done.record[name], expected[name])
-    with pytest.raises(StateError):
-        drive(wave, path, {"of": "another"}, say=quiet)
+        np.testing.assert_array_equal(found[name], whole[name])
+    assert len(Store(path, "toy").found) == 3
 
 
 def test_sizes_that_do_not_fit_are_refused():
@@ -523,5 +516,5 @@ def test_bad_input_is_told_in_words(scored, arguments, part, monkeypatch):
     folder, calibrate = scored
     arguments = [str(folder / a) if a.endswith(".npz") else a for a in arguments]
     monkeypatch.setattr(sys, "argv", ["calibrate.py", *arguments, "--out", str(folder)])
-    with pytest.raises((StateError, schema.SceneError), match=part):
+    with pytest.raises(schema.SceneError, match=part):
         calibrate.main()

@@ -134,10 +134,10 @@ def test_imports_point_one_way():
         ("codesign_jax.codesign", "codesign_jax.rollout", False),
         ("codesign_jax.optimize.schedule", "codesign_jax.scene.hand", True),
         ("codesign_jax.compiler.cpu", "codesign_jax.scene", True),
-        ("codesign_jax.runs.loop", "scripts.shared.record", True),
-        ("scripts.shared.record", "scripts.experiments.plan", True),
+        ("codesign_jax.runs.loop", "scripts.shared.output", True),
+        ("scripts.shared.output", "scripts.experiments.plan", True),
         ("scripts.accuracy.tables", "scripts.benchmark.report", True),
-        ("scripts.winners.variants", "scripts.experiments.worlds", False),
+        ("scripts.winners.variants", "scripts.experiments.study", False),
     ],
 )
 def test_an_import_against_the_arrows_would_be_found(name, other, forbidden):

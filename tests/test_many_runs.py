@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import dataclasses
 import io
 import json
 import os
@@ -30,6 +31,7 @@ from toy import TINY
 from codesign_jax import codesign, runs, scene
 from codesign_jax.batch import Batch
 from codesign_jax.commands import jobs, seeds
+from codesign_jax.commands.seeds import Compared
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.types import Outcome, Status
@@ -73,9 +75,10 @@ def test_seeds_are_compared(compared):
     assert "% of such runs (95 % interval)" in table
     with (both / "seeds.csv").open(newline="") as file:
         rows = [*csv.DictReader(file)]
-    assert [(row["seed"], row["finished"], row["run"]) for row in rows] == [
-        ("2", "1", "seed-2"),
-        ("3", "1", "seed-3"),
+    names = ("seed", "schedule", "first", "finished", "run")
+    assert [tuple(row[name] for name in names) for row in rows] == [
+        ("2", "concurrent", "morphology", "1", "seed-2"),
+        ("3", "concurrent", "morphology", "1", "seed-3"),
     ]
     for row in rows:
         with (both / row["run"] / "tests.csv").open(newline="") as file:
@@ -94,20 +97,57 @@ def test_rows_of_runs_are_verdicts():
     )
     record = SimpleNamespace(history=SimpleNamespace(cost=np.ones((1, 1))))
     result = runs.RunResult(record, test, 0)
-    own = seeds.of_test(tiny, result)
-    row = seeds._row(tiny, result, own, tested=True)
-    assert row == ("no", "final test", "1 of 3", "1", "1", "0", "0.5000", "no")
     kept = Outcome(np.zeros(2), np.zeros(2, int), np.full(2, np.inf), np.full(2, -1))
     fresh = Judged(tiny, kept, "reference")
-    row = seeds._row(tiny, result, fresh, tested=False)
-    assert row[1:] == ("reference", "2 of 2", "0", "0", "0", "0.0000", "yes")
-    assert seeds._fresh_values(fresh) == [2, 0, 0, 0, "0"]
-    text = io.StringIO()
-    runs_of = {1: result, 2: None, 3: result}
-    seeds.compare(tiny, runs_of, {1: fresh, 2: None, 3: None}, Console(file=text, width=80))
-    shown = text.getvalue()
-    assert "1 of 2 runs found a design" in shown and "success" in shown
-    assert "3     no         final test" in shown  # 80 columns have room for it
+
+    def compared(schedule, *chosen):
+        own = runs.make_settings("2d", schedule, "morphology", "structured", 0)
+        return {
+            Path(f"{schedule}-{seed}"): Compared(dataclasses.replace(own, seed=seed), *run)
+            for seed, run in enumerate(chosen, 1)
+        }
+
+    def shown(every, width=80):
+        text = io.StringIO()
+        seeds.compare(tiny, every, Console(file=text, width=width))
+        return [" ".join(line.split()) for line in text.getvalue().splitlines()]
+
+    one = compared("single", (result, fresh), (None, None), (result, None))
+    lines = shown(one)  # 80 columns have room for it
+    assert "1 no reference 2 of 2 0 0 0 0.0000 yes" in lines and "2 failed" in lines
+    assert "3 no final test 1 of 3 1 1 0 0.5000 no" in lines
+    assert any(line.startswith("1 of 2 runs found a design") for line in lines)
+    good = SimpleNamespace(history=SimpleNamespace(cost=np.array([[2.0], [0.0]])))
+    other = compared("concurrent", (runs.RunResult(good, test, 0), fresh))
+    lines = shown(one | other, width=100)
+    assert "single 3 no final test 1 of 3 1 1 0 0.5000 no" in lines
+    # By Wilson's formula: 1 of 2 is 9.5 to 90.5 %, 1 of 1 is 20.7 to 100 %.
+    assert "single 0 of 3 never 1 of 2 9 to 91 %" in lines
+    assert "concurrent 1 of 1 60 1 of 1 21 to 100 %" in lines
+
+
+def test_strategies_are_compared(compared, tmp_path, capsys):
+    """Two strategies of two seeds in one batch, each run with the bits that it has alone."""
+    both = [*TWO, "--schedule", "single,concurrent", "--first", "alternate"]
+    assert command(*both, "--out", tmp_path / "both") == 0
+    output = capsys.readouterr().out
+    assert output.count("compiled in") == 1 and "single, seed 3: seed" in output
+    assert "strategy" in output and "successful: the run found a design that keeps" in output
+    with (tmp_path / "both" / "seeds.csv").open(newline="") as file:
+        rows = [tuple(r[n] for n in ("run", "schedule", "first")) for r in csv.DictReader(file)]
+    assert rows[1:3] == [
+        ("single/seed-3", "single", "control"),
+        ("concurrent/seed-2", "concurrent", "morphology"),
+    ]
+    alone = ["--seed", "3", "--episodes", "2", "--schedule", "single", "--first", "control"]
+    assert command(*BASE, *alone, "--out", tmp_path / "alone") == 0
+    assert stored(tmp_path / "both" / "single" / "seed-3") == stored(tmp_path / "alone")
+    for seed in ("seed-2", "seed-3"):
+        assert stored(tmp_path / "both" / "concurrent" / seed) == stored(compared[0] / seed)
+    assert command(*TWO, "--schedule", "single,singel", "--out", tmp_path / "no") == 2
+    assert "did you mean 'single'?" in capsys.readouterr().err
+    assert command(*TWO, "--schedule", "single,single", "--out", tmp_path / "no") == 2
+    assert "names a strategy more than once" in capsys.readouterr().err
 
 
 class Here:

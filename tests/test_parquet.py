@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 import pytest
-from toy import ToyEngine, tiny
+from toy import tiny
 
-from codesign_jax import codesign
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Status, failed
-from scripts.experiments import Batch, Grid, Landscape, Strategies, Worlds, drive, parquet
+from scripts.experiments import parquet
+from scripts.experiments.plan import Strategies
 
 ROOT = Path(__file__).parents[1]
 PLAN = Strategies("2d", "2d", ("single", "switch-1", "concurrent"), 2, 4, 3, 3, 6)
@@ -21,13 +21,15 @@ NOTES = {"command": "python", "commit": "abc", "versions": {"jax": "0"}}
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A batch over the toy engine, some of whose worlds fail, and its record."""
-    scene, space, _ = tiny()
-    worlds = Worlds(scene, ToyEngine(scene, failing=[1, 40]), space, chunk=PLAN.worlds)
-    batch = Batch(PLAN, scene, worlds, codesign.make_filter(space), seed=5)
-    path = tmp_path_factory.mktemp("run") / "state.npz"
-    return batch, drive(batch, path, {}, say=lambda _: None).record
+def finished():
+    """Made-up arrays of `strategies.gather`, some of whose trials failed."""
+    random, sizes = np.random.default_rng(0), (3, 2, PLAN.episodes, 4, 3)
+    found = {}
+    for name, shape in (("trial_", sizes), ("test_", (3, 2, 4, 9))):
+        status = (random.random(shape) < 0.1).astype(np.uint8)
+        cost = np.where(status, 3.0, random.random(shape)).astype(np.float32)
+        found |= {f"{name}cost": cost, f"{name}status": status}
+    return found | {"status": found.pop("trial_status")}
 
 
 def columns(path):
@@ -40,8 +42,9 @@ def columns(path):
 
 
 def test_one_row_a_grasp_with_the_stored_values(finished, tmp_path):
-    batch, record = finished
-    path = parquet.write(tmp_path / "new" / "2d.parquet", batch, record, NOTES)
+    record = finished
+    path = tmp_path / "new" / "2d.parquet"
+    assert parquet.write_strategies(path, PLAN, tiny()[1], record, NOTES) == path
     assert sorted(p.name for p in path.parent.iterdir()) == ["2d.parquet"]
     rows = columns(path)
     assert len(rows["cost"]) == PLAN.grasps == 3 * 2 * 4 * 3 * 5
@@ -62,16 +65,13 @@ def test_one_row_a_grasp_with_the_stored_values(finished, tmp_path):
     np.testing.assert_array_equal(rows["status"][~test], status)
     bad = failed(status)
     assert bad.any() and (rows["cost"][~test][bad] == 3.0).all()
-    # The optimiser's own costs of particles: the mean over the trials that did not fail.
-    total, count = np.zeros((2, *record["cost"].shape))
-    np.add.at(total, tuple(i[~bad] for i in at), rows["cost"][~test][~bad])
-    np.add.at(count, tuple(i[~bad] for i in at), 1)
-    means = np.where(count > 0, total / np.maximum(count, 1), 3.0)
-    np.testing.assert_allclose(means, record["cost"], atol=1e-5)
+    costs = record["trial_cost"][(*at, rows["trial"][~test])]
+    np.testing.assert_array_equal(rows["cost"][~test], costs)
 
 
 def test_types_and_provenance_are_in_the_schema(finished, tmp_path):
-    path = parquet.write(tmp_path / "2d.parquet", *finished, NOTES)
+    path = tmp_path / "2d.parquet"
+    parquet.write_strategies(path, PLAN, tiny()[1], finished, NOTES)
     schema = pyarrow.parquet.read_schema(path)
     assert json.loads(schema.metadata[b"provenance"]) == NOTES
     bits = json.loads(schema.metadata[b"status_bits"])
@@ -83,24 +83,23 @@ def test_types_and_provenance_are_in_the_schema(finished, tmp_path):
 
 
 def test_what_was_not_simulated_yet_has_no_rows(finished, tmp_path):
-    batch, record = finished
-    for step, grasps in ((1, 1), (PLAN.episodes, 3), (PLAN.episodes + 1, 4)):
-        path = tmp_path / f"{step}.parquet"
-        parquet.write(path, batch, record | {"step": np.int64(step)}, {})
-        rows = pyarrow.parquet.read_metadata(path).num_rows
-        assert rows == grasps * PLAN.worlds
+    begun = {"trial_cost": finished["trial_cost"][:, :, :1], "status": finished["status"][:, :, :1]}
+    path = tmp_path / "begun.parquet"
+    parquet.write_strategies(path, PLAN, tiny()[1], begun, {})
+    assert pyarrow.parquet.read_metadata(path).num_rows == PLAN.worlds
 
 
 def test_a_landscape_s_rows_name_their_point(tmp_path):
-    scene, space, engine = tiny()
-    plan = Landscape("landscape", "2d", 3, 4, block=2)
-    grid = Grid(plan, scene, Worlds(scene, engine, space, chunk=18), seed=5)
-    record = grid.start()
-    for step in (1, 2):
-        grid.step(record)
-        path = parquet.write(tmp_path / f"{step}.parquet", grid, record, NOTES)
-        rows = columns(path)
-        assert len(rows["cost"]) == 9 * 2 * step
+    _, space, _ = tiny()
+    random, path = np.random.default_rng(0), tmp_path / "grid.parquet"
+    record = {
+        "designs": random.random((3, 3, 2)).astype(np.float32),
+        "trial_cost": random.random((3, 3, 4)).astype(np.float32),
+        "status": np.zeros((3, 3, 4), np.uint8),
+    }
+    parquet.write_landscape(path, "landscape", space, record, NOTES)
+    rows = columns(path)
+    assert len(rows["cost"]) == 9 * 4
     field = pyarrow.parquet.read_schema(path).field("first")
     assert field.metadata[b"parameter"].decode() == space.names[0]
     designs = space.in_units(record["designs"]).astype(np.float32)
@@ -114,7 +113,7 @@ def test_a_landscape_s_rows_name_their_point(tmp_path):
 def test_without_pyarrow_nothing_is_simulated(finished, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(SceneError, match=r"pip install 'codesign-jax\[parquet\]'"):
-        parquet.write(tmp_path / "x.parquet", *finished, NOTES)
+        parquet.write_strategies(tmp_path / "x.parquet", PLAN, tiny()[1], finished, NOTES)
     arguments = ["experiments", "2d", "--size", "tiny", "--engine", "mujoco"]
     arguments += ["--out", str(tmp_path / "out"), "--parquet", str(tmp_path / "x.parquet")]
     monkeypatch.setattr(sys, "argv", arguments)

@@ -10,11 +10,10 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import rollout
+from codesign_jax import archives, rollout
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import make_engine
-from codesign_jax.scene import parameters
-from scripts.shared import record
+from codesign_jax.scene import SceneError, parameters
 from scripts.winners import (
     files as winners_files,
 )
@@ -105,8 +104,9 @@ def test_a_drive_goes_on_where_it_stopped(finals, tmp_path, monkeypatch):
     noted = []
 
     def note(key):
-        stored = record.load(path, settings) if path.exists() else {}
+        stored = archives.load(path) if path.exists() else {}
         noted.append((key, len(winners_files.calls(stored))))
+        winners_files.write_runs(path, settings, [{"calls": [key]}])
 
     first, finished = winners.drive(
         todo[:1], path, settings, more=SMALL, say=said.append, note=note
@@ -121,7 +121,7 @@ def test_a_drive_goes_on_where_it_stopped(finals, tmp_path, monkeypatch):
         np.testing.assert_array_equal(every[name], value)
     assert winners.gather(every, "23d", "MuJoCo C")[0].shape == (2, 1, 6)
     assert winners.gather(every, "23d", "nothing") is None
-    with pytest.raises(record.StateError, match="size"):
+    with pytest.raises(SceneError, match="size"):
         winners.drive(todo, path, {"size": "paper"})
 
 
@@ -140,7 +140,7 @@ def stored(path, runs, **variants):
     for name, cost in variants.items():
         results[f"2d|{name}|0|cost"] = np.full((2, 1, 3), cost, np.float16)
         results[f"2d|{name}|0|status"] = np.zeros((2, 1, 3), np.uint8)
-    record.save(path, results, {"size": "tiny"})
+    archives.save(path, results)
     winners_files.write_runs(path, {"size": "tiny"}, runs)
     return path
 
@@ -156,18 +156,18 @@ def test_files_are_joined_with_their_runs(tmp_path):
         ("A", ["2d|x|0", "2d|y|0"]),
         ("B", ["2d|z|0"]),
     ]
-    with pytest.raises(record.StateError, match="exists and is not among"):
+    with pytest.raises(SceneError, match="exists and is not among"):
         winners_files.merge([a, b], out)
     c = stored(tmp_path / "c.npz", [{"command": "C", "calls": ["2d|z|0"]}], z=1)
-    with pytest.raises(record.StateError, match="c.npz: its 2d|z|0|cost differs"):
+    with pytest.raises(SceneError, match="c.npz: its 2d|z|0|cost differs"):
         winners_files.merge([out, c], out)
     other = tmp_path / "d.npz"
-    record.save(other, {}, {"size": "cpu"})
+    archives.save(other, {})
     winners_files.write_runs(other, {"size": "cpu"}, [])
-    with pytest.raises(record.StateError, match="size: tiny and cpu"):
+    with pytest.raises(SceneError, match="size: cpu there, tiny wanted"):
         winners_files.merge([out, other], out)
     (tmp_path / "c.json").unlink()
-    with pytest.raises(record.StateError, match="cannot be read from its .json"):
+    with pytest.raises(SceneError, match="cannot be read from its .json"):
         winners_files.merge([out, c], out)
 
 
@@ -258,7 +258,7 @@ def test_the_script_simulates_and_draws(tmp_path, monkeypatch, capsys):
     for part in ("cost", "status"):
         results[f"23d|{STANDARD}|0|{part}"] = results[f"23d|MuJoCo C|0|{part}"]
     runs.append({"command": "copied", "calls": [f"23d|{STANDARD}|0"]})
-    record.save(out, results, settings)
+    archives.save(out, results)
     winners_files.write_runs(out, settings, runs)
     for name in ("23d.npz", "2d.npz"):
         shutil.copy(DATA / name, tmp_path)

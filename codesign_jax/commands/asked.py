@@ -1,4 +1,4 @@
-"""What a command line of `codesign optimize` asks for: scene, settings, seeds and folders."""
+"""What a command line of `codesign optimize` asks for: scene, settings and the runs' folders."""
 
 import dataclasses
 import os
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from codesign_jax.cli import Optimize
 
 
+ALTERNATE, DOMAINS = "alternate", ("morphology", "control")
+"""Value of --first by which even seeds begin in the first domain and odd ones in the other."""
 _LONGEST = 200
 """Most bytes of a folder's name; file systems take 255, temporary files add to it."""
 
@@ -36,10 +38,11 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         scene = common.load_scene(options)
     except SceneError as error:
         problems += error.problems
+    schedules = options.schedule.split(",")
     settings = runs.make_settings(
         options.preset,
-        options.schedule,
-        options.first,
+        schedules[0],
+        DOMAINS[0] if options.first == ALTERNATE else options.first,
         options.engine or engines.DEFAULT,
         options.seed,
         particles=options.particles,
@@ -55,7 +58,10 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         except SceneError as error:
             problems += error.problems
     problems += _flag_problems(options)
-    problems += runs.check(settings, scene.hand if scene else None)
+    for name in schedules:
+        own = dataclasses.replace(settings, schedule=name)
+        found = runs.check(own, scene.hand if scene else None)
+        problems += [problem for problem in found if problem not in problems]
     if problems or scene is None:
         raise SceneError(problems)
     return scene, settings
@@ -66,8 +72,11 @@ def _flag_problems(options: "Optimize") -> list[str]:
     problems = []
     if options.seeds is not None and options.seed != 0:
         problems.append("--seed and --seeds exclude each other")
-    if options.jobs is not None and (options.seeds is None or options.jobs < 1):
-        problems.append("--jobs needs --seeds and at least one run at a time")
+    schedules = options.schedule.split(",")
+    if len({*schedules}) < len(schedules):
+        problems.append(f"--schedule {options.schedule!r} names a strategy more than once")
+    if options.jobs is not None and (not several(options) or options.jobs < 1):
+        problems.append("--jobs needs --seeds or strategies, and at least one run at a time")
     if options.job_set and options.jobs is None:
         problems.append("--job-set needs --jobs: its parameters are those of jobs")
     try:
@@ -93,8 +102,38 @@ def _as_the_runs(options: "Optimize", scene: Scene, settings: Settings) -> Setti
     Raises:
       SceneError: If the runs differ in them.
     """
-    folders = [folder(options, scene, settings, seed) for seed in seeds_of(options)]
+    folders = runs_of(options, scene, settings)
     return dataclasses.replace(settings, episodes=runs.episodes_of(folders) or settings.episodes)
+
+
+def several(options: "Optimize") -> bool:
+    """Whether the command compares runs, even if it happens to have one alone."""
+    return options.seeds is not None or "," in options.schedule
+
+
+def runs_of(options: "Optimize", scene: Scene, settings: Settings) -> dict[Path, Settings]:
+    """Settings of each run by its folder: of every strategy those of every seed.
+
+    Args:
+      options: The command line.
+      scene: The scene.
+      settings: Settings of any of the runs.
+
+    Raises:
+      SceneError: If --seeds is no list of seeds, or see `_folder`.
+    """
+    found = {}
+    for name in options.schedule.split(","):
+        for seed in seeds_of(options):
+            first = DOMAINS[seed % 2] if options.first == ALTERNATE else options.first
+            own = dataclasses.replace(settings, schedule=name, first=first, seed=seed)
+            found[_folder(options, scene, own)] = own
+    return found
+
+
+def table_folder(options: "Optimize") -> Path:
+    """Folder of the table that compares runs."""
+    return Path("runs") if options.out is None else options.out
 
 
 def seeds_of(options: "Optimize") -> list[int]:
@@ -106,16 +145,18 @@ def seeds_of(options: "Optimize") -> list[int]:
     return [options.seed] if options.seeds is None else seeds.parse(options.seeds)
 
 
-def folder(options: "Optimize", scene: Scene, settings: Settings, seed: int) -> Path:
-    """Folder of one run: --out, with a folder inside for each of --seeds.
+def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:
+    """Folder of one run: --out, with a folder inside for each of several strategies and --seeds.
 
     Raises:
       SceneError: If there is no --out, and what the files call hand or preset is no name of a
         folder: whoever wrote them would choose a place on this disk.
     """
     if options.out is not None:
-        return options.out if options.seeds is None else options.out / f"seed-{seed}"
-    names = [scene.hand.name, settings.preset, settings.schedule, str(seed)]
+        inside = [settings.schedule] if "," in options.schedule else []
+        inside += [f"seed-{settings.seed}"] if several(options) else []
+        return options.out.joinpath(*inside)
+    names = [scene.hand.name, settings.preset, settings.schedule, str(settings.seed)]
     others = (settings.optimizer, optimize.DEFAULT), (settings.cost, runs.SCENE_COST)
     names[3:3] = [asked.replace(":", ".") for asked, usual in others if asked != usual]
     name = "-".join(names)

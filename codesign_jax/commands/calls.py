@@ -1,6 +1,9 @@
 """Many designs in the same trials, some at a time: progress, and a file from which to go on."""
 
+import itertools
 import time
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +36,7 @@ class Trials(NamedTuple):
       space: Design space of the designs.
       count: Trials of each design.
       seed: Root of the trials' noise.
+      stream: What `codesign.stream_key` folds into the root; none for the root itself.
     """
 
     scene: Scene
@@ -40,6 +44,13 @@ class Trials(NamedTuple):
     space: DesignSpace
     count: int
     seed: int
+    stream: tuple[int, ...] = ()
+
+    @property
+    def key(self) -> jax.Array:
+        """Key of the trials' noise."""
+        root = jax.random.key(self.seed)
+        return codesign.stream_key(root, *self.stream) if self.stream else root
 
 
 def most_designs(trials: Trials) -> int:
@@ -50,6 +61,44 @@ def most_designs(trials: Trials) -> int:
 def equal(designs: int, most: int) -> int:
     """Designs of each of equal calls: a short last one would be filled up."""
     return -(-designs // -(-designs // most))
+
+
+def in_turn(
+    trials: Trials,
+    engine: Engine,
+    designs: np.ndarray,
+    size: int,
+    *,
+    devices: int | None = 1,
+    evaluate: codesign.EvaluateFunction | None = None,
+) -> Iterator[Outcome]:
+    """Outcomes of designs, some at a time in their order, of shape (design, trial).
+
+    Args:
+      trials: What every design meets.
+      engine: The engine of that name.
+      designs: Designs [SI units], shape (design, parameter).
+      size: Designs of a call; the last call is filled up.
+      devices: Devices that take turns; None for all.
+      evaluate: What `codesign.make_evaluate` returned for the same.
+    """
+    places, running = batch.take(devices), deque()
+    if evaluate is None:
+        evaluate = codesign.make_evaluate(trials.scene, engine, trials.space, trials.count)
+
+    def arrived() -> Outcome:
+        count, found = running.popleft()
+        return jax.tree.map(lambda v: np.asarray(v)[:count], found)
+
+    for start, place in zip(range(0, len(designs), size), itertools.cycle(places), strict=False):
+        if len(running) == len(places):
+            yield arrived()
+        part = designs[start : start + size]
+        rows = np.minimum(np.arange(size), len(part) - 1)
+        given = jax.device_put((jnp.asarray(part[rows], jnp.float32), trials.key), place)
+        running.append((len(part), evaluate(*given)))
+    while running:
+        yield arrived()
 
 
 def work(trials: Trials, size: int) -> rates.Work:
@@ -126,7 +175,16 @@ class Calls:
         subject; empty if they are.
     """
 
-    def __init__(self, trials: Trials, engine: Engine, size: int, part: Path, designs: np.ndarray):
+    def __init__(
+        self,
+        trials: Trials,
+        engine: Engine,
+        size: int,
+        part: Path,
+        designs: np.ndarray,
+        *,
+        devices: int | None = 1,
+    ):
         """Compiles nothing yet.
 
         Args:
@@ -136,41 +194,37 @@ class Calls:
           part: The file; the caller deletes it at the end.
           designs: All designs that may be asked for, shape (design, parameter), which with `trials`
             and `size` determine the outcomes: calls of another size round differently.
+          devices: Devices that calls are dealt to; None for all.
         """
-        self._trials, self._size, self._part = trials, size, archives.Parts(part)
         how = trials.scene, trials.engine, designs, trials.count, trials.seed
-        self._key = f"{outcomes.key(*how)} {size}"
-        read = [outcomes.unpacked(arrays, self._key) for arrays in self._part.found]
-        self.refused = next((why for _, why in read if why), "")
-        kept = [] if self.refused else [outcome for outcome, _ in read if outcome is not None]
-        self._part.go_on(len(kept))
+        key = " ".join(map(str, (outcomes.key(*how), size, *trials.stream)))
+        self._trials, self._size, self._part = trials, size, archives.Store(part, key)
+        self.refused = self._part.refused
+        kept = [Outcome(**arrays) for arrays in self._part.found]
         self._kept = joined(kept) if kept else None
         self.found = sum(len(outcome.cost) for outcome in kept)
         self._next, self._seconds = 0, []
-        self._evaluate = codesign.make_evaluate(trials.scene, engine, trials.space, trials.count)
+        evaluate = codesign.make_evaluate(trials.scene, engine, trials.space, trials.count)
+        self._how = {"size": size, "devices": devices, "evaluate": evaluate}
+        self._engine = engine
 
     def __call__(self, designs: np.ndarray, meter: Meter) -> Outcome:
         """Outcomes of designs [SI units], arrays of shape (design, trial)."""
-        parts = []
-        for start in range(0, len(designs), self._size):
-            parts.append(self._call(designs[start : start + self._size], meter))
+        first, self._next, count = self._next, self._next + len(designs), self._trials.count
+        done, parts = min(max(self.found - first, 0), len(designs)), []
+        if done:
+            meter.found(done * count)
+            parts.append(jax.tree.map(lambda v: v[first : first + done], self._kept))
+        start = time.perf_counter()
+        for outcome in in_turn(self._trials, self._engine, designs[done:], **self._how):
+            self._part.append(outcome._asdict())
+            self._seconds.append(time.perf_counter() - start)
+            parts.append(outcome)
+            meter.advance(outcome.cost.size)
+            if len(self._seconds) == 1:
+                meter.compiled()
+            start = time.perf_counter()
         return joined(parts)
-
-    def _call(self, designs: np.ndarray, meter: Meter) -> Outcome:
-        first, self._next = self._next, self._next + len(designs)
-        if self._next <= self.found:
-            meter.found(len(designs) * self._trials.count)
-            return jax.tree.map(lambda v: v[first : self._next], self._kept)
-        rows = np.minimum(np.arange(self._size), len(designs) - 1)
-        population, start = jnp.asarray(designs[rows], jnp.float32), time.perf_counter()
-        every = self._evaluate(population, jax.random.key(self._trials.seed))
-        outcome = jax.tree.map(lambda v: np.asarray(v)[: len(designs)], every)
-        self._seconds.append(time.perf_counter() - start)
-        self._part.append(outcomes.packed(outcome, self._key))
-        meter.advance(len(designs) * self._trials.count)
-        if len(self._seconds) == 1:
-            meter.compiled()
-        return outcome
 
     def record_rate(self) -> None:
         """Keeps what was measured for estimates, if a call compiled and others did not."""

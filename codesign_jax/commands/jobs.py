@@ -14,7 +14,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, runs
 from codesign_jax.commands import common, slurm, status
-from codesign_jax.runs import RunResult
+from codesign_jax.runs import RunResult, Settings
 from codesign_jax.runs.directory import EVENTS
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
@@ -136,18 +136,19 @@ def _value(text: str) -> bool | int | float | str:
     return text
 
 
-def one(options: "Optimize", seed: int, folder: Path, arguments: list[str]) -> int:
-    """Runs one seed in the process of a job; returns the command's exit status.
+def one(options: "Optimize", settings: Settings, folder: Path, arguments: list[str]) -> int:
+    """Runs one of the runs in the process of a job; returns the command's exit status.
 
     Args:
-      options: The command line for all seeds.
-      seed: The seed.
+      options: The command line for all of them.
+      settings: Settings of the run.
       folder: Its run folder.
       arguments: Command line to note in the run folder.
     """
     sys.argv = arguments
     slurm.resume_before_the_limit(folder)
-    own = {"seeds": None, "jobs": None, "job_set": (), "seed": seed, "out": folder}
+    own = {"seeds": None, "jobs": None, "job_set": (), "out": folder, "seed": settings.seed}
+    own |= {"schedule": settings.schedule, "first": settings.first}
     fresh = options.fresh and not slurm.restarted()
     try:
         return status.of(dataclasses.replace(options, **own, fresh=fresh).run)  # type: ignore[arg-type]
@@ -158,25 +159,29 @@ def one(options: "Optimize", seed: int, folder: Path, arguments: list[str]) -> i
 
 
 def run(
-    options: "Optimize", scene: Scene, folders: dict[int, Path], console: Console
-) -> dict[int, RunResult | None]:
-    """Runs every seed as a job and reads the results from the run folders.
+    options: "Optimize", scene: Scene, every: Mapping[Path, Settings], console: Console
+) -> dict[Path, RunResult | None]:
+    """Runs each of several runs as a job and reads the results from the run folders.
 
     Args:
       options: The command line.
       scene: The scene, for the rule by which failed trials count.
-      folders: Run folder of each seed.
+      every: Settings of each run by its folder.
       console: Told when a run ends.
 
     Returns:
-      Each run by its seed; None for one that did not finish.
+      Each run by its folder; None for one that did not finish.
 
     Raises:
       SceneError: See `executor`; or if SLURM does not take the jobs.
       KeyboardInterrupt: When all jobs were cancelled.
     """
-    calls = {s: (one, options, s, folder.absolute(), sys.argv) for s, folder in folders.items()}
-    with private_folder(next(iter(folders.values())).parent) as own:
+    calls = {
+        folder: (one, options, settings, folder.absolute(), sys.argv)
+        for folder, settings in every.items()
+    }
+    called = runs.names(every)
+    with private_folder(options.out or Path("runs")) as own:
         made = executor(options, own)
         console.print(
             f"{len(calls)} runs, {options.jobs} at a time, on {made.cluster}; logs: {made.folder}",
@@ -187,28 +192,28 @@ def run(
         else:
             place = Processes(made, options.jobs or 1)
         place.start(calls)
-    results: dict[int, RunResult | None] = {}
+    results: dict[Path, RunResult | None] = {}
     try:
-        with Busy(console, _state(results, folders)) as busy:
-            while len(results) < len(folders):
-                for seed, job, state in place.ended():
+        with Busy(console, _state(results, every)) as busy:
+            while len(results) < len(every):
+                for folder, job, state in place.ended():
                     problem = why(job, state)
-                    results[seed] = None if problem else read(scene, folders[seed])
-                    console.print(f"seed {seed}: {problem or 'done'}", markup=False)
-                busy.say(_state(results, folders))
+                    results[folder] = None if problem else read(scene, folder)
+                    console.print(f"{called[folder]}: {problem or 'done'}", markup=False)
+                busy.say(_state(results, every))
                 time.sleep(POLL_SECONDS)
     except KeyboardInterrupt:
         place.cancel()
         console.print("stopped: the jobs are cancelled; the same command resumes")
         raise
-    return {seed: results[seed] for seed in folders}
+    return {folder: results[folder] for folder in every}
 
 
-def _state(results: Mapping[int, RunResult | None], folders: Mapping[int, Path]) -> str:
+def _state(results: Mapping[Path, RunResult | None], every: Iterable[Path]) -> str:
     """How many runs have ended, and how far the others are, by their logs."""
-    events = [_last_event(folders[seed] / EVENTS) for seed in folders if seed not in results]
+    events = [_last_event(folder / EVENTS) for folder in every if folder not in results]
     busy = [event for event in events if event]
-    text = f"{len(results)} of {len(folders)} runs ended, {len(busy)} begun"
+    text = f"{len(results)} of {len(results) + len(events)} runs ended, {len(busy)} begun"
     return f"{text}; the last words of one: {max(busy)[1]}" if busy else text
 
 
@@ -230,23 +235,23 @@ class Processes:
     def __init__(self, made: Any, most: int):
         """Takes submitit's executor and how many may run at once."""
         self._made, self._most = made, most
-        self._waiting: dict[int, tuple[Any, ...]] = {}
-        self._running: dict[int, Any] = {}
+        self._waiting: dict[Path, tuple[Any, ...]] = {}
+        self._running: dict[Path, Any] = {}
 
-    def start(self, calls: Mapping[int, tuple[Any, ...]]) -> None:
-        """Takes a call for each seed; each starts when there is room."""
+    def start(self, calls: Mapping[Path, tuple[Any, ...]]) -> None:
+        """Takes a call for each run folder; each starts when there is room."""
         self._waiting = dict(calls)
 
-    def ended(self) -> Iterator[tuple[int, Any, str]]:
-        """Seed and job of each run that has ended since, and a word if it left no result."""
+    def ended(self) -> Iterator[tuple[Path, Any, str]]:
+        """Folder and job of each run that has ended since, and a word if it left no result."""
         while self._waiting and len(self._running) < self._most:
-            seed = next(iter(self._waiting))
+            folder = next(iter(self._waiting))
             # submitit's controller of a job tells every Ctrl-C with a traceback.
             with _errors_to(Path(self._made.folder) / CONTROLLERS):
-                self._running[seed] = self._made.submit(*self._waiting.pop(seed))
-        for seed in [s for s, job in self._running.items() if job.done()]:
-            job = self._running.pop(seed)
-            yield seed, job, "" if job.paths.result_pickle.exists() else "killed"
+                self._running[folder] = self._made.submit(*self._waiting.pop(folder))
+        for folder in [f for f, job in self._running.items() if job.done()]:
+            job = self._running.pop(folder)
+            yield folder, job, "" if job.paths.result_pickle.exists() else "killed"
 
     def cancel(self) -> None:
         """Ends what runs, and starts nothing more."""

@@ -1,6 +1,5 @@
 """`codesign optimize`."""
 
-import dataclasses
 import functools
 import shlex
 import signal
@@ -38,41 +37,41 @@ def main(options: "Optimize") -> int:
     if options.distributed is not None:
         return _distributed(options)
     scene, settings = asked.resolve(options)
-    chosen = asked.seeds_of(options)
+    every = asked.runs_of(options, scene, settings)
     # Everything that speaks against the runs, before anything that takes time.
     plan = runs.prepare(scene, settings)
-    folders = {seed: asked.folder(options, scene, settings, seed) for seed in chosen}
-    common.check_place("--out", options.out or next(iter(folders.values())), folder=True)
+    plans = {folder: runs.variant(plan, own) for folder, own in every.items()}
+    common.check_place("--out", options.out or next(iter(every)), folder=True)
     sources = common.source_files(options)
-    for seed, folder in folders.items():
-        own = dataclasses.replace(settings, seed=seed)
+    for folder, own in every.items():
         runs.check_folder(folder, scene, own, fresh=options.fresh, sources=sources)
-    if options.seeds is not None:
-        seeds.check_table(folders)
+    if asked.several(options):
+        seeds.check_table(asked.table_folder(options))
     notes = [*_preflight(scene, settings, options.dry_run), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
-        _dry_run(scene, settings, len(chosen), options)
+        _dry_run(scene, settings, len(every), options)
         return 0
     if options.jobs is not None:
-        return _jobs(options, scene, folders)
+        return _jobs(options, scene, every)
     devices, chunk = options.devices, options.chunk
     trials = reference.number_of_trials(options.reference_trials, settings)
     after = trials * reference.steps_and_links(scene)
     opened = {"fresh": options.fresh, "sources": sources, "after": after}
-    found = runs.optimize(plan, folders, sys.argv, **opened, devices=devices, chunk=chunk)
+    found = runs.optimize(plans, sys.argv, **opened, devices=devices, chunk=chunk)
     _record_rate(plan, found, devices)
-    results: dict[int, RunResult | None] = {}
-    for seed, result in found.runs.items():
-        results[seed] = result if isinstance(result, RunResult) else None
+    results: dict[Path, RunResult | None] = {}
+    called = runs.names(every) if asked.several(options) else {}
+    for folder, result in found.runs.items():
+        results[folder] = result if isinstance(result, RunResult) else None
         if isinstance(result, Exception):
-            _tell_error("" if options.seeds is None else f"seed {seed}: ", result)
+            _tell_error(f"{called[folder]}: " if called else "", result)
     if found.signum:
         return 128 + found.signum
     console = Console(highlight=False, soft_wrap=True)
-    _tell(options, plan, results, folders, console)
-    if options.seeds is not None:
-        _compare(scene, results, folders, console)
+    _tell(options, plans, results, called, console)
+    if called:
+        _compare(options, scene, every, results, console)
     return int(any(result is None for result in results.values()))
 
 
@@ -105,45 +104,52 @@ def _distributed(options: "Optimize") -> int:
 def _compare_all(options: "Optimize") -> int:
     """Compares the runs of all hosts; returns the exit status."""
     scene, settings = asked.resolve(options)
-    chosen = asked.seeds_of(options)
-    folders = {seed: asked.folder(options, scene, settings, seed) for seed in chosen}
-    results = {seed: jobs.read(scene, folder) for seed, folder in folders.items()}
-    _compare(scene, results, folders, Console(highlight=False, soft_wrap=True))
+    every = asked.runs_of(options, scene, settings)
+    results = {folder: jobs.read(scene, folder) for folder in every}
+    _compare(options, scene, every, results, Console(highlight=False, soft_wrap=True))
     return int(any(result is None for result in results.values()))
 
 
 def _compare(
-    scene: Scene, results: dict[int, RunResult | None], folders: dict[int, Path], console: Console
+    options: "Optimize",
+    scene: Scene,
+    every: dict[Path, Settings],
+    results: dict[Path, RunResult | None],
+    console: Console,
 ) -> None:
     """Compares runs on the console and in seeds.csv."""
-    fresh = reference.of_runs(results, folders)
-    seeds.compare(scene, results, fresh, console)
-    table = seeds.write_table(scene, results, fresh, folders)
+    fresh = reference.of_runs(results)
+    compared = {
+        folder: seeds.Compared(every[folder], result, fresh[folder])
+        for folder, result in results.items()
+    }
+    seeds.compare(scene, compared, console)
+    table = seeds.write_table(scene, compared, asked.table_folder(options))
     console.print(f"table: {table}", markup=False)
 
 
 def _tell(
     options: "Optimize",
-    plan: Plan,
-    results: dict[int, RunResult | None],
-    folders: dict[int, Path],
+    plans: dict[Path, Plan],
+    results: dict[Path, RunResult | None],
+    called: dict[Path, str],
     console: Console,
 ) -> None:
-    """Says how each run ended, and tests its design at reference."""
-    trials = reference.number_of_trials(options.reference_trials, plan.settings)
-    for seed, result in results.items():
+    """Says how each run ended, and tests its design at reference; several are `called` so."""
+    for folder, result in results.items():
         if result is None or result.record is None:
             continue
-        if options.seeds is not None:
-            console.print(f"seed {seed}:")
-        own, fresh = runs.with_seed(plan, seed), None
+        if called:
+            console.print(f"{called[folder]}:")
+        own, fresh = plans[folder], None
         _summarize(own, result, console)
+        trials = reference.number_of_trials(options.reference_trials, own.settings)
         if trials and result.test is not None:
-            found = reference.test(folders[seed], own.settings, trials, console)
-            fresh = reference.judged(plan.scene, found)
+            found = reference.test(folder, own.settings, trials, console)
+            fresh = reference.judged(own.scene, found)
         if result.test is not None:
-            _judge(own, result, fresh, folders[seed], console)
-        _say_places(result, folders[seed], console)
+            _judge(own, result, fresh, folder, console)
+        _say_places(result, folder, console)
 
 
 def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
@@ -154,14 +160,14 @@ def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
         rates.record(work, timing.grasps / timing.seconds, timing.compile_seconds)
 
 
-def _jobs(options: "Optimize", scene: Scene, folders: dict[int, Path]) -> int:
-    """Runs all seeds as jobs and compares them; returns the exit status."""
+def _jobs(options: "Optimize", scene: Scene, every: dict[Path, Settings]) -> int:
+    """Runs all of them as jobs and compares them; returns the exit status."""
     console = Console(highlight=False, soft_wrap=True)
     try:
-        results = jobs.run(options, scene, folders, console)
+        results = jobs.run(options, scene, every, console)
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
-    _compare(scene, results, folders, console)
+    _compare(options, scene, every, results, console)
     return int(any(result is None for result in results.values()))
 
 

@@ -98,21 +98,18 @@ def judged(scene: Scene, found: Outcome) -> Judged:
     return Judged(with_accuracy(scene, ACCURACY), found, ACCURACY)
 
 
-def of_runs(
-    results: dict[int, RunResult | None], folders: dict[int, Path]
-) -> dict[int, Judged | None]:
-    """What `test` kept of each run; None where there is nothing.
+def of_runs(results: dict[Path, RunResult | None]) -> dict[Path, Judged | None]:
+    """What `test` kept of each run, by its folder; None where there is nothing.
 
     Args:
-      results: Runs of a command by their seeds.
-      folders: Their folders.
+      results: Runs of a command by their folders.
     """
-    kept: dict[int, Judged | None] = dict.fromkeys(results)
-    for seed, result in results.items():
-        if result is not None and result.test is not None and (folders[seed] / FILE).exists():
-            scene, settings = read_run(folders[seed])
-            found, _ = stored(folders[seed], settings)
-            kept[seed] = None if found is None else judged(scene, found)
+    kept: dict[Path, Judged | None] = dict.fromkeys(results)
+    for folder, result in results.items():
+        if result is not None and result.test is not None and (folder / FILE).exists():
+            scene, settings = read_run(folder)
+            found, _ = stored(folder, settings)
+            kept[folder] = None if found is None else judged(scene, found)
     return kept
 
 

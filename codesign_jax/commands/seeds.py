@@ -1,8 +1,10 @@
-"""`codesign optimize --seeds`: several runs of one program, and how they compare."""
+"""`codesign optimize` with several seeds or strategies: the runs, and how they compare."""
 
 import csv
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -13,12 +15,40 @@ from rich.table import Table
 from codesign_jax import codesign, cost, files
 from codesign_jax.report import statistics, verdicts
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import RunResult, columns
+from codesign_jax.runs import RunResult, Settings, columns
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import SceneError
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
+
+
+class Compared(NamedTuple):
+    """A run that is compared with others.
+
+    Attributes:
+      settings: Its settings.
+      result: How it ended; None if it could not finish.
+      fresh: Fresh trials of its design; None without any.
+    """
+
+    settings: Settings
+    result: RunResult | None
+    fresh: Judged | None
+
+    @property
+    def converged(self) -> int | None:
+        """Number of the episode, from 1, from which on the mean cost stays below the limit."""
+        if self.result is None or self.result.record is None:
+            return None
+        episode = codesign.convergence_episode(self.result.record.history.cost.mean(1))
+        return None if episode is None else episode + 1
+
+    def judged(self, scene: Scene) -> Judged | None:
+        """Fresh trials of its design, else its final test's trials, else None."""
+        if self.fresh is None and self.result is not None and self.result.test is not None:
+            return of_test(scene, self.result)
+        return self.fresh
 
 
 def parse(text: str) -> list[int]:
@@ -52,124 +82,145 @@ def of_test(scene: Scene, result: RunResult) -> Judged:
     return Judged(scene, trials)
 
 
-def compare(
-    scene: Scene,
-    results: dict[int, RunResult | None],
-    fresh: dict[int, Judged | None],
-    console: Console,
-) -> None:
-    """Prints a row for each run and the share of successful ones.
+def compare(scene: Scene, every: Mapping[Path, Compared], console: Console) -> None:
+    """Prints a row for each run and for each strategy the share of successful ones.
 
     Args:
       scene: Scene of the runs.
-      results: Each run by its seed; None for one that could not finish.
-      fresh: Fresh trials of each run's design; None for one without.
+      every: The runs by their folders.
       console: Where to print.
     """
+    strategies = list(dict.fromkeys(run.settings.schedule for run in every.values()))
     head = ("seed", "converged", "judged by", "kept", "lost", "stuck", "failed", "cost", "success")
+    rows = []
+    for run in every.values():
+        own = [run.settings.schedule] if len(strategies) > 1 else []
+        rows.append((*own, str(run.settings.seed), *_row(scene, run)))
+    console.print(_table((*(["strategy"] * (len(strategies) > 1)), *head), rows))
+    rows = [_summary(scene, name, every) for name in strategies]
+    if len(strategies) > 1:
+        head = ("strategy", "converged", "grasps until then, median", "successful", "95 % interval")
+        console.print(_table(head, rows))
+    name, _, _, good, interval = rows[0]
+    if good and len(strategies) == 1:
+        console.print(
+            f"{good} runs found a design that {_SUCCESS}: {interval} of such runs (95 % interval)"
+        )
+    elif good:
+        console.print(f"successful: the run found a design that {_SUCCESS}")
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
     table = Table(box=box.SIMPLE, collapse_padding=True, pad_edge=False)
     for name in head:
         table.add_column(name, no_wrap=True)
-    good = []
-    for seed, result in results.items():
-        judged = fresh[seed]
-        if judged is None and result is not None and result.test is not None:
-            judged = of_test(scene, result)
-        table.add_row(str(seed), *_row(scene, result, judged, tested=fresh[seed] is None))
-        if judged is not None:
-            good.append(bool(verdicts.success(judged.scene, judged.outcomes)))
-    console.print(table)
-    if good:
-        share = statistics.wilson(sum(good), len(good))
-        console.print(
-            f"{sum(good)} of {len(good)} runs found a design that keeps at least "
-            f"{100 * verdicts.RELIABLE:.0f} % of all trials at a mean cost below "
-            f"{codesign.SUCCESS_COST}: {100 * share.low:.0f} to {100 * share.high:.0f} % of such "
-            "runs (95 % interval)"
-        )
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
-def check_table(folders: dict[int, Path]) -> None:
+_SUCCESS = (
+    f"keeps at least {100 * verdicts.RELIABLE:.0f} % of all trials at a mean cost below "
+    f"{codesign.SUCCESS_COST}"
+)
+
+
+def _summary(scene: Scene, strategy: str, every: Mapping[Path, Compared]) -> tuple[str, ...]:
+    """How the runs of a strategy did; what is not known of them is empty."""
+    own = [run for run in every.values() if run.settings.schedule == strategy]
+    size = own[0].settings.particles * own[0].settings.trials
+    episodes = [run.converged for run in own]
+    # Of an even number the upper one of the two in the middle: never, if half of them never do.
+    middle = sorted(np.inf if e is None else (e - 1) * size for e in episodes)[len(own) // 2]
+    converged = f"{sum(e is not None for e in episodes)} of {len(own)}"
+    grasps = "never" if np.isinf(middle) else f"{middle:.0f}"
+    found = [judged for run in own if (judged := run.judged(scene)) is not None]
+    if not found:
+        return strategy, converged, grasps, "", ""
+    good = sum(bool(verdicts.success(judged.scene, judged.outcomes)) for judged in found)
+    share = statistics.wilson(good, len(found))
+    interval = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
+    return strategy, converged, grasps, f"{good} of {len(found)}", interval
+
+
+def check_table(folder: Path) -> None:
     """Refuses to replace a file of the table's name that is none of these tables.
 
     Args:
-      folders: Run folder of each seed.
+      folder: Folder of the table.
 
     Raises:
       SceneError: If there is one.
     """
-    path = next(iter(folders.values())).parent / columns.SEEDS
-    head = ",".join(columns.MORE[columns.SEEDS].columns)
+    path = folder / columns.SEEDS
     if not path.exists():
         return
     with path.open("rb") as file:
-        ours = file.read(len(head)) == head.encode()
-    if not ours:
+        head = file.readline(1000)
+    if not (head.startswith(b"seed,") and b",best_test_cost," in head):
         raise SceneError(
             [f"{path} is no table of runs, and would be replaced: choose another --out"]
         )
 
 
-def write_table(
-    scene: Scene,
-    results: dict[int, RunResult | None],
-    fresh: dict[int, Judged | None],
-    folders: dict[int, Path],
-) -> Path:
-    """Writes seeds.csv beside the run folders: a row for each run; see `runs.columns.MORE`.
+def write_table(scene: Scene, every: Mapping[Path, Compared], folder: Path) -> Path:
+    """Writes seeds.csv: a row for each run; see `runs.columns.MORE`.
 
     Args:
       scene: Scene of the runs.
-      results: Each run by its seed; None for one that could not finish.
-      fresh: Fresh trials of each run's design; None for one without.
-      folders: Run folder of each seed.
+      every: The runs by their folders.
+      folder: Folder of the table, which has the run folders somewhere in it.
     """
-    path = next(iter(folders.values())).parent / columns.SEEDS
+    path = folder / columns.SEEDS
     with files.atomically(path) as part, part.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow([*columns.MORE[columns.SEEDS].columns])
-        for seed, result in results.items():
-            values = *_values(scene, result), *_fresh_values(fresh[seed])
-            writer.writerow([seed, int(result is not None), *values, folders[seed].name])
+        writer = csv.DictWriter(file, [*columns.MORE[columns.SEEDS].columns])
+        writer.writeheader()
+        for place, run in every.items():
+            own = {"seed": run.settings.seed, "run": place.relative_to(folder).as_posix()}
+            own |= {"schedule": run.settings.schedule, "first": run.settings.first}
+            own["finished"] = int(run.result is not None)
+            writer.writerow(own | _values(scene, run) | _fresh_values(run.fresh))
     return path
 
 
-def _values(scene: Scene, result: RunResult | None) -> list[object]:
-    """Numbers of a run in the order of the table, without seed, finished and run."""
-    if result is None or result.record is None:
-        return [""] * 7
-    episode = codesign.convergence_episode(result.record.history.cost.mean(1))
-    first: list[object] = ["" if episode is None else episode + 1]
-    if result.test is None:
-        return first + [""] * 6
-    costs, trials = np.asarray(result.test.cost), np.asarray(result.test.trials.cost)
+def _values(scene: Scene, run: Compared) -> dict[str, object]:
+    """How a run converged and how its final test ended, by column."""
+    found: dict[str, object] = {"converged_episode": run.converged}
+    if run.result is None or run.result.record is None or run.result.test is None:
+        return found
+    test = run.result.test
+    costs, trials = np.asarray(test.cost), np.asarray(test.trials.cost)
     best = int(costs.argmin())
-    counted = cost.counts(scene, np.asarray(result.test.trials.status)[best])
-    kept = int((counted & (trials[best] < codesign.SUCCESS_COST)).sum())
-    good = int(np.asarray(result.test.success).sum())
-    sizes = [kept, int(counted.sum()), trials.shape[1], good, costs.size]
-    return [*first, f"{costs[best]:.9g}", *sizes]
+    counted = cost.counts(scene, np.asarray(test.trials.status)[best])
+    return found | {
+        "best_test_cost": f"{costs[best]:.9g}",
+        "kept_trials": int((counted & (trials[best] < codesign.SUCCESS_COST)).sum()),
+        "counted_trials": int(counted.sum()),
+        "trials": trials.shape[1],
+        "successful_particles": int(np.asarray(test.success).sum()),
+        "particles": costs.size,
+    }
 
 
-def _fresh_values(judged: Judged | None) -> list[object]:
-    """Kept, lost, stuck and failed fresh trials, and their mean cost."""
+def _fresh_values(judged: Judged | None) -> dict[str, object]:
+    """Kept, lost, stuck and failed fresh trials, and their mean cost, by column."""
     if judged is None:
-        return [""] * 5
+        return {}
     mean = float(cost.particle_cost(judged.scene, judged.outcomes))
-    return [*verdicts.tally(judged.outcomes), f"{mean:.9g}"]
+    counts = verdicts.tally(judged.outcomes)
+    found: dict[str, object] = {f"fresh_{n}_trials": v for n, v in counts._asdict().items()}
+    return found | {"fresh_cost": f"{mean:.9g}"}
 
 
-def _row(
-    scene: Scene, result: RunResult | None, judged: Judged | None, *, tested: bool
-) -> tuple[str, ...]:
+def _row(scene: Scene, run: Compared) -> tuple[str, ...]:
     """Convergence of a run, and how its design did."""
-    if result is None or result.record is None:
+    if run.result is None or run.result.record is None:
         return ("failed", *[""] * 7)
-    episode = _values(scene, result)[0]
-    converged = f"episode {episode}" if episode else "no"
+    converged = f"episode {run.converged}" if run.converged else "no"
+    judged = run.judged(scene)
     if judged is None:
         return (converged, *[""] * 7)
-    where = "final test" if tested else f"{judged.accuracy}"
+    where = "final test" if run.fresh is None else f"{judged.accuracy}"
     found = verdicts.tally(judged.outcomes)
     mean = float(cost.particle_cost(judged.scene, judged.outcomes))
     word = "yes" if verdicts.success(judged.scene, judged.outcomes) else "no"

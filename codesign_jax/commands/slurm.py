@@ -79,20 +79,20 @@ class Array:
         # No limit of our own: the partition's, and not submitit's five minutes.
         made.parameters.setdefault("time", None)
         self._made, self._console = made, console
-        self._jobs: dict[int, Any] = {}
+        self._jobs: dict[Path, Any] = {}
         self._asked, self._said = float("-inf"), ""
         self._states: dict[str, State] = {}
-        self._ended: dict[int, float] = {}
+        self._ended: dict[Path, float] = {}
 
-    def start(self, calls: Mapping[int, tuple[Any, ...]]) -> None:
-        """Queues a call for each seed.
+    def start(self, calls: Mapping[Path, tuple[Any, ...]]) -> None:
+        """Queues a call for each run folder.
 
         Raises:
           SceneError: With SLURM's words, if it does not take them.
         """
         try:
             with self._made.batch():  # SLURM keeps an array within its number at a time
-                self._jobs = {seed: self._made.submit(*call) for seed, call in calls.items()}
+                self._jobs = {folder: self._made.submit(*call) for folder, call in calls.items()}
         except (OSError, RuntimeError) as error:
             words = str(error).strip().splitlines()[-1:] or ["without a word"]
             problem = f"SLURM does not take the jobs: {words[0].removeprefix('sbatch: error: ')}"
@@ -101,17 +101,17 @@ class Array:
         array = next(iter(self._jobs.values())).job_id.split("_")[0]
         self._console.print(f"SLURM job {array}; to look at it: squeue --jobs {array}")
 
-    def ended(self) -> Iterator[tuple[int, Any, str]]:
+    def ended(self) -> Iterator[tuple[Path, Any, str]]:
         """Seed and job of each run that has ended since, and SLURM's state if it left no result."""
         self._look()
-        for seed, job in [*self._jobs.items()]:
+        for folder, job in [*self._jobs.items()]:
             state = ""
             if not job.paths.result_pickle.exists():
-                state = self._lost(seed, job.job_id)
+                state = self._lost(folder, job.job_id)
                 if not state:
                     continue
-            del self._jobs[seed]
-            yield seed, job, state
+            del self._jobs[folder]
+            yield folder, job, state
 
     def cancel(self) -> None:
         """Cancels what is left."""
@@ -129,20 +129,20 @@ class Array:
         if found is None:
             return
         self._states = found
-        for seed, job in self._jobs.items():
+        for folder, job in self._jobs.items():
             state = found.get(job.job_id)
             if state is not None and state.name in LIVE:
-                self._ended.pop(seed, None)
+                self._ended.pop(folder, None)
             else:
-                self._ended.setdefault(seed, now)
+                self._ended.setdefault(folder, now)
         words = summary(found.values())
         if words and words != self._said:
             self._console.print(f"SLURM: {words}", markup=False)
             self._said = words
 
-    def _lost(self, seed: int, job_id: str) -> str:
+    def _lost(self, folder: Path, job_id: str) -> str:
         """State of a job that ended without a result, or nothing."""
-        since = self._ended.get(seed)
+        since = self._ended.get(folder)
         if since is None or time.monotonic() - since < RESULT_SECONDS:
             return ""
         state = self._states.get(job_id, State("unknown: it has left the queue"))

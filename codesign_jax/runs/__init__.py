@@ -10,12 +10,12 @@ The numerical modules know nothing of files; this package knows nothing of physi
 
 from codesign_jax.runs.directory import check_folder, episodes_of
 from codesign_jax.runs.errors import AllFailed, RunError
-from codesign_jax.runs.loop import Plan, RunResult, prepare, with_seed
+from codesign_jax.runs.loop import Plan, RunResult, prepare, variant
 from codesign_jax.runs.reading import load_record, read_run
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import SCENE_COST, Settings, check, make_settings
 from codesign_jax.runs.tables import describe, failure_counts, status_names, warning_counts
-from codesign_jax.runs.together import FAILURES, Results, optimize
+from codesign_jax.runs.together import FAILURES, Results, names, optimize
 
 __all__ = [
     "FAILURES",
@@ -35,10 +35,11 @@ __all__ = [
     "failure_counts",
     "load_record",
     "make_settings",
+    "names",
     "optimize",
     "prepare",
     "read_run",
     "status_names",
+    "variant",
     "warning_counts",
-    "with_seed",
 ]

@@ -109,9 +109,11 @@ SEEDS, LANDSCAPE, REFERENCE = "seeds.csv", "landscape.csv", "reference.csv"
 
 MORE = {
     SEEDS: Table(
-        "a run of `codesign optimize --seeds`, in the file beside the run folders",
+        "a run of `codesign optimize` with several seeds or strategies, in the folder of the runs",
         {
             "seed": "the run's seed",
+            "schedule": "its strategy",
+            "first": "domain in which it begins, with `single` and `switch-K`",
             "finished": "1 if the run ended without an error, else 0",
             "converged_episode": "number of the episode, from 1, from which on the mean cost stays "
             f"below {CONVERGED_COST:g}; empty if there is none",
@@ -128,7 +130,7 @@ MORE = {
             "fresh_stuck_trials": "those in which the hand did not let go of it",
             "fresh_failed_trials": "those that failed otherwise",
             "fresh_cost": "mean cost of these trials by the scene's rule for failed ones",
-            "run": "name of the run's folder",
+            "run": "the run's folder, from that of the table",
         },
     ),
     LANDSCAPE: Table(

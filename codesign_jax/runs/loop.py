@@ -28,7 +28,7 @@ from codesign_jax.runs.directory import RunDirectory
 from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.interrupts import Stopped
 from codesign_jax.runs.progress import Progress, Stopwatch
-from codesign_jax.runs.record import History, Record
+from codesign_jax.runs.record import History, Record, Start
 from codesign_jax.runs.settings import SCENE_COST, Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
@@ -107,19 +107,38 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
     return Plan(scene, settings, engine, space, optimizer, mask, key, cost, trajectory)
 
 
-def with_seed(plan: Plan, seed: int) -> Plan:
-    """The same run from another seed."""
-    settings = dataclasses.replace(plan.settings, seed=seed)
-    return plan._replace(settings=settings, key=jax.random.key(seed))
+def variant(plan: Plan, settings: Settings) -> Plan:
+    """The same run with another seed, schedule or first domain; see `together.optimize`.
+
+    Args:
+      plan: The run.
+      settings: Its settings, in which nothing but these three may differ.
+
+    Raises:
+      ValueError: If something else differs.
+    """
+    free = {name: getattr(settings, name) for name in ("seed", "schedule", "first")}
+    if dataclasses.replace(plan.settings, **free) != settings:
+        raise ValueError(f"{settings} differs from {plan.settings} in more than {[*free]}")
+    mask, key = masks_of(plan.scene, settings), jax.random.key(settings.seed)
+    return plan._replace(settings=settings, mask=mask, key=key)
 
 
 class Loop:
     """One process's part of a run."""
 
-    def __init__(self, plan: Plan, run: RunDirectory, store: Checkpoints, progress: Progress):
-        """Takes the run, its open folder and checkpoints, and what to tell."""
+    def __init__(
+        self,
+        plan: Plan,
+        run: RunDirectory,
+        store: Checkpoints,
+        progress: Progress,
+        *,
+        every: int = 1,
+    ):
+        """Takes the run, its open folder and checkpoints, what to tell, and episodes per save."""
         self.plan, self.run_directory, self.store = plan, run, store
-        self.progress = progress
+        self.progress, self._every, self._saved = progress, every, 0
         self._unsaved: Callable[[], None] | None = None
 
     def run(self) -> Generator[Request, tuple[State, EpisodeInfo], RunResult]:
@@ -142,6 +161,8 @@ class Loop:
             yield from self._test(record)
         except Stopped as stop:
             self.save()
+            if record is not None and record.done > self._saved:
+                self._save(record.done, record)
             signum = stop.signum
             self.run_directory.log(f"stopped by signal {signum}; the same command resumes")
         test = None if record is None else _final_test(self.plan, record)
@@ -150,8 +171,10 @@ class Loop:
     def save(self) -> None:
         """Saves and reports the last episode, unless that has been done.
 
-        The run does so by itself before its next episode is over; whoever drives it may ask for it
-        while that episode is simulated. It asks nothing of the devices, which are busy then.
+        With `every` above 1 most episodes are reported alone: a process that is killed repeats
+        those since the last checkpoint. The run does so by itself before its next episode is over;
+        whoever drives it may ask for it while that episode is simulated. It asks nothing of the
+        devices, which are busy then.
 
         Raises:
           AllFailed: If every trial of the episode failed.
@@ -169,7 +192,7 @@ class Loop:
         if found.step is None:
             self._begin_anew(found)
             return None
-        record = records.from_arrays(found.arrays)
+        record, self._saved = records.from_arrays(found.arrays), found.step
         plan = self.plan
         records.refuse_other(record, plan.settings, found.step, plan.space.num_parameters)
         for step, reason in found.damaged:
@@ -215,7 +238,9 @@ class Loop:
         design = tables.describe(plan.space, np.asarray(seed))
         self._say(f"seed {design}: cost {cost:.3f}, candidate {drawn} ({watch.seconds:.1f} s)")
         state = plan.optimizer.init(plan.key, seed, settings.particles)
-        record = Record(state, records.empty_history(settings, plan.space.num_parameters))
+        start = Start(np.asarray(seed), np.asarray(cost, np.float32), np.asarray(drawn))
+        history = records.empty_history(settings, plan.space.num_parameters)
+        record = Record(state, history, start=start)
         self._save(0, record)
         return record
 
@@ -259,7 +284,9 @@ class Loop:
         """
         records.report(record.history, e, info)
         self._save_failures(e, info)
-        self.store.save(e + 1, records.to_arrays(record))
+        last = e + 1 == self.plan.settings.episodes or record.failed_status() is not None
+        if last or (e + 1) % self._every == 0:
+            self._save(e + 1, record)
         self._write_tables(record, e)
         self._report(record.history, e, seconds)
         self._refuse_all_failed(record)
@@ -318,6 +345,7 @@ class Loop:
 
     def _save(self, step: int, record: Record) -> None:
         self.store.save(step, records.to_arrays(record))
+        self._saved = step
 
     def _write_tables(self, record: Record, start: int) -> None:
         plan, folder = self.plan, self.run_directory.path

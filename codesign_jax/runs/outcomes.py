@@ -1,11 +1,10 @@
 """Outcomes of trials in a file, with what determines them: simulated once, and found again."""
 
-import uuid
 from pathlib import Path
 
 import numpy as np
 
-from codesign_jax import archives, sources
+from codesign_jax import archives
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
@@ -27,25 +26,9 @@ def key(scene: Scene, engine: str, designs: np.ndarray, trials: int, seed: int) 
     return digest({"scene": texts, "designs": np.asarray(designs)} | how)
 
 
-def packed(outcomes: Outcome, key: str) -> dict[str, np.ndarray]:
-    """Outcomes as arrays by name, with their `key` and the code that simulated them."""
-    # Outcomes of code that is not known are nobody's: nothing is equal to this.
-    code = sources.digest() or f"unknown {uuid.uuid4()}"
-    return {"key": np.array(key), "code": np.array(code), **outcomes._asdict()}
-
-
-def unpacked(arrays: dict[str, np.ndarray], key: str) -> tuple[Outcome | None, str]:
-    """The outcomes of `packed`, or None and why: they are of other code, or of another key."""
-    if set(arrays) != {"key", "code", *Outcome._fields} or str(arrays["key"]) != key:
-        return None, "is of another case"
-    if str(arrays["code"]) != sources.digest():
-        return None, "is of another version of the code"
-    return Outcome(**{name: arrays[name] for name in Outcome._fields}), ""
-
-
 def save(path: Path, outcomes: Outcome, key: str) -> None:
     """Writes outcomes, arrays of any shape, their `key` and the code that simulated them."""
-    archives.save(path, packed(outcomes, key))
+    archives.save(path, archives.head(key) | outcomes._asdict())
 
 
 def load(path: Path, key: str) -> tuple[Outcome | None, str]:
@@ -60,7 +43,9 @@ def load(path: Path, key: str) -> tuple[Outcome | None, str]:
       it is of another key, of other code, or damaged. Empty if there is no such file.
     """
     try:
-        return unpacked(archives.load(path), key)
+        arrays = archives.load(path)
+        why = archives.refusal(arrays, key)
+        return None if why else Outcome(*(arrays[name] for name in Outcome._fields)), why
     except FileNotFoundError:
         return None, ""
     except OSError as error:

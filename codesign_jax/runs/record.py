@@ -33,6 +33,20 @@ class History(NamedTuple):
     ancestors: np.ndarray
 
 
+class Start(NamedTuple):
+    """The particle that a run starts from, as `codesign.find_seed` found it.
+
+    Attributes:
+      design: The particle [SI units], shape (parameter,).
+      cost: Its cost, shape ().
+      candidates: Candidates that were drawn until it was found, int, shape ().
+    """
+
+    design: np.ndarray
+    cost: np.ndarray
+    candidates: np.ndarray
+
+
 def empty_history(settings: Settings, num_parameters: int) -> History:
     """Returns a history with room for all episodes of a run."""
     e, n, t = settings.episodes, settings.particles, settings.trials
@@ -74,11 +88,13 @@ class Record:
       state: State of the optimiser.
       history: Reports of the episodes.
       test: Outcomes of the final test, shape (particle, trial), or None before it.
+      start: What the run started from; None if an older version of codesign-jax began it.
     """
 
     state: State
     history: History
     test: Outcome | None = None
+    start: Start | None = None
 
     @property
     def done(self) -> int:
@@ -109,6 +125,8 @@ def to_arrays(record: Record) -> dict:
     arrays = {"state": state, "history": h._asdict() | {"trials": h.trials._asdict()}}
     if record.test is not None:
         arrays["test"] = record.test._asdict()
+    if record.start is not None:
+        arrays["start"] = record.start._asdict()
     return jax.tree.map(np.asarray, arrays)
 
 
@@ -124,7 +142,8 @@ def from_arrays(arrays: dict) -> Record:
         memory = jax.tree.map(jnp.asarray, s.get("memory"))
         state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
         test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
-        return Record(state, History(**(h | {"trials": Outcome(**h["trials"])})), test)
+        start = Start(**arrays["start"]) if "start" in arrays else None
+        return Record(state, History(**(h | {"trials": Outcome(**h["trials"])})), test, start)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RunError(
             f"its checkpoints hold other arrays than this version of codesign-jax has ({error}): "

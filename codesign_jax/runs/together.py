@@ -1,7 +1,7 @@
 """Runs in their folders, one or many: the episodes that they want are simulated in one batch.
 
-The runs differ in their seed only.  Each has a folder of its own and may be at an episode of its
-own, as after a resumption; one that fails does not stop the others.
+The runs may differ in seed, schedule and first domain.  Each has a folder of its own and may be at
+an episode of its own, as after a resumption; one that fails does not stop the others.
 """
 
 import contextlib
@@ -15,8 +15,9 @@ from codesign_jax.batch import LIMIT, Batch, Request
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.runs.loop import Loop, Plan, RunResult, begin_fetch, with_seed
+from codesign_jax.runs.loop import Loop, Plan, RunResult, begin_fetch, variant
 from codesign_jax.runs.progress import GroupProgress, Progress
+from codesign_jax.runs.settings import Settings
 
 MOST = 100
 """Most runs at once: each holds open files.  More go on when these have ended."""
@@ -48,11 +49,11 @@ class Results(NamedTuple):
     """How runs ended.
 
     Attributes:
-      runs: Result of each run by its seed, or why it failed.
+      runs: Result of each run by its folder, or why it failed.
       timing: What they took; with more than `MOST` runs that of the first ones.
     """
 
-    runs: dict[int, RunResult | Exception]
+    runs: dict[Path, RunResult | Exception]
     timing: Timing
 
     @property
@@ -63,38 +64,41 @@ class Results(NamedTuple):
 
 
 def optimize(
-    plan: Plan,
-    folders: Mapping[int, Path],
+    plans: Mapping[Path, Plan],
     command: list[str],
     *,
     fresh: bool = False,
     sources: Iterable[Path] = (),
     devices: int | None = None,
     chunk: int | None = None,
+    every: int = 1,
     after: float = 0.0,
 ) -> Results:
-    """Runs an optimisation of each seed, or goes on with it; the same call does both.
+    """Runs optimisations, or goes on with them; the same call does both.
 
     Args:
-      plan: The runs, whatever its seed; see `prepare`.
-      folders: Run folder of each seed.
+      plans: Each run by its folder; all are variants of one plan, see `prepare` and `variant`.
       command: Command line to note in the folders.
       fresh: Deletes earlier runs in the folders first.
       sources: Files that the scene was read from, which `fresh` must not delete.
       devices: Devices that simulate; None for all of this host.
       chunk: Most worlds of one device in one call; None for `batch.LIMIT`.
+      every: Episodes between two checkpoints of a run; a killed process repeats what came after.
       after: What the caller simulates of each run afterwards, as a number of its grasps: the time
         left that is shown includes it.
 
     Raises:
       SceneError: If a folder cannot be used; see `open_run`.
+      ValueError: If the plans are not variants of one.
     """
-    found: dict[int, RunResult | Exception] = {}
-    timing, seeds = None, list(folders)
+    found: dict[Path, RunResult | Exception] = {}
+    timing, folders = None, list(plans)
     begun = {"fresh": fresh, "sources": tuple(sources)}
-    for start in range(0, len(seeds), MOST):
-        group = {seed: folders[seed] for seed in seeds[start : start + MOST]}
-        results = _group(plan, group, command, begun, devices, chunk, after)
+    for plan in plans.values():
+        variant(plans[folders[0]], plan.settings)
+    for start in range(0, len(folders), MOST):
+        group = {folder: plans[folder] for folder in folders[start : start + MOST]}
+        results = _group(group, command, begun, devices, chunk, every, after)
         found |= results.runs
         timing = timing or results.timing
         if results.signum:
@@ -102,35 +106,45 @@ def optimize(
     return Results(found, timing or Timing())
 
 
+def names(every: Mapping[Path, Settings]) -> dict[Path, str]:
+    """What to call each of several runs: by its seed, and by its schedule if these differ."""
+    several = len({own.schedule for own in every.values()}) > 1
+    return {
+        folder: (f"{own.schedule}, " if several else "") + f"seed {own.seed}"
+        for folder, own in every.items()
+    }
+
+
 def _group(
-    plan: Plan,
-    folders: Mapping[int, Path],
+    plans: Mapping[Path, Plan],
     command: list[str],
     begun: dict[str, Any],
     devices: int | None,
     chunk: int | None,
+    every: int,
     after: float,
 ) -> Results:
     """`optimize` of as many runs as fit into one process; `begun` is how to open the folders."""
-    settings, many = plan.settings, len(folders) > 1
+    plan = next(iter(plans.values()))
+    settings, many = plan.settings, len(plans) > 1
     batch = settings.particles * settings.trials
     ahead = {"test": batch * settings.test_rounds, "after": after}
+    called = names({folder: own.settings for folder, own in plans.items()})
     with contextlib.ExitStack() as stack:
         total = settings.episodes
-        progress = GroupProgress(total, len(folders), **ahead) if many else Progress(total, **ahead)
+        progress = GroupProgress(total, len(plans), **ahead) if many else Progress(total, **ahead)
         stack.enter_context(progress)
         loops = {}
-        for seed, folder in folders.items():
-            own = with_seed(plan, seed)
+        for folder, own in plans.items():
             how = folder, own.scene, own.settings, command
             run, notes = stack.enter_context(open_run(*how, **begun))
             voice = (
-                progress.one(f"seed {seed}") if isinstance(progress, GroupProgress) else progress
+                progress.one(called[folder]) if isinstance(progress, GroupProgress) else progress
             )
             store = stack.enter_context(run.store(tell=voice.message))
             for note in notes:
                 voice.message(note)
-            loops[seed] = Loop(own, run, store, voice)
+            loops[folder] = Loop(own, run, store, voice, every=every)
         interrupts = stack.enter_context(Interrupts(progress.message))
         simulator = _batch(plan, devices, chunk)
         return _Together(plan, loops, progress, interrupts, simulator).run()
@@ -150,7 +164,7 @@ class _Together:
     def __init__(
         self,
         plan: Plan,
-        loops: Mapping[int, Loop],
+        loops: Mapping[Path, Loop],
         progress: Progress,
         interrupts: Interrupts,
         batch: Batch,
@@ -158,12 +172,12 @@ class _Together:
         self.plan, self.loops, self.progress = plan, loops, progress
         self.interrupts, self.timing, self.seconds = interrupts, Timing(), 0.0
         self.batch = batch
-        self.waiting: dict[int, tuple[Generator, Request]] = {}
-        self.found: dict[int, RunResult | Exception] = {}
+        self.waiting: dict[Path, tuple[Generator, Request]] = {}
+        self.found: dict[Path, RunResult | Exception] = {}
 
     def run(self) -> Results:
-        for seed, loop in self.loops.items():
-            self._go_on(seed, loop.run(), None)
+        for folder, loop in self.loops.items():
+            self._go_on(folder, loop.run(), None)
         try:
             if self.waiting:
                 self._compile()
@@ -178,19 +192,20 @@ class _Together:
         self._show()
         signum = self.interrupts.signum
         ended = {
-            seed: r._replace(signum=signum) if isinstance(r, RunResult) else r
-            for seed, r in sorted(self.found.items())
+            folder: r._replace(signum=signum) if isinstance(r, RunResult) else r
+            for folder in self.loops
+            if (r := self.found.get(folder)) is not None
         }
         return Results(ended, self.timing)
 
-    def _go_on(self, seed: int, asking: Generator, reply: Any) -> None:
+    def _go_on(self, folder: Path, asking: Generator, reply: Any) -> None:
         """Lets a run go on until it wants another episode or ends."""
         try:
-            self.waiting[seed] = asking, asking.send(reply)
+            self.waiting[folder] = asking, asking.send(reply)
         except StopIteration as stop:
-            self.found[seed] = stop.value
+            self.found[folder] = stop.value
         except Exception as error:
-            self._fail(seed, error)
+            self._fail(folder, error)
 
     def _compile(self) -> None:
         """Compiles apart from the first round, so that its time is not an episode's."""
@@ -202,22 +217,22 @@ class _Together:
         message = f"compiled in {watch.seconds:.1f} s (engine {engine}{where})"
         self.progress.message(message)
         self.progress.compiled()
-        for seed in self.waiting:
-            self.loops[seed].run_directory.log(message)
+        for folder in self.waiting:
+            self.loops[folder].run_directory.log(message)
         self.timing = Timing(watch.seconds, runs=len(self.waiting))
 
     def _round(self) -> None:
         """One episode of every run that wants one; the episodes before are saved meanwhile."""
         start = time.perf_counter()
-        asked = {seed: request for seed, (_, request) in self.waiting.items()}
+        asked = {folder: request for folder, (_, request) in self.waiting.items()}
         answers = self.interrupts.begin(self.batch.begin, list(asked.values()))
         self._save()
         self._show()
         replies = answers()
         begin_fetch(replies)
-        for seed, reply in zip(asked, replies, strict=True):
-            if seed in self.waiting:
-                self._go_on(seed, self.waiting.pop(seed)[0], reply)
+        for folder, reply in zip(asked, replies, strict=True):
+            if folder in self.waiting:
+                self._go_on(folder, self.waiting.pop(folder)[0], reply)
         self.seconds = time.perf_counter() - start
         grasps = self.plan.settings.particles * self.plan.settings.trials * len(asked)
         self.timing = self.timing._replace(
@@ -226,12 +241,12 @@ class _Together:
 
     def _save(self) -> None:
         """Saves the last episode of each run; those that cannot be saved end."""
-        for seed in list(self.waiting):
+        for folder in list(self.waiting):
             try:
-                self.loops[seed].save()
+                self.loops[folder].save()
             except Exception as error:
-                self.waiting.pop(seed)[0].close()
-                self._fail(seed, error)
+                self.waiting.pop(folder)[0].close()
+                self._fail(folder, error)
 
     def _show(self) -> None:
         """Reports what was saved since the last round."""
@@ -240,18 +255,18 @@ class _Together:
 
     def _throw(self, error: Exception) -> None:
         """Ends every run that still waits."""
-        for seed, (asking, _) in self.waiting.items():
+        for folder, (asking, _) in self.waiting.items():
             try:
                 asking.throw(error)
             except StopIteration as stop:
-                self.found[seed] = stop.value
+                self.found[folder] = stop.value
             except Exception as failure:
-                self._fail(seed, failure)
+                self._fail(folder, failure)
         self.waiting = {}
 
-    def _fail(self, seed: int, error: Exception) -> None:
+    def _fail(self, folder: Path, error: Exception) -> None:
         """Notes how a run failed; the traceback as well, where it is none of `FAILURES`."""
-        self.found[seed] = error
+        self.found[folder] = error
         how = str(error) if isinstance(error, FAILURES) else "".join(format_exception(error))
         with contextlib.suppress(OSError):  # a full disk may be why it failed
-            self.loops[seed].run_directory.log(f"failed: {how.rstrip()}")
+            self.loops[folder].run_directory.log(f"failed: {how.rstrip()}")

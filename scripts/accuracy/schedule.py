@@ -17,15 +17,15 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import codesign
-from codesign_jax.engines import Engine
-from codesign_jax.scene import Scene, parameters
+from codesign_jax.batch import Batch, Request
+from codesign_jax.scene import parameters
 from codesign_jax.types import failed
 from scripts.accuracy.settings import FINE, STANDARD, Setting
-from scripts.experiments import Batch, Strategies, Worlds
-from scripts.experiments.worlds import chunking
 from scripts.shared import addition, output, provenance, statistics, tables
 
 FINER = Setting(timestep=5.0, damping="least")
@@ -52,41 +52,44 @@ class Simulation:
 
     def __init__(self, setting: Setting, limit: int):
         """Takes a setting and the most worlds of a call."""
-        self.scene: Scene = setting.scene()
-        self.engine: Engine = setting.make(self.scene)
-        self.space = parameters.design_space(self.scene.hand)
-        self.limit = limit
+        scene = setting.scene()
+        space = parameters.design_space(scene.hand)
+        self.optimizer = codesign.make_filter(space)
+        how = scene, setting.make(scene), space, self.optimizer, TRIALS
+        self.batch = Batch(*how, devices=1, limit=limit)
 
-    def batch(self, shape: tuple[int, int], episodes: int, seed: int) -> Batch:
-        """Runs that are to be carried on.
 
-        Args:
-          shape: Runs, and particles of each.
-          episodes: Further episodes.
-          seed: Root key of run 0.
-        """
-        plan = Strategies("23d", "23d", ("concurrent",), *shape, episodes, TRIALS, 0)
-        size, _ = chunking(plan.worlds, self.limit)
-        worlds = Worlds(self.scene, self.engine, self.space, chunk=size)
-        optimizer = codesign.make_filter(self.space)
-        return Batch(plan, self.scene, worlds, optimizer, seed=seed)
+def keys(runs: int, seed: int) -> list[jax.Array]:
+    """Root keys of runs, the first one with this seed."""
+    return [jax.random.key(seed + r) for r in range(runs)]
 
 
 def carry_on(simulation: Simulation, particles: np.ndarray, episodes: int) -> np.ndarray:
     """Particles of runs, shape (run, particle, 23), after further episodes."""
-    batch = simulation.batch(particles.shape[:2], episodes, SEED)
-    record = batch.blank(particles[None])
-    for _ in range(episodes):
-        print("  " + batch.step(record), flush=True)
-    return record["particles"][0]
+    optimizer, mask = simulation.optimizer, np.ones(particles.shape[-1], bool)
+    states = [
+        optimizer.init(key, own[0], len(own))._replace(particles=jnp.asarray(own))
+        for key, own in zip(keys(len(particles), SEED), particles, strict=True)
+    ]
+    for e in range(episodes):
+        ended = simulation.batch([Request(state, mask) for state in states])
+        states = [state for state, _ in ended]
+        cost = np.mean([info.selection.cost for _, info in ended])
+        print(f"  episode {e + 1}: mean cost {cost:.3f}", flush=True)
+    return np.array([state.particles for state in states])
 
 
 def judge(simulation: Simulation, particles: np.ndarray) -> dict[str, Any]:
     """Kept grasps of every run on fresh trials that all branches share."""
-    batch = simulation.batch(particles.shape[:2], 1, JUDGE_SEED)
-    outcome = batch.worlds.evaluate(particles[None], batch.trials(0))
-    good = ~failed(outcome.status[0])
-    kept = ((outcome.cost[0] < codesign.SUCCESS_COST) & good).sum(-1)
+    ended = simulation.batch(
+        [
+            Request(*codesign.closed(simulation.optimizer, jnp.asarray(own), key))
+            for key, own in zip(keys(len(particles), JUDGE_SEED), particles, strict=True)
+        ]
+    )
+    cost = np.array([info.trials.cost for _, info in ended])
+    good = ~failed(np.array([info.trials.status for _, info in ended]))
+    kept = ((cost < codesign.SUCCESS_COST) & good).sum(-1)
     return {
         "kept": [round(float(v), 5) for v in (kept / np.maximum(good.sum(-1), 1)).mean(-1)],
         "lossless": [round(float(v), 5) for v in ((kept == TRIALS) & good.all(-1)).mean(-1)],

@@ -1,6 +1,6 @@
 """Which of the constants that the paper leaves open give the paper's figures: history matching.
 
-python -m scripts.calibration wave first --size gpu --minutes 7       # again to resume
+python -m scripts.calibration wave first --size gpu                   # again to resume
 python -m scripts.calibration score first
 python -m scripts.calibration wave second --seed 1 --after runs/calibration/first_scores.npz
 python -m scripts.calibration wave check --like runs/calibration/first_scores.npz --best 60 \
@@ -12,16 +12,19 @@ A wave simulates a coarse landscape of the 2D experiment for each set of constan
 one compiled program; the skinned hull without contact between fingers unless --surface or --fingers
 say otherwise.  `score` runs the particle filter on the landscapes and compares with the paper's
 text.
-Exit status 3: stopped before the end; what is done is written, and the same command resumes.
+Stopped by Ctrl-C or `timeout -s INT 400`, it writes what is done, and the same command resumes.
 """
 
 import argparse
+import json
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 
 from codesign_jax import codesign, scene
+from codesign_jax.archives import Store
 from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
@@ -30,8 +33,8 @@ from codesign_jax.scene.schema import SceneError
 from scripts.calibration import files, score, sets
 from scripts.calibration.surrogate import Plan
 from scripts.calibration.wave import Size, Wave, keep
-from scripts.experiments import Stop, drive, results
-from scripts.shared import provenance, record
+from scripts.experiments import results
+from scripts.shared import provenance
 
 SCENE, PRESET = "paper", "2d"
 # Sets, grid points along a side, trials, most worlds of a call, and what changes in the scene.
@@ -70,8 +73,6 @@ def parse() -> argparse.Namespace:
         "--others", type=int, help="with --best: as many of the rest, evenly over their ranks"
     )
     wave.add_argument("--seed", type=int, default=0)
-    wave.add_argument("--minutes", type=float, help="save and stop after this time")
-    wave.add_argument("--every", type=int, help="calls between saves; by default 20 s")
     wave.add_argument("--fresh", action="store_true", help="delete an earlier state")
     scores = commands.add_parser("score", help="compare landscapes with the paper's text")
     scores.add_argument("name", nargs="+")
@@ -142,25 +143,38 @@ def simulate(args: argparse.Namespace) -> int:
     """Runs or resumes a wave and writes the sets that are done."""
     common.use_compilation_cache()
     wave, settings = build(args)
-    state = args.out / f"{args.name}.state.npz"
+    state, path = (args.out / f"{args.name}.{suffix}" for suffix in ("part", "json"))
     if args.fresh:
         state.unlink(missing_ok=True)
-    stop = Stop(every=args.every, minutes=args.minutes)
-    done = drive(wave, state, settings, stop=stop, say=lambda s: print(s, flush=True))
-    if int(done.record.get("step", 0)):
-        kept = keep(wave, done.record)
+        path.unlink(missing_ok=True)
+    store, start, grasps, stopped = (
+        Store(state, json.dumps(settings)),
+        time.perf_counter(),
+        0,
+        False,
+    )
+    if store.refused:
+        raise SceneError([f"{state} {store.refused}: delete it by --fresh to start anew"])
+    try:
+        grasps = wave.run(store, lambda text: print(text, flush=True))
+    except KeyboardInterrupt:
+        stopped = True
+    seconds = time.perf_counter() - start
+    before = json.loads(path.read_text()) if path.exists() else {}
+    if store.found:
+        kept = keep(wave, store.found)
         notes = provenance.results(args.commit) | {
             "settings": settings,
             "sets_done": len(kept["units"]),
-            "wall_seconds": round(done.total_seconds, 1),
-            "processes": done.processes,
-            "grasps_per_s": round(done.rate, 1),
+            "wall_seconds": round(before.get("wall_seconds", 0.0) + seconds, 1),
+            "processes": before.get("processes", 0) + 1,
+            "grasps_per_s": round(grasps / seconds, 1),
         }
-        for path in results.write(args.out, args.name, kept, notes):
-            print(path)
-    if not done.finished:
+        for written in results.write(args.out, args.name, kept, notes):
+            print(written)
+    if stopped:
         print(f"stopped; the same command resumes from {state}")
-        return 3
+        return 130
     return 0
 
 
@@ -218,5 +232,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except (record.StateError, SceneError, ValueError) as error:
+    except ValueError as error:
         sys.exit(f"error: {error}")

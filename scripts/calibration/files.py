@@ -10,13 +10,13 @@ import jax
 import numpy as np
 
 from codesign_jax.optimize import ParticleFilter
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, SceneError
 from codesign_jax.types import Status
 from scripts.calibration import score, sets, summary
 from scripts.calibration.surrogate import Plan, filled, make_runs
 from scripts.calibration.wave import Size, trial_costs
-from scripts.shared import record as records
-from scripts.shared.record import Arrays, StateError
+from scripts.experiments.strategies import Arrays
+from scripts.shared import provenance
 
 SCORES = "_scores"
 """What follows a wave's name in the names of its scores."""
@@ -51,7 +51,7 @@ class Scored(NamedTuple):
 def settings(scene: Scene, size: Size, units: np.ndarray, seed: int, fidelity: str) -> dict:
     """What determines the numbers of a wave, beside code, versions and device."""
     return {
-        "scene_sha256": records.scene_hash(scene),
+        "scene_sha256": provenance.scene_hash(scene),
         "fidelity": fidelity,
         "points": size.points,
         "trials": size.trials,
@@ -66,28 +66,28 @@ def read(path: Path) -> tuple[Arrays, dict[str, Any]]:
     """Reads arrays and notes of NAME.npz and NAME.json.
 
     Raises:
-      StateError: If a file is missing or damaged.
+      SceneError: If a file is missing or damaged.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             data = {key: file[key] for key in file.files}
         return data, json.loads(path.with_suffix(".json").read_text())
     except (OSError, ValueError, KeyError, EOFError) as error:
-        raise StateError(f"{path} and its .json cannot be read: {error}") from error
+        raise SceneError([f"{path} and its .json cannot be read: {error}"]) from error
 
 
 def read_scores(paths: Sequence[Path]) -> list[Scored]:
     """Reads scores of waves.
 
     Raises:
-      StateError: If a file is missing, damaged or holds no scores.
+      SceneError: If a file is missing, damaged or holds no scores.
     """
     found = []
     for path in paths:
         data, notes = read(path)
         missing = {"units", "distances", "landscape"} - set(data)
         if missing or data["units"].shape[1:] != (len(sets.OPEN),):
-            raise StateError(f"{path} holds no scores of a wave with {len(sets.OPEN)} constants")
+            raise SceneError([f"{path} holds no scores of a wave with {len(sets.OPEN)} constants"])
         found.append(Scored(path.stem.removesuffix(SCORES), data, notes))
     return found
 

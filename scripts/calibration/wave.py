@@ -1,6 +1,8 @@
 """A wave: coarse landscapes of many sets of constants, all in one compiled program."""
 
 import dataclasses
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -8,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import rollout
+from codesign_jax.archives import Store
 from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import Engine
@@ -16,8 +19,10 @@ from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, failed
 from scripts.calibration import sets
 from scripts.experiments.landscape import STREAM_GRID, grid
-from scripts.shared import record as records
-from scripts.shared.record import Arrays
+from scripts.experiments.strategies import Arrays
+
+KEPT = np.iinfo(np.uint16).max
+"""`lost_step` of a trial in which the object was not lost."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +51,7 @@ class Size:
 
 
 class Wave:
-    """Landscapes of sets, some sets a step; `shared.driver.drive` runs and resumes it.
+    """Landscapes of sets, some sets a step.
 
     Set i meets trials of the key (seed, number of the set); all designs of a set meet the same ones
     and a set's result does not depend on the others.
@@ -105,19 +110,16 @@ class Wave:
 
         self._simulate = jax.jit(simulate)
 
-    def start(self) -> Arrays:
-        """Returns the record before the first step."""
-        shape = (len(self.units), self.size.points, self.size.points, self.size.trials)
-        return {
-            "step": np.int64(0),
-            "units": np.asarray(self.units),
-            "lost_step": np.zeros(shape, np.uint16),
-            "status": np.zeros(shape, np.uint8),
-        }
+    def step(self, number: int) -> Arrays:
+        """Simulates the landscapes of some sets.
 
-    def step(self, record: Arrays) -> str:
-        """Simulates the landscapes of the next sets."""
-        first = int(record["step"]) * self.size.sets
+        Args:
+          number: Which of the steps.
+
+        Returns:
+          `lost_step` and `status`, shape (set, point, point, trial).
+        """
+        first = number * self.size.sets
         # Filled up with the last set, so that every call has the compiled size.
         index = np.minimum(np.arange(first, first + self.size.sets), len(self.units) - 1)
         part: Constants = jax.tree.map(
@@ -126,37 +128,61 @@ class Wave:
         root = jax.random.key(self.seed)
         keys = jax.vmap(lambda i: stream_key(root, STREAM_GRID, i))(jnp.asarray(index))
         outcome = jax.tree.map(np.asarray, self._simulate(part, keys))
-        lost, status = records.pack(self.scene, outcome)
         count = min(self.size.sets, len(self.units) - first)
-        shape = (self.size.sets, *record["lost_step"].shape[1:])
-        record["lost_step"][first : first + count] = lost.reshape(shape)[:count]
-        record["status"][first : first + count] = status.reshape(shape)[:count]
-        record["step"] = record["step"] + 1
-        kept = (outcome.cost == 0).mean()
-        return f"kept {100 * kept:.0f} %  failed {failed(outcome.status).sum()}"
+        shape = (self.size.sets, self.size.points, self.size.points, self.size.trials)
+        return {
+            "lost_step": _lost_step(self.scene, outcome).reshape(shape)[:count],
+            "status": outcome.status.astype(np.uint8).reshape(shape)[:count],
+        }
 
-    def grasps(self, step: int) -> int:
-        """Grasps of one step."""
-        return min(self.size.sets, len(self.units) - step * self.size.sets) * self.size.worlds
+    def run(self, store: Store, say: Callable[[str], None]) -> int:
+        """Simulates the steps that are left; returns the grasps of this process.
 
-    def done(self, record: Arrays) -> int:
-        """Number of sets whose landscapes are known."""
-        return min(int(record["step"]) * self.size.sets, len(self.units))
+        Args:
+          store: What is done; each step is a part of it.
+          say: Told one line a step.
+
+        Raises:
+          KeyboardInterrupt: If Ctrl-C came; what is done is stored.
+        """
+        begin, grasps, done = time.perf_counter(), 0, len(store.found)
+        for number in range(done, self.steps):
+            part = self.step(number)
+            store.append(part)
+            store.found.append(part)
+            grasps += part["status"].size
+            kept = (part["lost_step"] == KEPT).mean()
+            rate = grasps / (time.perf_counter() - begin)
+            say(
+                f"{number + 1:>3}/{self.steps}  {rate:,.0f} grasps/s  kept {100 * kept:.0f} %  "
+                f"failed {failed(part['status']).sum()}"
+            )
+        return grasps
 
 
-def keep(wave: Wave, record: Arrays) -> Arrays:
+def _lost_step(scene: Scene, outcome: Outcome) -> np.ndarray:
+    """Step in which each trial lost its object, uint16; `KEPT` if it did not."""
+    lost = np.asarray(outcome.lost_time, np.float64) / scene.discretization.timestep
+    return np.where(np.isfinite(lost), np.round(np.nan_to_num(lost)), KEPT).astype(np.uint16)
+
+
+def keep(wave: Wave, parts: Sequence[Arrays]) -> Arrays:
     """What is kept of a wave, also of one that was cut short: the sets that are done.
 
+    Args:
+      wave: The wave.
+      parts: What its steps returned, one at the least.
+
     Returns:
-      `units`, `lost_step` and `status` of the record, `first_axis` and `second_axis` in the
-      parameters' units, the cost's `window` and the `timestep` [s].
+      `units`, `lost_step` and `status`, `first_axis` and `second_axis` in the parameters' units,
+      the cost's `window` and the `timestep` [s].
     """
-    done, space = wave.done(record), wave.space
-    designs = space.in_units(wave.designs)
+    lost, status = (np.concatenate([part[n] for part in parts]) for n in ("lost_step", "status"))
+    designs = wave.space.in_units(wave.designs)
     return {
-        "units": record["units"][:done],
-        "lost_step": record["lost_step"][:done],
-        "status": record["status"][:done],
+        "units": np.asarray(wave.units)[: len(status)],
+        "lost_step": lost,
+        "status": status,
         "first_axis": designs[:, 0, 0],
         "second_axis": designs[0, :, 1],
         "window": np.array(wave.scene.window),
@@ -172,7 +198,7 @@ def trial_costs(kept: Arrays) -> np.ndarray:
     """
     start, end = kept["window"]
     maximum = sets.values(kept["units"])["cost_maximum"]
-    lost = np.where(kept["lost_step"] == records.KEPT, end, kept["lost_step"] * kept["timestep"])
+    lost = np.where(kept["lost_step"] == KEPT, end, kept["lost_step"] * kept["timestep"])
     cost = maximum[:, None, None, None] * (end - lost) / (end - start)
     return np.where(failed(kept["status"]), np.nan, cost)
 

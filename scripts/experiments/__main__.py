@@ -1,6 +1,7 @@
 """Repeats the paper's experiments and redraws its figures.
 
 python -m scripts.experiments 2d --out runs/reproduction           # on a GPU; again to resume
+timeout -s INT 500 python -m scripts.experiments 2d --out runs/reproduction    # stop after a time
 python -m scripts.experiments 2d --out runs/small --size cpu       # minutes on a CPU
 python -m scripts.experiments 2d --parquet runs/2d.parquet         # every grasp, also afterwards
 python -m scripts.experiments types --videos docs/figures            # what the landscape's hands do
@@ -10,20 +11,21 @@ python -m scripts.experiments figures --data docs/data/reproduction
 import argparse
 import json
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
-import jax
+from rich.console import Console
 
-from codesign_jax import codesign, scene
+from codesign_jax import runs, scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
 from codesign_jax.runs.parquet import library
-from codesign_jax.scene import keypaths, parameters
+from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.scene.schema import SceneError
-from scripts.experiments import Batch, Grid, Stop, Worlds, drive, parquet, plan, results
-from scripts.experiments.worlds import chunking
-from scripts.shared import output, provenance, record
+from scripts.experiments import landscape, parquet, plan, results, strategies
+from scripts.shared import output, provenance
 
 
 def parse() -> argparse.Namespace:
@@ -51,10 +53,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
     parser.add_argument("--devices", type=int, help="by default all that are visible")
-    parser.add_argument("--every", type=int, help="steps between saves; by default 20 s")
-    parser.add_argument("--minutes", type=float, help="save and stop after this time")
-    parser.add_argument("--partial", action="store_true", help="also write results when stopped")
-    parser.add_argument("--fresh", action="store_true", help="delete an earlier state")
+    parser.add_argument("--every", type=int, default=4, help="episodes between checkpoints")
+    parser.add_argument("--fresh", action="store_true", help="delete what is there of it")
     provenance.add_commit(parser)
     parser.add_argument(
         "--trials",
@@ -76,8 +76,11 @@ def parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], int]:
-    """Returns the experiment, the settings its state must belong to, and its grasps."""
+def simulate(args: argparse.Namespace) -> int:
+    """Runs or resumes an experiment; returns the exit status."""
+    common.use_compilation_cache()
+    if args.parquet:
+        library(parquet.FLAG)  # refused before hours of simulation, not after
     the_plan = plan.experiment(args.experiment, args.size)
     try:
         the_plan = plan.narrowed(the_plan, args.strategies, args.runs)
@@ -85,50 +88,96 @@ def build(args: argparse.Namespace) -> tuple[Batch | Grid, dict[str, object], in
         sys.exit(f"error: {error}")
     overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
     the_scene = scene.load(args.scene, overrides=overrides)
-    space = parameters.design_space(the_scene.hand, the_plan.preset)
-    devices = args.devices or jax.device_count()
-    chunk, calls = chunking(the_plan.worlds, args.chunk, devices)
-    engine = make_engine(args.engine, the_scene)
-    worlds = Worlds(the_scene, engine, space, chunk=chunk, devices=devices)
-    print(f"{args.experiment}: {the_plan.grasps:,} grasps, {the_plan.worlds:,} a step in {calls}")
-    print(f"call(s) of {chunk:,} worlds on {devices} device(s)", flush=True)
-    settings = record.settings(the_plan, the_scene, args.engine, args.seed, chunk)
+    print(f"{args.experiment}: {the_plan.grasps:,} grasps", flush=True)
+    path = args.out / f"{args.experiment}.json"
+    before = json.loads(path.read_text()) if path.exists() and not args.fresh else None
+    settings = results.settings_of(the_plan, the_scene, args.engine, args.seed)
+    if before and before["settings"] != json.loads(json.dumps(settings)):
+        sys.exit(f"error: {path} belongs to another experiment; choose another --out, or --fresh")
+    start = time.perf_counter()
     if isinstance(the_plan, plan.Landscape):
-        return Grid(the_plan, the_scene, worlds, seed=args.seed), settings, the_plan.grasps
-    batch = Batch(the_plan, the_scene, worlds, codesign.make_filter(space), seed=args.seed)
-    return batch, settings, the_plan.grasps
+        return _landscape(args, the_plan, the_scene, before, start)
+    return _strategies(args, the_plan, the_scene, before, start)
 
 
-def simulate(args: argparse.Namespace) -> int:
-    """Runs or resumes an experiment; 3 is the exit status of one that was stopped."""
-    common.use_compilation_cache()
+def _strategies(
+    args: argparse.Namespace,
+    the_plan: plan.Strategies,
+    the_scene: Scene,
+    before: dict[str, Any] | None,
+    start: float,
+) -> int:
+    folder = args.out / args.experiment
+    plans = strategies.plans(the_plan, the_scene, args.engine, folder, args.seed)
+    how = {"fresh": args.fresh, "every": args.every, "devices": args.devices, "chunk": args.chunk}
+    done = runs.optimize(plans, sys.argv, **how)
+    problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
+    for place, error in problems.items():
+        print(f"error: {place}: {error}", file=sys.stderr)
+    found = strategies.gather(the_plan, folder, args.seed)
+    code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
+    if found is None or not found["cost"].shape[2]:
+        return code
+    space = parameters.design_space(the_scene.hand, the_plan.preset)
+    kept = results.of_strategies(the_plan, the_scene, space, found)
+    timing, screened = done.timing, strategies.screened(the_plan, found)
+    grasps = found["status"].size + (the_plan.worlds * the_plan.rounds if not code else 0)
+    rate = timing.grasps / max(timing.seconds, 1e-9)
+    seconds = time.perf_counter() - start
+    process = results.Process(timing.grasps, seconds, timing.compile_seconds, rate)
+    notes = _write(args, kept, found, process, before, (the_plan, the_scene), (grasps, screened))
     if args.parquet:
-        library(parquet.FLAG)  # refused before hours of simulation, not after
-    experiment, settings, grasps = build(args)
-    state = args.out / f"{args.experiment}.state.npz"
+        print(parquet.write_strategies(args.parquet, the_plan, space, found, notes))
+    return code
+
+
+def _landscape(
+    args: argparse.Namespace,
+    the_plan: plan.Landscape,
+    the_scene: Scene,
+    before: dict[str, Any] | None,
+    start: float,
+) -> int:
+    console, part = Console(highlight=False, soft_wrap=True), args.out / f"{args.experiment}.part"
     if args.fresh:
-        state.unlink(missing_ok=True)
-    stop = Stop(every=args.every, minutes=args.minutes)
-    done = drive(experiment, state, settings, stop=stop, say=lambda s: print(s, flush=True))
-    if not done.finished and args.partial and done.record:
-        made = results.describe(settings, done, done.grasps, commit=args.commit)
-        made |= {"steps": int(done.record["step"]), "steps_of_all": experiment.steps}
-        results.write(args.out, args.experiment, results.summarize(experiment, done.record), made)
-    if not done.finished:
-        print(f"stopped; the same command resumes from {state}")
-        return 3
-    notes = args.out / f"{args.experiment}.json"
-    # A finished state from which a table is asked for: who made the results stays as it is.
-    if done.grasps or not notes.exists():
-        made = results.describe(settings, done, grasps, commit=args.commit)
-        kept = results.summarize(experiment, done.record)
-        for path in results.write(args.out, args.experiment, kept, made):
+        part.unlink(missing_ok=True)
+    how = {"seed": args.seed, "chunk": args.chunk, "devices": args.devices, "console": console}
+    try:
+        found, earlier = landscape.simulate(the_plan, the_scene, args.engine, part, **how)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on")
+        return 130
+    space = parameters.design_space(the_scene.hand, the_plan.preset)
+    kept, seconds = results.of_landscape(the_scene, space, found), time.perf_counter() - start
+    grasps = the_plan.grasps - earlier
+    process = results.Process(grasps, seconds, 0.0, grasps / seconds)
+    sizes = the_plan.grasps, 0
+    notes = _write(args, kept, found, process, before, (the_plan, the_scene), sizes)
+    if args.parquet:
+        print(parquet.write_landscape(args.parquet, the_plan.name, space, found, notes))
+    return 0
+
+
+def _write(
+    args: argparse.Namespace,
+    kept: strategies.Arrays,
+    found: strategies.Arrays,
+    process: results.Process,
+    before: dict[str, Any] | None,
+    subject: tuple[Any, Scene],
+    grasps: tuple[int, int],
+) -> dict[str, Any]:
+    """Writes the results; returns their provenance: that of who made them, if nothing is new."""
+    notes = before or {}
+    if process.grasps or before is None:
+        settings = results.settings_of(*subject, args.engine, args.seed)
+        made = {"before": before, "commit": args.commit}
+        notes = results.describe(settings, process, *grasps, **made)
+        for path in results.write(args.out, args.experiment, kept, notes):
             print(path)
     if args.trials:
-        print(output.write_arrays(args.trials, done.record))
-    if args.parquet:
-        print(parquet.write(args.parquet, experiment, done.record, json.loads(notes.read_text())))
-    return 0
+        print(output.write_arrays(args.trials, found))
+    return notes
 
 
 def find_types(args: argparse.Namespace) -> int:
@@ -150,7 +199,7 @@ def find_types(args: argparse.Namespace) -> int:
         notes = {
             **provenance.results(args.commit),
             "settings": {
-                "scene_sha256": record.scene_hash(the_scene),
+                "scene_sha256": provenance.scene_hash(the_scene),
                 "engine": args.engine,
                 "threshold": LANDSCAPE_THRESHOLD,
             },
@@ -183,5 +232,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except (record.StateError, SceneError) as error:
+    except SceneError as error:
         sys.exit(f"error: {error}")

@@ -3,8 +3,8 @@
 python -m scripts.experiments.devices --json docs/data/devices.json      # machine with two GPUs
 python -m scripts.experiments.devices --json runs/devices.json --size tiny  # on a CPU, minutes
 
-Each number of devices is a process of `scripts.experiments` that sees so many, with the same
-chunk.  The records of all are compared bit by bit.  Exit status 1: they differ.
+Each number of devices is a process of `scripts.experiments` that sees so many.  All trials of all
+are compared bit by bit.  Exit status 1: they differ.
 """
 
 import argparse
@@ -18,13 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax.batch import LIMIT
 from scripts.experiments import plan
-from scripts.experiments.worlds import chunking
 from scripts.shared import output, provenance
-
-TIMES = ("seconds", "processes", "_settings", "_digest")
-"""What may differ between two records of an experiment."""
 
 
 def parse() -> argparse.Namespace:
@@ -33,7 +28,7 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--json", type=Path, default=Path("runs/devices.json"))
-    parser.add_argument("--experiment", choices=list(plan.PAPER), default="23d")
+    parser.add_argument("--experiment", choices=["2d", "23d"], default="23d")
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="short")
     parser.add_argument("--counts", type=lambda s: [int(n) for n in s.split(",")], default=[1, 2])
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -50,23 +45,22 @@ def run(args: argparse.Namespace, count: int, folder: Path) -> tuple[dict[str, A
       folder: Where the run is written.
 
     Returns:
-      Provenance and record.
+      Provenance and arrays of all trials.
 
     Raises:
       CalledProcessError: If the run fails.
     """
-    worlds = plan.experiment(args.experiment, args.size).worlds
-    chunk = chunking(worlds, LIMIT, max(args.counts)).size
     command = [sys.executable, "-m", "scripts.experiments", args.experiment]
-    command += ["--size", args.size, "--devices", str(count), "--chunk", str(chunk)]
-    command += ["--out", str(folder)] + [part for pair in args.set for part in ("--set", pair)]
+    command += ["--size", args.size, "--devices", str(count), "--out", str(folder)]
+    command += ["--trials", str(folder / "trials.npz")]
+    command += [part for pair in args.set for part in ("--set", pair)]
     command += ["--commit", args.commit] if args.commit else []
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
     visible = {"CUDA_VISIBLE_DEVICES": ",".join(map(str, range(count))), "XLA_FLAGS": flags}
     subprocess.run(command, check=True, env=os.environ | visible)
     notes = json.loads((folder / f"{args.experiment}.json").read_text())
-    with np.load(folder / f"{args.experiment}.state.npz", allow_pickle=False) as file:
-        return notes, {name: file[name] for name in file.files if name not in TIMES}
+    with np.load(folder / "trials.npz", allow_pickle=False) as file:
+        return notes, {name: file[name] for name in file.files}
 
 
 def compare(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -79,7 +73,7 @@ def compare(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         rows[str(count)] = {
             "different_arrays": differ,
             "grasps_per_s": last["grasps_per_s"],
-            "seconds_before_the_second_step": last["seconds_before_the_second_step"],
+            "compile_seconds": last["compile_seconds"],
             "speedup": round(last["grasps_per_s"] / notes["last_process"]["grasps_per_s"], 3),
         }
     kept = ("commit", "modified", "python", "versions", "platform", "device", "settings", "grasps")

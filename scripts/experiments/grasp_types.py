@@ -19,7 +19,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Trial, failed
-from scripts.shared.record import Arrays
+from scripts.experiments.strategies import Arrays
 
 MOST = 5
 """Largest number of grasp types that is tried."""

@@ -1,16 +1,19 @@
-"""The cost on a grid of two parameters, a few trials of every point in a step."""
+"""The cost on a grid of two parameters, some points in a call."""
+
+from pathlib import Path
 
 import jax
 import numpy as np
+from rich.console import Console
 
-from codesign_jax import rollout
-from codesign_jax.codesign import stream_key
-from codesign_jax.scene import Scene
-from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import failed
+from codesign_jax import batch
+from codesign_jax.commands import calls
+from codesign_jax.commands.calls import Calls, Meter, Trials
+from codesign_jax.engines import make_engine
+from codesign_jax.scene import Scene, SceneError
+from codesign_jax.scene.parameters import DesignSpace, design_space
 from scripts.experiments.plan import Landscape
-from scripts.experiments.worlds import Worlds
-from scripts.shared.record import Arrays, pack
+from scripts.experiments.strategies import Arrays
 
 STREAM_GRID = 0x67726964
 """Stream of the noise of the grid's trials ("grid")."""
@@ -33,51 +36,45 @@ def grid(space: DesignSpace, points: int) -> np.ndarray:
     return np.asarray(jax.vmap(jax.vmap(space.project))(designs))
 
 
-class Grid:
-    """The landscape as steps; the interface of `Batch`.
+def simulate(
+    plan: Landscape,
+    scene: Scene,
+    engine: str,
+    part: Path,
+    *,
+    seed: int,
+    chunk: int,
+    devices: int | None,
+    console: Console,
+) -> tuple[Arrays, int]:
+    """Simulates every point in the same trials; the same call goes on where it stopped.
 
-    Attributes:
-      steps: Steps of at most `plan.block` trials of every point.
+    Args:
+      plan: The experiment.
+      scene: The scene.
+      engine: Name of the engine.
+      part: File of what is done, which the caller deletes at the end.
+      seed: Root of the trials' noise.
+      chunk: Most worlds of a call.
+      devices: Devices that calls are dealt to; None for all.
+      console: Told what is done.
+
+    Returns:
+      `designs` (point, point, parameter), `trial_cost` and `status` (point, point, trial); and how
+      many grasps were found in the file.
     """
-
-    def __init__(self, plan: Landscape, scene: Scene, worlds: Worlds, *, seed: int = 0):
-        """Takes the experiment and what simulates it; see `Batch`."""
-        self.plan, self.scene, self.worlds, self.steps = plan, scene, worlds, plan.steps
-        self.designs = grid(worlds.space, plan.points)
-        key = stream_key(jax.random.key(seed), STREAM_GRID)
-        trials = jax.jit(lambda k: rollout.sample_trials(scene, k, plan.trials))(key)
-        self.trials = jax.tree.map(np.asarray, trials)
-
-    def start(self) -> Arrays:
-        """Returns the record before the first step."""
-        shape = (self.plan.points, self.plan.points, self.plan.trials)
-        return {
-            "step": np.int64(0),
-            "designs": self.designs,
-            "lost_step": np.zeros(shape, np.uint16),
-            "status": np.zeros(shape, np.uint8),
-            "trial_cost": np.zeros(shape, np.float32),
-        }
-
-    def step(self, record: Arrays) -> str:
-        """Simulates the next trials of every point."""
-        part = self._part(int(record["step"]))
-        trials = jax.tree.map(lambda v: v[None, part], self.trials)
-        flat = self.designs.reshape(1, 1, -1, self.designs.shape[-1])
-        outcome = self.worlds.evaluate(flat, trials)
-        shape = (self.plan.points, self.plan.points, -1)
-        lost_step, status = pack(self.scene, outcome)
-        record["lost_step"][..., part] = lost_step.reshape(shape)
-        record["status"][..., part] = status.reshape(shape)
-        record["trial_cost"][..., part] = outcome.cost.reshape(shape)
-        record["step"] = record["step"] + 1
-        return f"mean cost {outcome.cost.mean():.3f}  failed {failed(outcome.status).sum()}"
-
-    def grasps(self, step: int) -> int:
-        """Grasps of one step."""
-        part = self._part(step)
-        return self.plan.points**2 * (part.stop - part.start)
-
-    def _part(self, step: int) -> slice:
-        first = step * self.plan.block
-        return slice(first, min(first + self.plan.block, self.plan.trials))
+    space = design_space(scene.hand, plan.preset)
+    designs = grid(space, plan.points)
+    flat = designs.reshape(-1, designs.shape[-1])
+    trials = Trials(scene, engine, space, plan.trials, seed, (STREAM_GRID,))
+    most = max(1, chunk // plan.trials)
+    size = calls.equal(len(flat), min(most, -(-len(flat) // len(batch.take(devices)))))
+    run = Calls(trials, make_engine(engine, scene), size, part, flat, devices=devices)
+    if run.refused:
+        raise SceneError([f"{part} {run.refused}: choose another --out, or delete it"])
+    with Meter(plan.name, plan.grasps, console) as meter:
+        outcome = run(flat, meter)
+    shape = (plan.points, plan.points, plan.trials)
+    found = {"trial_cost": outcome.cost, "status": outcome.status.astype(np.uint8)}
+    found = {name: values.reshape(shape) for name, values in found.items()}
+    return {"designs": designs, **found}, run.found * plan.trials

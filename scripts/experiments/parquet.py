@@ -1,6 +1,5 @@
 """Every grasp of an experiment as a row of a Parquet file (pyarrow, the extra `parquet`)."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,15 +7,15 @@ import numpy as np
 
 from codesign_jax.runs import parquet
 from codesign_jax.runs.parquet import Column
-from scripts.experiments import results
-from scripts.experiments.batch import Batch
-from scripts.experiments.landscape import Grid
-from scripts.shared.record import Arrays
+from codesign_jax.scene.parameters import DesignSpace
+from scripts.experiments.plan import Strategies
+from scripts.experiments.strategies import Arrays
 
 FLAG = "--parquet"
 """Flag of the study that asks for the file."""
 EPISODE, TEST = "episode", "test"
 """Phases of an experiment on strategies."""
+_TEST = "test_cost"
 
 _OUTCOME = {
     "cost": (
@@ -47,79 +46,79 @@ _GRID = {
 }
 
 
-def write(path: Path, experiment: Batch | Grid, record: Arrays, notes: dict[str, Any]) -> Path:
-    """Writes one row a grasp, as a whole or not at all.
+def write_strategies(
+    path: Path, plan: Strategies, space: DesignSpace, found: Arrays, notes: dict[str, Any]
+) -> Path:
+    """Writes one row a grasp of `strategies.gather`, as a whole or not at all.
 
     Grasps that screened the seeds are in no row.  A test also counts the last episode's grasps of
     the particles that survived it: these are rows of that episode alone.
 
     Args:
       path: File to write.
-      experiment: What was run.
-      record: Its record; episodes that were not simulated yet have no rows.
+      plan: The experiment.
+      space: Its design space.
+      found: What was gathered.
       notes: Provenance, kept as JSON in the schema's metadata.
 
     Raises:
       SceneError: If pyarrow is missing.
     """
+    # The first columns of the test repeat the last episode's grasps.
+    test = {f"test_{v}": found[f"test_{v}"][..., plan.trials :] for v in _OUTCOME if _TEST in found}
+    tables = []
+    for s, strategy in enumerate(plan.strategies):
+        fixed = {"experiment": plan.name, "strategy": strategy}
+        cost, status = found["trial_cost"][s], found["status"][s]
+        axes = _indices(cost, "run", "episode", "particle", "trial")
+        tables.append(fixed | {"phase": EPISODE, "cost": cost, "status": status} | axes)
+        if test:
+            cost, status = (test[f"test_{v}"][s] for v in ("cost", "status"))
+            axes = _indices(cost, "run", "particle", "trial")
+            own = {"phase": TEST, "episode": None, "cost": cost, "status": status}
+            tables.append(fixed | own | axes)
+    return _write(path, _STRATEGIES, space, tables, notes)
+
+
+def write_landscape(
+    path: Path, name: str, space: DesignSpace, found: Arrays, notes: dict[str, Any]
+) -> Path:
+    """As `write_strategies`, of what `landscape.simulate` returns."""
+    designs = space.in_units(found["designs"])[..., None, :]
+    columns = {
+        "experiment": name,
+        "first": designs[..., 0],
+        "second": designs[..., 1],
+        "trial": np.arange(found["status"].shape[-1]),
+        "cost": found["trial_cost"],
+        "status": found["status"],
+    }
+    return _write(path, _GRID, space, [columns], notes)
+
+
+def _write(
+    path: Path,
+    described: dict[str, tuple[str, str]],
+    space: DesignSpace,
+    tables: list[dict[str, Any]],
+    notes: dict[str, Any],
+) -> Path:
     pa = parquet.library(FLAG)
-    metadata = {"provenance": notes, "status_bits": parquet.STATUS_BITS}
-    schema = parquet.schema(pa, _columns(experiment), metadata)
-    batch = isinstance(experiment, Batch)
-    tables = _strategies(experiment, record) if batch else _points(experiment, record)
-    with parquet.writing(pa, path, schema) as writer:
-        for columns in tables:
-            writer.write_table(parquet.table(pa, schema, columns, columns["cost"].shape))
-    return path
-
-
-def _columns(experiment: Batch | Grid) -> dict[str, Column]:
-    space, found = experiment.worlds.space, {}
-    columns = _STRATEGIES if isinstance(experiment, Batch) else _GRID
-    for name, (kind, text) in columns.items():
+    columns = {}
+    for name, (kind, text) in described.items():
         more = {}
         if name in ("first", "second"):
             index = ("first", "second").index(name)
             more = {"parameter": space.names[index], "unit": space.units[index]}
-        found[name] = Column(kind, text, more, nullable=name == "episode")
-    return found
-
-
-def _strategies(batch: Batch, record: Arrays) -> Iterator[dict[str, Any]]:
-    """Columns of each strategy's episodes, then of its tests: broadcast axes, and arrays."""
-    plan, step = batch.plan, int(record["step"])
-    episodes = min(step, plan.episodes)
-    # The first columns of the test repeat the last episode's grasps.
-    tested = slice(plan.trials, plan.trials * (1 + max(step - plan.episodes, 0)))
-    for s, strategy in enumerate(plan.strategies):
-        fixed = {"experiment": plan.name, "strategy": strategy}
-        if episodes:
-            status = record["status"][s, :, :episodes]
-            cost = results.costs(batch.scene, record["lost_step"][s, :, :episodes], status)
-            axes = _indices(cost, "run", "episode", "particle", "trial")
-            yield fixed | {"phase": EPISODE, "cost": cost, "status": status} | axes
-        if tested.stop > tested.start:
-            cost, status = (record[f"test_{v}"][s, ..., tested] for v in ("cost", "status"))
-            axes = _indices(cost, "run", "particle", "trial")
-            yield fixed | {"phase": TEST, "episode": None, "cost": cost, "status": status} | axes
+        columns[name] = Column(kind, text, more, nullable=name == "episode")
+    metadata = {"provenance": notes, "status_bits": parquet.STATUS_BITS}
+    schema = parquet.schema(pa, columns, metadata)
+    with parquet.writing(pa, path, schema) as writer:
+        for values in tables:
+            writer.write_table(parquet.table(pa, schema, values, values["cost"].shape))
+    return path
 
 
 def _indices(values: np.ndarray, *names: str) -> dict[str, Any]:
     """Indices along the axes, to broadcast."""
     return dict(zip(names, np.indices(values.shape, sparse=True), strict=True))
-
-
-def _points(grid: Grid, record: Arrays) -> Iterator[dict[str, Any]]:
-    """Columns of the grid's grasps."""
-    done = min(grid.plan.block * int(record["step"]), grid.plan.trials)
-    cost, status = (record[name][..., :done] for name in ("trial_cost", "status"))
-    designs = grid.worlds.space.in_units(record["designs"])[..., None, :]
-    trial = np.arange(done)
-    yield {
-        "experiment": grid.plan.name,
-        "first": designs[..., 0],
-        "second": designs[..., 1],
-        "trial": trial,
-        "cost": cost,
-        "status": status,
-    }

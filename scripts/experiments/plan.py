@@ -1,4 +1,4 @@
-"""Sizes of the experiments (paper Secs. VI.3 to VI.5) and what their runs differ in: the masks."""
+"""Sizes of the experiments (paper Secs. VI.3 to VI.5)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from codesign_jax.optimize import schedule
-from codesign_jax.scene.parameters import DesignSpace
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,16 +65,6 @@ class Strategies:
         """Domain in which each run starts: either one in turn, so equally often (Sec. VI.4)."""
         return tuple(("morphology", "control")[r % 2] for r in range(self.runs))
 
-    def masks(self, space: DesignSpace) -> np.ndarray:
-        """Returns which parameters are open, bool, shape (strategy, run, episode, parameter)."""
-        domain = np.array(space.is_morphology)
-        return np.array(
-            [
-                [schedule(s, domain, self.episodes, first) for first in self.first()]  # type: ignore[arg-type]
-                for s in self.strategies
-            ]
-        )
-
 
 @dataclasses.dataclass(frozen=True)
 class Landscape:
@@ -86,24 +75,12 @@ class Landscape:
       preset: Design space of the hand, of two parameters.
       points: Grid points along either parameter, bounds included.
       trials: Trials of each point; every point meets the same ones.
-      block: Trials simulated in one step.
     """
 
     name: str
     preset: str
     points: int
     trials: int
-    block: int = 6
-
-    @property
-    def steps(self) -> int:
-        """Steps of at most `block` trials of every point."""
-        return -(-self.trials // self.block)
-
-    @property
-    def worlds(self) -> int:
-        """Grasps of one whole step."""
-        return self.points**2 * min(self.block, self.trials)
 
     @property
     def grasps(self) -> int:
@@ -132,7 +109,7 @@ SMALL: dict[str, dict[str, Strategies | Landscape]] = {
     "tiny": {
         "2d": Strategies("2d", "2d", ("single", "concurrent"), 2, 2, 2, 3, 3),
         "23d": Strategies("23d", "23d", ("single", "concurrent"), 2, 2, 2, 3, 3),
-        "landscape": Landscape("landscape", "2d", 2, 3, 3),
+        "landscape": Landscape("landscape", "2d", 2, 3),
     },
     "cpu": {
         "2d": Strategies("2d", "2d", _FEW, 4, 6, 16, 3, 6),

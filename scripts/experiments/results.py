@@ -1,28 +1,21 @@
-"""From the record of an experiment to what is kept: small arrays, and where they come from."""
+"""From what was simulated to what is kept: small arrays, and where they come from."""
 
+import dataclasses
 import datetime
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Status, failed
-from scripts.experiments.batch import Batch
-from scripts.experiments.landscape import Grid
+from scripts.experiments.plan import Strategies
+from scripts.experiments.strategies import Arrays
 from scripts.shared import output, provenance
-from scripts.shared.driver import Drive
-from scripts.shared.record import KEPT, Arrays
 
 BITS = tuple(s for s in Status if s)
 """Status bits in the order of the `failed` arrays' last axis."""
-
-
-def costs(scene: Scene, lost_step: np.ndarray, status: np.ndarray) -> np.ndarray:
-    """Cost of each trial from its packed form, float32; the maximum where it failed."""
-    start, end = scene.window
-    lost = np.where(lost_step == KEPT, end, lost_step * scene.discretization.timestep)
-    cost = scene.cost.maximum * (end - lost) / (end - start)
-    return np.where(failed(status), scene.cost.maximum, cost).astype(np.float32)
 
 
 def both_means(scene: Scene, cost: np.ndarray, status: np.ndarray) -> dict[str, np.ndarray]:
@@ -40,30 +33,24 @@ def failures(status: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
     return np.stack([((status & bit) != 0).sum(axes) for bit in BITS], -1).astype(np.int32)
 
 
-def summarize(experiment: Batch | Grid, record: Arrays) -> Arrays:
-    """Returns what is kept of a record; docs/notes/results.md says what each array is."""
-    return (
-        _batch(experiment, record) if isinstance(experiment, Batch) else _grid(experiment, record)
-    )
-
-
-def _batch(batch: Batch, record: Arrays) -> Arrays:
-    plan, scene, space = batch.plan, batch.scene, batch.worlds.space
-    done = min(int(record["step"]), plan.episodes)
-    cost, status = record["cost"][:, :, :done], record["status"][:, :, :done]
-    trial_cost = costs(scene, record["lost_step"][:, :, :done], status)
+def of_strategies(plan: Strategies, scene: Scene, space: DesignSpace, found: Arrays) -> Arrays:
+    """What is kept of `strategies.gather`; docs/notes/results.md says what each array is."""
+    cost, status = found["cost"], found["status"]
     quartiles = np.quantile(cost, [0.25, 0.5, 0.75], axis=-1).astype(np.float32)
-    means = both_means(scene, trial_cost, status)
-    test = both_means(scene, record["test_cost"], record["test_status"])
-    if int(record["step"]) < batch.steps:  # not a number: the final test is not complete
-        test = {rule: np.full_like(v, np.nan) for rule, v in test.items()}
+    means = both_means(scene, found["trial_cost"], status)
+    if "test_cost" in found:
+        test = both_means(scene, found["test_cost"], found["test_status"])
+        test_status = found["test_status"]
+    else:  # not a number: the final test is not complete
+        test = {rule: np.full(found["particles"].shape[:3], np.nan, np.float32) for rule in means}
+        test_status = np.zeros((*found["particles"].shape[:3], 1), np.uint8)
     return {
         "strategies": np.array(plan.strategies),
         "first": np.array(plan.first()),
         "parameters": np.array(space.names),
-        "seeds": record["seeds"],
-        "seed_cost": record["seed_cost"],
-        "seed_candidates": record["seed_candidates"],
+        "seeds": found["seeds"],
+        "seed_cost": found["seed_cost"],
+        "seed_candidates": found["seed_candidates"],
         "mean": cost.mean(-1),
         "best": cost.min(-1),
         "quartiles": np.moveaxis(quartiles, 0, -1),
@@ -72,58 +59,98 @@ def _batch(batch: Batch, record: Arrays) -> Arrays:
         "failed": failures(status, (3, 4)),
         # Enough for Fig. 6; half precision is finer than the costs' own steps matter in a plot.
         "particle_cost": cost[-1].astype(np.float16),
-        "final_particles": record["particles"],
+        "final_particles": found["particles"],
         "test_exclude": test["exclude"],
         "test_worst": test["worst"],
-        "test_failed": failures(record["test_status"], (3,)).astype(np.int16),
+        "test_failed": failures(test_status, (3,)).astype(np.int16),
     }
 
 
-def _grid(grid: Grid, record: Arrays) -> Arrays:
-    done = grid.plan.block * int(record["step"])
-    status = record["status"][..., :done]
-    means = both_means(grid.scene, record["trial_cost"][..., :done], status)
-    space = grid.worlds.space
+def of_landscape(scene: Scene, space: DesignSpace, found: Arrays) -> Arrays:
+    """What is kept of `landscape.simulate`."""
+    cost, status = found["trial_cost"], found["status"]
+    means = both_means(scene, cost, status)
+    designs = space.in_units(found["designs"])
     return {
         "parameters": np.array(space.names),
         "units": np.array(space.units),
-        "first_axis": space.in_units(record["designs"])[:, 0, 0],
-        "second_axis": space.in_units(record["designs"])[0, :, 1],
+        "first_axis": designs[:, 0, 0],
+        "second_axis": designs[0, :, 1],
         "exclude": means["exclude"],
         "worst": means["worst"],
-        "success_ratio": ((record["trial_cost"][..., :done] == 0) & ~failed(status)).mean(-1),
+        "success_ratio": ((cost == 0) & ~failed(status)).mean(-1),
         "failed": failures(status, (2,)).astype(np.int16),
     }
 
 
+class Process(NamedTuple):
+    """What a process did.
+
+    Attributes:
+      grasps: Grasps that it simulated.
+      seconds: Its wall time, with compilation.
+      compile_seconds: Time to compile, as far as that is known.
+      rate: Grasps a second, without compilation as far as that is known.
+    """
+
+    grasps: int
+    seconds: float
+    compile_seconds: float
+    rate: float
+
+
 def describe(
     settings: dict[str, object],
-    done: Drive,
+    process: Process,
     grasps: int,
+    screened: int,
     *,
+    before: dict[str, Any] | None = None,
     commit: str | None = None,
 ) -> dict[str, object]:
     """Returns what a result depends on, and what it took.
 
     Args:
-      settings: See `record.settings`.
-      done: The drive that finished the experiment.
-      grasps: Grasps of the experiment.
+      settings: See `settings_of`.
+      process: What this process did.
+      grasps: Grasps of the experiment so far.
+      screened: Grasps that screened the seeds.
+      before: What an earlier process wrote of the same experiment.
       commit: Commit of the code, for a machine without git.
     """
+    earlier = before or {}
     return {
         **provenance.results(commit),
         "settings": settings,
         "grasps": grasps,
-        "grasps_that_screened_seeds": done.screened,
-        "wall_seconds": round(done.total_seconds, 1),
-        "processes": done.processes,
+        "grasps_that_screened_seeds": screened,
+        "wall_seconds": round(earlier.get("wall_seconds", 0.0) + process.seconds, 1),
+        "processes": earlier.get("processes", 0) + 1,
         "last_process": {
-            "grasps": done.grasps,
-            "seconds": round(done.seconds, 1),
-            "seconds_before_the_second_step": round(done.first_seconds, 1),
-            "grasps_per_s": round(done.rate, 1),
+            "grasps": process.grasps,
+            "seconds": round(process.seconds, 1),
+            "compile_seconds": round(process.compile_seconds, 1),
+            "grasps_per_s": round(process.rate, 1),
         },
+    }
+
+
+def settings_of(plan: Any, scene: Scene, engine: str, seed: int) -> dict[str, object]:
+    """What determines the numbers of an experiment, beside code, versions and device.
+
+    Args:
+      plan: Sizes of the experiment, a dataclass of numbers and names.
+      scene: The scene.
+      engine: Name of the engine.
+      seed: Root of all random numbers.
+    """
+    return {
+        "plan": dataclasses.asdict(plan),
+        "scene": scene.name,
+        "scene_sha256": provenance.scene_hash(scene),
+        "failure": scene.cost.failure,
+        "engine": engine,
+        "seed": seed,
     }
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import datetime
+import hashlib
 import os
 import platform
 import shlex
@@ -14,6 +15,8 @@ import mujoco
 import numpy as np
 
 from codesign_jax.provenance import environment, git_state
+from codesign_jax.runs.scene_files import scene_texts
+from codesign_jax.scene import Scene
 
 
 def command() -> str:
@@ -39,6 +42,12 @@ def results(commit: str | None = None) -> dict[str, object]:
       commit: Commit of the code, for a machine without its repository.
     """
     return {"command": command(), **git_state(commit), **environment()}
+
+
+def scene_hash(scene: Scene) -> str:
+    """SHA-256 of the resolved scene with hand and objects."""
+    texts = scene_texts(scene)
+    return hashlib.sha256("\n".join(texts[n] for n in sorted(texts)).encode()).hexdigest()
 
 
 def measurement(commit: str | None = None) -> dict:

@@ -19,7 +19,7 @@ from pathlib import Path
 from codesign_jax import scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.scene.schema import SceneError
-from scripts.shared import provenance, record
+from scripts.shared import provenance
 from scripts.winners import files as winners_files
 from scripts.winners import variants as winners
 from scripts.winners.variants import VARIANTS, Variant
@@ -87,7 +87,7 @@ def simulate(args: argparse.Namespace) -> int:
     settings = {
         "size": args.size,
         "particles": "the best of each run first",
-        "scene_sha256": record.scene_hash(scene.load("paper_spheres")),
+        "scene_sha256": provenance.scene_hash(scene.load("paper_spheres")),
         "set": list(args.set),
     }
     made = winners_files.read(args.out)[2] if args.out.exists() else []
@@ -125,5 +125,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except (record.StateError, SceneError) as error:
+    except ValueError as error:
         sys.exit(f"error: {error}")

@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from codesign_jax import archives
+from codesign_jax.scene import SceneError
 from scripts.shared import output
-from scripts.shared import record as records
-from scripts.shared.record import Arrays, StateError
+
+Arrays = dict[str, Any]
+"""NumPy arrays by name."""
 
 Run = dict[str, Any]
 """Provenance of a process, with the keys of the `calls` it made."""
@@ -30,16 +33,31 @@ def read(path: Path) -> tuple[Arrays, dict[str, Any], list[Run]]:
       path: The .npz file; its .json lies beside it.
 
     Raises:
-      StateError: If either file cannot be read.
+      SceneError: If what made them cannot be read.
+      ArchiveError: If the results are damaged.
     """
     try:
         notes = json.loads(path.with_suffix(".json").read_text())
         settings = notes.pop("settings")
     except (OSError, ValueError, KeyError) as error:
-        raise StateError(f"what made {path} cannot be read from its .json: {error}") from error
-    results = records.load(path, settings)
+        problem = f"what made {path} cannot be read from its .json: {error}"
+        raise SceneError([problem]) from error
+    results = archives.load(path)
     runs = notes["runs"] if "runs" in notes else _early(notes, calls(results))
     return results, settings, runs
+
+
+def refuse_others(path: Path, found: dict[str, Any], settings: dict[str, Any]) -> None:
+    """Refuses results of other settings.
+
+    Raises:
+      SceneError: With what differs.
+    """
+    wanted = json.loads(json.dumps(settings))
+    different = [k for k in {*found, *wanted} if found.get(k) != wanted.get(k)]
+    if different:
+        text = "; ".join(f"{k}: {found.get(k)} there, {wanted.get(k)} wanted" for k in different)
+        raise SceneError([f"{path} belongs to something else ({text}); delete it to start anew"])
 
 
 def _early(notes: dict[str, Any], keys: list[str]) -> list[Run]:
@@ -79,23 +97,20 @@ def merge(paths: Sequence[Path], out: Path) -> list[str]:
       The calls of the new file.
 
     Raises:
-      StateError: If a file cannot be read, if settings or the numbers of a call differ, or if
+      SceneError: If a file cannot be read, if settings or the numbers of a call differ, or if
         `out` exists and is not joined.
     """
     if out.exists() and out.resolve() not in [p.resolve() for p in paths]:
-        raise StateError(f"{out} exists and is not among the files to join")
+        raise SceneError([f"{out} exists and is not among the files to join"])
     joined, settings, runs = read(paths[0])
     for path in paths[1:]:
         results, other, more = read(path)
-        different = [k for k in {*settings, *other} if settings.get(k) != other.get(k)]
-        if different:
-            text = "; ".join(f"{k}: {settings.get(k)} and {other.get(k)}" for k in different)
-            raise StateError(f"{paths[0]} and {path} do not belong together ({text})")
+        refuse_others(path, other, settings)
         _same_numbers(joined, results, path)
         known = set(calls(joined))
         runs += [{**run, "calls": [k for k in run["calls"] if k not in known]} for run in more]
         joined = results | joined
-    records.save(out, joined, settings)
+    archives.save(out, joined, compressed=True)
     write_runs(out, settings, runs)
     return calls(joined)
 
@@ -104,4 +119,4 @@ def _same_numbers(a: Arrays, b: Arrays, path: Path) -> None:
     for key in sorted(set(calls(a)) & set(calls(b))):
         for part in (f"{key}|cost", f"{key}|status"):
             if not np.array_equal(a[part], b[part], equal_nan=True):
-                raise StateError(f"{path}: its {part} differs from that of the files before it")
+                raise SceneError([f"{path}: its {part} differs from that of the files before it"])

@@ -11,11 +11,10 @@ from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.types import failed
 from scripts.shared import figures as pictures
 from scripts.shared import statistics
-from scripts.shared.record import Arrays
 from scripts.shared.tables import fill
 from scripts.winners import files as winners_files
 from scripts.winners import variants as winners
-from scripts.winners.files import Run
+from scripts.winners.files import Arrays, Run
 from scripts.winners.variants import STANDARD, VARIANTS, Finals
 
 MARK = "winners"

@@ -1,7 +1,6 @@
 """Do winners hold?  Final particles simulated again with other engines, steps, hands, objects."""
 
 import dataclasses
-import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,17 +9,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from codesign_jax import rollout
+from codesign_jax import archives
 from codesign_jax import scene as scenes
 from codesign_jax.batch import LIMIT
-from codesign_jax.codesign import SUCCESS_COST, stream_key
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.commands import calls
+from codesign_jax.commands.calls import Trials
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import Scene, keypaths, parameters
-from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import Outcome
-from scripts.experiments.worlds import Worlds, chunking
-from scripts.shared import record as records
-from scripts.shared.record import Arrays
+from scripts.winners import files
+from scripts.winners.files import Arrays
 
 STREAM_WINNERS = 0x77696E6E
 """Stream of the noise of these trials ("winn"): none of them was met in a run."""
@@ -164,23 +162,17 @@ class Task:
         scene = self.variant.scene(more)
         space = parameters.design_space(scene.hand, self.finals.preset)
         designs = self.finals.chosen(self.variant.best)
-        chunk = chunking(int(np.prod(designs.shape[:2])) * self.trials, limit).size
-        worlds = _worlds(scene, self.variant.engine, space, chunk)
-        key = stream_key(jax.random.key(0), STREAM_WINNERS, self.block)
-        trials = jax.tree.map(lambda v: v[None], rollout.sample_trials(scene, key, self.trials))
-        flat = designs.reshape(1, 1, -1, designs.shape[-1])
-        found: Outcome = worlds.evaluate(flat, trials)
+        flat = designs.reshape(-1, designs.shape[-1])
+        size = calls.equal(len(flat), max(1, limit // self.trials))
+        stream = STREAM_WINNERS, self.block
+        trials = Trials(scene, self.variant.engine, space, self.trials, 0, stream)
+        engine = make_engine(self.variant.engine, scene)
+        found = calls.joined([*calls.in_turn(trials, engine, flat, size)])
         shape = (*designs.shape[:2], self.trials)
         return {
             f"{self.key}|cost": found.cost.reshape(shape).astype(np.float16),
             f"{self.key}|status": found.status.reshape(shape).astype(np.uint8),
         }
-
-
-@functools.lru_cache(maxsize=8)
-def _worlds(scene: Scene, engine: str, space: DesignSpace, chunk: int) -> Worlds:
-    """The simulation of a variant: its blocks and experiments share one compiled program."""
-    return Worlds(scene, make_engine(engine, scene), space, chunk=chunk)
 
 
 def tasks(
@@ -211,7 +203,7 @@ def drive(
     Args:
       todo: The calls.
       path: File of the results, written after each.
-      settings: What the file must belong to; see `record.load`.
+      settings: What the file must belong to.
       more: Overrides of every variant's scene.
       budget: Seconds to begin calls in.
       limit: Most worlds of a call of the engine.
@@ -222,10 +214,14 @@ def drive(
       The results, and whether all calls are done.
 
     Raises:
-      StateError: If the file cannot be used.
+      SceneError: If the file belongs to other settings.
+      ArchiveError: If it is damaged.
     """
     begin, longest = time.monotonic(), 0.0
-    results = records.load(path, settings) if path.exists() else {}
+    results: Arrays = {}
+    if path.exists():
+        results, found, _ = files.read(path)
+        files.refuse_others(path, found, settings)
     left = [t for t in todo if f"{t.key}|cost" not in results]
     for number, task in enumerate(left, 1):
         start = time.monotonic()
@@ -237,7 +233,7 @@ def drive(
         longest = max(longest, seconds)
         results |= new | {f"{task.key}|seconds": np.float64(seconds)}
         note(task.key)
-        records.save(path, results, settings)
+        archives.save(path, results, compressed=True)
         cost = new[f"{task.key}|cost"]
         say(
             f"[{number}/{len(left)}] {task.key}: {cost.size:,} grasps, {(cost == 0).mean():.1%} "

@@ -91,6 +91,7 @@ class Task:
     def _cost(self, plan: Plan, knots: jax.Array) -> jax.Array:
         """Costs of a plan for each world, (world,)."""
         trace = self._trace(plan, knots)
+        assert trace.last is not None
         nq = trace.qpos.shape[-1]
         path = jnp.concatenate([trace.qpos, trace.last[:, None, :nq]], 1)
         moved = jnp.diff(in_palm(path), axis=1) / SLIP
@@ -116,6 +117,7 @@ class Task:
         plan = plan._replace(ctrl=driven(plan.ctrl, knots)[:, :STRIDE])
         fields = self.grasps.fields._replace(start=plan.start)
         trace = self.engine.rollout(fields, plan.ctrl, trajectory=True)
+        assert trace.last is not None
         nq = trace.qpos.shape[-1]
         path = jnp.concatenate([trace.qpos, trace.last[:, None, :nq]], 1)
         slip = jnp.linalg.norm(jnp.diff(in_palm(path), axis=1), axis=2).sum(1)

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import optax
 
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import apply_columns, world_constants
 from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.engines.structured.laws.kinematics import kinematics
+from codesign_jax.engines.structured.world_model import apply_columns, world_constants
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.model.layout import implicit_damping
 from codesign_jax.scene import Scene

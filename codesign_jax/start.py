@@ -7,17 +7,17 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured.assembly import contacts
-from codesign_jax.engines.structured.constants import (
-    WorldConstants,
+from codesign_jax.engines.structured.coordinates import reset
+from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.engines.structured.laws import shapes
+from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
+from codesign_jax.engines.structured.world_model import (
+    WorldModel,
     apply_columns,
     apply_rows,
     world_constants,
 )
-from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.kinematics import Kinematics, straight
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.model.layout import first_on_palm
 from codesign_jax.scene import Scene
@@ -123,13 +123,13 @@ def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
     local = apply_rows(kin.palm[:, :, None, None], point - kin.place[:, None, None])
     assert hand.palm_disc is not None
     above = jnp.stack([local[0], local[1], local[2] - hand.palm_disc[1]])
-    distance, _ = collision.cylinder(hand.palm_disc[:, None, None], above)
+    distance, _ = shapes.cylinder(hand.palm_disc[:, None, None], above)
     deepest = (radius - distance)[:, first:]
     return deepest.reshape(-1, deepest.shape[-1]).max(0)
 
 
 @partial(jax.jit, static_argnums=0)
-def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldConstants, Kinematics, jax.Array]:
+def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldModel, Kinematics, jax.Array]:
     """Worlds with straight fingers, and the height of the object above the table, (1, world)."""
     state, hand = reset(scene, fields), world_constants(scene, fields)
     return hand, straight(hand, state), state.position[2]

@@ -18,8 +18,8 @@ import tyro
 
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines.structured import StructuredEngine, assembly
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import parameters
 from codesign_jax.types import Trial
 from scripts.shared import figures as pictures

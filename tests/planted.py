@@ -17,30 +17,40 @@ import pytest
 from codesign_jax import sources
 from codesign_jax.compiler import cache
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import (
     Limits,
     Program,
-    contacts,
+    advance,
+    contact_sets,
     coupling,
-    elimination,
-    fingers,
-    hull,
-    integration,
+    linear_system,
     newton,
+    pair_search,
     pairs,
     problem,
     program,
+    skin,
     slots,
     step,
 )
-from codesign_jax.engines.structured.kernel.contacts import ContactSet
+from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
+from codesign_jax.engines.structured.world_model import world_constants
 
 FAR = 1e30
 DEEP = 1e6
 """Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
-MODULES = (contacts, coupling, elimination, fingers, hull, integration, newton, pairs, problem)
+MODULES = (
+    contact_sets,
+    coupling,
+    linear_system,
+    pair_search,
+    skin,
+    advance,
+    newton,
+    pairs,
+    problem,
+)
 MODULES += (slots, step)
 
 

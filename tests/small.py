@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import control, cost, model, rollout, scene
-from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Trial
 

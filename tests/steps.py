@@ -14,17 +14,17 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import assembly, coordinates
-from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.contact import Contacts, constraint_update
-from codesign_jax.engines.structured.kinematics import Acc
 from codesign_jax.engines.structured.lanes import Stages, dot, sum_axis, sum_fingers, sum_items
-from codesign_jax.engines.structured.problem import (
+from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
+from codesign_jax.engines.structured.laws.kinematics import Acc
+from codesign_jax.engines.structured.linear.tree import (
     Forces,
     Problem,
     Spatial,
     propagate,
     relative,
 )
+from codesign_jax.engines.structured.world_model import world_constants
 from tests import small
 
 FLOOR = 100.0

@@ -12,7 +12,7 @@ import pytest
 from codesign_jax import cli, model, scene
 from codesign_jax.commands import asked
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import parameters, schema
 from codesign_jax.scene.effects import ENGINES
 from scripts.accuracy import beam, decision, impulse, oracle, steps, study, tip, worlds

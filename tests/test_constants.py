@@ -11,7 +11,7 @@ import pytest
 from codesign_jax import model, rollout, scene
 from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import schema
 from tests.small import hand_world, nth, pinch, random_constants, random_worlds, repeat
 

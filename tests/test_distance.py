@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax.engines.structured import collision
 from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.engines.structured.laws import shapes
 from tests import small
 
 SIZES = {
@@ -75,7 +75,7 @@ def engine_contacts(kind, position, quat, centre):
             :, :, None
         ]  # column, row, 1, world
         kin = SimpleNamespace(object=jnp.asarray(frames))
-        return collision.spheres_on_object(
+        return shapes.spheres_on_object(
             alone, hand, kin, Stages(), jnp.asarray((centre - position).T[:, None]), RADIUS
         )
 

@@ -14,8 +14,8 @@ from codesign_jax import control, model
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine, coordinates
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import effects, schema
 from codesign_jax.types import WARNINGS
 from tests import small, steps

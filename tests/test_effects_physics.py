@@ -8,7 +8,7 @@ import pytest
 from scipy import integrate, optimize
 
 from codesign_jax import control
-from codesign_jax.engines.structured import cones, contact
+from codesign_jax.engines.structured.laws import cones, contact
 from codesign_jax.model import morphology
 from tests import small
 from tests.test_effects import inflated, setting

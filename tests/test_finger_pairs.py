@@ -8,9 +8,9 @@ import pytest
 
 from codesign_jax import model, scene
 from codesign_jax.engines.mjx import MjxEngine
-from codesign_jax.engines.structured import finger_pairs
 from codesign_jax.engines.structured.kernel.pairs import pair_slots
 from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.engines.structured.laws import finger_pairs
 from tests import small
 
 SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 2}

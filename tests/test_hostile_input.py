@@ -15,7 +15,7 @@ from command_runs import command, own_workplace  # noqa: F401  (a fixture)
 from solids import box, object_file
 
 from codesign_jax import engines, make_engine, rollout, scene
-from codesign_jax.engines.structured import mesh as lanes
+from codesign_jax.engines.structured.laws import meshes as lanes
 from codesign_jax.scene import SceneError, constants, library, meshes, objects, reach
 from codesign_jax.scene.meshes import reading, surface
 from codesign_jax.scene.parameters import design_space

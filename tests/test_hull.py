@@ -10,12 +10,12 @@ import trimesh
 from codesign_jax import model, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured import hull as skin
-from codesign_jax.engines.structured.cones import make_cone
-from codesign_jax.engines.structured.contact import Contacts
-from codesign_jax.engines.structured.kinematics import kinematics
 from codesign_jax.engines.structured.lanes import Stages
-from codesign_jax.engines.structured.problem import Spatial, relative
+from codesign_jax.engines.structured.laws import hull as skin
+from codesign_jax.engines.structured.laws.cones import make_cone
+from codesign_jax.engines.structured.laws.contact import Contacts
+from codesign_jax.engines.structured.laws.kinematics import kinematics
+from codesign_jax.engines.structured.linear.tree import Spatial, relative
 from codesign_jax.model import hull
 from codesign_jax.scene.schema import SceneError
 from tests import small

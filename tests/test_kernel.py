@@ -10,8 +10,8 @@ from codesign_jax.compiler import gpu, launch, vector
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Status
 from tests import small, steps

@@ -12,8 +12,8 @@ import pytest
 
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program, tables
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import layout
 from codesign_jax.types import Status
 from tests import small

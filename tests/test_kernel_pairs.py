@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import hull, layout
 from tests import small
 from tests import test_hull_contact as oracle

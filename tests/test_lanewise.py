@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax.engines.structured import elimination, identity, lanewise
+from codesign_jax.engines.structured import identity, lanewise
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
+from codesign_jax.engines.structured.linear import elimination
 from tests import small
 
 FINGERS, WORLDS = 4, 8

@@ -34,6 +34,7 @@ cli
 """
 ORDER = {name: level for level, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 TOPS = ("codesign_jax", "scripts")
+ENGINE = "codesign_jax.engines.structured"
 STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "winners"}
 # Studies of results: they take up what these left.
 BUILD_ON = {name: {"experiments"} for name in ("accuracy", "calibration", "winners")}
@@ -94,9 +95,26 @@ def graph(*, inside=True):
     return {n: set(imports(parse(path), names, inside=inside)) for n, path in names.items()}
 
 
+# Within the engine `structured`: what stands in a folder may import those before it.
+STRUCTURED = ["laws", "linear", "kernel"]
+
+
+def within(mine, theirs):
+    """What forbids an import between the folders of the engine `structured`, or None."""
+    root = ["codesign_jax", "engines", "structured"]
+    if mine[:3] != root or theirs[:3] != root:
+        return None
+    one, two = (parts[3] if len(parts) > 3 else "" for parts in (mine, theirs))
+    if one in STRUCTURED and two in STRUCTURED and STRUCTURED.index(two) > STRUCTURED.index(one):
+        return f"{two} comes after {one}"
+    return None
+
+
 def wrong(name, other):
     """What forbids an import, or None."""
     mine, theirs = name.split("."), other.split(".")
+    if problem := within(mine, theirs):
+        return problem
     if theirs[0] == "scripts" and mine[0] != "scripts":
         return "the package does not know the studies"
     if mine[0] == "scripts":
@@ -135,6 +153,9 @@ def test_imports_point_one_way():
         ("codesign_jax.optimize.schedule", "codesign_jax.scene.hand", True),
         ("codesign_jax.compiler.cpu", "codesign_jax.scene", True),
         ("codesign_jax.runs.loop", "scripts.shared.output", True),
+        (f"{ENGINE}.laws.hull", f"{ENGINE}.linear.elimination", True),
+        (f"{ENGINE}.linear.elimination", f"{ENGINE}.kernel.skin", True),
+        (f"{ENGINE}.kernel.skin", f"{ENGINE}.laws.hull", False),
         ("scripts.shared.output", "scripts.experiments.plan", True),
         ("scripts.accuracy.tables", "scripts.benchmark.report", True),
         ("scripts.winners.variants", "scripts.experiments.study", False),
@@ -142,6 +163,11 @@ def test_imports_point_one_way():
 )
 def test_an_import_against_the_arrows_would_be_found(name, other, forbidden):
     assert bool(wrong(name, other)) == forbidden
+
+
+def test_no_module_of_the_engine_has_the_name_of_another():
+    names = [n.split(".")[-1] for n in modules() if n.startswith(f"{ENGINE}.")]
+    assert sorted(names) == sorted(set(names))
 
 
 def test_no_modules_import_in_a_circle():

@@ -19,9 +19,9 @@ from codesign_jax import control, model, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines import mujoco as mujoco_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured import mesh as mesh_lanes
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Program
+from codesign_jax.engines.structured.laws import meshes as mesh_lanes
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.report import sketch
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import objects, parameters, schema

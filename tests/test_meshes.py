@@ -13,7 +13,7 @@ from solids import box, bracket, object_file
 
 from codesign_jax import scene
 from codesign_jax.commands import common
-from codesign_jax.engines.structured import collision
+from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.scene import meshes, objects, schema
 from codesign_jax.scene.meshes import grid, mass, repair, surface
 
@@ -83,7 +83,7 @@ def test_exact_distance_of_a_box_and_a_ball():
     mesh, half = box(), np.array([0.02, 0.025, 0.03])
     found = surface.signed_distance(surface.prepare(mesh.vertices, mesh.faces), points)
     with jax.enable_x64(True):
-        expected = collision._box(jnp.asarray(half)[:, None], jnp.asarray(points.T))[0]
+        expected = shapes._box(jnp.asarray(half)[:, None], jnp.asarray(points.T))[0]
     np.testing.assert_allclose(found, expected, atol=1e-15)
     ball = trimesh.creation.icosphere(3, 0.03)
     found = surface.signed_distance(surface.prepare(ball.vertices, ball.faces), points)

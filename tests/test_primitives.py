@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import model
-from codesign_jax.engines.structured import collision
+from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.report import sketch
 from codesign_jax.scene import primitives
 from tests import small
@@ -76,7 +76,7 @@ def test_outline_and_triangles_lie_on_the_surface(kind):
     points = np.concatenate([*shape.outline(size), shape.triangles(size).vertices])
     with jax.enable_x64(True):
         sizes = jnp.asarray(size)[:, None, None]
-        distance, _ = collision.SHAPES[kind].distance(sizes, jnp.asarray(points.T[:, None]))
+        distance, _ = shapes.SHAPES[kind].distance(sizes, jnp.asarray(points.T[:, None]))
     assert np.abs(distance).max() < 1e-9  # trimesh rounds corners that it merges to 1e-8
 
 

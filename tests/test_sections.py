@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax.engines.structured.kernel import hull, sections
+from codesign_jax.engines.structured.kernel import skin
+from codesign_jax.engines.structured.laws import sections
 from codesign_jax.scene import load
 
 WIDTH, HEIGHT, LINKS = 0.024, 0.020, 10
@@ -19,7 +20,7 @@ def added(rings):
     """What points of a row add to the sums of another row, all at once, and a finger's points."""
     density = {"discretization": {"hull_rings": rings}}
     the_scene = load("paper", overrides=density)
-    count = hull.pair_points(the_scene)
+    count = skin.pair_points(the_scene)
 
     def one(point, joint, frame, there, turned, size, last):
         own, theirs = (joint[:, None], frame, frame), (there[:, None], turned, turned)
@@ -34,8 +35,8 @@ def added(rings):
 
     def points(length):
         section = jnp.array([HEIGHT, 0.004, length / LINKS, WIDTH])[:, None, None]
-        found = np.asarray(hull.pair_vertices(the_scene, section))[..., 0, 0]
-        return found.reshape(hull.KINDS, count, -1)
+        found = np.asarray(skin.pair_vertices(the_scene, section))[..., 0, 0]
+        return found.reshape(skin.KINDS, count, -1)
 
     return sums, points
 

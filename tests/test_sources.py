@@ -103,8 +103,8 @@ def test_a_kernel_of_code_that_changed_is_neither_kept_nor_found(code, folder, m
 
 
 def test_a_replaced_name_is_seen_until_it_is_put_back(monkeypatch):
-    from codesign_jax.engines.structured import contact
     from codesign_jax.engines.structured.kernel import step
+    from codesign_jax.engines.structured.laws import contact
 
     first = sources.digest()
     assert first and sources.replaced() == []

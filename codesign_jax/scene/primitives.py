@@ -1,6 +1,6 @@
 """Primitive shapes of objects: all that is known of one but its distance, a record by name.
 
-`engines/structured/collision.py` has the distances, by the same names.
+`engines/structured/laws/shapes.py` has the distances, by the same names.
 
 The functions of a record take the three sizes of a shape [m], those it lacks zero, as numbers or
 arrays.  A shape's frame is MuJoCo's: the origin is the centre, which half a turn about any axis

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured import StructuredEngine, assembly, coordinates
-from codesign_jax.engines.structured.constants import WorldConstants, world_constants
-from codesign_jax.engines.structured.contact import constraint_update
-from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import Stages, dot
-from codesign_jax.engines.structured.problem import propagate, relative
+from codesign_jax.engines.structured.laws.contact import constraint_update
+from codesign_jax.engines.structured.laws.kinematics import State
+from codesign_jax.engines.structured.linear.tree import propagate, relative
+from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
 from scripts.accuracy import oracle, worlds
@@ -68,7 +68,7 @@ def _structured(engine: StructuredEngine, fields: ModelFields, ctrl: np.ndarray)
     hand = world_constants(scene, jax.tree.map(jnp.asarray, fields))
 
     @jax.jit
-    def run(hand: WorldConstants, state: State, ctrl: jax.Array) -> jax.Array:
+    def run(hand: WorldModel, state: State, ctrl: jax.Array) -> jax.Array:
         found, _ = engine.advance(hand, state, ctrl)
         path = (found["qpos"], found["qvel"], found["acc"], ctrl)
 
@@ -83,7 +83,7 @@ def _structured(engine: StructuredEngine, fields: ModelFields, ctrl: np.ndarray)
     return np.asarray(found, np.float64).T
 
 
-def grip(scene: Scene, hand: WorldConstants, state: State, ctrl: jax.Array) -> jax.Array:
+def grip(scene: Scene, hand: WorldModel, state: State, ctrl: jax.Array) -> jax.Array:
     """Sum of the normal forces of fingers and palm on the object [N], shape (world,).
 
     The force of the cones (`contact.constraint_update`) at the accelerations that a step found,

@@ -15,8 +15,8 @@ import jax
 import numpy as np
 
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Program
+from codesign_jax.engines.structured.world_model import world_constants
 from scripts.accuracy import timing, worlds
 from scripts.accuracy.settings import CONTACT, FINGERS, STANDARD, Setting, sweep
 from scripts.shared import addition, output, provenance, tables

@@ -10,8 +10,8 @@ import numpy as np
 
 from codesign_jax import model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.engines.structured.laws.kinematics import Acc, State
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
 from scripts.accuracy import oracle, worlds

@@ -239,7 +239,7 @@ def quality(case: Case) -> dict:
     A case of growth has the short rollouts in contact that its times are of.
     """
     from codesign_jax.engines.structured import kernel
-    from codesign_jax.engines.structured.constants import world_constants
+    from codesign_jax.engines.structured.world_model import world_constants
 
     worlds, scene = case.values["worlds"][0], case.scene
     engine: Any = peers.build(case.engine, case.setting, scene)

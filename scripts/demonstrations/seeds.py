@@ -15,10 +15,11 @@ import optax
 
 from codesign_jax import rollout
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.structured import collision, coordinates, hull
-from codesign_jax.engines.structured.constants import world_constants
-from codesign_jax.engines.structured.kinematics import kinematics
+from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.lanes import Stages
+from codesign_jax.engines.structured.laws import hull, shapes
+from codesign_jax.engines.structured.laws.kinematics import kinematics
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import layout
 from codesign_jax.scene import Scene, load, parameters
 from codesign_jax.types import Trial, failed
@@ -37,8 +38,8 @@ def gaps(scene: Scene, fields: Any, qpos: jax.Array) -> jax.Array:
     state = coordinates.reset(scene, fields._replace(start=qpos))
     kin = kinematics(Stages(), hand, layout(scene).axes, state)
     point = hull.vertices(scene, hand, kin).point
-    local = collision.in_object(kin.object[:, :, None, None], point)
-    return collision.signed_distance(scene, hand, local)[0].reshape(-1, qpos.shape[0])
+    local = shapes.in_object(kin.object[:, :, None, None], point)
+    return shapes.signed_distance(scene, hand, local)[0].reshape(-1, qpos.shape[0])
 
 
 class Surrogate:

@@ -14,8 +14,8 @@ from codesign_jax import rollout
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel import Program
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import Scene, parameters
 from codesign_jax.scene.effects import refusals

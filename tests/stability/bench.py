@@ -13,7 +13,7 @@ import numpy as np
 from codesign_jax import model, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.constants import world_constants
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import Scene
 from tests import small, steps
 

@@ -8,21 +8,21 @@ from functools import partial
 
 import jax
 
-from codesign_jax.engines.structured import collision, finger_pairs, hull
-from codesign_jax.engines.structured.constants import WorldConstants
-from codesign_jax.engines.structured.contact import Contacts
-from codesign_jax.engines.structured.inertia import bodies, smooth_forces
-from codesign_jax.engines.structured.integration import rigid_arm
-from codesign_jax.engines.structured.kinematics import Kinematics, State, kinematics
 from codesign_jax.engines.structured.lanes import Stages
-from codesign_jax.engines.structured.problem import Matrices, Problem, Spatial
+from codesign_jax.engines.structured.laws import finger_pairs, hull, shapes
+from codesign_jax.engines.structured.laws.contact import Contacts
+from codesign_jax.engines.structured.laws.inertia import bodies, smooth_forces
+from codesign_jax.engines.structured.laws.integration import rigid_arm
+from codesign_jax.engines.structured.laws.kinematics import Kinematics, State, kinematics
+from codesign_jax.engines.structured.linear.tree import Matrices, Problem, Spatial
+from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model import layout
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
 
 
 def problem(
-    scene: Scene, run: Stages, hand: WorldConstants, state: State, ctrl: jax.Array
+    scene: Scene, run: Stages, hand: WorldModel, state: State, ctrl: jax.Array
 ) -> tuple[Problem, Spatial]:
     """Assembles a step's problem and the bodies' velocities; ctrl has shape (nu, world)."""
     kin = kinematics(run, hand, layout(scene).axes, state)
@@ -38,7 +38,7 @@ def problem(
 
 
 def contacts(
-    scene: Scene, run: Stages, hand: WorldConstants, kin: Kinematics, height: jax.Array
+    scene: Scene, run: Stages, hand: WorldModel, kin: Kinematics, height: jax.Array
 ) -> dict[str, Contacts]:
     """Contacts that the scene's effects call for, by pair of bodies.
 
@@ -50,10 +50,10 @@ def contacts(
       height: Height of the object's centre above the table, shape (1, world).
     """
     e, found = scene.effects, {}
-    on_object = partial(collision.spheres_on_object, scene, hand, kin)
-    on_table = partial(collision.spheres_on_table, hand.cones.hand_table, height)
+    on_object = partial(shapes.spheres_on_object, scene, hand, kin)
+    on_table = partial(shapes.spheres_on_table, hand.cones.hand_table, height)
     if hand.sphere.size:
-        spheres = run(collision.finger_spheres, hand, kin)
+        spheres = run(shapes.finger_spheres, hand, kin)
         if e.finger_object:
             found["finger_object"] = on_object(run, spheres, hand.radius)
         if e.finger_table:
@@ -69,11 +69,11 @@ def contacts(
         if e.finger_table:
             found["hull_table"] = hull.attach(on_table(skin.point, 0.0), skin)
     if palm_touches(scene):
-        palm, radius = collision.palm_spheres(hand, kin), hand.palm_radius
+        palm, radius = shapes.palm_spheres(hand, kin), hand.palm_radius
         if e.palm_object:
             found["palm_object"] = on_object(run, palm, radius)
         if e.palm_table:
             found["palm_table"] = on_table(palm, radius)
     if e.object_table:
-        found["object_table"] = collision.object_on_table(run, scene, hand, kin, height)
+        found["object_table"] = shapes.object_on_table(run, scene, hand, kin, height)
     return found

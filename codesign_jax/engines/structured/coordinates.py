@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene
 

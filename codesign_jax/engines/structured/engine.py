@@ -8,11 +8,12 @@ import jax.numpy as jnp
 from codesign_jax import sources
 from codesign_jax.compiler.launch import KernelUnavailable, available
 from codesign_jax.engines.base import Equal, Staged
-from codesign_jax.engines.structured import coordinates, mesh, transforms
-from codesign_jax.engines.structured.constants import WorldConstants, world_constants
+from codesign_jax.engines.structured import coordinates, transforms
 from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
 from codesign_jax.engines.structured.kernel.adjoint import Path, recorded
-from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.engines.structured.laws import meshes
+from codesign_jax.engines.structured.laws.kinematics import Acc, State
+from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene, effects, reach
 from codesign_jax.types import Status, Trace
@@ -83,7 +84,7 @@ class StructuredEngine(Equal):
             raise ValueError(f"segment = {segment}: a segment has one time step at least")
         if truncate and segment is None:
             raise ValueError("truncate = True needs segment, the number of steps of a segment")
-        mesh.tables(scene)
+        meshes.tables(scene)
         self.scene, self.segment, self.truncate = scene, segment, truncate
         newton = scene.newton
         self.limits = Limits(
@@ -117,7 +118,7 @@ class StructuredEngine(Equal):
         """MuJoCo's qvel, shape (world, nv)."""
         return coordinates.qvel(state)
 
-    def step(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> tuple[State, StepInfo]:
+    def step(self, hand: WorldModel, state: State, ctrl: jax.Array) -> tuple[State, StepInfo]:
         """Advances a batch by one time step under controls of shape (nu, world).
 
         No verdict ends a world here, see `advance`.
@@ -127,7 +128,7 @@ class StructuredEngine(Equal):
         return new, StepInfo(new.acc, found["residual"].T, found["iterations"].T, overflow)
 
     def advance(
-        self, hand: WorldConstants, state: State, ctrl: jax.Array
+        self, hand: WorldModel, state: State, ctrl: jax.Array
     ) -> tuple[dict[str, jax.Array], State]:
         """Simulates from any state, whatever becomes of the worlds.
 

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 
 from codesign_jax import verdict
 from codesign_jax.engines.structured import segments
-from codesign_jax.engines.structured.constants import world_constants
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Path
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.types import Trace
 

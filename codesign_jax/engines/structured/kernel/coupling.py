@@ -19,14 +19,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured.kernel.contacts import direct, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import direct, zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.linear import elimination as el
 
 ITERATIONS = 60
 """Largest number of conjugate gradient steps; a longer one would be of rounding."""

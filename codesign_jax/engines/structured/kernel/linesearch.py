@@ -6,9 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured.kernel import hull, solver
-from codesign_jax.engines.structured.kernel.contacts import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel import solver
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop, solid
 from codesign_jax.engines.structured.kernel.problem import (
     Iterate,
@@ -20,6 +19,8 @@ from codesign_jax.engines.structured.kernel.problem import (
 from codesign_jax.engines.structured.kernel.slots import only
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import hull
+from codesign_jax.engines.structured.linear import elimination as el
 
 LINE_TOLERANCE = 0.01
 """Slope at which a line search ends, over the first one: MuJoCo's default `ls_tolerance`."""
@@ -133,8 +134,8 @@ class LineSearch:
 
             problem = self.problem
             sums = [zeros((), self.like)] * 2
-            links, skin = (self.links, problem.fingers), (self.links + 1, problem.skin)
-            for count, sets in (links, skin):
+            links, surface = (self.links, problem.fingers), (self.links + 1, problem.skin)
+            for count, sets in (links, surface):
                 if sets:
                     sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
             for c in problem.slots:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import solver
 from codesign_jax.engines.structured.kernel.coupling import Coupling
-from codesign_jax.engines.structured.kernel.elimination import Elimination
+from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.linesearch import LINE_TOLERANCE, LineSearch
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop, solid
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem

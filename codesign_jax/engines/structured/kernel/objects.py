@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured import collision, mesh
 from codesign_jax.engines.structured.kernel.memory import (
     Block,
     MemoryLayout,
@@ -21,7 +20,8 @@ from codesign_jax.engines.structured.kernel.memory import (
     loop,
 )
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.mesh import GridLanes, MeshLanes
+from codesign_jax.engines.structured.laws import meshes, shapes
+from codesign_jax.engines.structured.laws.meshes import GridLanes, MeshLanes
 from codesign_jax.scene import Scene
 
 _LAST = 1e9  # beyond any index of a support point
@@ -65,7 +65,7 @@ class WorldObject(NamedTuple):
 
 def tables(scene: Scene, fingers: int) -> tuple[dict, dict]:
     """Groups that meshes add to the table of the hand and to the table of the worlds."""
-    if not (found := mesh.tables(scene)):
+    if not (found := meshes.tables(scene)):
         return {}, {}
     one: tuple[int, ...] = ()
     rows = max(1, found.support.shape[1] // fingers)
@@ -109,8 +109,8 @@ def read(
     size, shape = constant("object_size"), constant("object_id")
     if values is None:
         return WorldObject(size, shape, block, None)
-    meshes = np.array(collision.mesh_indices(scene), np.int32)
-    meshed = lanewise(lambda s: jnp.isin(s.astype(jnp.int32), meshes), shape)
+    indices = np.array(shapes.mesh_indices(scene), np.int32)
+    meshed = lanewise(lambda s: jnp.isin(s.astype(jnp.int32), indices), shape)
     found = MeshMemory(
         values,
         partial(hand[0].read, hand[1], "support"),
@@ -143,7 +143,7 @@ def _for_both(
     if thing.mesh is None:
         return primitive()
     mine, size = thing.mesh.meshed.lane, thing.block.size
-    if len(collision.mesh_indices(scene)) == len(scene.objects.object):
+    if len(shapes.mesh_indices(scene)) == len(scene.objects.object):
         return meshed() if near is None else choose(anywhere(near), meshed, like, size)
     plain = choose(anywhere(~mine), primitive, like, size)
     other = choose(anywhere(mine if near is None else near & mine), meshed, like, size)
@@ -156,16 +156,16 @@ def signed_distance(scene: Scene, thing: WorldObject, local: Lanes) -> tuple[Lan
 
     def primitive() -> tuple[Lanes, Lanes]:
         def compute(size, shape, local):
-            return collision.primitive_distance(scene, size, shape.astype(jnp.int32), local)
+            return shapes.primitive_distance(scene, size, shape.astype(jnp.int32), local)
 
         return lanewise(compute, thing.size, thing.shape, local)
 
     def meshed() -> tuple[Lanes, Lanes]:
         assert thing.mesh is not None
         grid = thing.mesh.grid
-        cell = lanewise(mesh.locate, grid, local)
-        values = _gather(thing.mesh.values, lanewise(mesh.corners, grid, cell), local.dtype)
-        return lanewise(mesh.interpolate, grid, cell, values)
+        cell = lanewise(meshes.locate, grid, local)
+        values = _gather(thing.mesh.values, lanewise(meshes.corners, grid, cell), local.dtype)
+        return lanewise(meshes.interpolate, grid, cell, values)
 
     none = lanewise(lambda p: (jnp.zeros_like(p[0]), jnp.zeros_like(p)), local)
     return _for_both(scene, thing, primitive, meshed, none)
@@ -182,11 +182,11 @@ def distance_of(scene: Scene, local: jax.Array, at: dict, still: dict) -> tuple:
         object is a mesh, and the distances at the corners of the points' cells, see `cell_values`.
     """
     found, shape = None, still["object_id"].astype(jnp.int32)
-    if len(collision.mesh_indices(scene)) < len(scene.objects.object):
-        found = collision.primitive_distance(scene, at["object_size"], shape, local)
+    if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
+        found = shapes.primitive_distance(scene, at["object_size"], shape, local)
     if "meshed" in still:
         grid = GridLanes(**{k: (at | still)[f"grid_{k}"] for k in GridLanes._fields})
-        new = mesh.interpolate(grid, mesh.locate(grid, local), still["values"])
+        new = meshes.interpolate(grid, meshes.locate(grid, local), still["values"])
         found = new if found is None else _pick(still["meshed"], new, found)
     assert found is not None
     return found
@@ -196,7 +196,7 @@ def cell_values(thing: WorldObject, local: Lanes) -> Lanes:
     """Distances at the corners of the grid cells in which points (3, ...) lie, shape (8, ...)."""
     assert thing.mesh is not None
     grid = thing.mesh.grid
-    index = lanewise(lambda g, p: mesh.corners(g, mesh.locate(g, p)), grid, local)
+    index = lanewise(lambda g, p: meshes.corners(g, meshes.locate(g, p)), grid, local)
     return _gather(thing.mesh.values, index, local.dtype)
 
 
@@ -210,11 +210,11 @@ def points_of(scene: Scene, at: dict, still: dict) -> jax.Array:
         factor that they have.
     """
     found, shape, columns = None, still["object_id"].astype(jnp.int32), at["columns"][:, :, 0]
-    if len(collision.mesh_indices(scene)) < len(scene.objects.object):
-        found = collision.primitive_points(scene, at["object_size"][:, 0], shape, columns)
+    if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
+        found = shapes.primitive_points(scene, at["object_size"][:, 0], shape, columns)
     if "meshed" in still:
         support = still["support"] * (at["grid_factor"] / still["factor"])
-        new = mesh.turned(columns, support)
+        new = meshes.turned(columns, support)
         found = new if found is None else _pick(still["meshed"], new, found)
     assert found is not None
     return found
@@ -245,15 +245,15 @@ def table_points(scene: Scene, thing: WorldObject, columns: Lanes, height: Lanes
     def primitive() -> Lanes:
         def compute(size, shape, columns):
             shape = shape.astype(jnp.int32)
-            return collision.primitive_points(scene, size[:, 0], shape, columns[:, :, 0])
+            return shapes.primitive_points(scene, size[:, 0], shape, columns[:, :, 0])
 
         return lanewise(compute, thing.size, thing.shape, columns)
 
     def meshed() -> Lanes:
         search = partial(_search, thing, columns)
-        (first,) = search(lambda *a: (mesh.lowest(*a),))
-        (second,) = search(lambda *a: (mesh.farthest(*a),), first)
-        found = [first, second, *search(mesh.beside, first, second)]
+        (first,) = search(lambda *a: (meshes.lowest(*a),))
+        (second,) = search(lambda *a: (meshes.farthest(*a),), first)
+        found = [first, second, *search(meshes.beside, first, second)]
         return lanewise(lambda points: jnp.concatenate(points, 1), found)
 
     near = None
@@ -284,7 +284,7 @@ def _search(thing: WorldObject, columns: Lanes, scores: Callable, *known: Lanes)
     finger = block.finger.astype(dtype)
 
     def compare(columns, point, index, known, best):
-        point = mesh.turned(columns[:, :, 0], point)
+        point = meshes.turned(columns[:, :, 0], point)
         new = scores(point, index, *known)
         if best is None:
             return [(score, index, point) for score in new]

@@ -4,18 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.constants import WorldConstants
-from codesign_jax.engines.structured.kernel import hull, objects
+from codesign_jax.engines.structured.kernel import objects, skin
 from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.kernel.tables import Tables
-from codesign_jax.engines.structured.kinematics import Acc, State
+from codesign_jax.engines.structured.laws.kinematics import Acc, State
+from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model.layout import palm_touches
 
 
 class Packing(Tables):
     """Packs the constants, states and controls of worlds; unpacks states and recorded rows."""
 
-    def pack_hand(self, hand: WorldConstants) -> tuple[jax.Array, jax.Array]:
+    def pack_hand(self, hand: WorldModel) -> tuple[jax.Array, jax.Array]:
         """The hand's tables; padded worlds are not alive, padded fingers have no mass."""
         worlds, n = hand.object_id.shape[1], self.num_fingers
         dtype, lane = hand.mass.dtype, (n, worlds)
@@ -38,7 +38,7 @@ class Packing(Tables):
         if hand.section is not None:
             arrays["section"] = hand.section[None]
         if self.scene.effects.surface == "hull":
-            arrays |= hull.pack(self.scene, hand)
+            arrays |= skin.pack(self.scene, hand)
         if hand.mesh is not None:
             arrays |= objects.rows(hand.mesh, self.fingers, dtype)
         extra = self.fingers - n
@@ -63,7 +63,7 @@ class Packing(Tables):
         """Fingers up to a power of two."""
         return lengthened(array, array.ndim - 2, self.fingers)
 
-    def _palm_slots(self, hand: WorldConstants) -> dict[str, jax.Array]:
+    def _palm_slots(self, hand: WorldModel) -> dict[str, jax.Array]:
         """The palm's contact spheres, shared out among the lanes."""
         f, g, worlds = self.fingers, self.palm_groups, hand.palm_radius.shape[1]
         missing = (0, g * f - len(hand.palm_radius))

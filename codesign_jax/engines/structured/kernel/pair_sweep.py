@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import hull, powers, sections
-from codesign_jax.engines.structured.kernel.contacts import zeros
+from codesign_jax.engines.structured.kernel import powers, skin
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
@@ -21,6 +21,7 @@ from codesign_jax.engines.structured.kernel.powers import Place, RowSide
 from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import sections
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.sweep import Sweep
@@ -144,7 +145,7 @@ class PairSweep:
     def _rows(self, item: Any, pairing: Pairing, row: jax.Array, live: Lanes) -> None:
         """Adds the cotangents of a row of the hull and of the other finger's row."""
         p, links = self.p, jnp.int32(self.p.links)
-        count = hull.pair_points(p.scene)
+        count = skin.pair_points(p.scene)
         vertex, behind, ends = self._row(row, "pair_vertex", count)
         size = p.hand.read(self.sweep.step.hand, "section_box")
         mine = self._chain("origin", behind), *(side.frame for side in ends), size
@@ -189,7 +190,7 @@ class PairSweep:
     ) -> tuple[Callable, jax.Array, tuple[RowSide, RowSide]]:
         """Points of a row by number, of a table with so many a row; the row behind; both sides."""
         behind = jnp.minimum(row + 1, self.p.links)
-        first = hull.kind_of(row, self.p.links) * count
+        first = skin.kind_of(row, self.p.links) * count
 
         def vertex(k: Any) -> tuple[jax.Array, Lanes]:
             number = (first + k).astype(jnp.int32)

@@ -4,8 +4,7 @@ A contact is stored on the lanes of both fingers; each lane keeps its own finger
 Fingers are paired by the exclusive or of their indices with 1, 2, and so on, which reaches every
 pair; a row of slots belongs to one such number.  Both lanes of a pair put the same contact into the
 same slot, so that they process it at the same time and exchange numbers in registers.  The side of
-a contact is a joint's row as in `codesign_jax.engines.structured.hull`; a sphere follows the link
-before that joint.
+a contact is a joint's row as in `laws.hull`; a sphere follows the link before that joint.
 
 Contacts of fingers with the palm are a row of slots as well, with the number 0: they are on the
 finger's lane alone.  The sides' motions are relative to the palm's then, which changes nothing
@@ -19,16 +18,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import contact
-from codesign_jax.engines.structured.contact import Contacts
-from codesign_jax.engines.structured.kernel.contacts import ROWS, ContactSet, zeros
-from codesign_jax.engines.structured.kernel.hull import across
+from codesign_jax.engines.structured.kernel.contact_sets import ROWS, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop, solid
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet, any_of
 from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import contact
+from codesign_jax.engines.structured.laws.contact import Contacts
+from codesign_jax.engines.structured.laws.hull import across
 from codesign_jax.scene import Scene
 
 

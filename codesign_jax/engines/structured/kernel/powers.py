@@ -11,17 +11,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, contact
-from codesign_jax.engines.structured.cones import which_cone
-from codesign_jax.engines.structured.constants import apply_columns
-from codesign_jax.engines.structured.contact import Contacts
-from codesign_jax.engines.structured.kernel import hull, objects, sections
-from codesign_jax.engines.structured.kernel.contacts import cone_of, sphere_on_table
+from codesign_jax.engines.structured.kernel import objects
+from codesign_jax.engines.structured.kernel.contact_sets import cone_of, sphere_on_table
 from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.slots import HullSet
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
-from codesign_jax.engines.structured.problem import next_motion, palm_motion
+from codesign_jax.engines.structured.laws import contact, hull, sections, shapes
+from codesign_jax.engines.structured.laws.cones import which_cone
+from codesign_jax.engines.structured.laws.contact import Contacts
+from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
+from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.scene import Scene
 
 
@@ -75,9 +75,9 @@ def geometry(scene: Scene, name: str, centre, radius, at: dict, still: dict):
     """Point, normal and gap of points of the hand on the object or the table."""
     if not name.endswith("_object"):
         return sphere_on_table(at["height"], centre, radius)
-    local = collision.in_object(at["columns"], centre)
+    local = shapes.in_object(at["columns"], centre)
     distance, gradient = objects.distance_of(scene, local, at, still)
-    point, normal, gap = collision.on_surface(at["columns"], centre, radius, distance, gradient)
+    point, normal, gap = shapes.on_surface(at["columns"], centre, radius, distance, gradient)
     return point, normal, gap[None]
 
 
@@ -149,7 +149,7 @@ def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dic
       still: As in `of_spheres`, with the motions of the object.
     """
     arms = objects.points_of(scene, at, still)
-    places = collision.on_table(arms, at["height"])
+    places = shapes.on_table(arms, at["height"])
     dealt = []
     for place in places:
         lane = jnp.zeros_like(place[..., 0, None, :]) + 0 * finger

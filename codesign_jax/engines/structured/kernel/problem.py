@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.inertia import Body, Centred
 from codesign_jax.engines.structured.kernel import solver
-from codesign_jax.engines.structured.kernel.contacts import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.engines.structured.laws.inertia import Body, Centred
 
 
 class Palm(NamedTuple):

@@ -16,12 +16,12 @@ from jax.experimental import pallas as pl
 from codesign_jax import sources, verdict
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.constants import WorldConstants
 from codesign_jax.engines.structured.kernel.memory import Block, anywhere
 from codesign_jax.engines.structured.kernel.packing import Packing
 from codesign_jax.engines.structured.kernel.step import Step
-from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanewise import lanes, of_code
+from codesign_jax.engines.structured.laws.kinematics import State
+from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model import layout
 from codesign_jax.scene import Scene
 
@@ -65,13 +65,13 @@ class Program(Packing):
         width = lanes_here(scene, dtype, worlds)
         return cls(scene, limits, backend=jax.default_backend(), width=width)
 
-    def run(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
+    def run(self, hand: WorldModel, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
         """Runs a rollout; returns `trace` by name, shape (world, time)."""
         return self.simulate(hand, state, ctrl)[0]
 
     def simulate(
         self,
-        hand: WorldConstants,
+        hand: WorldModel,
         state: State,
         ctrl: jax.Array,
         *,
@@ -132,12 +132,12 @@ class Program(Packing):
             found["acc"] = jnp.concatenate([found["acc"][:, 1:], end], 1)
         return found, last
 
-    def jaxpr(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> Any:
+    def jaxpr(self, hand: WorldModel, state: State, ctrl: jax.Array) -> Any:
         """The jaxpr of a block of a rollout's kernel; arguments may be `jax.ShapeDtypeStruct`."""
         inputs = jax.eval_shape(self.inputs, hand, state, ctrl)
         return kernel_jaxpr(self._call(inputs, False, False)[0], list(inputs))
 
-    def inputs(self, hand: WorldConstants, state: State, ctrl: jax.Array) -> tuple:
+    def inputs(self, hand: WorldModel, state: State, ctrl: jax.Array) -> tuple:
         """The kernel's arguments, which have a leading axis of blocks; the last may be shared."""
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         return inputs if hand.mesh is None else (*inputs, hand.mesh.values[None])

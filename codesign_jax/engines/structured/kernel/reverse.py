@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import integration, objects, powers, speed
+from codesign_jax.engines.structured.kernel import advance, objects, powers, speed
 from codesign_jax.engines.structured.kernel.bars import Bars
 from codesign_jax.engines.structured.kernel.memory import Block
 from codesign_jax.engines.structured.kernel.pair_sweep import PairSweep
@@ -107,7 +107,7 @@ class ReverseStep(Step):
             n: p.world_state.read(self.bars.world_state, n, 0, self.block.world) for n in MOVED
         }
         given = old, at["columns"], now.wrist, now.object_motion
-        run = partial(integration.moved, h)
+        run = partial(advance.moved, h)
         own, columns, wrist, obj = pull(run, given, (), only_on(go, after))
         self.bars.add_once({"columns": columns})
 
@@ -165,5 +165,5 @@ class ReverseStep(Step):
 
 
 def _turned(h: float, q, rate, acc):
-    rate, q, _ = integration.turned(h, q, rate, acc)
+    rate, q, _ = advance.turned(h, q, rate, acc)
     return q, rate

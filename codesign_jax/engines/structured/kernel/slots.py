@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.contact import Cone, Contacts
-from codesign_jax.engines.structured.kernel.contacts import BoundContacts, ContactSet, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.counts import Counts
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, full, solid
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws.contact import Cone, Contacts
 from codesign_jax.scene import Scene
 
 

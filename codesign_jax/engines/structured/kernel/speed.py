@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contacts import zeros
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.pull import plus
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise

@@ -4,12 +4,12 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision
-from codesign_jax.engines.structured.constants import apply_columns
 from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Memory, relative
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import shapes
+from codesign_jax.engines.structured.world_model import apply_columns
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
@@ -76,7 +76,7 @@ class Spheres:
         arms = objects.table_points(self.p.scene, self.thing, at["columns"], height)
 
         def compute(arms, height):
-            point, normal, gap = collision.on_table(arms, height)
+            point, normal, gap = shapes.on_table(arms, height)
             return [
                 (point[:, k : k + 1], normal[:, k : k + 1], gap[None, k : k + 1])
                 for k in range(gap.shape[0])

@@ -7,36 +7,30 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import inertia
-from codesign_jax.engines.structured import kinematics as kin
-from codesign_jax.engines.structured.constants import apply_columns
-from codesign_jax.engines.structured.inertia import Body, Centred
-from codesign_jax.engines.structured.integration import rigid_arm
-from codesign_jax.engines.structured.kernel import integration, objects
-from codesign_jax.engines.structured.kernel.contacts import (
+from codesign_jax.engines.structured.kernel import advance, objects
+from codesign_jax.engines.structured.kernel.contact_sets import (
     sphere_on_object,
     sphere_on_table,
     zeros,
 )
-from codesign_jax.engines.structured.kernel.fingers import Search
-from codesign_jax.engines.structured.kernel.hull import Side, Skin
 from codesign_jax.engines.structured.kernel.memory import Block, loop
 from codesign_jax.engines.structured.kernel.newton import Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
+from codesign_jax.engines.structured.kernel.pair_search import Search
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
-from codesign_jax.engines.structured.kernel.problem import (
-    Iterate,
-    Memory,
-    Palm,
-    Problem,
-    triangle,
-)
+from codesign_jax.engines.structured.kernel.problem import Iterate, Memory, Palm, Problem, triangle
+from codesign_jax.engines.structured.kernel.skin import Side, Skin
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.kernel.spheres import Spheres
-from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
-from codesign_jax.engines.structured.problem import next_motion, palm_motion
+from codesign_jax.engines.structured.laws import inertia
+from codesign_jax.engines.structured.laws import kinematics as kin
+from codesign_jax.engines.structured.laws.inertia import Body, Centred
+from codesign_jax.engines.structured.laws.integration import rigid_arm
+from codesign_jax.engines.structured.laws.kinematics import State
+from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
+from codesign_jax.engines.structured.world_model import apply_columns
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.program import Program
@@ -123,7 +117,7 @@ class Step:
         if p.slotted:
             slots = [self._overflow(bound, waiting)]
             goes_on &= slots[0] == 0
-        new_speed, good = integration.advance(self, state, geometry, now, goes_on, speed)
+        new_speed, good = advance.advance(self, state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
         # Residuals of decided worlds are reported as 0; no iterations are spent on them.
         residual = jnp.where(waiting, quality.residual.lane, 0.0)

@@ -6,20 +6,20 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision
-from codesign_jax.engines.structured.cones import which_cone
-from codesign_jax.engines.structured.constants import apply_columns
 from codesign_jax.engines.structured.kernel import objects, powers
 from codesign_jax.engines.structured.kernel.bars import Bars
-from codesign_jax.engines.structured.kernel.contacts import zeros
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import choose, loop
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.powers import Chain, Place, RowSide
 from codesign_jax.engines.structured.kernel.problem import Iterate, Memory
 from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
-from codesign_jax.engines.structured.kinematics import mounted
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import shapes
+from codesign_jax.engines.structured.laws.cones import which_cone
+from codesign_jax.engines.structured.laws.kinematics import mounted
+from codesign_jax.engines.structured.world_model import apply_columns
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
@@ -252,7 +252,7 @@ class Sweep:
         return chosen | {cone: self.step.constant(cone)}
 
     def _values(self, centre: Lanes) -> Lanes:
-        local = lanewise(collision.in_object, self.at["columns"], centre)
+        local = lanewise(shapes.in_object, self.at["columns"], centre)
         return objects.cell_values(self.thing, local)
 
 
@@ -263,7 +263,7 @@ def dot_of(weight: jax.Array, vector: jax.Array) -> jax.Array:
 
 def _turned_back(columns: jax.Array, points: jax.Array) -> jax.Array:
     """Points (3, point, world) along the world's axes in the object's frame."""
-    return collision.in_object(columns[:, :, 0], points)
+    return shapes.in_object(columns[:, :, 0], points)
 
 
 def _place(chain: Chain) -> Place:

@@ -3,12 +3,12 @@
 from functools import partial
 
 from codesign_jax import verdict
-from codesign_jax.engines.structured import collision
-from codesign_jax.engines.structured.kernel import fingers, hull, objects
-from codesign_jax.engines.structured.kernel.contacts import ContactSet
+from codesign_jax.engines.structured.kernel import objects, pair_search, skin
+from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_slots
+from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.model import layout
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
@@ -42,7 +42,7 @@ class Tables:
         self.size = self.fingers * self.block
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
         self.palm_groups = -(-self.lay.palm.size // self.fingers)
-        self.meshes = bool(collision.mesh_indices(scene))
+        self.meshes = bool(shapes.mesh_indices(scene))
         self.sets = self._sets()
         self.slotted = any(isinstance(s, SlotSet) for s in self.sets)
         self._tables()
@@ -85,7 +85,7 @@ class Tables:
         if self.scene.effects.neo_hookean:
             more |= {"section": (1, (4,))}
         if self.scene.effects.surface == "hull":
-            more |= hull.fields(self.scene)
+            more |= skin.fields(self.scene)
         support, grid = objects.tables(self.scene, self.fingers)
         self.hand = MemoryLayout(
             True,
@@ -155,5 +155,5 @@ class Tables:
         for contacts in self.sets:
             fields |= contacts.groups()
         if any(isinstance(s, PairSet) for s in self.sets):
-            fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))} | fingers.fields(n, self.k)
+            fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))} | pair_search.fields(n, self.k)
         self.scratch = MemoryLayout.by_item(True, **fields)

@@ -8,14 +8,14 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured.kernel.contacts import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling
-from codesign_jax.engines.structured.kernel.elimination import Elimination
+from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.memory import choose, loop
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.engines.structured.linear import elimination as el
 
 ITERATIONS = 300
 """Largest number of conjugate gradients: more than Newton's method needs, whose steps may err."""

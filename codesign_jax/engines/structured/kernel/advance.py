@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import kinematics as kin
-from codesign_jax.engines.structured.integration import integrate
-from codesign_jax.engines.structured.kernel.contacts import zeros
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.problem import Iterate
-from codesign_jax.engines.structured.kinematics import State
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import kinematics as kin
+from codesign_jax.engines.structured.laws.integration import integrate
+from codesign_jax.engines.structured.laws.kinematics import State
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step

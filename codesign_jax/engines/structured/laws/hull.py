@@ -16,11 +16,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import WorldConstants, apply_columns, turn_columns
-from codesign_jax.engines.structured.contact import (
-    Contacts,
-)
-from codesign_jax.engines.structured.kinematics import Kinematics
+from codesign_jax.engines.structured.lanes import dot
+from codesign_jax.engines.structured.laws.contact import Contacts
+from codesign_jax.engines.structured.laws.kinematics import Kinematics
+from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, turn_columns
 from codesign_jax.model import hull
 from codesign_jax.scene import Scene
 
@@ -41,7 +40,7 @@ class Vertices(NamedTuple):
     share: jax.Array
 
 
-def places(scene: Scene, hand: WorldConstants) -> tuple[jax.Array, jax.Array, jax.Array]:
+def places(scene: Scene, hand: WorldModel) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The vertices on their links, which do not change with the hand's pose.
 
     Args:
@@ -64,7 +63,7 @@ def places(scene: Scene, hand: WorldConstants) -> tuple[jax.Array, jax.Array, ja
     return local, weight, surface / width**2
 
 
-def vertices(scene: Scene, hand: WorldConstants, kin: Kinematics) -> Vertices:
+def vertices(scene: Scene, hand: WorldModel, kin: Kinematics) -> Vertices:
     """Places the hull's contact points."""
     local, weight, share = places(scene, hand)
     base = turn_columns(kin.palm, hand.mount)
@@ -94,3 +93,34 @@ def across_joints(palm: jax.Array, links: jax.Array) -> jax.Array:
     before = jnp.concatenate([first, links], 1)
     turning = jnp.concatenate([links[:3] - before[:3, :-1], jnp.zeros_like(first[:3])], 1)
     return jnp.concatenate([before, turning])
+
+
+def across(before: jax.Array, after: jax.Array, obj: jax.Array | None) -> jax.Array:
+    """Motion of a row, of nine components, relative to the object or to what is at rest."""
+    first = before if obj is None else before - obj
+    return jnp.concatenate([first, after[:3] - before[:3]])
+
+
+def ball_around(joint, before, after, ball):
+    """Centre (3, 1, ...) and radius (1, ...) of a ball around a row's vertices.
+
+    The link before the joint holds the straight row's centre somewhere else: the radius grows by
+    that distance.
+    """
+    radius, up = ball[0], ball[1]
+    apart = up * (after[2] - before[2])
+    centre = joint + up * after[2]
+    return centre[:, None], radius + jnp.sqrt(dot(apart, apart))[None]
+
+
+def placed(vertex, joint, before, after):
+    """Place (3, 1, ...), image (3, 1, ...), weight (1, ...) and share (1, 1, ...) of a vertex."""
+    local, weight, share = vertex[:3], vertex[3], vertex[4]
+    image = apply_columns(after, local)
+    point = joint + (1.0 - weight) * apply_columns(before, local) + weight * image
+    return point[:, None], image[:, None], weight[None], share[None, None]
+
+
+def lever(weight, image, where, point):
+    """Lever of a vertex's contact: how far it is from the joint that it follows in part."""
+    return weight * (image + where - point)

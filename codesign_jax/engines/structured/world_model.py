@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.cones import Cones, make_cones
 from codesign_jax.engines.structured.lanes import dot, total
-from codesign_jax.engines.structured.mesh import MeshLanes, mesh_lanes
+from codesign_jax.engines.structured.laws.cones import Cones, make_cones
+from codesign_jax.engines.structured.laws.meshes import MeshLanes, mesh_lanes
 from codesign_jax.model import ModelFields, compile_template, layout
 from codesign_jax.scene import Scene
 from codesign_jax.verdict import Bounds, bounds
 
 
-class WorldConstants(NamedTuple):
+class WorldModel(NamedTuple):
     """Hand and object of every world; lanes are (finger, world) or (1, world), all lengths SI.
 
     Attributes:
@@ -128,7 +128,7 @@ def _items(columns: jax.Array, v: jax.Array) -> jax.Array:
     return columns.reshape(3, 3, *[1] * missing, *columns.shape[2:])
 
 
-def world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
+def world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
     """Transposes batched model fields, leading axis (world,), into lane layout.
 
     A rollout asks for them at its start and in the engine, and traces them once.
@@ -137,7 +137,7 @@ def world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
 
 
 @partial(jax.jit, static_argnums=0)
-def _world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
+def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
     lay, template = layout(scene), compile_template(scene)
 
     def last(array: jax.Array) -> jax.Array:
@@ -162,7 +162,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldConstants:
     object_size = last(picked)[:, None]
     no_spheres = lay.spheres.size == 0
     numbers = scene.with_constants(jax.tree.map(lambda v: v[None], fields.constants))
-    return WorldConstants(
+    return WorldModel(
         mount=mount,
         base=base,
         offset=by_link(fields.body_pos[..., 0], lay.bodies),

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.contact import Cone
+from codesign_jax.engines.structured.laws.contact import Cone
 from codesign_jax.model import contact_invweight
 from codesign_jax.model.layout import palm_impedance
 from codesign_jax.scene import Scene

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import Stages, contract, inverse_spd, sum_fingers
-from codesign_jax.engines.structured.problem import Forces, Matrices
+from codesign_jax.engines.structured.linear.tree import Forces, Matrices
 
 
 class Quadratic(NamedTuple):
@@ -285,3 +285,24 @@ def wrist_slides(like: jax.Array) -> jax.Array:
     """Motion subspace of the three wrist slides, shape (3, 6, 1, world)."""
     eye = jnp.eye(3, 6, 3, dtype=like.dtype)[:, :, None, None]
     return jnp.broadcast_to(eye, (3, 6, *like.shape[1:]))
+
+
+def row_terms(
+    axes: jax.Array, inertia: jax.Array, wrench: jax.Array
+) -> tuple[JointTerms, jax.Array, jax.Array]:
+    """What a row adds to its joint, as if it touched the object, and to the link before it.
+
+    Args:
+      axes: Motion subspace of the joint, shape (axis, 6, finger, world).
+      inertia: Contact inertia of the row, shape (9, 9, finger, world).
+      wrench: Its wrench, shape (9, finger, world).
+
+    Returns:
+      The terms of the joint, and the contact inertia (6, 6) and wrench (6,) of the link.
+    """
+    turn = axes[:, :3]
+    mixed = contract(turn[:, :, None], inertia[None, 6:], 1)  # (axis, 9, ...)
+    parent = mixed[:, :6]
+    own = contract(turn[:, None], mixed[None, :, 6:], 2)
+    force = contract(turn, wrench[None, 6:], 1)
+    return JointTerms(own, parent, parent, force), inertia[:6, :6], wrench[:6]

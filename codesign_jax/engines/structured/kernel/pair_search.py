@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import apply_columns
-from codesign_jax.engines.structured.kernel import hull, sections
-from codesign_jax.engines.structured.kernel.contacts import zeros
+from codesign_jax.engines.structured.kernel import skin
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import hull, sections
+from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import first_on_palm
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ class Search:
             row, ball = i + first, self.read("ball", i + first)
 
             def vertices() -> None:
-                links, kind = self._links(row), hull.kind_of(row, self.p.links)
+                links, kind = self._links(row), skin.kind_of(row, self.p.links)
 
                 def add(k: Any, sums: Lanes) -> Lanes:
                     vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
@@ -180,7 +181,7 @@ class Search:
         """Balls around the vertices of every row."""
 
         def one(row: Any) -> None:
-            kind = hull.kind_of(row, self.p.links)
+            kind = skin.kind_of(row, self.p.links)
             ball = self.p.hand.read(self.step.hand, "ball", kind)
             joint, before, after = self._links(row)
             centre, reach = lanewise(hull.ball_around, joint, before, after, ball)
@@ -209,7 +210,7 @@ class Search:
                 near = there & (lanewise(sections.apart, self.read("ball", j), ball).lane < 0)
 
                 def boxes() -> None:
-                    own, kind = self._links(j), hull.kind_of(j, links)
+                    own, kind = self._links(j), skin.kind_of(j, links)
                     apart = lanewise(
                         sections.separated,
                         own,
@@ -253,7 +254,7 @@ class Search:
           other: Links of their partners' row, its size, and whether it is the last one.
           rows: Numbers of both rows.
         """
-        count, (links, kind), (theirs, size, last) = hull.pair_points(self.p.scene), own, other
+        count, (links, kind), (theirs, size, last) = skin.pair_points(self.p.scene), own, other
 
         def add(k: Any, sums: Lanes) -> Lanes:
             vertex = self.p.hand.read(self.step.hand, "pair_vertex", kind * count + k)

@@ -5,13 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import (
-    WorldConstants,
-    apply_columns,
-    turn_columns,
-)
-from codesign_jax.engines.structured.kinematics import Kinematics, State
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
+from codesign_jax.engines.structured.laws.kinematics import Kinematics, State
+from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, turn_columns
 from codesign_jax.model.morphology import softening
 
 
@@ -154,7 +150,7 @@ def turned_tensor(frame: jax.Array, tensor: jax.Array) -> jax.Array:
     return turn_columns(frame, jnp.moveaxis(turn_columns(frame, tensor), 0, 1))
 
 
-def bodies(run: Stages, hand: WorldConstants, kin: Kinematics) -> Bodies:
+def bodies(run: Stages, hand: WorldModel, kin: Kinematics) -> Bodies:
     """Inertia of all bodies at the present positions."""
 
     def link(origin: jax.Array, frame: jax.Array):
@@ -184,7 +180,7 @@ def softening_moment(section: jax.Array, stiffness: jax.Array, angle: jax.Array)
 
 def smooth_forces(
     run: Stages,
-    hand: WorldConstants,
+    hand: WorldModel,
     kin: Kinematics,
     body: Bodies,
     state: State,

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured import mesh
-from codesign_jax.engines.structured.constants import WorldConstants, apply_columns, apply_rows
-from codesign_jax.engines.structured.contact import Cone, Contacts
-from codesign_jax.engines.structured.kinematics import Kinematics
 from codesign_jax.engines.structured.lanes import Stages, cross, dot
+from codesign_jax.engines.structured.laws import meshes
+from codesign_jax.engines.structured.laws.contact import Cone, Contacts
+from codesign_jax.engines.structured.laws.kinematics import Kinematics
+from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, apply_rows
 from codesign_jax.scene import Scene, primitives
 
 _TINY = 1e-12
@@ -20,7 +20,7 @@ _TINY = 1e-12
 
 def spheres_on_object(
     scene: Scene,
-    hand: WorldConstants,
+    hand: WorldModel,
     kin: Kinematics,
     run: Stages,
     centre: jax.Array,
@@ -84,18 +84,18 @@ def spheres_on_table(
     return Contacts(point, normal, gap, cone)
 
 
-def finger_spheres(hand: WorldConstants, kin: Kinematics) -> jax.Array:
+def finger_spheres(hand: WorldModel, kin: Kinematics) -> jax.Array:
     """Centres of the finger spheres from the object's, shape (3, link, k, finger, world)."""
     return kin.origin[:, :, None] + apply_columns(kin.link[:, :, :, None], hand.sphere)
 
 
-def palm_spheres(hand: WorldConstants, kin: Kinematics) -> jax.Array:
+def palm_spheres(hand: WorldModel, kin: Kinematics) -> jax.Array:
     """Centres of the palm spheres from the object's, shape (3, sphere, world)."""
     return kin.place + apply_columns(kin.palm, hand.palm_point)
 
 
 def signed_distance(
-    scene: Scene, hand: WorldConstants, local: jax.Array
+    scene: Scene, hand: WorldModel, local: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Signed distance and its unit gradient in the object's frame, for the shape of each world.
 
@@ -104,14 +104,14 @@ def signed_distance(
       hand: Sizes and shape index of the objects.
       local: Points, shape (3, ...).
     """
-    meshes = mesh_indices(scene)
-    if len(meshes) == len(scene.objects.object):
-        return mesh.signed_distance(hand.mesh, local)  # type: ignore[arg-type]
+    indices = mesh_indices(scene)
+    if len(indices) == len(scene.objects.object):
+        return meshes.signed_distance(hand.mesh, local)  # type: ignore[arg-type]
     distance, gradient = primitive_distance(scene, hand.object_size, hand.object_id, local)
-    if not meshes:
+    if not indices:
         return distance, gradient
-    mine = jnp.isin(hand.object_id, jnp.array(meshes))
-    other = mesh.signed_distance(hand.mesh, local)  # type: ignore[arg-type]
+    mine = jnp.isin(hand.object_id, jnp.array(indices))
+    other = meshes.signed_distance(hand.mesh, local)  # type: ignore[arg-type]
     return jnp.where(mine, other[0], distance), jnp.where(mine, other[1], gradient)
 
 
@@ -190,7 +190,7 @@ def _capsule(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def object_on_table(
-    run: Stages, scene: Scene, hand: WorldConstants, kin: Kinematics, height: jax.Array
+    run: Stages, scene: Scene, hand: WorldModel, kin: Kinematics, height: jax.Array
 ) -> Contacts:
     """Contacts of the object with the table, four slots as in MuJoCo's plane colliders.
 
@@ -201,12 +201,12 @@ def object_on_table(
     """
 
     def points(size: jax.Array, columns: jax.Array, height: jax.Array):
-        meshes, arms = mesh_indices(scene), None
-        if len(meshes) < len(scene.objects.object):
+        indices, arms = mesh_indices(scene), None
+        if len(indices) < len(scene.objects.object):
             arms = primitive_points(scene, size, hand.object_id, columns)
-        if meshes:
-            new = mesh.table_points(hand.mesh, columns)  # type: ignore[arg-type]
-            mine = jnp.isin(hand.object_id, jnp.array(meshes))
+        if indices:
+            new = meshes.table_points(hand.mesh, columns)  # type: ignore[arg-type]
+            mine = jnp.isin(hand.object_id, jnp.array(indices))
             arms = new if arms is None else jnp.where(mine, new, arms)
         return on_table(arms, height)
 

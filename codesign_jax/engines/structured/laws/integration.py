@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kinematics import Acc, State
 from codesign_jax.engines.structured.lanes import total
+from codesign_jax.engines.structured.laws.kinematics import Acc, State
 
 
 def integrate(state: State, columns: jax.Array, acc: Acc, h: float) -> State:

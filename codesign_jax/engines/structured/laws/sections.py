@@ -12,10 +12,9 @@ direction flips.  Lane by lane, see `fingers`.
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision
-from codesign_jax.engines.structured.constants import apply_columns, apply_rows
-from codesign_jax.engines.structured.kernel import hull
 from codesign_jax.engines.structured.lanes import dot, total
+from codesign_jax.engines.structured.laws import hull, shapes
+from codesign_jax.engines.structured.world_model import apply_columns, apply_rows
 
 AXIS = 1e-3
 """Distance from a section's axis, over half its sides, below which the depth is constant."""
@@ -66,7 +65,7 @@ def palm_distance(point: jax.Array, palm: tuple) -> tuple[jax.Array, jax.Array]:
     """
     place, frame, size = palm
     local = apply_rows(frame, point - place)
-    distance, slope = collision.cylinder(size, jnp.stack([local[0], local[1], local[2] - size[1]]))
+    distance, slope = shapes.cylinder(size, jnp.stack([local[0], local[1], local[2] - size[1]]))
     return distance, apply_columns(frame, slope)
 
 

@@ -9,21 +9,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import collision, contact
-from codesign_jax.engines.structured.cones import which_cone
-from codesign_jax.engines.structured.contact import Cone, Contacts, Line
 from codesign_jax.engines.structured.kernel import objects
-from codesign_jax.engines.structured.kernel.memory import (
-    MemoryLayout,
-    anywhere,
-    full,
-    solid,
-    upper,
-)
+from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, full, solid, upper
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import contact, shapes
+from codesign_jax.engines.structured.laws.cones import which_cone
+from codesign_jax.engines.structured.laws.contact import Cone, Contacts, Line
 from codesign_jax.scene import Scene
 
 # Rows of a contact's jar and numbers of its line, by friction model.
@@ -126,10 +120,10 @@ class BoundContacts:
             mask = mask | (gap < 0)
         return anywhere(mask)
 
-    def if_touching(self, item: Any, compute: Callable, shapes: list[tuple]) -> list[Lanes]:
+    def if_touching(self, item: Any, compute: Callable, parts: list[tuple]) -> list[Lanes]:
         """compute() where a lane touches, zeros of wide shapes elsewhere."""
         like = jnp.zeros((self.set.size,), self.ref.dtype)
-        empty = [zeros(shape, like) for shape in shapes]
+        empty = [zeros(shape, like) for shape in parts]
         none, rebuild = solid(empty, self.set.size)
 
         def some() -> list[jax.Array]:
@@ -170,8 +164,8 @@ class BoundContacts:
         Returns:
           Contact inertia (6, 6) and wrench (6,) at the new jar, summed over the item's contacts.
         """
-        shapes: list[tuple] = [(21,), (6,)]
-        triangle, wrench = self.if_touching(item, lambda: self._push(item, alpha), shapes)
+        parts: list[tuple] = [(21,), (6,)]
+        triangle, wrench = self.if_touching(item, lambda: self._push(item, alpha), parts)
         return full(triangle), wrench
 
     def _push(self, item: Any, alpha: Lanes) -> list[Lanes]:
@@ -257,11 +251,11 @@ def sphere_on_object(
       Contact points [m] and unit normals from object to hand, shape (3, k), and gaps [m], negative
       in contact, shape (1, k).
     """
-    local = lanewise(collision.in_object, columns, centre)
+    local = lanewise(shapes.in_object, columns, centre)
     distance, gradient = objects.signed_distance(scene, thing, local)
 
     def place(*args):
-        point, normal, gap = collision.on_surface(*args)
+        point, normal, gap = shapes.on_surface(*args)
         return point, normal, gap[None]
 
     return lanewise(place, columns, centre, radius, distance, gradient)
@@ -269,7 +263,7 @@ def sphere_on_object(
 
 def sphere_on_table(height, centre, radius):
     """Point, normal and gap of spheres (3, k, ...) against the table."""
-    c = collision.spheres_on_table(None, height, centre, radius)  # type: ignore[arg-type]
+    c = shapes.spheres_on_table(None, height, centre, radius)  # type: ignore[arg-type]
     return c.point, c.normal, c.distance[None]
 
 

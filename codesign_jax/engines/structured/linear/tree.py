@@ -5,19 +5,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import finger_pairs, hull
-from codesign_jax.engines.structured.constants import WorldConstants
-from codesign_jax.engines.structured.contact import (
-    Contacts,
-)
-from codesign_jax.engines.structured.inertia import Bodies, Smooth
-from codesign_jax.engines.structured.kinematics import Acc, Kinematics
-from codesign_jax.engines.structured.lanes import (
-    Stages,
-    scan_links,
-    spatial,
-    total,
-)
+from codesign_jax.engines.structured.lanes import Stages, scan_links, spatial, total
+from codesign_jax.engines.structured.laws import finger_pairs, hull
+from codesign_jax.engines.structured.laws.contact import Contacts
+from codesign_jax.engines.structured.laws.inertia import Bodies, Smooth
+from codesign_jax.engines.structured.laws.kinematics import Acc, Kinematics
+from codesign_jax.engines.structured.world_model import WorldModel
 
 
 class Spatial(NamedTuple):
@@ -50,7 +43,7 @@ class Problem(NamedTuple):
         compliant wrist, whose accelerations are unknowns.
     """
 
-    hand: WorldConstants
+    hand: WorldModel
     kin: Kinematics
     body: Bodies
     matrix: Matrices

@@ -12,12 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.contact import (
-    Cone,
-    Contacts,
-    Ends,
-)
 from codesign_jax.engines.structured.lanes import Stages, dot
+from codesign_jax.engines.structured.laws.contact import Cone, Contacts, Ends
 
 BLOCK = 8
 """Slots that are done at a time."""

@@ -1,6 +1,6 @@
 """The skinned hull in a kernel: which vertices touch, and how they enter the joints' elimination.
 
-The algebra is that of `codesign_jax.engines.structured.hull`, one row at a time.
+The algebra is that of `codesign_jax.engines.structured.laws.hull`, one row at a time.
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured import hull
-from codesign_jax.engines.structured.constants import WorldConstants, apply_columns
-from codesign_jax.engines.structured.elimination import JointTerms
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, any_of
-from codesign_jax.engines.structured.lanes import contract, dot
+from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.engines.structured.laws import hull
+from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model import hull as mesh
 from codesign_jax.scene import Scene
 
@@ -116,7 +115,7 @@ def pair_vertices(scene: Scene, section: jax.Array) -> jax.Array:
     return jnp.concatenate(found)
 
 
-def pack(scene: Scene, hand: WorldConstants) -> dict[str, jax.Array]:
+def pack(scene: Scene, hand: WorldModel) -> dict[str, jax.Array]:
     """Arrays of `fields`, (item, component, finger, world).
 
     A ball is a radius and a height: around the point of that height above the joint, on the link
@@ -168,7 +167,7 @@ class Skin:
         kind = kind_of(row, self.links)
         moves = {c.set.name: self._moves(c.set.name, before, after) for c in self.sets}
         ball = self.step.p.hand.read(self.step.hand, "ball", kind)
-        centre, reach = lanewise(ball_around, joint, before.frame, after.frame, ball)
+        centre, reach = lanewise(hull.ball_around, joint, before.frame, after.frame, ball)
         for slots in self.sets:
             slots.clear(row)
             _, _, gap = self.step.geometry(slots.set.name, centre, reach, self.at, self.thing)
@@ -184,7 +183,7 @@ class Skin:
 
     def _vertex(self, row, item, slots, joint, before, after, moves) -> None:
         vertex = self.step.p.hand.read(self.step.hand, "vertex", item)
-        place = lanewise(placed, vertex, joint, before.frame, after.frame)
+        place = lanewise(hull.placed, vertex, joint, before.frame, after.frame)
         point, image, weight, share = place
         name = slots.set.name
         where, normal, gap = self.step.geometry(name, point, 0.0, self.at, self.thing)
@@ -194,7 +193,7 @@ class Skin:
             which = which & (self.step.block.finger < self.step.p.num_fingers)
 
         def store() -> None:
-            arm = lanewise(lambda *places: lever(*places), weight, image, where, point)
+            arm = lanewise(lambda *places: hull.lever(*places), weight, image, where, point)
             kept = slots.begin((where, normal, gap, arm, share), *moves[name])
             kept |= slots.remembered({"vertex": item})
             slots.add(row, which, kept, self.step.block.lane)
@@ -206,58 +205,6 @@ class Skin:
         obj = (self.at["now"].object_motion, self.at["object_vel"])
         one, two = (before.motion, before.vel), (after.motion, after.vel)
         return tuple(  # type: ignore[return-value]
-            lanewise(across, a, b, o if name.endswith("object") else None)
+            lanewise(hull.across, a, b, o if name.endswith("object") else None)
             for a, b, o in zip(one, two, obj, strict=True)
         )
-
-
-def across(before: jax.Array, after: jax.Array, obj: jax.Array | None) -> jax.Array:
-    """Motion of a row, of nine components, relative to the object or to what is at rest."""
-    first = before if obj is None else before - obj
-    return jnp.concatenate([first, after[:3] - before[:3]])
-
-
-def ball_around(joint, before, after, ball):
-    """Centre (3, 1, ...) and radius (1, ...) of a ball around a row's vertices.
-
-    The link before the joint holds the straight row's centre somewhere else: the radius grows by
-    that distance.
-    """
-    radius, up = ball[0], ball[1]
-    apart = up * (after[2] - before[2])
-    centre = joint + up * after[2]
-    return centre[:, None], radius + jnp.sqrt(dot(apart, apart))[None]
-
-
-def placed(vertex, joint, before, after):
-    """Place (3, 1, ...), image (3, 1, ...), weight (1, ...) and share (1, 1, ...) of a vertex."""
-    local, weight, share = vertex[:3], vertex[3], vertex[4]
-    image = apply_columns(after, local)
-    point = joint + (1.0 - weight) * apply_columns(before, local) + weight * image
-    return point[:, None], image[:, None], weight[None], share[None, None]
-
-
-def lever(weight, image, where, point):
-    """Lever of a vertex's contact: how far it is from the joint that it follows in part."""
-    return weight * (image + where - point)
-
-
-def row_terms(
-    axes: jax.Array, inertia: jax.Array, wrench: jax.Array
-) -> tuple[JointTerms, jax.Array, jax.Array]:
-    """What a row adds to its joint, as if it touched the object, and to the link before it.
-
-    Args:
-      axes: Motion subspace of the joint, shape (axis, 6, finger, world).
-      inertia: Contact inertia of the row, shape (9, 9, finger, world).
-      wrench: Its wrench, shape (9, finger, world).
-
-    Returns:
-      The terms of the joint, and the contact inertia (6, 6) and wrench (6,) of the link.
-    """
-    turn = axes[:, :3]
-    mixed = contract(turn[:, :, None], inertia[None, 6:], 1)  # (axis, 9, ...)
-    parent = mixed[:, :6]
-    own = contract(turn[:, None], mixed[None, :, 6:], 2)
-    force = contract(turn, wrench[None, 6:], 1)
-    return JointTerms(own, parent, parent, force), inertia[:6, :6], wrench[:6]

@@ -13,12 +13,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.constants import (
-    WorldConstants,
-    apply_columns,
-    rotation_columns,
-    turn_columns,
-)
 from codesign_jax.engines.structured.lanes import (
     Stages,
     cross,
@@ -26,6 +20,12 @@ from codesign_jax.engines.structured.lanes import (
     rotate,
     scan_links,
     spatial,
+)
+from codesign_jax.engines.structured.world_model import (
+    WorldModel,
+    apply_columns,
+    rotation_columns,
+    turn_columns,
 )
 
 # Axis of the frame about which each hinge turns, in the order bend (y), lateral (z), twist (x).
@@ -106,7 +106,7 @@ class Kinematics(NamedTuple):
 
 
 def kinematics(
-    run: Stages, hand: WorldConstants, axis_names: tuple[str, ...], state: State
+    run: Stages, hand: WorldModel, axis_names: tuple[str, ...], state: State
 ) -> Kinematics:
     """Computes the kinematics of all bodies."""
     place = _place(state)
@@ -143,7 +143,7 @@ def kinematics(
     )
 
 
-def straight(hand: WorldConstants, state: State) -> Kinematics:
+def straight(hand: WorldModel, state: State) -> Kinematics:
     """Places of all bodies with straight fingers: no loop along the links, and nothing else."""
     place = _place(state)
     palm = _palm_columns(state.wrist)

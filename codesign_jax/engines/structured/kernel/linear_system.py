@@ -5,9 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured import elimination as el
-from codesign_jax.engines.structured.kernel import hull
-from codesign_jax.engines.structured.kernel.contacts import BoundContacts, direct, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, direct, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
 from codesign_jax.engines.structured.kernel.memory import choose, full, loop, upper
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
@@ -15,7 +13,8 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Proble
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
-from codesign_jax.engines.structured.problem import Forces, Matrices
+from codesign_jax.engines.structured.linear import elimination as el
+from codesign_jax.engines.structured.linear.tree import Forces, Matrices
 
 
 class Row(NamedTuple):
@@ -140,7 +139,7 @@ class Elimination:
             inertia, wrench = self.push(slots, row, alpha)
             if axes is None:
                 return [*empty[:4], upper(inertia[:6, :6]), wrench[:6]]
-            terms, matrix, force = lanewise(hull.row_terms, axes, inertia, wrench)
+            terms, matrix, force = lanewise(el.row_terms, axes, inertia, wrench)
             return [*terms, upper(matrix), force]
 
         *terms, matrix, force = choose(used, compute, empty, self.block.size)

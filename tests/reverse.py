@@ -61,12 +61,10 @@ def curled(scene, steps, *, bend=0.9, height=0.07, seed=1):
 
 
 def weights_of(start, seed=0):
-    """Random ones; the first entry of the speed is a constant, zero."""
+    """Random ones."""
     random, nq, steps = np.random.default_rng(seed), len(start.fields.start), len(start.ctrl)
     shapes = (2 * nq - 1,), (steps, 3), (steps, nq)
-    found = Weights(*(random.normal(size=shape) for shape in shapes))
-    found.entries[0, 2] = 0.0
-    return found
+    return Weights(*(random.normal(size=shape) for shape in shapes))
 
 
 class Case:

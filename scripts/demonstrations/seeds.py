@@ -6,14 +6,16 @@ trials, is smooth in the design.  Adam moves drawn particles down its gradient. 
 only if whole grasps cost less with them than with the drawn ones, and by more than the gradients.
 """
 
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from scipy.stats import mannwhitneyu
 
-from codesign_jax import rollout
+from codesign_jax import codesign, rollout
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.lanes import Stages
@@ -24,6 +26,7 @@ from codesign_jax.model import layout
 from codesign_jax.scene import Scene, load, parameters
 from codesign_jax.types import Trial, failed
 from scripts.demonstrations import windows
+from scripts.experiments.study import load_study
 
 PARTICLES, TRIALS, STEPS, RATE = 60, 6, 60, 0.02
 """Particles and trials of a 23D run; steps of Adam, and its rate in fractions of the ranges."""
@@ -45,12 +48,12 @@ def gaps(scene: Scene, fields: Any, qpos: jax.Array) -> jax.Array:
 class Surrogate:
     """The distance of closed hands from objects, in a scene without contact."""
 
-    def __init__(self, scene_name: str, trials: Trial, preset: str):
+    def __init__(self, scene_name: str, trials: Trial):
         """Prepares it; the trials are those of all particles."""
         off = {"effects": dict.fromkeys(WITHOUT, False)}
         self.scene = load(scene_name, overrides=off)
         self.engine = make_engine("structured", self.scene)
-        self.space = parameters.design_space(self.scene.hand, preset)
+        self.space = parameters.design_space(self.scene.hand, "23d")
         self.trials = trials
         self.steps = round(self.scene.phases.inflate / self.scene.discretization.timestep)
         self.low, self.range = self.space.low, np.asarray(self.space.high) - self.space.low
@@ -82,31 +85,63 @@ class Surrogate:
         return np.asarray(project(self.low + units * self.range)), values, seconds
 
 
-def run(scene: Scene, preset: str = "23d", seed: int = 0) -> dict[str, Any]:
-    """Costs of whole grasps of drawn particles, and of those by shape; seconds of processor."""
-    engine = make_engine("structured", scene)
-    keys = jax.random.split(jax.random.key(seed), 3)
-    surrogate = Surrogate(scene.name, rollout.sample_trials(scene, keys[0], TRIALS), preset)
-    space = surrogate.space
-    drawn = np.asarray(space.sample(keys[1], PARTICLES))
+def check(scene: Scene, surrogate: Surrogate) -> dict[str, Any]:
+    """Costs of whole grasps of drawn particles, and of the same ones moved by shape."""
+    engine, space = make_engine("structured", scene), surrogate.space
+    keys = jax.random.split(jax.random.key(1), 2)
+    drawn = np.asarray(space.sample(keys[0], PARTICLES))
     moved, values, seconds = surrogate.descend(drawn)
-    fresh = rollout.sample_trials(scene, keys[2], TRIALS)
+    fresh = rollout.sample_trials(scene, keys[1], TRIALS)
     judge = jax.jit(lambda d: rollout.evaluate(scene, engine, jax.vmap(space.params)(d), fresh))
-    found: dict[str, Any] = {"preset": preset, "values": values, "seconds": seconds}
-    found["gradients"] = STEPS * PARTICLES * TRIALS
+    found: dict[str, Any] = {"values": values, "seconds": seconds}
     for name, designs in {"drawn": drawn, "by shape": moved}.items():
-        outcome, used = windows.timed(judge, designs)
+        outcome = judge(designs)
         good = ~failed(np.asarray(outcome.status))
         cost = np.where(good, outcome.cost, np.nan)
-        kept = np.isinf(np.asarray(outcome.lost_time)) & good
         found[name] = {
             "cost": float(np.nanmean(cost)),
-            "deviation": float(np.nanstd(np.nanmean(cost, 1)) / np.sqrt(PARTICLES)),
             "best": float(np.nanmin(np.nanmean(cost, 1))),
-            "kept": float(kept.mean()),
+            "kept": float((np.isinf(np.asarray(outcome.lost_time)) & good).mean()),
             "failed": float((~good).mean()),
         }
-        _, again = windows.timed(judge, designs)
-        found["seconds_of_grasps"] = again
         print(name, found[name], flush=True)
+    return found
+
+
+def run(scene: Scene, runs: int = 30, episodes: int = 12) -> dict[str, Any]:
+    """Runs of the particle filter from the published seeds, each moved by shape beforehand.
+
+    Args:
+      scene: The scene.
+      runs: How many of the published runs.
+      episodes: Episodes of each; a run that has not converged by then counts as never.
+    """
+    study = load_study(Path(__file__).parents[2] / "docs" / "data" / "paper_fingers", "23d")
+    assert study is not None
+    row = study.strategies.index("concurrent")
+    published = study.convergence()[row, :runs] * study.per_episode
+    surrogate = Surrogate(scene.name, rollout.sample_trials(scene, jax.random.key(0), TRIALS))
+    found: dict[str, Any] = {"check": check(scene, surrogate)}
+    moved, values, seconds = surrogate.descend(study.data["seeds"][:runs])
+    passes = STEPS * TRIALS  # of a run, each of which counts as two simulations
+    engine, space = make_engine("structured", scene), surrogate.space
+    optimizer = codesign.make_filter(space)
+    episode = codesign.make_episode(scene, engine, space, optimizer, TRIALS)
+    many = jax.jit(jax.vmap(episode, (0, None)))
+    keys = jax.vmap(jax.random.key)(np.arange(runs))
+    state = jax.vmap(lambda key, start: optimizer.init(key, start, PARTICLES))(
+        keys, jnp.asarray(moved)
+    )
+    means = []
+    for k in range(episodes):
+        state, info = many(state, np.ones(space.num_parameters, bool))
+        means.append(np.asarray(info.selection.mean_cost).tolist())
+        print(f"episode {k + 1}: median of the mean costs {np.median(means[-1]):.3f}", flush=True)
+    ends = [codesign.convergence_episode(m) for m in np.transpose(means)]
+    needed = np.array([np.inf if e is None else e + 1.0 for e in ends]) * study.per_episode
+    needed += 2 * passes
+    test = mannwhitneyu(needed, published, alternative="less")
+    found |= {"values": values, "seconds": seconds, "means": means, "p": float(test.pvalue)}
+    found |= {"simulations": needed.tolist(), "published": published.tolist()}
+    found |= {"median": float(np.median(needed)), "published_median": float(np.median(published))}
     return found

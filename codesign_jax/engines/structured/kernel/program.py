@@ -16,6 +16,7 @@ from jax.experimental import pallas as pl
 from codesign_jax import sources, verdict
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
+from codesign_jax.engines.structured.kernel import speed
 from codesign_jax.engines.structured.kernel.memory import Block, anywhere
 from codesign_jax.engines.structured.kernel.packing import Packing
 from codesign_jax.engines.structured.kernel.step import Step
@@ -214,32 +215,32 @@ class Program(Packing):
                     jax.lax.cond(jax.lax.rem(t, stride) == 0, put, lambda: None)
 
         def body(carry: tuple) -> tuple:
-            t, alive, speed = carry
+            t, alive, fastest = carry
 
             def undecided(distance: jax.Array, height: jax.Array) -> jax.Array:
-                return verdict.goes_on(bounds, distance, height, speed, t, to_end=to_end)
+                return verdict.goes_on(bounds, distance, height, fastest, t, to_end=to_end)
 
             record(t)
             commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)
             chamber = lanes([pressure[t]], (), wide=True)
-            entry, new_speed, moved = step.advance(commands, chamber, undecided, alive > 0, speed)
+            entry, new_speed, moved = step.advance(commands, chamber, undecided, alive > 0, fastest)
             alive = jnp.where(moved, alive, 0.0)
-            for k, value in enumerate((*entry[:2], speed, *entry[2:4], alive, *entry[4:])):
+            for k, value in enumerate((*entry[:2], fastest, *entry[2:4], alive, *entry[4:])):
                 trace[t, k, own] = value
             return t + 1, alive, new_speed
 
         def going(carry: tuple) -> jax.Array:
             return (carry[0] < steps) & anywhere(carry[1] > 0)
 
-        done, _, speed = jax.lax.while_loop(
-            going, body, (jnp.int32(0), alive, jnp.zeros_like(alive))
-        )
+        moving = {n: self.world_state.read(world_state, n, 0, own) for n in speed.VELOCITIES}
+        first = speed.largest(step, moving).lane
+        done, _, last_speed = jax.lax.while_loop(going, body, (jnp.int32(0), alive, first))
 
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
             record(t)
             for k in range(len(self.trace)):
                 last = trace[jnp.maximum(done - 1, 0), k, own]
-                trace[t, k, own] = speed if k == 2 else last
+                trace[t, k, own] = last_speed if k == 2 else last
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))

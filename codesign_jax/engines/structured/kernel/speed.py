@@ -1,5 +1,6 @@
-"""The largest velocity of a state in reverse: its cotangent goes to the velocities that it is."""
+"""The largest velocity of a state, and in reverse: its cotangent goes to the velocities it is."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -12,8 +13,14 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.reverse import ReverseStep
+    from codesign_jax.engines.structured.kernel.step import Step
 
 VELOCITIES = ("wrist_vel", "linear_vel", "angular_vel")
+
+
+def largest(step: "Step", state: dict[str, Lanes]) -> Lanes:
+    """Largest absolute velocity of each world's state; see `add`."""
+    return _folded(step, state, _largest, jnp.maximum)
 
 
 def add(step: "ReverseStep", state: dict[str, Lanes], bar: jax.Array) -> None:
@@ -24,29 +31,13 @@ def add(step: "ReverseStep", state: dict[str, Lanes], bar: jax.Array) -> None:
       state: Velocities of wrist and object, by name.
       bar: The cotangent, numbers of a world.
     """
-    p, block, like = step.p, step.block, step.like
-
-    def rates(i: Any) -> Lanes:
-        return p.finger_state.read(step.finger_state, "finger_vel", i)
-
-    def folded(function: Any, combine: Any, *more: Lanes) -> Lanes:
-        """function(x, velocities, *more) folded over all velocities of a world."""
-
-        def one(i: Any, x: Lanes) -> Lanes:
-            return lanewise(function, x, rates(i), *more)
-
-        fingers = block.fold(loop(p.links, one, zeros((), like), p.size).lane, combine)
-        found = lanes([fingers], (), wide=False)
-        for name in VELOCITIES:
-            found = lanewise(function, found, state[name], *more)
-        return found
-
-    top = folded(_largest, jnp.maximum)
-    number = folded(_count, jnp.add, top)
+    p, block = step.p, step.block
+    top = largest(step, state)
+    number = _folded(step, state, _count, jnp.add, top)
     share = lanewise(_share, lanes([bar], (), wide=False), number)
 
     def link(i: Any, x: Any) -> Any:
-        step.bars.add_joint({"finger_vel": lanewise(_slope, rates(i), top, share)}, i)
+        step.bars.add_joint({"finger_vel": lanewise(_slope, _rates(step, i), top, share)}, i)
         return x
 
     jax.lax.fori_loop(0, p.links, link, jnp.int32(0))
@@ -55,6 +46,28 @@ def add(step: "ReverseStep", state: dict[str, Lanes], bar: jax.Array) -> None:
         old = table.read(ref, name, 0, block.world)
         new = plus(old, lanewise(_slope, state[name], top, share))
         table.write(ref, name, new, 0, block.world)
+
+
+def _rates(step: "Step", i: Any) -> Lanes:
+    return step.p.finger_state.read(step.finger_state, "finger_vel", i)
+
+
+def _folded(
+    step: "Step", state: dict[str, Lanes], function: Callable, combine: Callable, *more: Lanes
+) -> Lanes:
+    """function(x, velocities, *more) folded over all velocities of a world."""
+    p = step.p
+
+    def one(i: Any, x: Lanes) -> Lanes:
+        return lanewise(function, x, _rates(step, i), *more)
+
+    first = zeros((), jnp.zeros((p.size,), state[VELOCITIES[0]].dtype))
+    found = lanes(
+        [step.block.fold(loop(p.links, one, first, p.size).lane, combine)], (), wide=False
+    )
+    for name in VELOCITIES:
+        found = lanewise(function, found, state[name], *more)
+    return found
 
 
 def _largest(x, velocities):

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         types,
     )
     from codesign_jax.caches import use_compilation_cache
+    from codesign_jax.codesign import Task
     from codesign_jax.engines import make_engine
     from codesign_jax.scene import SceneError, constants, hand, objects, parameters
     from codesign_jax.types import Params, Status, Trace, Trial
@@ -38,6 +39,7 @@ _HOME = {
     "parameters": "codesign_jax.scene",
     "SceneError": "codesign_jax.scene",
     "make_engine": "codesign_jax.engines",
+    "Task": "codesign_jax.codesign",
     "Params": "codesign_jax.types",
     "Status": "codesign_jax.types",
     "Trace": "codesign_jax.types",
@@ -50,6 +52,7 @@ __all__ = [
     "Params",
     "SceneError",
     "Status",
+    "Task",
     "Trace",
     "Trial",
     "codesign",

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax import rollout
-from codesign_jax.codesign import EpisodeInfo, episode_trials
+from codesign_jax.codesign import EpisodeInfo, Task, episode_trials
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import block_lanes, staged
@@ -88,44 +88,27 @@ class _Stages(NamedTuple):
 
 
 class Batch:
-    """Runs episodes as `codesign.make_episode`'s function does, of many runs in one call.
+    """Runs episodes as `codesign.Task.episode` does, of many runs in one call.
 
     The runs have scene, sizes and design space in common; their states, seeds and schedules differ.
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        engine: Engine,
-        space: DesignSpace,
-        optimizer: Optimizer,
-        num_trials: int,
-        *,
-        devices: int | None = None,
-        limit: int = LIMIT,
-        trajectory: bool | None = None,
-        cost: rollout.CostFunction | None = None,
+        self, task: Task, optimizer: Optimizer, *, devices: int | None = None, limit: int = LIMIT
     ):
         """Compiles nothing yet.
 
         Args:
-          scene: The scene.
-          engine: Engine that simulates.
-          space: Design space of the particles.
-          optimizer: Optimiser over the same space.
-          num_trials: Trials of each particle in an episode.
+          task: What is simulated.
+          optimizer: Optimiser over the task's space.
           devices: Number of devices that simulate; None for all of this process.
           limit: Most worlds of one device in one call.
-          trajectory: As in `rollout.simulate`, for a cost of one's own.
-          cost: As in `rollout.simulate`.
 
         Raises:
           ValueError: If there are fewer devices.
         """
-        self._how = scene, engine, space, num_trials
-        self._own = trajectory, cost
-        self._optimizer, self._parts = optimizer, None
-        self._joins, self._trials, self._limit = staged(engine).joins, num_trials, limit
+        self._task, self._optimizer, self._parts = task, optimizer, None
+        self._joins, self._limit = staged(task.engine).joins, limit
         self.devices = take(devices)
         self._programs: dict[Any, Callable] = {}
 
@@ -178,7 +161,7 @@ class Batch:
 
     def _worlds(self, request: Request) -> int:
         """Worlds of an episode."""
-        return len(request.state.particles) * self._trials
+        return len(request.state.particles) * self._task.trials
 
     def _stages(self, request: Request, runs: int) -> "_Stages":
         """The programs, whose blocks fit the first call's worlds.
@@ -187,9 +170,10 @@ class Batch:
         all programs would be compiled again in the middle.
         """
         if self._parts is None:
-            (scene, engine, *_), joined = self._how, min(runs, self._group(request))
+            task, joined = self._task, min(runs, self._group(request))
             worlds = -(-joined * self._worlds(request) // len(self.devices))
-            how = *self._how, block_lanes(engine, worlds), *self._own
+            scene, engine, *rest = task.how
+            how = scene, engine, rest[0], block_lanes(engine, worlds), *rest[1:]
             draw, before, after = (
                 Program(scene, make(*how), self._optimizer) for make in (_draw, _before, _after)
             )
@@ -266,9 +250,10 @@ def _draw(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
-    num_trials: int,
     lanes: int | None,
-    trajectory: bool | None,
+    num_trials: int,
+    record_qpos: bool,
+    stop_when_lost: bool | None,
     cost: rollout.CostFunction | None,
 ) -> Callable:
     """Draws an episode's trials."""
@@ -284,9 +269,10 @@ def _before(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
-    num_trials: int,
     lanes: int | None,
-    trajectory: bool | None,
+    num_trials: int,
+    record_qpos: bool,
+    stop_when_lost: bool | None,
     cost: rollout.CostFunction | None,
 ) -> Callable:
     """Moves a run's particles and prepares their worlds."""
@@ -307,12 +293,14 @@ def _launch(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
-    num_trials: int,
     lanes: int | None,
-    trajectory: bool | None,
+    num_trials: int,
+    record_qpos: bool,
+    stop_when_lost: bool | None,
     cost: rollout.CostFunction | None,
 ) -> Callable:
-    return staged(engine, lanes, trajectory=bool(trajectory)).launch
+    whole = rollout.goes_on(record_qpos, stop_when_lost)
+    return staged(engine, lanes, trajectory=whole).launch
 
 
 @shared
@@ -320,9 +308,10 @@ def _after(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
-    num_trials: int,
     lanes: int | None,
-    trajectory: bool | None,
+    num_trials: int,
+    record_qpos: bool,
+    stop_when_lost: bool | None,
     cost: rollout.CostFunction | None,
 ) -> Callable:
     """Judges a run's worlds and tells its optimiser."""
@@ -335,10 +324,11 @@ def _after(
     ) -> tuple[State, EpisodeInfo]:
         (state, packed), (mask, out) = asked, found
         shape = packed.population.shape[0], num_trials
-        parts = staged(engine, lanes, trajectory=bool(trajectory))
-        trace = parts.unpack(out, shape[0] * shape[1])
+        whole = rollout.goes_on(record_qpos, stop_when_lost)
+        trace = staged(engine, lanes, trajectory=whole).unpack(out, shape[0] * shape[1])
         judged = trace, packed.ctrl, packed.initial, packed.trials, constants
-        outcome = rollout.judge(scene, *judged, trajectory=trajectory, cost=cost)
+        how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
+        outcome = rollout.judge(scene, *judged, **how)
         trials, last = rollout.grid((outcome, trace.last), shape)
         costs = particle_cost(scene.with_constants(constants), trials)
         new, selection = optimizer.tell(state, packed.population, costs, mask)

@@ -94,20 +94,24 @@ def _failures_count(scene: Scene) -> bool:
     return scene.cost.failure == "worst"
 
 
-def shown(trace: Trace, trajectory: bool | None) -> Trace:
+def shown(trace: Trace, record_qpos: bool, stop_when_lost: bool | None) -> Trace:
     """A trace for a cost of one's own: reading what was not simulated or recorded is refused.
 
-    Without a trajectory a trace repeats the step at which a world lost its object, which a cost of
-    one's own would take for what happened.
+    A world that stopped repeats the step at which it lost its object, which a cost of one's own
+    would take for what happened.
 
     Args:
       trace: Trace of one world.
-      trajectory: Whether it is a trajectory; None if the caller did not say what the cost needs.
+      record_qpos: Whether it has qpos, of a whole grasp.
+      stop_when_lost: Whether it ends where the object is lost; None if the caller did not say what
+        the cost needs.
 
     Returns:
       The trace, whose fields raise ValueError when they are read if they are not to be.
     """
-    return trace if trajectory else (_UNASKED if trajectory is None else _TO_LOSS)(*trace)
+    if record_qpos:
+        return trace
+    return (_UNASKED if stop_when_lost is None else _WITHOUT_QPOS)(*trace)
 
 
 def _refusing(name: str, problems: dict[str, str]) -> type:
@@ -132,16 +136,14 @@ def _refusing(name: str, problems: dict[str, str]) -> type:
     return kind
 
 
-_QPOS = (
-    "a cost reads trace.qpos, which is recorded with trajectory=True only: pass that beside cost="
-)
-_TO_LOSS = _refusing("TraceToTheLoss", {"qpos": _QPOS})
+_QPOS = "a cost reads trace.qpos, which is recorded with record_qpos=True: pass that beside cost="
+_WITHOUT_QPOS = _refusing("TraceWithoutQpos", {"qpos": _QPOS})
 _UNASKED = _refusing(
     "TraceUnasked",
     {
-        field: f"a cost reads trace.{field}, but without a trajectory a world stops when it loses "
-        "its object, and its last step repeats: pass trajectory=True beside cost= to have all of "
-        "the grasp, or trajectory=False if the cost is to see it up to the loss only (faster)"
+        field: f"a cost reads trace.{field}, but a world stops when it loses its object, and its "
+        "last step repeats: pass stop_when_lost=False beside cost= to have all of the grasp, or "
+        "stop_when_lost=True if the cost is to see it up to the loss only (faster)"
         for field in Trace._fields
     }
     | {"qpos": _QPOS},

@@ -66,33 +66,33 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
       scene: The scene whose grasps it is to judge.
 
     Returns:
-      The function and whether it sees a whole grasp (`trajectory`): it does unless it has an
-      attribute `trajectory` that is False, with which a grasp ends where the object is lost.
+      The function and whether a grasp ends where the object is lost: the function's attribute
+      `stop_when_lost`, False if it has none.
 
     Raises:
       SceneError: If it is no function of scene, trace and controls that returns one number.
     """
     flag, cost = f"--cost {name}", _load(name, "--cost")
     _refuse_signature(flag, cost, ("scene", "trace", "ctrl"))
-    trajectory = getattr(cost, "trajectory", True)
-    if not isinstance(trajectory, bool):
-        raise SceneError([f"{flag}: its attribute trajectory must be True or False"])
+    stops = getattr(cost, "stop_when_lost", False)
+    if not isinstance(stops, bool):
+        raise SceneError([f"{flag}: its attribute stop_when_lost must be True or False"])
 
     constants = scene.constants()
 
     def judge(trace: Trace, params: Params, trials: Any) -> Outcome:
         _, ctrl, initial = rollout.prepare(scene, params, trials, constants)
-        how = {"trajectory": trajectory, "cost": cost}
+        how = {"record_qpos": not stops, "stop_when_lost": stops, "cost": cost}
         return rollout.judge(scene, trace, ctrl, initial, trials, constants, **how)
 
     one = jax.tree.map(lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene)))
     fields, _, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t, constants), *one)
     dtype = jnp.result_type(float)
     series = jax.ShapeDtypeStruct((1, scene.num_steps), dtype)
-    qpos = (1, scene.num_steps, fields.start.shape[-1] if trajectory else 0)
+    qpos = (1, scene.num_steps, fields.start.shape[-1] if not stops else 0)
     trace = Trace(series, series, series, jax.ShapeDtypeStruct(qpos, dtype))
     _tried(flag, cost, lambda: jax.eval_shape(judge, trace, *one))
-    return cost, trajectory
+    return cost, stops
 
 
 def make_optimizer(name: str, space: Space, num_particles: int | None = None) -> Optimizer:

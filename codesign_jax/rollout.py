@@ -37,8 +37,8 @@ shape (time, nq)) and its controls (time, nu) to a number.
 Whether a world failed, and when it lost its object, is told by the scene's rule all the same, and a
 trial whose cost is not a finite number has failed too (NONFINITE).  A failed trial shows the
 scene's `cost.maximum`, and `cost.particle_cost` leaves it out or scores it with that.  What the
-cost reads of the trace needs `trajectory=True`, or `trajectory=False` if it is meant to see a grasp
-up to the loss of the object only, see `cost.shown`.
+cost reads of the trace needs `stop_when_lost=False`, or `stop_when_lost=True` if it is meant to see
+a grasp up to the loss of the object only, and its qpos needs `record_qpos=True`; see `cost.shown`.
 """
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
@@ -131,7 +131,8 @@ def simulate(
     params: Params,
     trials: Trial,
     *,
-    trajectory: bool | None = None,
+    record_qpos: bool = False,
+    stop_when_lost: bool | None = None,
     cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> tuple[Outcome, Trace]:
@@ -142,9 +143,9 @@ def simulate(
       engine: The engine.
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
-      trajectory: Whether the trace holds qpos of every step, and goes on to the end of the grasp
-        where the object is lost before; see `Trace`. A cost of one's own that reads the trace must
-        say which.
+      record_qpos: Whether the trace holds qpos of every step; such worlds go on when they are lost.
+      stop_when_lost: Whether a world that lost its object stops there, see `Trace`; None for True,
+        but a cost of one's own that reads the trace must say which.
       cost: A cost of one's own in place of the scene's, see `CostFunction`.
       constants: Numbers instead of the scene's, see `Scene.constants`; leaves of shape () or
         (world,). The engine may be that of any scene of the same structure.
@@ -161,9 +162,33 @@ def simulate(
     """
     constants = _checked(scene, engine, params, trials, constants)
     fields, ctrl, initial = prepare(scene, params, trials, constants)
-    trace = engine.rollout(fields, ctrl, trajectory=bool(trajectory))
-    judged = judge(scene, trace, ctrl, initial, trials, constants, trajectory=trajectory, cost=cost)
-    return judged, trace
+    trace = recorded(engine.rollout, fields, ctrl, record_qpos, stop_when_lost)
+    how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
+    return judge(scene, trace, ctrl, initial, trials, constants, **how), trace
+
+
+def goes_on(record_qpos: bool, stop_when_lost: bool | None) -> bool:
+    """Whether worlds are simulated to the end though they are lost.
+
+    Raises:
+      SceneError: If they are to stop, and to be recorded: an engine records whole grasps.
+    """
+    if record_qpos and stop_when_lost:
+        problem = "record_qpos=True records whole grasps: leave out stop_when_lost=True"
+        raise schema.SceneError([problem])
+    return record_qpos or stop_when_lost is False
+
+
+def recorded(
+    simulate: Callable[..., Trace],
+    fields: Any,
+    ctrl: jax.Array,
+    record_qpos: bool,
+    stop_when_lost: bool | None,
+) -> Trace:
+    """What an engine's `rollout` returns, with qpos only where that is asked for."""
+    trace = simulate(fields, ctrl, trajectory=goes_on(record_qpos, stop_when_lost))
+    return trace if record_qpos else trace._replace(qpos=trace.qpos[..., :0])
 
 
 def grasp(
@@ -173,7 +198,8 @@ def grasp(
     trial: Trial,
     *,
     steps: int | None = None,
-    trajectory: bool = False,
+    record_qpos: bool = False,
+    stop_when_lost: bool | None = None,
     constants: Constants | None = None,
 ) -> Trace:
     """Simulates one world, or the beginning of it; `jax.vmap` makes a batch of it.
@@ -184,7 +210,8 @@ def grasp(
       params: Parameters of one hand.
       trial: One trial.
       steps: How many time steps are simulated; None for the whole grasp.
-      trajectory: As in `simulate`.
+      record_qpos: As in `simulate`.
+      stop_when_lost: As in `simulate`.
       constants: Numbers instead of the scene's, leaves of shape ().
 
     Returns:
@@ -198,7 +225,7 @@ def grasp(
     params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
     constants = _checked(scene, engine, params, trial, constants)
     fields, ctrl, _ = prepare(scene, params, trial, constants)
-    trace = engine.rollout(fields, ctrl[:, :steps], trajectory=trajectory)
+    trace = recorded(engine.rollout, fields, ctrl[:, :steps], record_qpos, stop_when_lost)
     return jax.tree.map(lambda v: v[0], trace)
 
 
@@ -259,7 +286,8 @@ def judge(
     trials: Trial,
     constants: Constants,
     *,
-    trajectory: bool | None = None,
+    record_qpos: bool = False,
+    stop_when_lost: bool | None = None,
     cost: CostFunction | None = None,
 ) -> Outcome:
     """Outcomes of a batch of worlds, with leading axis (world,).
@@ -271,14 +299,17 @@ def judge(
       initial: Bits of `Status` that they started with, shape (world,).
       trials: Their trials, with leading axis (world,).
       constants: Their numbers, leaves of shape () or (world,).
-      trajectory: As in `simulate`, with which the trace was made.
+      record_qpos: As in `simulate`, with which the trace was made.
+      stop_when_lost: As in `simulate`, with which the trace was made.
       cost: As in `simulate`.
     """
 
     def world(t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial, c: Constants) -> Outcome:
         own = scene.with_constants(c)
         result = outcome(own, t, i, trial)
-        return result if cost is None else _by_own(own, cost, shown(t, trajectory), u, result)
+        if cost is None:
+            return result
+        return _by_own(own, cost, shown(t, record_qpos, stop_when_lost), u, result)
 
     every = trace, ctrl, initial, trials, constants
     return jax.vmap(world, in_axes=(0, 0, 0, 0, batch_axes(constants)))(*every)
@@ -307,7 +338,8 @@ def evaluate(
     params: Params,
     trials: Trial,
     *,
-    trajectory: bool | None = None,
+    record_qpos: bool = False,
+    stop_when_lost: bool | None = None,
     cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> Outcome:
@@ -319,7 +351,8 @@ def evaluate(
       params: Parameters with leading axis (particle,).
       trials: Trials with leading axis (trial,): common random numbers, every particle meets the
         same ones.
-      trajectory: As in `simulate`; for a cost of one's own.
+      record_qpos: As in `simulate`; for a cost of one's own.
+      stop_when_lost: As in `simulate`; for a cost of one's own.
       cost: As in `simulate`.
       constants: Numbers instead of the scene's; leaves of shape () or (trial,).
 
@@ -330,7 +363,14 @@ def evaluate(
       SceneError: See `simulate`.
     """
     return evaluate_to_end(
-        scene, engine, params, trials, trajectory=trajectory, cost=cost, constants=constants
+        scene,
+        engine,
+        params,
+        trials,
+        record_qpos=record_qpos,
+        stop_when_lost=stop_when_lost,
+        cost=cost,
+        constants=constants,
     )[0]
 
 
@@ -340,7 +380,8 @@ def evaluate_to_end(
     params: Params,
     trials: Trial,
     *,
-    trajectory: bool | None = None,
+    record_qpos: bool = False,
+    stop_when_lost: bool | None = None,
     cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> tuple[Outcome, jax.Array | None]:
@@ -356,7 +397,8 @@ def evaluate_to_end(
         scene,
         engine,
         *crossed(params, trials),
-        trajectory=trajectory,
+        record_qpos=record_qpos,
+        stop_when_lost=stop_when_lost,
         cost=cost,
         constants=jax.tree.map(lambda v: jnp.tile(v, shape[0]) if jnp.ndim(v) else v, constants),
     )

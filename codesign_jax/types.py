@@ -153,17 +153,17 @@ class Trace(NamedTuple):
     fast or not finite, and the first one below the table.  From the failure on its speed is that of
     the failed step, and its other entries repeat.
 
-    A world that lost its object within the window of the cost is decided.  Without a trajectory it
-    stays where that happened, and its later entries repeat; with one it is simulated to the end of
-    the grasp, so that pictures and costs of one's own see all of it.  Its `Outcome` is the same.
+    A world that lost its object within the window of the cost is decided.  It stays where that
+    happened, and its later entries repeat, unless qpos is recorded or it was asked to go on
+    (`rollout.simulate`): then it is simulated to the end of the grasp, so that pictures and costs
+    of one's own see all of it.  Its `Outcome` is the same.
 
     Attributes:
       distance: Object centre to hand centre [m], shape (time,).
       height: Object centre above the table [m], shape (time,).
       speed: Largest absolute generalized velocity [rad/s or m/s], shape (time,); not finite if any
         state is not.
-      qpos: Generalized positions if trajectories were asked for, shape (time, nq), else shape
-        (time, 0).
+      qpos: Generalized positions if they were recorded, shape (time, nq), else shape (time, 0).
       status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP,
         CONTACT_OVERFLOW), shape (time,) int32, or None if it does not tell.
       last: Generalized positions and velocities at the end, those in which a decided world stays,

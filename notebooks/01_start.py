@@ -70,7 +70,7 @@ trials = jax.tree.map(
 hands = jax.tree.map(
     lambda value: jnp.broadcast_to(value, (3, *value.shape)), space.params(jnp.asarray(design))
 )
-simulate = jax.jit(lambda p, t: rollout.simulate(grasping, engine, p, t, trajectory=True))
+simulate = jax.jit(lambda p, t: rollout.simulate(grasping, engine, p, t, record_qpos=True))
 outcome, trace = simulate(hands, trials)
 for shape, cost, lost in zip(grasping.objects.object, outcome.cost, outcome.lost_time, strict=True):
     print(f"{shape.name:>10}: cost {cost:.2f}, lost at {lost:.2f} s")
@@ -115,13 +115,13 @@ plt.show()
 # %%
 particles, num_trials, episodes = (4, 2, 2) if FAST else (10, 3, 15)
 optimizer = codesign.make_filter(space)
-episode = codesign.make_episode(grasping, engine, space, optimizer, num_trials)
+task = codesign.Task(grasping, space, num_trials, engine)
 mask = schedule("concurrent", np.array(space.is_morphology), episodes)
 
 state = optimizer.init(jax.random.key(0), space.from_units(np.array([110.0, 80.0])), particles)
 costs = []
 for e in range(episodes):
-    state, info = episode(state, mask[e])
+    state, info = task.episode(optimizer, state, mask[e])
     costs.append(np.asarray(info.selection.cost))
     best = info.population[info.selection.best_index]
     length, height = space.in_units(best)

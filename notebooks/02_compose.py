@@ -21,6 +21,7 @@
 # everything runs.
 
 # %%
+import dataclasses
 import os
 
 import jax
@@ -63,7 +64,7 @@ trials = rollout.sample_trials(grasping, jax.random.key(0), 2)
 # %%
 def distance(design, trial):
     """Distance of object and hand when the object is lifted [m]."""
-    trace = rollout.grasp(grasping, engine, space.params(design), trial, trajectory=True)
+    trace = rollout.grasp(grasping, engine, space.params(design), trial, stop_when_lost=False)
     return trace.at(grasping, "lift").distance
 
 
@@ -107,18 +108,18 @@ print(jax.jit(shared)(many))
 # %% [markdown]
 # ## An optimisation as one program, and many seeds of it in one batch
 #
-# `codesign.make_run` is a `jax.lax.scan` over episodes: the same numbers as the loop of
+# `Task.run` is a `jax.lax.scan` over episodes: the same numbers as the loop of
 # `notebooks/01_start.py`.  Mapped over start states it runs a seed in each.
 
 # %%
 seeds, episodes, particles = (2, 2, 3) if FAST else (5, 10, 10)
 optimizer = codesign.make_filter(space)
-run = codesign.make_run(grasping, engine, space, optimizer, num_trials=2)
+task = codesign.Task(grasping, space, trials=2)
 masks = schedule("concurrent", np.array(space.is_morphology), episodes)
 start = space.from_units(np.array([60.0, 80.0]))  # mm, mm
 states = [optimizer.init(jax.random.key(k), start, particles) for k in range(seeds)]
 batch = jax.tree.map(lambda *v: jnp.stack(v), *states)
-ends, infos = jax.jit(jax.vmap(run, in_axes=(0, None)))(batch, masks)
+ends, infos = jax.jit(jax.vmap(lambda state: task.run(optimizer, state, masks)))(batch)
 print("mean cost, a row for each seed:\n", np.round(np.asarray(infos.selection.mean_cost), 2))
 
 # %% [markdown]
@@ -126,7 +127,7 @@ print("mean cost, a row for each seed:\n", np.round(np.asarray(infos.selection.m
 #
 # Any function of the scene, the trace of a world and its controls; here how high the object is at
 # the end of the lift.  (In a scene that is shaken too, ask for the trace at the end of "disturb":
-# the last entry of a whole grasp comes after the release.)  With `trajectory=True` a world is
+# the last entry of a whole grasp comes after the release.)  With `stop_when_lost=False` a world is
 # simulated to the end though it lost its object.
 
 
@@ -136,10 +137,8 @@ def height_missing(scene, trace, ctrl):
     return jnp.maximum(0.2 - trace.at(scene, "lift").height, 0.0)
 
 
-evaluate = codesign.make_evaluate(
-    grasping, engine, space, num_trials=2, trajectory=True, cost=height_missing
-)
-print(evaluate(designs, jax.random.key(0)).cost)
+lifting = dataclasses.replace(task, cost=height_missing, stop_when_lost=False)
+print(lifting.evaluate(designs, jax.random.key(0)).cost)
 
 # %% [markdown]
 # ## Another optimiser
@@ -150,9 +149,7 @@ print(evaluate(designs, jax.random.key(0)).cost)
 
 # %%
 searcher = codesign.make_optimizer("cma-es", space)  # pip install 'codesign-jax[baselines]'
-search = codesign.make_run(
-    grasping, engine, space, searcher, num_trials=2, trajectory=True, cost=height_missing
-)
-end, info = search(searcher.init(jax.random.key(0), start, particles), masks)
+begin = searcher.init(jax.random.key(0), start, particles)
+end, info = lifting.run(searcher, begin, masks)
 print("mean cost of each episode [m]:", np.round(np.asarray(info.selection.mean_cost), 3))
 print("best design [mm]:", np.round(space.in_units(np.asarray(end.particles[0])), 1))

@@ -20,19 +20,19 @@
 
 # %%
 import os
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from codesign_jax import codesign, make_engine, parameters, scene, use_compilation_cache
+from codesign_jax import codesign, parameters, scene, use_compilation_cache
 from codesign_jax.optimize import schedule
 
 use_compilation_cache()  # compiled programs are kept: the second start takes seconds
 FAST = bool(os.environ.get("CODESIGN_FAST"))
 grasping = scene.load("quick.toml" if FAST else "paper_spheres")
-engine = make_engine("structured", grasping)
 space = parameters.design_space(grasping.hand, "2d")
 
 # %% [markdown]
@@ -45,14 +45,15 @@ space = parameters.design_space(grasping.hand, "2d")
 points, trials = (6, 2) if FAST else (16, 3)
 lengths, heights = (np.linspace(*ends, points) for ends in zip(space.low, space.high, strict=True))
 grid = np.stack(np.meshgrid(lengths, heights, indexing="ij"), -1).reshape(-1, 2)
-evaluate = codesign.make_evaluate(grasping, engine, space, trials)
-landscape = evaluate(jnp.asarray(grid), jax.random.key(0)).cost.mean(1).reshape(points, points)
+task = codesign.Task(grasping, space, trials)
+landscape = task.evaluate(jnp.asarray(grid), jax.random.key(0)).cost.mean(1)
+landscape = landscape.reshape(points, points)
 print(f"{grid.shape[0] * trials} grasps; {np.mean(landscape < 0.01):.0%} of the designs keep all")
 
 # %% [markdown]
 # ## Three strategies, one batch
 #
-# A strategy is a mask: which parameters may move in which episode.  `codesign.make_run` is a whole
+# A strategy is a mask: which parameters may move in which episode.  `Task.run` is a whole
 # optimisation as one function of start state and masks, so `jax.vmap` runs the three strategies,
 # each with several seeds, together.  All start at one design that drops everything.
 
@@ -60,13 +61,12 @@ print(f"{grid.shape[0] * trials} grasps; {np.mean(landscape < 0.01):.0%} of the 
 strategies = ("concurrent", "morphology", "control")
 seeds, episodes, particles = (1, 3, 4) if FAST else (3, 24, 10)
 optimizer = codesign.make_filter(space)
-run = codesign.make_run(grasping, engine, space, optimizer, trials)
 start = space.from_units(np.array([150.0, 110.0]))  # mm, mm
 masks = [schedule(name, np.array(space.is_morphology), episodes) for name in strategies]
 masks = jnp.asarray(np.repeat(masks, seeds, axis=0))
 keys = jax.vmap(jax.random.key)(jnp.tile(jnp.arange(seeds), len(strategies)))
 states = jax.vmap(lambda key: optimizer.init(key, start, particles))(keys)
-ends, infos = jax.jit(jax.vmap(run))(states, masks)
+ends, infos = jax.jit(jax.vmap(partial(task.run, optimizer)))(states, masks)
 
 
 def by_strategy(values):

@@ -27,14 +27,13 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from codesign_jax import codesign, make_engine, parameters, scene, use_compilation_cache
+from codesign_jax import codesign, parameters, scene, use_compilation_cache
 from codesign_jax.optimize import Space, State, reflect, schedule
 from codesign_jax.optimize.protocol import episode_key, summarize
 
 use_compilation_cache()
 FAST = bool(os.environ.get("CODESIGN_FAST"))
 grasping = scene.load("quick.toml" if FAST else "paper_spheres")
-engine = make_engine("structured", grasping)
 space = parameters.design_space(grasping.hand, "2d")  # finger length and arm height
 
 # %% [markdown]
@@ -45,8 +44,8 @@ space = parameters.design_space(grasping.hand, "2d")  # finger length and arm he
 # counts as lost; what comes later is the release.  (`trace.at(scene, "disturb")` is one time step
 # of a trace, the last one of a phase.)  The cost sees the trace of one world, arrays with the axis
 # time, and the controls.  A cost that reads the trace says how much of it there is to be:
-# `trajectory=True` simulates a world to the end though it lost its object; with `trajectory=False`
-# it stops there, which is faster, and its last entry repeats.
+# `stop_when_lost=False` simulates a world to the end though it lost its object; with
+# `stop_when_lost=True` it stops there, which is faster, and its last entry repeats.
 
 # %%
 closed, shaken = grasping.last_step("inflate") + 1, grasping.last_step() + 1
@@ -117,10 +116,10 @@ optimizers["cross-entropy"] = CrossEntropy(codesign.make_filter(space).space)
 masks = schedule("concurrent", np.array(space.is_morphology), episodes)
 start = space.from_units(np.array([130.0, 90.0]))  # mm, mm
 found = {}
+task = codesign.Task(grasping, space, trials, cost=looseness, stop_when_lost=True)
 for name, optimizer in optimizers.items():
-    how = grasping, engine, space, optimizer, trials
-    run = codesign.make_run(*how, trajectory=False, cost=looseness)
-    end, found[name] = run(optimizer.init(jax.random.key(1), start, particles), masks)
+    state = optimizer.init(jax.random.key(1), start, particles)
+    end, found[name] = task.run(optimizer, state, masks)
     best = int(jnp.argmin(found[name].selection.best_cost))
     row = int(found[name].selection.best_index[best])
     design = np.round(space.in_units(np.asarray(found[name].population[best, row])), 1)

@@ -53,10 +53,10 @@ def costs(engine, step, links, calls=2):
     """Costs of all grasps, shape (design, trial), and the seconds of the last call."""
     sizes = {"timestep": 1e-3 * step, "links": links}
     chosen = scene.load(name, overrides={"discretization": sizes})
-    evaluate = codesign.make_evaluate(chosen, make_engine(engine, chosen), space, trials)
+    task = codesign.Task(chosen, space, trials, make_engine(engine, chosen))
     for _ in range(calls):  # the first one compiles
         start = time.perf_counter()
-        found = np.asarray(evaluate(jnp.asarray(designs), jax.random.key(1)).cost)
+        found = np.asarray(task.evaluate(jnp.asarray(designs), jax.random.key(1)).cost)
     return found, time.perf_counter() - start
 
 

@@ -26,12 +26,11 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from codesign_jax import codesign, make_engine, parameters, scene, use_compilation_cache
+from codesign_jax import codesign, parameters, scene, use_compilation_cache
 
 use_compilation_cache()
 FAST = bool(os.environ.get("CODESIGN_FAST"))
 grasping = scene.load("quick.toml" if FAST else "paper_spheres")
-engine = make_engine("structured", grasping)
 space = parameters.design_space(grasping.hand, "2d")
 
 # %% [markdown]
@@ -55,7 +54,7 @@ for path, value in leaves[:: max(1, len(leaves) // 8)]:
 # %%
 designs = jnp.asarray(space.from_units(np.array([[60.0, -5.0], [75.0, 5.0], [95.0, 25.0]])))  # mm
 trials = 12 if FAST else 180
-evaluate = codesign.make_evaluate(grasping, engine, space, trials)
+evaluate = codesign.Task(grasping, space, trials).evaluate
 
 
 def scaled(friction=1.0, stiffness=1.0, contact=1.0, palm=1.0):

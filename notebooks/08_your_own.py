@@ -159,8 +159,8 @@ for s, g in zip(grasping.objects.object, grasps, strict=True):
 # %%
 particles, num_trials, episodes = (4, 2, 1) if FAST else (10, 4, 12)
 optimizer = codesign.make_filter(space)
-episode = codesign.make_episode(grasping, engine, space, optimizer, num_trials)
+task = codesign.Task(grasping, space, num_trials, engine)
 state = optimizer.init(jax.random.key(0), space.from_units(np.array([120.0, 60.0])), particles)
 for e in range(episodes):
-    state, info = episode(state, np.ones(2, bool))
+    state, info = task.episode(optimizer, state)
     print(f"episode {e + 1}: mean cost {info.selection.mean_cost:.2f}")

@@ -24,7 +24,7 @@ def simulate(params, trials, **more):
 
 
 def evaluate(population, constants=None):
-    made = codesign.make_evaluate(SCENE, ENGINE, SPACE, 2)
+    made = codesign.Task(SCENE, SPACE, 2, ENGINE).evaluate
     return made(jnp.asarray(population), jax.random.key(0), constants)
 
 
@@ -35,7 +35,7 @@ def draw(key, count):
 
 def episode(mask):
     state = OPTIMIZER.init(jax.random.key(0), SPACE.default(), 3)
-    return codesign.make_episode(SCENE, ENGINE, SPACE, OPTIMIZER, 2)(state, mask)
+    return codesign.Task(SCENE, SPACE, 2, ENGINE).episode(OPTIMIZER, state, mask)
 
 
 FINER = scene.load(TINY, overrides={"discretization.links": 4, "effects.twist": True})
@@ -144,7 +144,7 @@ def test_it_is_said_while_tracing():
 
 
 def test_a_population_may_be_a_list():
-    listed = codesign.make_evaluate(SCENE, ENGINE, SPACE, 2)(
+    listed = codesign.Task(SCENE, SPACE, 2, ENGINE).evaluate(
         [[float(v) for v in SPACE.default()]], jax.random.key(0)
     )
     np.testing.assert_array_equal(listed.cost, evaluate(SPACE.default()[None]).cost)

@@ -126,7 +126,8 @@ def packed_lanes(particles, runs, devices=1, limit=LIMIT):
     engine = object.__new__(StructuredEngine)  # its constructor looks for the GPU
     engine.scene, engine.limits = the_scene, Limits(4, 2, 1e-6)
     engine.segment, engine.truncate = None, False
-    batch = Batch(the_scene, engine, space, filter_, 6, devices=1, limit=limit)
+    task = codesign.Task(the_scene, space, 6, engine)
+    batch = Batch(task, filter_, devices=1, limit=limit)
     batch.devices = batch.devices * devices
     state = filter_.init(jax.random.key(0), space.default(), particles)
     request = Request(state, np.ones(2, bool))

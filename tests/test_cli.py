@@ -235,7 +235,7 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys):
         going.wait(30)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(codesign, "make_evaluate", lambda *arguments: simulate)
+    monkeypatch.setattr(codesign.Task, "evaluate", simulate)
     monkeypatch.setattr(status, "leave", left.append)
     arguments = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--trials", "1"]
     monkeypatch.setattr(sys, "argv", ["codesign", *arguments])

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -11,7 +12,6 @@ import pytest
 from toy import ToyEngine, tiny
 
 from codesign_jax import codesign
-from codesign_jax.codesign import episode as episodes
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import State, schedule
 from codesign_jax.optimize.schedule import NAMES
@@ -25,7 +25,7 @@ def setup():
     """Scene, space, engine, filter and the episode function."""
     the_scene, space, engine = tiny()
     optimizer = codesign.make_filter(space)
-    episode = codesign.make_episode(the_scene, engine, space, optimizer, TRIALS)
+    episode = partial(codesign.Task(the_scene, space, TRIALS, engine).episode, optimizer)
     return the_scene, space, engine, optimizer, episode
 
 
@@ -68,7 +68,7 @@ def test_other_bounds_and_defaults_share_the_program(setup):
     low, high = ([0.04, -0.001], [0.06, 0.001])
     other = dataclasses.replace(space, bounds=(tuple(low), tuple(high)), base=base)
     narrow = codesign.make_filter(other)
-    found = codesign.make_episode(the_scene, engine, other, narrow, TRIALS)
+    found = partial(codesign.Task(the_scene, other, TRIALS, engine).episode, narrow)
     _, info = found(start(narrow), np.array([True, True]))
     assert engine.traced == traced > 0
     assert (np.float32(low) <= info.population).all() and (
@@ -141,7 +141,7 @@ def failing():
     # Worlds are particle-major: the first particle fails once, the second always.
     engine = ToyEngine(the_scene, failing=[0, 3, 4, 5])
     optimizer = codesign.make_filter(space)
-    episode = codesign.make_episode(the_scene, engine, space, optimizer, TRIALS)
+    episode = partial(codesign.Task(the_scene, space, TRIALS, engine).episode, optimizer)
     return the_scene, episode(start(optimizer, particles=3), np.zeros(2, bool))[1]
 
 
@@ -162,7 +162,7 @@ def test_noise_does_not_depend_on_the_number_of_particles(setup, failing):
 def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):
     """Each seed of a batch with its own schedule, as a loop over single episodes."""
     the_scene, space, engine, optimizer, episode = setup
-    run = codesign.make_run(the_scene, engine, space, optimizer, TRIALS)
+    run = partial(codesign.Task(the_scene, space, TRIALS, engine).run, optimizer)
     masks = np.stack(
         [schedule(n, np.array(space.is_morphology), 3) for n in ("concurrent", "control")]
     )
@@ -183,7 +183,7 @@ def test_evaluate_by_an_episode_equals_evaluate(setup):
     population = jnp.asarray(np.random.default_rng(0).uniform([0.03, -0.05], [0.17, 0.1], (8, 2)))
     key = jax.random.key(3)
     by_episode = codesign.evaluate_by(episode, optimizer)(population, key)
-    evaluate = codesign.make_evaluate(the_scene, engine, space, TRIALS)
+    evaluate = codesign.Task(the_scene, space, TRIALS, engine).evaluate
     direct = evaluate(population, codesign.stream_key(key, codesign.STREAM_TRIAL))
     # Two programs round the noise differently, which may move a loss by one time step.
     step = the_scene.discretization.timestep
@@ -250,7 +250,7 @@ def test_episode_on_real_physics_is_repeatable():
     the_scene, space, _ = tiny()
     optimizer = codesign.make_filter(space)
     engine = make_engine("mujoco", the_scene)
-    episode = codesign.make_episode(the_scene, engine, space, optimizer, 2)
+    episode = partial(codesign.Task(the_scene, space, 2, engine).episode, optimizer)
     state = start(optimizer, particles=3, design=(0.1, 0.0))
     once, info = episode(state, np.ones(2, bool))
     again, repeated = episode(state, np.ones(2, bool))
@@ -268,9 +268,8 @@ def test_negative_costs_of_ones_own_are_told(costs, own):
     the_scene, space, _ = tiny()
     info = SimpleNamespace(selection=SimpleNamespace(cost=np.array(costs)))
     cost = (lambda scene, trace, ctrl: 0.0) if own else None
-    program = episodes._joined(
-        the_scene, lambda *_: (None, info), codesign.make_filter(space), cost
-    )
+    task = codesign.Task(the_scene, space, 1, ToyEngine(the_scene), cost)
+    program = task._joined(lambda *_: (None, info), codesign.make_filter(space))
     warned = pytest.warns(UserWarning, match="cost of your own is negative")
     with warned if own and min(costs) < 0 else contextlib.nullcontext():
         assert program(0, 0) == (None, info)

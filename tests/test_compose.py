@@ -168,13 +168,13 @@ def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes():
     scene = small.pinch("sphere", **SHORT)
     space = parameters.design_space(scene.hand, "2d")
     optimizer, engine = codesign.make_filter(space), StructuredEngine(scene)
-    run = codesign.make_run(scene, engine, space, optimizer, 2)
+    run = partial(codesign.Task(scene, space, 2, engine).run, optimizer)
     seeds = [(0, (0.1, 0.05), "concurrent"), (7, (0.09, 0.03), "control")]
     starts = [optimizer.init(jax.random.key(k), np.array(d), 3) for k, d, _ in seeds]
     masks = np.stack([schedule(n, np.array(space.is_morphology), 2) for *_, n in seeds])
     batch = jax.tree.map(lambda *v: jnp.stack(v), *starts)
     ends, infos = jax.jit(jax.vmap(run), compiler_options=QUICK)(batch, masks)
-    episode = codesign.make_episode(scene, engine, space, optimizer, 2)
+    episode = partial(codesign.Task(scene, space, 2, engine).episode, optimizer)
     episode = jax.jit(episode, compiler_options=QUICK)
     # XLA rounds the model fields of these programs differently in their last bit, which moves the
     # states at the end by 1e-5, but no loss by a step, which would be 4e-2 of cost.
@@ -194,7 +194,7 @@ def test_a_run_vmaps_over_constants():
     scene = small.pinch("sphere", **SHORT)
     space = parameters.design_space(scene.hand, "2d")
     optimizer = codesign.make_filter(space)
-    run = codesign.make_run(scene, StructuredEngine(scene), space, optimizer, 2)
+    run = partial(codesign.Task(scene, space, 2).run, optimizer)
     start = optimizer.init(jax.random.key(0), np.array((0.1, 0.05)), 3)
     masks = np.ones((2, 2), bool)
     numbers = [scene.constants(), small.random_constants(scene, 1)]
@@ -225,7 +225,7 @@ def test_a_cost_of_ones_own_sees_the_end_of_the_trace():
     hand, trial = (jax.tree.map(lambda v: jnp.asarray(v)[None], x) for x in (hand, trial))
     engine = MujocoEngine(scene, num_threads=1)
     result = jax.jit(
-        lambda p, t: rollout.evaluate(scene, engine, p, t, trajectory=True, cost=final_height)
+        lambda p, t: rollout.evaluate(scene, engine, p, t, record_qpos=True, cost=final_height)
     )(hand, trial)
     fields, commands = small.world_inputs(scene, *(small.nth(x, 0) for x in (hand, trial)))
     data = mujoco.MjData(compiled := world_model(scene, fields))
@@ -244,7 +244,7 @@ def test_failed_trials_do_not_ask_ones_own_cost():
     params = jax.tree.map(lambda v: jnp.stack([v] * 3), space.params(jnp.array([0.05, 0.0])))
     trial = jax.tree.map(lambda v: v[None], rollout.nominal_trial(scene))
     evaluate = jax.jit(
-        lambda p, t, c: rollout.evaluate(scene, engine, p, t, trajectory=True, cost=c),
+        lambda p, t, c: rollout.evaluate(scene, engine, p, t, record_qpos=True, cost=c),
         static_argnums=2,
     )
     result = evaluate(params, trial, lambda s, t, u: t.height[-1])
@@ -275,27 +275,27 @@ def test_a_cost_does_not_read_what_was_not_simulated():
     jitted = jax.jit(lambda trace: trace.height[-1])  # the trace is still a tree of arrays
     reads = [lambda s, t, u: t[1][-1], lambda s, t, u: t.at(s).height]
     for cost in (height, lambda s, t, u: jitted(t), *reads):
-        words = "pass trajectory=True beside cost= to have all of the grasp, or trajectory=False"
+        words = "pass stop_when_lost=False beside cost= to have all of the grasp, or stop_when_lost"
         with pytest.raises(ValueError, match=words):
             trace_it(cost)
-    for flags in ({}, {"trajectory": False}):
-        with pytest.raises(ValueError, match="trace.qpos, which is recorded with trajectory=True"):
+    for flags in ({}, {"stop_when_lost": True}, {"stop_when_lost": False}):
+        with pytest.raises(ValueError, match="trace.qpos, which is recorded with record_qpos=True"):
             trace_it(lambda s, t, u: t.qpos[-1, -5], **flags)
-    with pytest.raises(ValueError, match="trace.qpos, which is recorded with trajectory=True"):
-        trace_it(lambda s, t, u: t.at(s, "disturb").qpos[-5], trajectory=False)
+    with pytest.raises(ValueError, match="trace.qpos, which is recorded with record_qpos=True"):
+        trace_it(lambda s, t, u: t.at(s, "disturb").qpos[-5], stop_when_lost=True)
 
     @jax.jit
     def allowed(p, t):
         return [
-            cost_of(p, t, height, trajectory=True),
-            cost_of(p, t, height, trajectory=False),
-            cost_of(p, t, lambda s, t, u: t.at(s, "disturb").height, trajectory=False),
-            cost_of(p, t, lambda s, t, u: jitted(t), trajectory=False),
+            cost_of(p, t, height, stop_when_lost=False),
+            cost_of(p, t, height, stop_when_lost=True),
+            cost_of(p, t, lambda s, t, u: t.at(s, "disturb").height, stop_when_lost=True),
+            cost_of(p, t, lambda s, t, u: jitted(t), stop_when_lost=True),
             cost_of(p, t, lambda s, t, u: u[0, 0] * 0 + 1.5),  # reads nothing of the trace
         ]
 
     assert [float(v) for v in allowed(params, trial)] == [0.5, 0.5, 0.5, 0.5, 1.5]
-    make = codesign.make_evaluate(scene, engine, space, 1, cost=height)
+    make = codesign.Task(scene, space, 1, engine, cost=height).evaluate
     with pytest.raises(ValueError, match=r"reads trace\.height"):
         make(jnp.array([[0.05, 0.0]]), jax.random.key(0))
 

@@ -55,7 +55,7 @@ def grasp(dtype, **settings):
         count = jax.tree.leaves(constants)[0].shape[0]
         worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (count, *v.shape)), (hand, trial))
         # `evaluate` would do: what is differentiated are the coordinates at the end.
-        _, trace = rollout.simulate(scene, engine, *worlds, trajectory=True, constants=constants)
+        _, trace = rollout.simulate(scene, engine, *worlds, record_qpos=True, constants=constants)
         size = trace.last.shape[1]
         weights = np.random.default_rng(0).normal(size=size) / np.sqrt(size)
         return trace.last @ jnp.asarray(weights, dtype)

@@ -152,7 +152,9 @@ def test_mjx_with_changed_constants_equals_mujoco_with_a_file_of_those_numbers()
     def run(constants):
         # Its template has the float type of the moment.
         engine = make_engine("mjx", the_scene)
-        return rollout.simulate(the_scene, engine, *worlds, trajectory=True, constants=constants)[1]
+        return rollout.simulate(the_scene, engine, *worlds, record_qpos=True, constants=constants)[
+            1
+        ]
 
     def reference(constants):
         file = as_file(the_scene, constants)

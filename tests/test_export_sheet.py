@@ -121,7 +121,7 @@ def test_rollouts_find_the_length_at_which_the_toy_loses(toy):
     the_scene, space, _ = tiny(**{"objects.noise.position": 0.0})
     design = space.from_units(np.array([100.0, 40.0]))
     planned = tolerance.study(the_scene, space, design, STEPS, free=True)
-    evaluate = codesign.make_evaluate(the_scene, toy, planned.space, 4)
+    evaluate = codesign.Task(the_scene, planned.space, 4, toy).evaluate
     found = jax.tree.map(np.asarray, evaluate(jnp.asarray(planned.designs), jax.random.key(0)))
     assert toy.traced == 1 and found.cost.shape == (len(planned.designs), 4)
     length, _ = tolerance.tolerances(planned, dict(enumerate(tolerance.shares(found))))

@@ -33,7 +33,7 @@ def grasp(the_scene, *designs, trials=None):
     trials = trials or [rollout.nominal_trial(the_scene, s) for s in SHAPES]
     params = stack(*(p for p in designs for _ in trials))
     worlds = stack(*(t for _ in designs for t in trials))
-    result = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t, trajectory=True))(
+    result = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t, record_qpos=True))(
         params, worlds
     )
     return jax.tree.map(

@@ -18,7 +18,7 @@ import pytest
 from toy import TINY
 
 import codesign_jax
-from codesign_jax import engines, parameters, rollout, scene
+from codesign_jax import Task, engines, parameters, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.types import Trace
 
@@ -174,13 +174,14 @@ def measured(page, name, make_engine, *designs):
     engine = names["engine"] = make_engine(grasping)
     space = names["space"] = parameters.design_space(grasping.hand, "2d")
     trials = names["trials"] = rollout.sample_trials(grasping, jax.random.key(0), 2)
+    names["task"] = Task(grasping, space, 2, engine)
     arguments = function.__code__.co_varnames[: function.__code__.co_argcount]
 
     @jax.jit
     def run(designs):
         how = {"cost": function} if "ctrl" in arguments else {}
         hands = jax.vmap(space.params)(designs)
-        found = rollout.evaluate(grasping, engine, hands, trials, trajectory=True, **how)
+        found = rollout.evaluate(grasping, engine, hands, trials, record_qpos=True, **how)
         if "trial" in arguments:
             values = jax.vmap(jax.vmap(function, (None, 0)), (0, None))(designs, trials)
         else:

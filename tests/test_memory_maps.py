@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, make_engine, memory_maps, programs
+from codesign_jax import codesign, memory_maps, programs
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.scene import parameters
 from tests import kernels, small
@@ -94,7 +94,7 @@ def test_many_structures_stay_below_a_limit(monkeypatch):
     for links in range(2, 11):
         scene = small.pinch("sphere", links, **changes)
         space = parameters.design_space(scene.hand)
-        evaluate = codesign.make_evaluate(scene, make_engine("structured", scene), space, 2)
+        evaluate = codesign.Task(scene, space, 2).evaluate
         population = np.repeat(np.asarray(space.default(), np.float32)[None], 2, 0)
         jax.block_until_ready(evaluate(population, jax.random.key(0)))
         found.append(memory_maps.count())

@@ -219,15 +219,16 @@ def test_steps_of_cma_es_do_not_shrink_on_a_plateau():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVOSAX)
 def test_a_whole_run_is_its_episodes_with_one_compile(name):
-    """Toy engine, a cost of one's own: a loop, `make_run`, and a batch of seeds."""
+    """Toy engine, a cost of one's own: a loop, `Task.run`, and a batch of seeds."""
     the_scene, space, engine = tiny()
 
     def seconds_held(scene, trace, ctrl):
         return 2.0 - (trace.distance < 0.5).sum() * scene.discretization.timestep
 
     made = codesign.make_optimizer(name, space)
-    how = (the_scene, engine, space, made, 3)
-    episode = codesign.make_episode(*how, trajectory=False, cost=seconds_held)
+    how = {"stop_when_lost": True, "cost": seconds_held}
+    task = codesign.Task(the_scene, space, 3, engine, **how)
+    episode = partial(task.episode, made)
     masks = optimize.schedule("switch-1", np.array(space.is_morphology), 4)
     states = [made.init(jax.random.key(s), np.array([0.05, 0.0]), 8) for s in range(2)]
     costs, state, traced = [], states[0], []
@@ -238,7 +239,7 @@ def test_a_whole_run_is_its_episodes_with_one_compile(name):
     assert len(set(traced)) == 1
     by_episode = codesign.evaluate_by(episode, made)(state.particles, jax.random.key(5))
     assert engine.traced == traced[0] and np.asarray(by_episode.cost).shape == (8, 3)
-    run = codesign.make_run(*how, trajectory=False, cost=seconds_held)
+    run = partial(task.run, made)
     batch = jax.tree.map(lambda *v: jnp.stack(v), *states)
     _, infos = jax.vmap(run, (0, None))(batch, masks)
     # A cost is a number of time steps, and two programs may round a loss to the next one.

@@ -10,7 +10,7 @@ import pytest
 from command_runs import assert_same_run, snapshot
 from toy import TINY
 
-from codesign_jax import cli, codesign, make_engine, own, parameters, runs, scene
+from codesign_jax import cli, codesign, own, parameters, runs, scene
 
 MINE = '''
 import dataclasses
@@ -95,14 +95,14 @@ def until_lost(scene, trace, ctrl):
     return trace.distance.mean()
 
 
-until_lost.trajectory = False
+until_lost.stop_when_lost = True
 
 
 def reads_too_much(scene, trace, ctrl):
     return trace.qpos.mean()
 
 
-reads_too_much.trajectory = False
+reads_too_much.stop_when_lost = True
 
 
 def of_two(scene, trace):
@@ -157,8 +157,7 @@ def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
     space = parameters.design_space(the_scene.hand, "2d")
     assert record is not None
     low = sys.modules["mine"].low
-    how = the_scene, make_engine("structured", the_scene), space, 2
-    evaluate = codesign.make_evaluate(*how, trajectory=True, cost=low)
+    evaluate = codesign.Task(the_scene, space, 2, cost=low, record_qpos=True).evaluate
     noise = codesign.stream_key(jax.random.key(3), codesign.STREAM_TRIAL, 1)
     again = evaluate(jnp.asarray(record.history.population[1]), noise)
     # Two programs round model fields differently, and 0.3 s of contact let that grow.
@@ -219,7 +218,7 @@ def test_what_is_wrong_is_said_before_anything_is_created(asked, here, capsys):
 
 def test_costs_see_as_much_of_a_grasp_as_they_say(here):
     the_scene = scene.load(TINY)
-    assert own.make_cost("mine:turned", the_scene)[1] is True
-    assert own.make_cost("mine:until_lost", the_scene)[1] is False
+    assert own.make_cost("mine:turned", the_scene)[1] is False
+    assert own.make_cost("mine:until_lost", the_scene)[1] is True
     with pytest.raises(scene.SceneError, match="builtins has no file of Python code"):
         own.contents(["scene", "builtins:pow"])

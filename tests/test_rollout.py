@@ -204,7 +204,7 @@ def test_jit_and_single_worlds_agree(batch):
     params = space.params(designs[3])
     world = jax.tree.map(lambda v: v[None], (params, nth(trials, 1)))
     outcome, trace = jax.jit(
-        lambda p, t: rollout.simulate(the_scene, engine, p, t, trajectory=True)
+        lambda p, t: rollout.simulate(the_scene, engine, p, t, record_qpos=True)
     )(*stack(nth(world, 0)))
     assert_same(nth(outcome, 0), (v[3, 1] for v in whole))
     assert trace.qpos.shape == (1, the_scene.num_steps, engine.template.nq)

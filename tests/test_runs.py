@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -52,7 +53,7 @@ def run():
     """A toy run of three episodes: scene, space, record and final test."""
     the_scene, space, engine = tiny()
     s, optimizer = settings(), codesign.make_filter(space)
-    episode = codesign.make_episode(the_scene, engine, space, optimizer, s.trials)
+    episode = partial(codesign.Task(the_scene, space, s.trials, engine).episode, optimizer)
     state = optimizer.init(jax.random.key(0), np.array([0.05, 0.0]), s.particles)
     record = Record(state, records.empty_history(s, space.num_parameters))
     for e in range(s.episodes):

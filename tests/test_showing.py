@@ -182,7 +182,7 @@ def test_landscape_has_every_point(run, monkeypatch, capsys):
     np.testing.assert_allclose(found.second, np.linspace(low[1], high[1], 3))
     designs = space.from_units([[a, b] for a in found.first for b in found.second])
     engine = make_engine("mujoco", the_scene)
-    evaluate = codesign.make_evaluate(the_scene, engine, space, 2)
+    evaluate = codesign.Task(the_scene, space, 2, engine).evaluate
     # As many designs in a call as the command has: the same program, which is there already.
     parts = [evaluate(np.float32(part), jax.random.key(5)) for part in (designs[:5], designs[4:])]
     joined = jax.tree.map(lambda a, b: np.concatenate([a, b[1:]]), *parts)
@@ -266,28 +266,20 @@ def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
     monkeypatch.setattr(sources, "digest", lambda: "this code")  # in spite of what is replaced here
     count = []
 
-    def made(*arguments):
-        def evaluate(designs, *rest):
-            cost = np.asarray(designs)[:, :1]
-            return Outcome(cost, np.zeros(cost.shape, int), cost, np.zeros(cost.shape, int))
+    def made(task, designs, key):
+        cost = np.asarray(designs)[:, :1]
+        return Outcome(cost, np.zeros(cost.shape, int), cost, np.zeros(cost.shape, int))
 
-        return evaluate
-
-    def stopping(*arguments):
-        evaluate = made(*arguments)
-
-        def call(*rest):
-            count.append(len(rest[0]))
-            if len(count) == 2:
-                raise KeyboardInterrupt
-            return evaluate(*rest)
-
-        return call
+    def stopping(task, designs, key):
+        count.append(len(designs))
+        if len(count) == 2:
+            raise KeyboardInterrupt
+        return made(task, designs, key)
 
     grid = ["landscape", *DESIGN, "--points", "3", "--trials", "1", "--out"]
-    monkeypatch.setattr(codesign, "make_evaluate", made)
+    monkeypatch.setattr(codesign.Task, "evaluate", made)
     assert cli.main([*grid, "whole"]) == 0
-    monkeypatch.setattr(codesign, "make_evaluate", stopping)
+    monkeypatch.setattr(codesign.Task, "evaluate", stopping)
     assert cli.main([*grid, "part"]) == 130
     assert "the same command goes on" in capsys.readouterr().out
     assert (workplace / "part" / command.PART).exists()
@@ -298,11 +290,11 @@ def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
     assert not (workplace / "part" / command.PART).exists()
     count.clear()
     assert cli.main([*grid, "part"]) == 130
-    monkeypatch.setattr(codesign, "make_evaluate", made)
+    monkeypatch.setattr(codesign.Task, "evaluate", made)
     assert cli.main([*grid, "part", "--seed", "1"]) == 0
     said = capsys.readouterr().out
     assert "going on" not in said and f"{command.PART} is of another case: simulated again" in said
-    monkeypatch.setattr(codesign, "make_evaluate", stopping)
+    monkeypatch.setattr(codesign.Task, "evaluate", stopping)
     count.clear()
     assert cli.main([*grid, "part"]) == 130
     monkeypatch.setattr(sources, "digest", lambda: "other code")

@@ -13,8 +13,8 @@ from codesign_jax import (
     Params,
     SceneError,
     Status,
+    Task,
     codesign,
-    make_engine,
     parameters,
     rollout,
     scene,
@@ -28,17 +28,16 @@ def find_a_design(steps: int) -> np.ndarray:
         grasping = scene.load("paper", overrides={"discretization.links": 5})
     except SceneError as error:
         raise SystemExit("; ".join(error.problems)) from error
-    engine = make_engine("structured", grasping)
     space = parameters.design_space(grasping.hand, "2d")
+    task = Task(grasping, space, trials=3)
     optimizer = codesign.make_filter(space)
-    episode = codesign.make_episode(grasping, engine, space, optimizer, num_trials=3)
     state = optimizer.init(jax.random.key(0), space.default(), num_particles=10)
     for _ in range(steps):
-        state, _info = episode(state, np.ones(2, bool))
+        state, _info = task.episode(optimizer, state)
     hand: Params = space.params(state.particles[0])
     trials = rollout.sample_trials(grasping, jax.random.key(1), 6)
     batch = jax.tree.map(lambda v: v[None], hand)
-    outcome = rollout.evaluate(grasping, engine, batch, trials)
+    outcome = rollout.evaluate(grasping, task.engine, batch, trials)
     if Status(int(outcome.status[0, 0])) & Status.STUCK:
         return np.zeros(0)
     return space.in_units(np.asarray(state.particles[0]))

@@ -1,5 +1,7 @@
-"""Programs: the evaluation of a population, one episode, and a whole optimisation."""
+"""`Task`: the evaluation of a population, one episode, and a whole optimisation as programs."""
 
+import dataclasses
+import functools
 import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import rollout
+from codesign_jax import axes, engines, rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
@@ -45,98 +47,139 @@ class EpisodeInfo(NamedTuple):
     drawn: Trial | None = None
 
 
-def make_evaluate(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    num_trials: int,
-    *,
-    trajectory: bool | None = None,
-    cost: rollout.CostFunction | None = None,
-) -> EvaluateFunction:
-    """Returns a function (population, key) -> outcomes of shape (particle, trial); one program.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """What is optimised: grasps of hands of a design space, and what they cost.
 
-    All particles meet the same trials: common random numbers compare designs, not luck.  As a third
-    argument it takes `Constants` instead of the scene's, leaves of shape () or (trial,): neither
-    other numbers nor another scene of the same structure compile anything, see `programs`.
+    Its functions are programs that all scenes of one structure share (`programs`): neither other
+    `constants` nor another scene of the same structure compile anything.  `jax.jit`, `jax.vmap` and
+    so on work on them.
 
-    Args:
+    Attributes:
       scene: The scene.
-      engine: Engine that simulates.
-      space: Design space of the population.
-      num_trials: Trials of each particle.
-      trajectory: As in `rollout.simulate`.
-      cost: As in `rollout.simulate`.
+      space: Design space of the particles.
+      trials: Trials of each particle in an evaluation or an episode.
+      engine: Engine that simulates; by default the engine `structured` of the scene.
+      cost: A cost of one's own in place of the scene's, see `rollout.CostFunction`.
+      record_qpos: As in `rollout.simulate`, for a cost of one's own.
+      stop_when_lost: As in `rollout.simulate`, for a cost of one's own.
+
+    >>> from codesign_jax import Task, parameters, scene
+    >>> grasping = scene.load("paper")
+    >>> task = Task(grasping, parameters.design_space(grasping.hand, "2d"), trials=3)
+    >>> task.engine.name
+    'structured'
     """
-    program = Program(scene, _evaluation(scene, engine, space, num_trials, trajectory, cost))
+
+    scene: Scene
+    space: DesignSpace
+    trials: int
+    engine: Engine = None  # type: ignore[assignment]  # made after this
+    cost: rollout.CostFunction | None = None
+    record_qpos: bool = False
+    stop_when_lost: bool | None = None
+
+    def __post_init__(self) -> None:
+        """Makes the engine.
+
+        Raises:
+          SceneError: If the engine is that of a scene of another structure, or worlds are to be
+            recorded and to stop.
+        """
+        if self.engine is None:
+            object.__setattr__(self, "engine", engines.make_engine(engines.DEFAULT, self.scene))
+        axes.refuse_other(self.scene, self.engine)
+        rollout.goes_on(self.record_qpos, self.stop_when_lost)
+
+    @property
+    def how(self) -> tuple[Any, ...]:
+        """What its programs are built from, see `programs.shared`."""
+        shown = self.record_qpos, self.stop_when_lost
+        return self.scene, self.engine, self.space, self.trials, *shown, self.cost
 
     def evaluate(
-        population: jax.Array, key: jax.Array, constants: Constants | None = None
+        self, population: jax.Array, key: jax.Array, constants: Constants | None = None
     ) -> Outcome:
-        space.refuse_population(population)
-        space.refuse_unit_slips(population)
-        return program(jnp.asarray(population), key, constants)
+        """Outcomes of particles in random trials, arrays of shape (particle, trial).
 
-    return evaluate
+        All particles meet the same trials: common random numbers compare designs, not luck.
 
+        Args:
+          population: Particles [SI units], shape (particle, parameter).
+          key: Key of the trials.
+          constants: Numbers instead of the scene's, leaves of shape () or (trial,).
 
-@shared
-def _evaluation(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    num_trials: int,
-    trajectory: bool | None,
-    cost: rollout.CostFunction | None,
-) -> Callable[..., Outcome]:
-    def simulate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
-        trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
-        hands = jax.vmap(space.params)(population)
-        return rollout.evaluate(
-            scene, engine, hands, trials, trajectory=trajectory, cost=cost, constants=constants
-        )
+        Raises:
+          SceneError: If the population or the constants do not fit.
+        """
+        self.space.refuse_population(population)
+        self.space.refuse_unit_slips(population)
+        return Program(self.scene, self._evaluation)(jnp.asarray(population), key, constants)
 
-    return simulate
+    def episode(
+        self,
+        optimizer: Optimizer,
+        state: State,
+        mask: jax.typing.ArrayLike | None = None,
+        constants: Constants | None = None,
+    ) -> tuple[State, "EpisodeInfo"]:
+        """Runs one episode: moves the particles, simulates, and tells the optimiser their costs.
 
+        The noise of trial t derives from (root key, stream, episode, t), so that it depends neither
+        on the number of particles nor on where a run was resumed.
 
-def make_episode(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    optimizer: Optimizer,
-    num_trials: int,
-    *,
-    trajectory: bool | None = None,
-    cost: rollout.CostFunction | None = None,
-) -> Program:
-    """Returns the jitted function (state, mask) -> (state, info) that runs one episode.
+        Args:
+          optimizer: Optimiser over the same space, see `optimize.Optimizer`.
+          state: Its state.
+          mask: Parameters that may move, bool, shape (parameter,): data, so that every schedule
+            shares one program. None for all.
+          constants: Numbers instead of the scene's, leaves of shape () or (trial,) but for
+            `cost.maximum`, which is one number.
+        """
+        mask = np.ones(self.space.num_parameters, bool) if mask is None else mask
+        return self._joined(self._episode, optimizer)(state, mask, constants)
 
-    The mask, bool of shape (parameter,), is data: every schedule shares one compile, and so does
-    every scene of one structure, see `programs`.  An optional third argument are `Constants`
-    instead of the scene's, leaves of shape () or (trial,) but for `cost.maximum`, which is one
-    number.  The noise of
-    trial t derives from (root key, stream, episode, t), so that it depends neither on the number
-    of particles nor on where a run was resumed.
+    def run(
+        self,
+        optimizer: Optimizer,
+        state: State,
+        masks: jax.typing.ArrayLike,
+        constants: Constants | None = None,
+    ) -> tuple[State, "EpisodeInfo"]:
+        """Runs a whole optimisation as one program, a `jax.lax.scan` over the episodes.
 
-    Args:
-      scene: The scene.
-      engine: Engine that simulates.
-      space: Design space of the particles.
-      optimizer: Optimiser over the same space, see `optimize.Optimizer`.
-      num_trials: Trials of each particle in an episode.
-      trajectory: As in `rollout.simulate`.
-      cost: As in `rollout.simulate`.
-    """
-    program = _episode(scene, engine, space, num_trials, trajectory, cost)
-    return _joined(scene, program, optimizer, cost)
+        It is a loop in Python over `episode` without a way to stop in between.  XLA rounds the
+        model fields of the two programs, and of batches of other sizes, differently in the last
+        bit.  `jax.vmap` over the state runs many seeds in one batch, see `optimize.State`, and over
+        constants many worlds' physics.
 
+        Args:
+          optimizer: As of `episode`.
+          state: Its state.
+          masks: The mask of each episode, shape (episode, parameter).
+          constants: As of `episode`.
 
-def _joined(
-    scene: Scene, program: Callable, optimizer: Optimizer, cost: rollout.CostFunction | None
-) -> Program:
-    """A program with its optimiser, which warns where that does not see costs of one's own."""
-    weighs = cost is not None and isinstance(optimizer, ParticleFilter)
-    return (_Weighing if weighs else Program)(scene, program, optimizer)
+        Returns:
+          The state at the end, and reports with leading axis (episode,).
+        """
+        return self._joined(self._run, optimizer)(state, masks, constants)
+
+    @functools.cached_property
+    def _evaluation(self) -> Callable[..., Outcome]:
+        return _evaluation(*self.how)
+
+    @functools.cached_property
+    def _episode(self) -> Callable:
+        return _episode(*self.how)
+
+    @functools.cached_property
+    def _run(self) -> Callable:
+        return _run(*self.how)
+
+    def _joined(self, program: Callable, optimizer: Optimizer) -> Program:
+        """A program with its optimiser, which warns where that does not see costs of one's own."""
+        weighs = self.cost is not None and isinstance(optimizer, ParticleFilter)
+        return (_Weighing if weighs else Program)(self.scene, program, optimizer)
 
 
 class _Weighing(Program):
@@ -157,14 +200,37 @@ class _Weighing(Program):
 
 
 @shared
+def _evaluation(
+    scene: Scene,
+    engine: Engine,
+    space: DesignSpace,
+    num_trials: int,
+    record_qpos: bool,
+    stop_when_lost: bool | None,
+    cost: rollout.CostFunction | None,
+) -> Callable[..., Outcome]:
+    how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
+
+    def simulate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
+        trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
+        hands = jax.vmap(space.params)(population)
+        return rollout.evaluate(scene, engine, hands, trials, constants=constants, **how)
+
+    return simulate
+
+
+@shared
 def _episode(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    trajectory: bool | None,
+    record_qpos: bool,
+    stop_when_lost: bool | None,
     cost: rollout.CostFunction | None,
 ) -> EpisodeFunction:
+    how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
+
     def episode(
         state: State,
         mask: jax.typing.ArrayLike,
@@ -176,9 +242,8 @@ def _episode(
         population = optimizer.ask(state, mask)
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
-        trials, last = rollout.evaluate_to_end(
-            scene, engine, hands, noise, trajectory=trajectory, cost=cost, constants=constants
-        )
+        worlds = scene, engine, hands, noise
+        trials, last = rollout.evaluate_to_end(*worlds, constants=constants, **how)
         costs = particle_cost(scene.with_constants(constants), trials)
         new, selection = optimizer.tell(state, population, costs, mask)
         return new, EpisodeInfo(population, trials, selection, last)
@@ -197,38 +262,6 @@ def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
         raise SceneError(
             [f"the mask has shape {np.shape(mask)}, not ({space.num_parameters},), that is {names}"]
         )
-
-
-def make_run(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    optimizer: Optimizer,
-    num_trials: int,
-    *,
-    trajectory: bool | None = None,
-    cost: rollout.CostFunction | None = None,
-) -> Program:
-    """Returns the jitted function (state, masks, constants) -> (state, info) of a whole run.
-
-    The loop over the episodes is a `jax.lax.scan`: a loop in Python over `make_episode`'s function
-    without a way to stop in between. XLA rounds the model fields of the two programs, and of
-    batches of other sizes, differently in the last bit.  The masks, one for each episode,
-    have shape (episode, parameter), and the info's arrays get a leading axis (episode,).
-    `jax.vmap` over the state runs many seeds in one batch, see `optimize.State`, and over constants
-    (`Scene.constants`, by default the scene's own) many worlds' physics.
-
-    Args:
-      scene: The scene.
-      engine: Engine that simulates; with `jax.vmap` it has to be one that composes, as the default.
-      space: Design space of the particles.
-      optimizer: Optimiser over the same space, see `optimize.Optimizer`.
-      num_trials: Trials of each particle in an episode.
-      trajectory: As in `rollout.simulate`.
-      cost: As in `rollout.simulate`.
-    """
-    program = _run(scene, engine, space, num_trials, trajectory, cost)
-    return _joined(scene, program, optimizer, cost)
 
 
 @shared
@@ -266,11 +299,11 @@ def evaluate_by(episode: EpisodeFunction, optimizer: Optimizer) -> EvaluateFunct
     """Returns an evaluation (population, key) -> outcomes that uses an episode's own program.
 
     With every parameter closed nothing moves, so that seeds and final particles are simulated
-    without a second compile.
+    without a second compile, as long as they are as many as an episode's.
 
     Args:
-      episode: See `make_episode`; works for as many particles as it was compiled for.
-      optimizer: The episode's optimiser.
+      episode: Function (state, mask) of an episode, such as `partial(task.episode, optimizer)`.
+      optimizer: The episodes' optimiser.
     """
 
     def evaluate(population: jax.Array, key: jax.Array) -> Outcome:

@@ -54,7 +54,7 @@ def find_seed(
 
     Args:
       scene: The scene.
-      evaluate: See `make_evaluate`.
+      evaluate: Function (population, key) -> outcomes, such as `Task.evaluate`.
       optimizer: Optimiser whose space is sampled.
       key: Root key of the run.
       batch: Candidates simulated at once.
@@ -112,7 +112,7 @@ def final_test(
 
     Args:
       scene: The scene.
-      evaluate: See `make_evaluate`; called until there are at least `num_trials` more trials, so
+      evaluate: As of `find_seed`; called until there are at least `num_trials` more trials, so
         that a multiple of its own number of trials gives exactly that many.
       particles: Particles [SI units], shape (particle, parameter).
       key: Root key of the run.

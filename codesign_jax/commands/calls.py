@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress, TimeRemainingColumn
 
 from codesign_jax import archives, batch, codesign
+from codesign_jax.codesign import Task
 from codesign_jax.engines import Engine
 from codesign_jax.runs import outcomes, rates
 from codesign_jax.runs.progress import Ticker, duration
@@ -64,27 +65,18 @@ def equal(designs: int, most: int) -> int:
 
 
 def in_turn(
-    trials: Trials,
-    engine: Engine,
-    designs: np.ndarray,
-    size: int,
-    *,
-    devices: int | None = 1,
-    evaluate: codesign.EvaluateFunction | None = None,
+    task: Task, key: jax.Array, designs: np.ndarray, size: int, *, devices: int | None = 1
 ) -> Iterator[Outcome]:
     """Outcomes of designs, some at a time in their order, of shape (design, trial).
 
     Args:
-      trials: What every design meets.
-      engine: The engine of that name.
+      task: What they are simulated in.
+      key: Key of the trials, which all of them meet.
       designs: Designs [SI units], shape (design, parameter).
       size: Designs of a call; the last call is filled up.
       devices: Devices that take turns; None for all.
-      evaluate: What `codesign.make_evaluate` returned for the same.
     """
     places, running = batch.take(devices), deque()
-    if evaluate is None:
-        evaluate = codesign.make_evaluate(trials.scene, engine, trials.space, trials.count)
 
     def arrived() -> Outcome:
         count, found = running.popleft()
@@ -95,8 +87,8 @@ def in_turn(
             yield arrived()
         part = designs[start : start + size]
         rows = np.minimum(np.arange(size), len(part) - 1)
-        given = jax.device_put((jnp.asarray(part[rows], jnp.float32), trials.key), place)
-        running.append((len(part), evaluate(*given)))
+        given = jax.device_put((jnp.asarray(part[rows], jnp.float32), key), place)
+        running.append((len(part), task.evaluate(*given)))
     while running:
         yield arrived()
 
@@ -204,9 +196,8 @@ class Calls:
         self._kept = joined(kept) if kept else None
         self.found = sum(len(outcome.cost) for outcome in kept)
         self._next, self._seconds = 0, []
-        evaluate = codesign.make_evaluate(trials.scene, engine, trials.space, trials.count)
-        self._how = {"size": size, "devices": devices, "evaluate": evaluate}
-        self._engine = engine
+        self._task = Task(trials.scene, trials.space, trials.count, engine)
+        self._devices = devices
 
     def __call__(self, designs: np.ndarray, meter: Meter) -> Outcome:
         """Outcomes of designs [SI units], arrays of shape (design, trial)."""
@@ -216,7 +207,8 @@ class Calls:
             meter.found(done * count)
             parts.append(jax.tree.map(lambda v: v[first : first + done], self._kept))
         start = time.perf_counter()
-        for outcome in in_turn(self._trials, self._engine, designs[done:], **self._how):
+        left = self._trials.key, designs[done:], self._size
+        for outcome in in_turn(self._task, *left, devices=self._devices):
             self._part.append(outcome._asdict())
             self._seconds.append(time.perf_counter() - start)
             parts.append(outcome)

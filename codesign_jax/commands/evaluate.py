@@ -116,11 +116,11 @@ def _evaluate(
     case: Case, engine: engines.Engine, options: "Evaluate", console: Console
 ) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
-    evaluate = codesign.make_evaluate(case.scene, engine, case.space, options.trials)
+    task = codesign.Task(case.scene, case.space, options.trials, engine)
     population = jnp.asarray(case.design, jnp.float32)[None]
     work = rates.batch_work(case.scene, case.engine, options.trials, devices=1)
     with Busy(console, f"simulating {options.trials} grasps", rates.seconds(work)):
-        found = interruptible(evaluate, population, jax.random.key(options.seed))
+        found = interruptible(task.evaluate, population, jax.random.key(options.seed))
     outcomes = jax.tree.map(np.asarray, found)
     one = jax.tree.map(lambda v: v[0], outcomes)
     names = [shape.name for shape in case.scene.objects.object]

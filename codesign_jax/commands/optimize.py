@@ -155,7 +155,7 @@ def _tell(
 def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
     """Keeps what was measured, for estimates."""
     timing = found.timing
-    if timing.grasps and timing.compile_seconds and plan.cost is None:
+    if timing.grasps and timing.compile_seconds and plan.task.cost is None:
         work = rates.work(plan.scene, plan.settings, runs=timing.runs, devices=devices)
         rates.record(work, timing.grasps / timing.seconds, timing.compile_seconds)
 
@@ -219,7 +219,7 @@ def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
     assert result.record is not None
     history, particles = result.record.history, np.asarray(result.record.state.particles)
     converged = codesign.convergence_episode(history.cost.mean(1))
-    if plan.cost is not None:
+    if plan.task.cost is not None:
         console.print(
             f"lowest mean cost of an episode, by {plan.settings.cost}: "
             f"{history.cost.mean(1).min():.4g}",

@@ -143,11 +143,9 @@ def _case(folder: Path, settings: Settings, trials: int) -> tuple[Case, str]:
 
 def _simulate(case: Case, settings: Settings, trials: int) -> Outcome:
     """Outcomes of the design in fresh trials, shape (trial,)."""
-    evaluate = codesign.make_evaluate(
-        case.scene, make_engine(case.engine, case.scene), case.space, trials
-    )
+    task = codesign.Task(case.scene, case.space, trials, make_engine(case.engine, case.scene))
     population = jnp.asarray(case.design, jnp.float32)[None]
-    found = interruptible(evaluate, population, _noise(settings))
+    found = interruptible(task.evaluate, population, _noise(settings))
     return jax.tree.map(lambda v: np.asarray(v)[0], found)
 
 

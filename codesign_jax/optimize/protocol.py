@@ -65,7 +65,7 @@ class Info(NamedTuple):
 
 
 class Optimizer(Protocol):
-    """What ``codesign.make_episode`` and ``make_run`` take; also one of your own.
+    """What ``Task.episode`` and ``Task.run`` take; also one of your own.
 
     It is an argument of jitted programs and so has to be a pytree, such as a dataclass registered
     with ``jax.tree_util.register_dataclass``: arrays as leaves, everything else static.

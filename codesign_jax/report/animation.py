@@ -71,7 +71,7 @@ def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _simulate(scene: Scene, engine: Engine, worlds: Params, trials: Trial) -> tuple:
-    return rollout.simulate(scene, engine, worlds, trials, trajectory=True)
+    return rollout.simulate(scene, engine, worlds, trials, record_qpos=True)
 
 
 def frames(

@@ -17,10 +17,9 @@ import numpy as np
 
 from codesign_jax import codesign, own, types
 from codesign_jax.batch import Request
-from codesign_jax.codesign import EpisodeInfo, FinalTest
-from codesign_jax.engines import Engine, make_engine
+from codesign_jax.codesign import EpisodeInfo, FinalTest, Task
+from codesign_jax.engines import make_engine
 from codesign_jax.optimize import NoSeed, Optimizer, State, translated
-from codesign_jax.rollout import CostFunction
 from codesign_jax.runs import failures, reading, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints, Restored
@@ -62,15 +61,21 @@ def _numbers(array: Any) -> Any:
 class Plan(NamedTuple):
     """A run that was checked and can start; see `prepare`."""
 
-    scene: Scene
+    task: Task
     settings: Settings
-    engine: Engine
-    space: DesignSpace
     optimizer: Optimizer
     mask: np.ndarray
     key: jax.Array
-    cost: CostFunction | None = None
-    trajectory: bool | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self.task.scene
+
+    @property
+    def space(self) -> DesignSpace:
+        """The design space."""
+        return self.task.space
 
 
 class RunResult(NamedTuple):
@@ -101,10 +106,12 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
     engine = make_engine(settings.engine, scene)
     n = settings.particles
     optimizer = codesign.make_optimizer(settings.optimizer, space, num_particles=n)
-    mine = settings.cost != SCENE_COST
-    cost, trajectory = own.make_cost(settings.cost, scene) if mine else (None, None)
-    key = jax.random.key(settings.seed)
-    return Plan(scene, settings, engine, space, optimizer, mask, key, cost, trajectory)
+    task, key = Task(scene, space, settings.trials, engine), jax.random.key(settings.seed)
+    if settings.cost != SCENE_COST:
+        cost, stops = own.make_cost(settings.cost, scene)
+        how = {"record_qpos": not stops, "stop_when_lost": stops}
+        task = dataclasses.replace(task, cost=cost, **how)
+    return Plan(task, settings, optimizer, mask, key)
 
 
 def variant(plan: Plan, settings: Settings) -> Plan:
@@ -227,7 +234,7 @@ class Loop:
         """Finds the seed particle and saves it as step 0."""
         plan, settings = self.plan, self.plan.settings
         # A cost of one's own has a scale of its own: the first candidate is poor enough.
-        limit = codesign.SEED_COST if plan.cost is None else -np.inf
+        limit = codesign.SEED_COST if plan.task.cost is None else -np.inf
         how = {"batch": settings.particles, "threshold": limit}
         search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, **how)
         with self.progress.busy("looking for a poor seed") as watch:

@@ -146,16 +146,9 @@ def _group(
                 voice.message(note)
             loops[folder] = Loop(own, run, store, voice, every=every)
         interrupts = stack.enter_context(Interrupts(progress.message))
-        simulator = _batch(plan, devices, chunk)
+        limit = LIMIT if chunk is None else chunk
+        simulator = Batch(plan.task, plan.optimizer, devices=devices, limit=limit)
         return _Together(plan, loops, progress, interrupts, simulator).run()
-
-
-def _batch(plan: Plan, devices: int | None, chunk: int | None) -> Batch:
-    """What simulates the runs' episodes."""
-    how = plan.scene, plan.engine, plan.space, plan.optimizer, plan.settings.trials
-    most = LIMIT if chunk is None else chunk
-    judged = {"trajectory": plan.trajectory, "cost": plan.cost}
-    return Batch(*how, devices=devices, limit=most, **judged)
 
 
 class _Together:
@@ -212,7 +205,7 @@ class _Together:
         request = next(iter(self.waiting.values()))[1]
         with self.progress.busy("compiling") as watch:
             self.interrupts.call(self.batch.compile, request, len(self.waiting))
-        count, engine = len(self.batch.devices), self.plan.engine.name
+        count, engine = len(self.batch.devices), self.plan.task.engine.name
         where = f", {count} devices" if count > 1 else ""
         message = f"compiled in {watch.seconds:.1f} s (engine {engine}{where})"
         self.progress.message(message)

@@ -55,8 +55,8 @@ class Simulation:
         scene = setting.scene()
         space = parameters.design_space(scene.hand)
         self.optimizer = codesign.make_filter(space)
-        how = scene, setting.make(scene), space, self.optimizer, TRIALS
-        self.batch = Batch(*how, devices=1, limit=limit)
+        task = codesign.Task(scene, space, TRIALS, setting.make(scene))
+        self.batch = Batch(task, self.optimizer, devices=1, limit=limit)
 
 
 def keys(runs: int, seed: int) -> list[jax.Array]:

@@ -61,7 +61,7 @@ def postures(
 
     def simulate(chosen: jax.Array, trials: Trial) -> tuple[jax.Array, ...]:
         params = jax.vmap(space.params)(chosen)
-        outcome, trace = rollout.simulate(scene, engine, params, trials, trajectory=True)
+        outcome, trace = rollout.simulate(scene, engine, params, trials, record_qpos=True)
         bend = trace.qpos[:, step][:, bends].sum(-1).mean(-1)
         kept = (outcome.cost == 0) & ~failed(outcome.status)
         x, y = trace.qpos[:, : step + 1, -3], trace.qpos[:, : step + 1, -2]

@@ -57,12 +57,11 @@ def _simulate(overrides: dict[str, Any], key: int = 0, **scene_of: Any) -> Any:
     import jax
 
     from codesign_jax import codesign, scene
-    from codesign_jax.engines import make_engine
     from codesign_jax.scene.parameters import design_space
 
     world = scene.load("paper_spheres", overrides=overrides, **scene_of)
     space = design_space(world.hand, "2d")
-    evaluate = codesign.make_evaluate(world, make_engine("structured", world), space, 1)
+    evaluate = codesign.Task(world, space, 1).evaluate
     designs = np.repeat(np.asarray(space.default(), np.float32)[None], 2, 0)
     return jax.tree.map(np.asarray, evaluate(designs, jax.random.key(key)))
 

@@ -20,27 +20,21 @@ def _evaluate() -> tuple[Any, Any, np.ndarray, Any]:
     import jax
 
     from codesign_jax import codesign, scene
-    from codesign_jax.engines import make_engine
+    from codesign_jax.programs import Program
     from codesign_jax.scene.parameters import design_space
 
     world = scene.load("paper_spheres", overrides={"discretization": {"links": 3}})
     space = design_space(world.hand, "2d")
-    program = codesign.make_evaluate(world, make_engine("structured", world), space, _TRIALS)
+    # The program itself, without its checks of the population.
+    program = Program(world, codesign.Task(world, space, _TRIALS)._evaluation)
     random = np.random.default_rng(0)
     low, high = np.asarray(space.low), np.asarray(space.high)
     designs = (low + (high - low) * random.random((_DESIGNS, len(low)))).astype(np.float32)
 
     def run(designs: np.ndarray) -> Any:
-        return jax.tree.map(np.asarray, _unchecked(program)(designs, jax.random.key(0)))
+        return jax.tree.map(np.asarray, program(designs, jax.random.key(0)))
 
     return run, space, designs, run(designs)
-
-
-def _unchecked(evaluate: Any) -> Any:
-    """The program inside `make_evaluate`, without its checks of the population."""
-    cells = dict(zip(evaluate.__code__.co_freevars, evaluate.__closure__, strict=True))
-    program = cells["program"].cell_contents
-    return lambda designs, key: program(designs, key, None)
 
 
 def planted(bench: Bench, number: int) -> Result:

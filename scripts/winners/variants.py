@@ -9,12 +9,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from codesign_jax import archives
+from codesign_jax import archives, codesign
 from codesign_jax import scene as scenes
 from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.commands import calls
-from codesign_jax.commands.calls import Trials
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import Scene, keypaths, parameters
 from scripts.winners import files
@@ -164,10 +163,10 @@ class Task:
         designs = self.finals.chosen(self.variant.best)
         flat = designs.reshape(-1, designs.shape[-1])
         size = calls.equal(len(flat), max(1, limit // self.trials))
-        stream = STREAM_WINNERS, self.block
-        trials = Trials(scene, self.variant.engine, space, self.trials, 0, stream)
         engine = make_engine(self.variant.engine, scene)
-        found = calls.joined([*calls.in_turn(trials, engine, flat, size)])
+        task = codesign.Task(scene, space, self.trials, engine)
+        key = codesign.stream_key(jax.random.key(0), STREAM_WINNERS, self.block)
+        found = calls.joined([*calls.in_turn(task, key, flat, size)])
         shape = (*designs.shape[:2], self.trials)
         return {
             f"{self.key}|cost": found.cost.reshape(shape).astype(np.float16),

@@ -209,7 +209,7 @@ def release(engine, step, precision):
     with floats(precision == "float64" and engine == "structured"):
         chosen = make_engine(engine, base)
         batch = (small.stack(*params), small.stack(*trials))
-        run = jax.jit(lambda p, t: rollout.simulate(base, chosen, p, t, trajectory=True))
+        run = jax.jit(lambda p, t: rollout.simulate(base, chosen, p, t, record_qpos=True))
         result, trace = jax.tree.map(np.asarray, run(*batch))
     held = (result.cost == 0) & ~failed(result.status)
     last = trace.qpos[:, -1]

@@ -331,7 +331,36 @@ class Replay(Shown):
         return replay.main(self)
 
 
-COMMANDS = Optimize | Evaluate | Landscape | Sample | Report | Replay | Render | Export | Scenes
+@dataclasses.dataclass
+class Finger(flags.Subject):
+    """Predict one finger's bending and forces over pressure, and compare it with measurements.
+
+    A file of measurements is a CSV whose head names columns and their units: pressure_kPa, and one
+    or more of angle_deg, tip_force_N, blocked_force_N, and deflection_mm beside load_N
+    (docs/measurements.md).
+    """
+
+    measured: Annotated[
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CSV]", help_behavior_hint="")
+    ] = None
+    """The measurements; default: a curve up to the design's pressure."""
+    finger: int = 0
+    """Which finger of the hand."""
+    fit: Flag = False
+    """Fit the shear modulus, and where forces were measured the moment per pressure, too."""
+    out: File = None
+    """Write what is printed, measured and predicted, as a table (.csv)."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        from codesign_jax.commands import finger
+
+        return finger.main(self)
+
+
+COMMANDS = (
+    Optimize | Evaluate | Landscape | Sample | Report | Replay | Render | Export | Finger | Scenes
+)
 """The commands, in the order of the help text."""
 
 

@@ -18,7 +18,7 @@ import yaml
 from toy import TINY
 
 from codesign_jax import cli
-from codesign_jax.commands import evaluate, export, landscape, render, replay, report
+from codesign_jax.commands import evaluate, export, finger, landscape, render, replay, report
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "scripts/README.md")]
@@ -54,9 +54,10 @@ def test_the_pages_have_examples():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A working directory with the files that the examples name: a run and a set of objects."""
+    """A working directory with the files that the examples name."""
     place = tmp_path_factory.mktemp("examples")
     shutil.copy(TINY.parent / "box.toml", place / "my_objects.toml")
+    (place / "measured.csv").write_text("pressure_kPa,angle_deg\n20,18.9\n40,37.2\n")
     tiny_run.copied(place / "runs" / "demo")
     return place
 
@@ -85,6 +86,8 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
             monkeypatch.setattr(evaluate, name, lambda *rest: reached.append(rest) or kept)
     elif arguments[0] == "export":
         monkeypatch.setattr(export, "_write", lambda *rest: reached.append(rest))
+    elif arguments[0] == "finger":
+        monkeypatch.setattr(finger, "_compare", lambda *rest: reached.append(rest))
     elif arguments[0] == "report":
         monkeypatch.setattr(report, "_best_grasp", lambda *rest: reached.append(rest))
     elif arguments[0] == "landscape":

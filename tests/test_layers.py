@@ -24,7 +24,7 @@ start
 rollout
 own
 programs
-codesign fit sampling
+codesign finger fit sampling
 batch
 runs
 report

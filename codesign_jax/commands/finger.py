@@ -1,0 +1,173 @@
+"""`codesign finger`."""
+
+import csv
+import io
+import math
+from itertools import chain
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from codesign_jax import files
+from codesign_jax import finger as fingers
+from codesign_jax.commands import common
+from codesign_jax.commands.case import find_case
+from codesign_jax.finger import Finger, Fit
+from codesign_jax.scene import schema
+from codesign_jax.scene.schema import SceneError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Finger as Options
+
+SHOWN = {
+    "pressure": ("kPa", 1e3),
+    "angle": ("deg", math.pi / 180),
+    "tip_force": ("N", 1.0),
+    "blocked_force": ("N", 1.0),
+    "load": ("N", 1.0),
+    "deflection": ("mm", 1e-3),
+}
+"""Units of what is printed, and how many SI units they are."""
+
+POINTS = 11
+"""Pressures of a curve without measurements."""
+
+
+def main(options: "Options") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      SceneError: If something is wrong with the input, or the finger has no rest.
+    """
+    case = find_case(options)
+    params = case.space.params(np.asarray(case.design))
+    problems = []
+    number = schema.range_problem("--finger", options.finger, "", 0, case.scene.num_fingers - 1)
+    problems += [number] if number else []
+    if options.fit and options.measured is None:
+        problems.append("--fit needs measurements: give a file, codesign finger FILE.csv --fit")
+    if options.out and options.out.suffix != ".csv":
+        problems.append(f"--out {options.out} must end in .csv")
+    if problems:
+        raise SceneError(problems)
+    if options.out:
+        common.check_place("--out", options.out)
+    measured = options.measured and fingers.read(options.measured)
+    mine = fingers.of_design(case.scene, params, options.finger)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(_about(mine, options.finger, case.scene.hand.name), markup=False)
+    if not options.run_folder:
+        given = [*chain.from_iterable(options.design)]
+        if note := common.by_default(case.space, given):
+            console.print(note, markup=False)
+    table = measured
+    if table is None:
+        top = float(np.asarray(params.pressure)[options.finger])
+        table = {"pressure": np.linspace(0.0, top, POINTS)}
+        table |= {n: np.zeros(POINTS) for n in ("angle", "tip_force", "blocked_force")}
+    try:
+        _compare(mine, table, options, console)
+    except ValueError as error:
+        raise SceneError([str(error)]) from error
+    return 0
+
+
+def _about(mine: Finger, number: int, hand: str) -> str:
+    law = "neo-Hookean" if mine.neo_hookean else "linear"
+    size = f"{1e3 * mine.length:.4g} mm long, section {1e3 * mine.width:.4g} x "
+    size += f"{1e3 * mine.height:.4g} mm, walls {1e3 * mine.wall:.4g} mm"
+    return (
+        f"finger {number} of {hand}: {size}; bending law {law}, G = "
+        f"{1e-3 * mine.shear_modulus:.4g} kPa, {mine.links} links, without weight"
+    )
+
+
+def _compare(
+    mine: Finger, table: dict[str, np.ndarray], options: "Options", console: Console
+) -> None:
+    """Prints and writes what was measured, predicted and fitted."""
+    models = {"model": mine}
+    fit: Fit | None = None
+    if options.fit:
+        fit = fingers.fit(mine, table)
+        models["fitted"] = mine.of_material(fit.shear_modulus, fit.gain)
+    found = {which: fingers.predict(model, table) for which, model in models.items()}
+    columns = _columns(table, found, measured=options.measured is not None)
+    shown = Table(box=box.SIMPLE)
+    for name in columns:
+        shown.add_column(name.replace("_", " "), justify="right")
+    for row in zip(*columns.values(), strict=True):
+        shown.add_row(*("" if math.isnan(v) else f"{v:.4g}" for v in row))
+    console.print(shown)
+    if options.measured:
+        for which, values in found.items():
+            console.print(f"{which}: {_errors(table, values)}", markup=False)
+    if fit:
+        for line in _of_fit(fit, table):
+            console.print(line, markup=False)
+    if options.out:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(
+            [[*columns], *([_number(v) for v in r] for r in zip(*columns.values(), strict=True))]
+        )
+        with files.atomically(options.out) as temporary:
+            temporary.write_text(text.getvalue(), encoding="utf-8")
+        console.print(f"table: {options.out}", markup=False)
+
+
+def _number(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.9g}"
+
+
+def _columns(
+    table: dict[str, np.ndarray], found: dict[str, dict[str, np.ndarray]], *, measured: bool
+) -> dict[str, np.ndarray]:
+    """Columns to print, by name and unit; measured and predicted ones beside each other."""
+    columns = {}
+    for name, (unit, size) in SHOWN.items():
+        if name in ("pressure", "load"):
+            if name in table:
+                columns[f"{name}_{unit}"] = table[name] / size
+        elif name in table:
+            if measured:
+                columns[f"{name}_{unit}"] = table[name] / size
+            for which, values in found.items():
+                columns[f"{which}_{name}_{unit}"] = values[name] / size
+    return columns
+
+
+def _errors(table: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> str:
+    """Root mean squares of the errors, in units and relative to what was measured."""
+    parts = []
+    for name, model in values.items():
+        unit, size = SHOWN[name]
+        error, whole = (math.sqrt(np.nanmean(v**2)) for v in (model - table[name], table[name]))
+        share = f" ({100 * error / whole:.3g} %)" if whole else ""
+        parts.append(f"{name} errs by {error / size:.3g} {unit}{share}")
+    return ", ".join(parts) + ", root mean square"
+
+
+def _of_fit(fit: Fit, table: dict[str, np.ndarray]) -> list[str]:
+    """What was fitted, and what to set."""
+    modulus, gain = fingers.fitted(table)
+    lines = []
+    if modulus:
+        lines.append(
+            f"fitted: G = {1e-3 * fit.shear_modulus:.4g} kPa, standard error "
+            f"{100 * fit.spread[0]:.2g} %: --set "
+            f"hand.material.shear_modulus={fit.shear_modulus:.4g}"
+        )
+    if gain:
+        lines.append(
+            f"fitted: moment {fit.gain:.4g} of the model's at the same pressure, standard error "
+            f"{100 * fit.spread[1]:.2g} %: multiply the pressures that you command by it"
+        )
+    elif modulus:
+        lines.append(
+            "the moment is the model's: angles alone give its ratio to G; a column tip_force or "
+            "blocked_force tells them apart"
+        )
+    return lines

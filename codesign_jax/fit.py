@@ -87,7 +87,8 @@ def tip_positions(scene: Scene, fields: ModelFields, qpos: jax.Array) -> jax.Arr
     world = jax.tree.map(lambda v: v[None], fields)
     hand = world_constants(scene, world)
     # Times stand in for worlds: all of them see the same hand.
-    state = reset(scene, world._replace(start=qpos))
+    still = jnp.zeros((len(qpos), world.dof_damping.shape[-1]), qpos.dtype)
+    state = reset(scene, world._replace(start=jnp.concatenate([qpos, still], 1)))
     kin = kinematics(Stages(), hand, layout(scene).axes, state)
     half = jnp.zeros_like(kin.origin[:, -1]).at[0].set(0.5 * hand.offset[-1])
     tip = kin.origin[:, -1] + apply_columns(kin.link[:, :, -1], half) + state.position

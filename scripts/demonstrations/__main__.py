@@ -38,7 +38,8 @@ def main() -> None:
         results[name] = STUDIES[name](scene.load("paper"), **more)
         results[name]["provenance"] = provenance.measurement(options.commit)
         output.write_json(options.json, results)
-    draw(results, options.figure)
+    if set(STUDIES) <= set(results):
+        draw(results, options.figure)
 
 
 def draw(results: dict[str, Any], path: Path) -> None:

@@ -34,7 +34,7 @@ cli
 """
 ORDER = {name: level for level, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 TOPS = ("codesign_jax", "scripts")
-STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "winners"}
+STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "search", "winners"}
 # Studies of results: they take up what these left.
 BUILD_ON = {name: {"experiments"} for name in ("accuracy", "calibration", "winners")}
 BUILD_ON["front_page"] = {"accuracy", "experiments"}  # it quotes what they found

@@ -27,7 +27,7 @@ class Optimize:
     """Co-design morphology and control of a hand.
 
     The same command again resumes the run in its folder, and more --episodes extend it.  Sizes that
-    are not given are the paper's.
+    are not given depend on the optimiser: those of all but the default are the paper's.
     """
 
     preset: str = "2d"
@@ -48,23 +48,25 @@ class Optimize:
     first: Literal["morphology", "control", "alternate"] = "morphology"
     """Domain of the first episode with single and switch-K; alternate: morphology for even seeds,
     control for odd ones, as in the paper's experiments."""
-    optimizer: str = "particle-filter"
-    """Optimiser: particle-filter (the paper's), cma-es, pso or random, all on one budget of grasps
-    (what differs: docs/command_line.md); or MODULE:CLASS, one of your own."""
+    optimizer: Text = None
+    """Optimiser: screened-cma-es, the default of a new run, particle-filter (the paper's), cma-es,
+    pso or random (docs/command_line.md); or MODULE:CLASS, one of your own. A run goes on with
+    its own."""
     cost: Text = None
     """MODULE:FUNCTION, a cost of your own instead of the scene's: a number from scene, trace and
     controls of a grasp (docs/command_line.md)."""
     engine: Text = None
     """Engine that simulates: structured (ours, the default), mujoco (C, float64) or mjx (stock)."""
     particles: Count = None
-    """Particles; the paper's 10 in 2d, 60 otherwise."""
+    """Particles; default: 12 in 2d, 24 otherwise; the paper's are 10 and 60."""
     trials: Count = None
-    """Trials of a particle in an episode, best a multiple of the objects; the paper's 6."""
+    """Trials of a particle in an episode, best a multiple of the objects; default: one with each
+    object; the paper's are 6."""
     episodes: Count = None
-    """Episodes; the paper's 64 in 2d, 128 otherwise."""
+    """Episodes; default: 24 in 2d, 29 otherwise; the paper's are 64 and 128."""
     test_trials: Count = None
-    """Further trials that test each final particle, in whole rounds of --trials; the paper's 36 in
-    2d, 72 otherwise; 0: none."""
+    """Further trials that test each final particle, in whole rounds of --trials; default: 12; the
+    paper's are 36 in 2d, 72 otherwise; 0: none."""
     reference_trials: Count = None
     """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine
     structured; 0: none."""

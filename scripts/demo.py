@@ -1,9 +1,8 @@
-"""A 2D co-design from a poor seed to a design that grasps, with figure, animation and pictures.
+"""A co-design of all 23 parameters, from random designs to one that grasps, with pictures.
 
-`make demo` runs it: two to three minutes on two cores.  It is `codesign optimize` and `codesign
+`make demo` runs it: a minute or two on two cores.  It is `codesign optimize` and `codesign
 evaluate` with the arguments below; further arguments go to the former, such as --fresh or --seed 1.
-The sizes are the paper's but for a shorter final test, and the scene has its skinned hull and
-contact between fingers.  Not every seed succeeds, see README.md.
+The scene has its skinned hull and contact between fingers.
 """
 
 import csv
@@ -13,24 +12,12 @@ from pathlib import Path
 from codesign_jax import cli
 
 FOLDER = Path("runs") / "demo"
-SIZES = [
-    "--particles",
-    "10",
-    "--trials",
-    "6",
-    "--episodes",
-    "64",
-    "--test-trials",
-    "18",
-    "--reference-trials",
-    "0",
-]
 
 
 def main() -> int:
     """Runs the demo and returns the exit status: 0 only if a final particle passed its test."""
-    run = ["optimize", "--scene", "paper", "--preset", "2d", *SIZES, "--seed", "3"]
-    run += ["--out", str(FOLDER)]
+    run = ["optimize", "--scene", "paper", "--preset", "23d", "--seed", "3"]
+    run += ["--reference-trials", "0", "--out", str(FOLDER)]
     status = cli.main([*run, *sys.argv[1:]])
     if status:
         return status

@@ -17,6 +17,7 @@ EPISODES = 14  # enough that a signal after the third finds the run on its way
 
 RUN = [
     *("optimize", "--scene", str(TINY), "--seed", "3", "--engine", "mujoco"),
+    *("--optimizer", "particle-filter"),
     *("--particles", "4", "--trials", "2", "--episodes", str(EPISODES), "--test-trials", "4"),
 ]
 

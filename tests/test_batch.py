@@ -19,6 +19,7 @@ from codesign_jax.runs.record import to_arrays
 
 RUN = [
     *("optimize", "--scene", str(TINY), "--particles", "10", "--trials", "2", "--episodes", "2"),
+    *("--optimizer", "particle-filter"),
     *("--test-trials", "2", "--reference-trials", "0"),
 ]
 

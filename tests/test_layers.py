@@ -35,7 +35,7 @@ cli
 ORDER = {name: level for level, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 TOPS = ("codesign_jax", "scripts")
 ENGINE = "codesign_jax.engines.structured"
-STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "winners"}
+STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "search", "winners"}
 # Studies of results: they take up what these left.
 BUILD_ON = {
     name: {"experiments"} for name in ("accuracy", "calibration", "demonstrations", "winners")

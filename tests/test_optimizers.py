@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from toy import tiny
 
 from codesign_jax import codesign, optimize
@@ -15,10 +16,12 @@ from codesign_jax.optimize import (
     NAMES,
     Evolution,
     ParticleFilter,
+    ScreenedCMA,
     Space,
     evolution,
     make_optimizer,
     names,
+    screened,
     strictly_below,
 )
 from codesign_jax.runs import record as records
@@ -127,6 +130,50 @@ def test_populations_are_those_of_evosax_called_directly(name):
         state, _ = own.tell(*told, state, params)
 
 
+def test_the_default_screens_then_averages_the_means_of_evosax():
+    """Random designs, the best of them again, evosax's CMA-ES from there; particle 0 averages."""
+    from evosax import algorithms
+
+    made = ScreenedCMA(SPACE)
+    state, populations, infos = run(made, start(made), OPEN[:5])
+    free = np.arange(WIDTH) != LIMITED
+    drawn = ((populations[:3] - LOW) / (HIGH - LOW)).reshape(-1, WIDTH)
+    assert stats.kstest(drawn[:, free].ravel(), "uniform").pvalue > 0.01
+    costs = np.array([info.cost for info in infos])
+    best, kept = drawn[costs[:3].argmin()], np.sort(costs[:3], axis=None)[:PARTICLES]
+    np.testing.assert_allclose(costs[3:], [kept, kept], rtol=1e-6)  # sorted: no noise here
+    own = algorithms.CMA_ES(PARTICLES - 1, jnp.zeros(WIDTH))
+    params = own.default_params.replace(std_init=jnp.float32(0.2))
+    keys = [
+        jax.random.fold_in(jax.random.fold_in(jax.random.key(0), stream), 5)
+        for stream in (screened.STREAM_MOVE, screened.STREAM_TELL)
+    ]
+    begun = own.init(jax.random.key(1), best, params)
+    asked, strategy = own.ask(keys[0], begun, params)
+    near = partial(np.testing.assert_allclose, rtol=0, atol=1e-5)  # float32
+    average = best
+    for t in range(1, 4):
+        state, [population], [info] = run(made, state, OPEN[:1])
+        unit = (population - LOW) / (HIGH - LOW)
+        near(unit[0, free], 1 - np.abs(1 - average[free] % 2))  # mirrors at 0 and 1
+        mean = np.asarray(state.memory["strategy"]["mean"])
+        if t == 1:  # later ones draw along eigenvectors, whose sign hangs on the last bit
+            near(unit[1:, free], 1 - np.abs(1 - np.asarray(asked)[:, free] % 2))
+            near(mean, own.tell(keys[1], asked, info.cost[1:], strategy, params)[0].mean)
+        average = average + 4 / (t + 3) * (mean - average)
+
+
+def test_the_particles_of_the_default_are_what_was_simulated_as_particle_0():
+    """The averages newest first, before the best random designs: those that the run can show."""
+    made = ScreenedCMA(SPACE)
+    state, populations, infos = run(made, start(made), OPEN[:7])
+    np.testing.assert_array_equal(state.particles[:2], populations[[6, 5], 0])
+    random = populations[:3].reshape(-1, WIDTH)
+    order = np.argsort([info.cost for info in infos[:3]], axis=None)
+    np.testing.assert_array_equal(state.particles[2:], random[order[: PARTICLES - 2]])
+    assert infos[-1].ancestors[0] == 0 and (infos[-1].ancestors[1:] == -1).all()
+
+
 def test_an_optimiser_of_the_package_needs_no_evosax(monkeypatch):
     """A second own one is built by its entry, without evosax; NAMES keeps the two kinds apart."""
     monkeypatch.setattr(names, "OWN", {**names.OWN, "wide": lambda s: ParticleFilter(s, sigma=0.5)})
@@ -135,7 +182,7 @@ def test_an_optimiser_of_the_package_needs_no_evosax(monkeypatch):
     made = make_optimizer("wide", SPACE)
     assert isinstance(made, ParticleFilter) and made.sigma == 0.5
     assert names.problem("wide") is None
-    assert set(NAMES) - set(EVOSAX) == {"particle-filter"}
+    assert set(NAMES) - set(EVOSAX) == {"particle-filter", "screened-cma-es"}
 
 
 def test_bounds_and_constraint_hold(optimizer):
@@ -250,7 +297,7 @@ def test_a_whole_run_is_its_episodes_with_one_compile(name):
 
 
 def test_unknown_names_and_wrong_numbers_are_answered_in_words():
-    with pytest.raises(ValueError, match=r"'cma_es'; did you mean 'cma-es'\? Valid: particle-fil"):
+    with pytest.raises(ValueError, match=r"'cma_es'; did you mean 'cma-es'\? Valid: screened-cma"):
         make_optimizer("cma_es", SPACE)
     with pytest.raises(ValueError, match="at least 2"):
         make_optimizer("cma-es", SPACE).init(jax.random.key(0), SEED, 1)
@@ -265,6 +312,6 @@ def test_a_missing_extra_is_one_line_with_the_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "evosax", None)  # as if it were not installed
     with pytest.raises(ModuleNotFoundError) as error:
         make_optimizer("pso", SPACE)
-    assert str(error.value) == "pso needs evosax: pip install 'codesign-jax[baselines]'"
+    assert str(error.value) == "pso needs evosax: pip install evosax"
     assert optimize.problem("pso") == str(error.value)  # what the command says
     assert make_optimizer("particle-filter", SPACE).space is SPACE

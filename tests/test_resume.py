@@ -300,6 +300,25 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
     assert_same_run(grown, long)
 
 
+def test_the_default_search_goes_on_and_a_run_keeps_its_optimiser(finished, tmp_path, capsys):
+    run = without([*RUN], "--optimizer")
+    long, grown = tmp_path / "long", tmp_path / "grown"
+    assert command(*run, "--episodes", "8", "--out", long) == 0
+    assert "seed" not in capsys.readouterr().out, "it looks for its start by itself"
+    for episodes in ("2", "4", "6", "8"):  # within the random designs, and after them
+        assert command(*run, "--episodes", episodes, "--out", grown) == 0
+    assert_same_run(grown, long)
+    assert runs.read_run(grown)[1].optimizer == "screened-cma-es"
+    # The design that was found was simulated in an episode, whose grasp can be shown.
+    scene, record = runs.read_run(grown)[0], choice.read_record(grown)
+    chosen, grasp = choice.choose(scene, record), choice.find_grasp(scene, record)
+    np.testing.assert_array_equal(grasp.design, chosen.design)
+    copy = shutil.copytree(finished, tmp_path / "filter")
+    assert command(*run, "--out", copy) == 0
+    assert f"all {EPISODES} episodes are done" in capsys.readouterr().out
+    assert runs.read_run(copy)[1].optimizer == "particle-filter"
+
+
 def test_a_schedule_that_divides_its_episodes_cannot_be_extended(tmp_path, capsys):
     switching = [*RUN, "--schedule", "switch-1", "--out", tmp_path / "run", "--test-trials", "0"]
     assert command(*switching, "--episodes", "2") == 0

@@ -314,7 +314,7 @@ def test_a_hostile_provenance_is_refused_in_words(case, run):
     ):
         runs.read_run(run)
     with pytest.raises(SceneError, match="is damaged"):
-        runs.episodes_of([run])
+        runs.setting_of([run], "episodes")
 
 
 def test_a_name_that_is_too_long_for_a_run_is_refused():

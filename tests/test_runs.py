@@ -18,7 +18,7 @@ import pytest
 from rich.console import Console
 from toy import tiny
 
-from codesign_jax import codesign, files, scene
+from codesign_jax import codesign, files, optimize, scene
 from codesign_jax.runs import columns, rates, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
@@ -117,15 +117,22 @@ def test_text_survives_the_scene_file(tmp_path):
 
 
 def test_sizes_default_to_the_papers():
-    def sizes(preset):
-        s = settings_module.make_settings(preset, "concurrent", "control", "mujoco", 0)
+    def sizes(preset, optimizer="particle-filter", objects=3):
+        s = settings_module.make_settings(
+            preset, "concurrent", "control", "mujoco", 0, optimizer=optimizer, objects=objects
+        )
         return s.particles, s.trials, s.episodes, s.test_trials
 
     assert sizes("2d") == (10, 6, 64, 36)
     assert sizes("23d") == (60, 6, 128, 72)
     # Figure 7's budget, per run: 64 episodes of 60 grasps and 36 more tests of 10 particles.
-    two = settings_module.make_settings("2d", "concurrent", "control", "mujoco", 0)
+    two = settings_module.make_settings(
+        "2d", "concurrent", "control", "mujoco", 0, optimizer="particle-filter"
+    )
     assert two.grasps == 64 * 60 + 360
+    # The default optimiser's: each of its trials is one with another object.
+    assert sizes("23d", optimize.DEFAULT) == (24, 3, 29, 12)
+    assert sizes("full", optimize.DEFAULT, objects=8) == (24, 8, 29, 12)
 
 
 def test_settings_report_every_problem():

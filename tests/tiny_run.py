@@ -12,6 +12,7 @@ from codesign_jax import cli
 
 RUN = [
     *("optimize", "--scene", str(TINY), "--seed", "3", "--engine", "mujoco"),
+    *("--optimizer", "particle-filter"),
     *("--particles", "4", "--trials", "3", "--episodes", "3", "--test-trials", "4"),
 ]
 

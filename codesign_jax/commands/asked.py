@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import jax
 
-from codesign_jax import engines, optimize, runs
+from codesign_jax import engines, optimize, own, runs
 from codesign_jax.commands import common, jobs, seeds
 from codesign_jax.runs import Settings
 from codesign_jax.scene import Scene, schema
@@ -39,6 +39,12 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     except SceneError as error:
         problems += error.problems
     schedules = options.schedule.split(",")
+    optimizer = options.optimizer or optimize.DEFAULT
+    if scene is not None and options.optimizer is None and not options.fresh:
+        try:
+            optimizer = _of_the_runs(options, scene) or optimizer
+        except SceneError as error:
+            problems += error.problems
     settings = runs.make_settings(
         options.preset,
         schedules[0],
@@ -49,8 +55,9 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         trials=options.trials,
         episodes=options.episodes,
         test_trials=options.test_trials,
-        optimizer=options.optimizer,
+        optimizer=optimizer,
         cost=options.cost or runs.SCENE_COST,
+        objects=len(scene.objects.object) if scene else 1,
     )
     if scene is not None and options.episodes is None and not options.fresh:
         try:
@@ -96,6 +103,21 @@ def _flag_problems(options: "Optimize") -> list[str]:
     return problems
 
 
+def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:
+    """The optimiser of the runs that are there: a run goes on with its own.
+
+    One of somebody's own is not among them: only a command line has code imported.
+
+    Raises:
+      SceneError: If the runs differ in it.
+    """
+    named = {"optimizer": optimize.DEFAULT, "cost": options.cost or runs.SCENE_COST}
+    usual = runs.make_settings(options.preset, "", "", "", 0, **named)
+    folders = runs_of(options, scene, usual)
+    found = runs.setting_of(folders, "optimizer")
+    return None if found is None or own.is_own(found) else found
+
+
 def _as_the_runs(options: "Optimize", scene: Scene, settings: Settings) -> Settings:
     """Settings with the episodes of the runs that are there: these may have been extended.
 
@@ -103,7 +125,8 @@ def _as_the_runs(options: "Optimize", scene: Scene, settings: Settings) -> Setti
       SceneError: If the runs differ in them.
     """
     folders = runs_of(options, scene, settings)
-    return dataclasses.replace(settings, episodes=runs.episodes_of(folders) or settings.episodes)
+    episodes = runs.setting_of(folders, "episodes") or settings.episodes
+    return dataclasses.replace(settings, episodes=episodes)
 
 
 def several(options: "Optimize") -> bool:

@@ -50,7 +50,7 @@ def main(options: "Optimize") -> int:
     notes = [*_preflight(scene, settings, options.dry_run), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
-        _dry_run(scene, settings, len(every), options)
+        _dry_run(plan, len(every), options)
         return 0
     if options.jobs is not None:
         return _jobs(options, scene, every)
@@ -188,14 +188,16 @@ def _preflight(scene: Scene, settings: Settings, details: bool) -> list[str]:
     return common.preflight_notes(scene, space, designs, details=details)
 
 
-def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") -> None:
+def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     """Prints scene, settings, grasps and what this many runs will take; see `runs.rates`."""
+    scene, settings = plan.scene, plan.settings
     for name, text in scene_texts(scene).items():
         print(f"# ---- {name}\n{text}")
     print(f"# ---- settings\n{settings}\n")
     space = design_space(scene.hand, settings.preset)
     batch = settings.particles * settings.trials
-    print(f"grasps: {settings.grasps} and at least {batch} to find the seed")
+    seed = batch if runs.needs_poor_seed(plan) else 0
+    print(f"grasps: {settings.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
     if settings.test_trials % settings.trials:
         tested = settings.test_rounds * settings.trials
         print(f"final test: {tested} trials of each particle, in whole rounds of {settings.trials}")
@@ -207,7 +209,7 @@ def _dry_run(scene: Scene, settings: Settings, count: int, options: "Optimize") 
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     together = 1 if options.jobs else count
     work = rates.work(scene, settings, runs=together, devices=options.devices)
-    parts = [Part("", work, count * (settings.grasps + batch))]
+    parts = [Part("", work, count * (settings.grasps + seed))]
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
         parts.append(reference.part(scene, settings, trials, count))

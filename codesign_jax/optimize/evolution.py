@@ -79,7 +79,7 @@ class Evolution:
         try:
             import evosax  # noqa: F401
         except ModuleNotFoundError as error:
-            message = f"{self.name} needs evosax: pip install 'codesign-jax[baselines]'"
+            message = f"{self.name} needs evosax: pip install evosax"
             raise ModuleNotFoundError(message, name=error.name) from error
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
@@ -97,7 +97,7 @@ class Evolution:
         memory = {
             "mask": jnp.ones(seed.shape, bool),
             "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
-            "strategy": _arrays(self._start(state)),
+            "strategy": arrays(self._start(state)),
         }
         return state._replace(memory=memory)
 
@@ -135,7 +135,7 @@ class Evolution:
         memory = {
             "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
             "cost": costs[best],
-            "strategy": _arrays(new),
+            "strategy": arrays(new),
         }
         particles = jnp.concatenate([population, state.particles])[best]
         ancestors = jnp.where(best < cost.shape[0], best, -1).astype(jnp.int32)
@@ -148,7 +148,7 @@ class Evolution:
         strategy, start = self._strategy(state), self._start(state)
         same = jnp.all(mask == state.memory["mask"])
         kept = jax.tree.map(
-            lambda old, new: jnp.where(same, old, new), state.memory["strategy"], _arrays(start)
+            lambda old, new: jnp.where(same, old, new), state.memory["strategy"], arrays(start)
         )
         key = episode_key(state, STREAM_ASK)
         return strategy.algorithm.ask(key, start.replace(**kept), strategy.params)
@@ -165,17 +165,19 @@ class Evolution:
         # Nothing of it is evaluated yet. Among equal fitness the first is the swarm's best.
         return algorithm.init(key, swarm, jnp.full(len(swarm), jnp.inf, best.dtype), params)
 
-    def _strategy(self, state: State) -> "_Strategy":
-        return _build(self.name, *state.particles.shape, self.sigma, str(state.particles.dtype))
+    def _strategy(self, state: State) -> "Strategy":
+        return build(self.name, *state.particles.shape, self.sigma, str(state.particles.dtype))
 
 
-class _Strategy(NamedTuple):
+class Strategy(NamedTuple):
+    """A strategy of evosax: its functions and its numbers."""
+
     algorithm: Any
     params: Any
 
 
 @functools.lru_cache(maxsize=32)
-def _build(name: str, particles: int, width: int, sigma: float, dtype: str) -> _Strategy:
+def build(name: str, particles: int, width: int, sigma: float, dtype: str) -> Strategy:
     """A strategy; one for each size, as JAX tells them apart by identity."""
     from evosax.algorithms import CMA_ES, PSO, RandomSearch
 
@@ -190,10 +192,10 @@ def _build(name: str, particles: int, width: int, sigma: float, dtype: str) -> _
         params = algorithm.default_params
         if name == "cma-es":
             params = params.replace(std_init=jnp.asarray(sigma, dtype))
-        return _Strategy(algorithm, params)
+        return Strategy(algorithm, params)
 
 
-def _arrays(state: Any) -> dict[str, jax.Array]:
+def arrays(state: Any) -> dict[str, jax.Array]:
     """A strategy's state as arrays by name; their types do not depend on where they come from."""
     fields = {f.name: jnp.asarray(getattr(state, f.name)) for f in dataclasses.fields(state)}
     return {name: jax.lax.convert_element_type(v, v.dtype) for name, v in fields.items()}

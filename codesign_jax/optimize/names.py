@@ -4,15 +4,19 @@ import difflib
 import importlib.util
 from collections.abc import Callable, Mapping
 
+from codesign_jax.optimize import screened
 from codesign_jax.optimize.bounds import Space
 from codesign_jax.optimize.evolution import EVOSAX, LEAST, Evolution
 from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Optimizer
+from codesign_jax.optimize.screened import ScreenedCMA
 
-DEFAULT = "particle-filter"
-"""The paper's optimiser, which a run has if it names no other."""
+DEFAULT = "screened-cma-es"
+"""The optimiser of a run that names no other."""
+PAPER = "particle-filter"
+"""The paper's optimiser."""
 
-OWN: Mapping[str, Callable[[Space], Optimizer]] = {DEFAULT: ParticleFilter}
+OWN: Mapping[str, Callable[[Space], Optimizer]] = {DEFAULT: ScreenedCMA, PAPER: ParticleFilter}
 """The optimisers that this package implements itself, by name: what makes each over a space."""
 
 NAMES = (*OWN, *EVOSAX)
@@ -46,9 +50,9 @@ def problem(name: str, num_particles: int | None = None) -> str | None:
         near = difflib.get_close_matches(name, NAMES, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         return f"unknown optimizer {name!r}; {hint}Valid: {', '.join(NAMES)}"
-    if name in EVOSAX and importlib.util.find_spec("evosax") is None:
-        return f"{name} needs evosax: pip install 'codesign-jax[baselines]'"
-    least = LEAST.get(name, 1)
+    if name in (DEFAULT, *EVOSAX) and importlib.util.find_spec("evosax") is None:
+        return f"{name} needs evosax: pip install evosax"
+    least = screened.LEAST if name == DEFAULT else LEAST.get(name, 1)
     if num_particles is not None and num_particles < least:
         return f"{name} ranks its particles: it needs at least {least}, got {num_particles}"
     return None

@@ -86,6 +86,9 @@ class Optimizer(Protocol):
         """
         ...
 
+    # An attribute `screens` that is True says that the optimiser finds its start by itself: a run
+    # then simulates nothing before its first episode, and the seed particle is any random one.
+
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0.
 

@@ -8,9 +8,9 @@ The numerical modules know nothing of files; this package knows nothing of physi
 (10, 6, 64, 4200)
 """
 
-from codesign_jax.runs.directory import check_folder, episodes_of
+from codesign_jax.runs.directory import check_folder, setting_of
 from codesign_jax.runs.errors import AllFailed, RunError
-from codesign_jax.runs.loop import Plan, RunResult, prepare, variant
+from codesign_jax.runs.loop import Plan, RunResult, needs_poor_seed, prepare, variant
 from codesign_jax.runs.reading import load_record, read_run
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import SCENE_COST, Settings, check, make_settings
@@ -31,14 +31,15 @@ __all__ = [
     "check",
     "check_folder",
     "describe",
-    "episodes_of",
     "failure_counts",
     "load_record",
     "make_settings",
     "names",
+    "needs_poor_seed",
     "optimize",
     "prepare",
     "read_run",
+    "setting_of",
     "status_names",
     "variant",
     "warning_counts",

@@ -139,22 +139,26 @@ def check_folder(
             raise SceneError([reading.lost_all(path)])
 
 
-def episodes_of(paths: Iterable[Path]) -> int | None:
-    """Episodes that the runs in folders are to have; None if no folder has a run.
+def setting_of(paths: Iterable[Path], name: str) -> Any:
+    """A setting of the runs in folders, such as their episodes; None if no folder has a run.
+
+    Args:
+      paths: The folders.
+      name: Name of the setting.
 
     Raises:
-      SceneError: If they are to have different numbers, or a run cannot be read.
+      SceneError: If the runs differ in it, or one cannot be read.
     """
     found = [path for path in paths if (path / PROVENANCE).exists()]
-    numbers = {path: manifest.read_provenance(path)["settings"]["episodes"] for path in found}
-    if len(set(numbers.values())) > 1:
-        least, most = (f(numbers, key=lambda path: numbers[path]) for f in (min, max))
-        problem = (
-            f"{least} has {numbers[least]} episodes and {most} {numbers[most]}: say by --episodes "
-            "how many all are to have"
-        )
+    values = {path: manifest.read_provenance(path)["settings"][name] for path in found}
+    if len(set(values.values())) > 1:
+        least, most = (f(values, key=lambda path: values[path]) for f in (min, max))
+        one = values[least]
+        told = f"{one} {name}" if isinstance(one, int) else f"{name} {one}"
+        problem = f"{least} has {told} and {most} {values[most]}: say by --{name} what all "
+        problem += "are to have"
         raise SceneError([problem])
-    return next(iter(numbers.values()), None)
+    return next(iter(values.values()), None)
 
 
 @contextlib.contextmanager

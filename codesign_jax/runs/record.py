@@ -90,7 +90,8 @@ class Record:
       state: State of the optimiser.
       history: Reports of the episodes.
       test: Outcomes of the final test, shape (particle, trial), or None before it.
-      start: What the run started from; None if an older version of codesign-jax began it.
+      start: What the run started from; None if an older version of codesign-jax began it,
+        or if its optimiser looks for its start by itself.
     """
 
     state: State

@@ -78,6 +78,7 @@ class Surrogate:
         units = jnp.asarray((designs - self.low) / self.range, jnp.float32)
         adam = optax.adam(RATE)
         state, values, seconds = adam.init(units), [], 0.0
+        jax.block_until_ready(self.slopes(units))  # compiled before it is timed
         for _ in range(STEPS):
             ((_, each), slope), used = windows.timed(self.slopes, units)
             seconds += used
@@ -128,17 +129,16 @@ def run(scene: Scene, runs: int = 30, episodes: int = 12) -> dict[str, Any]:
     found: dict[str, Any] = {"check": check(scene, surrogate)}
     second = study.per_episode / found["check"]["episode_seconds"]  # simulations of a second
     moved, values, seconds = surrogate.descend(study.data["seeds"][:runs])
-    engine, space = make_engine("structured", scene), surrogate.space
-    optimizer = codesign.make_filter(space)
-    episode = codesign.make_episode(scene, engine, space, optimizer, TRIALS)
-    many = jax.jit(jax.vmap(episode, (0, None)))
+    space = surrogate.space
+    task, optimizer = codesign.Task(scene, space, TRIALS), codesign.make_filter(space)
+    many = jax.jit(jax.vmap(lambda state: task.episode(optimizer, state)))
     keys = jax.vmap(jax.random.key)(np.arange(runs))
     state = jax.vmap(lambda key, start: optimizer.init(key, start, PARTICLES))(
         keys, jnp.asarray(moved)
     )
     means = []
     for k in range(episodes):
-        state, info = many(state, np.ones(space.num_parameters, bool))
+        state, info = many(state)
         means.append(np.asarray(info.selection.mean_cost).tolist())
         print(f"episode {k + 1}: median of the mean costs {np.median(means[-1]):.3f}", flush=True)
     ends = [codesign.convergence_episode(m) for m in np.transpose(means)]

@@ -1,0 +1,195 @@
+"""Random designs first, then CMA-ES from the best, and the average of its means as the answer.
+
+Grasps are noisy: a design that loses none of three objects may lose one in ten.  So no single
+particle is believed.  CMA-ES recombines the better half of a population, and its mean moves where
+particles keep their objects on the whole; the average of these means over the episodes, recent ones
+weighing more, has less noise still, and no trial chose it.  Each average is simulated as particle 0
+of the next episode, and the final test takes the last ones.
+
+Sources: Hansen (2016), "The CMA evolution strategy: a tutorial", arXiv:1604.00772, by evosax;
+Shamir and Zhang (2013), "Stochastic gradient descent for non-smooth optimization",
+arXiv:1212.1824, section 4 (polynomial-decay averaging).  docs/notes/search.md has what each part is
+worth.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from codesign_jax.optimize.bounds import Space, reflect
+from codesign_jax.optimize.evolution import Strategy, arrays, build
+from codesign_jax.optimize.protocol import (
+    Info,
+    State,
+    check_start,
+    check_told,
+    episode_key,
+    summarize,
+)
+from codesign_jax.optimize.resampling import MAX_PARTICLES
+
+# Four ASCII letters each, as the particle filter's.
+STREAM_SCREEN = 0x72616E64
+"""Stream of the random designs ("rand")."""
+STREAM_MOVE = 0x636D6173
+"""Stream of the strategy's draws in ``ask`` ("cmas")."""
+STREAM_TELL = 0x636D6174
+"""Stream of its draws in ``tell`` ("cmat")."""
+LEAST = 3
+"""Fewest particles: the average, and two for the strategy to rank."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class ScreenedCMA:
+    """CMA-ES from the best of random designs; its answer is an average of means.
+
+    The first episodes simulate random designs, uniform in the parameters that the schedule opens,
+    and the next ones the best of these again, in other trials: a start in the wrong place costs
+    more than they do.  Later ones simulate the average so far, as particle 0, and draws of the
+    strategy.  The state's particles are the averages of the last episodes, newest first, and before
+    there are enough of them the best random designs behind these.  When a schedule opens other
+    parameters, strategy and average start anew at particle 0.
+
+    Attributes:
+        keeps_best: True: the final test counts new trials only; see ``Optimizer.keeps_best``.
+        screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
+        space: Bounds and constraint of the parameters.
+        screening: Episodes of random designs.
+        retests: Episodes that simulate the best of them again.
+        sigma: First standard deviation of CMA-ES as a fraction of the parameter range.
+        recency: After ``t`` episodes of the strategy its mean has weight ``recency / (t + recency
+            - 1)`` in the average: 1 is the plain average, more forgets the first means sooner.
+    """
+
+    keeps_best = True
+    screens = True
+
+    space: Space
+    screening: int = dataclasses.field(default=3, metadata={"static": True})
+    retests: int = dataclasses.field(default=2, metadata={"static": True})
+    sigma: float = dataclasses.field(default=0.2, metadata={"static": True})
+    recency: float = dataclasses.field(default=4.0, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        """Check the static fields.
+
+        Raises:
+            ValueError: If one of them is out of its range.
+        """
+        if not (min(self.screening, self.retests + 1, self.recency) >= 1 and self.sigma > 0):
+            raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma > 0: {self}")
+
+    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
+        """The state before episode 0; see ``Optimizer.init``.
+
+        The seed particle gives the parameters that a schedule closes from the start.
+
+        Raises:
+            TypeError: If ``key`` is not a typed key.
+            ValueError: If the shape of the seed particle or the number of particles is wrong.
+        """
+        seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
+        if num_particles < LEAST:
+            raise ValueError(f"{num_particles=}: screened-cma-es needs at least {LEAST}")
+        state = State(jnp.tile(seed, (num_particles, 1)), jnp.zeros((), jnp.int32), key)
+        memory = {
+            "mask": jnp.ones(seed.shape, bool),
+            "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
+        }
+        return state._replace(memory=memory | self._start(state))
+
+    def ask(self, state: State, mask: ArrayLike) -> jax.Array:
+        """Particles to evaluate; see ``Optimizer.ask``.
+
+        The constraint of the space may change a closed parameter, as with the particle filter.
+        """
+        key, shape = episode_key(state, STREAM_SCREEN), state.particles.shape
+        drawn = jax.random.uniform(key, shape, state.particles.dtype)
+        unit = jnp.where(self._screens(state), drawn, self._asked(state, mask)[0])
+        kept = jnp.where(jnp.any(mask), state.particles[:1], state.particles)
+        population = jnp.where(mask, self._design(unit), kept).astype(state.particles.dtype)
+        again = (state.episode >= self.screening) & self._screens(state)
+        return self.space.constrain(jnp.where(again, state.particles, population))
+
+    def tell(
+        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[State, Info]:
+        """The next state and the episode's report; see ``Optimizer.tell``.
+
+        Raises:
+            ValueError: If shapes do not match.
+        """
+        assert state.memory is not None
+        cost = check_told(state, population, cost)
+        ranked, screens = jnp.where(jnp.isfinite(cost), cost, jnp.inf), self._screens(state)
+        # Screening keeps the best so far, best first; newer ones win among equal costs.  Simulated
+        # again, a design has the mean of its costs, and what it was before does not count.
+        tests = jnp.maximum(state.episode - self.screening + 1, 0)
+        known = state.memory["cost"]
+        ranked = jnp.where((tests > 0) & screens, known + (ranked - known) / (tests + 1), ranked)
+        costs = jnp.concatenate([ranked, jnp.where(tests > 0, jnp.inf, known)])
+        best = jnp.argsort(costs)[: len(cost)]
+        screened = jnp.concatenate([population, state.particles])[best]
+        # Later the average that was simulated comes before the earlier ones.
+        averages = jnp.concatenate([population[:1], state.particles[:-1]])
+        unit, asked, memory = self._asked(state, mask)
+        # CMA-ES knows ranks only; rows are a fair draw among equal costs, see `Evolution.tell`.
+        ranks = jnp.argsort(jnp.argsort(ranked[1:])).astype(unit.dtype)
+        algorithm, params = self._strategy(state)
+        key = episode_key(state, STREAM_TELL)
+        new, _ = algorithm.tell(key, unit[1:], ranks, asked, params)
+        weight = self.recency / (memory["averaged"] + self.recency)
+        average = memory["average"] + weight * (new.mean - memory["average"])
+        now = {"average": average, "averaged": memory["averaged"] + 1, "strategy": arrays(new)}
+        following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
+            "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
+            "cost": jnp.where(screens, costs[best], state.memory["cost"]),
+        }
+        last = jnp.minimum(jnp.arange(len(cost)), 1)
+        copied = jnp.where(screens, jnp.where(best < len(cost), best, -1), -last)
+        particles = jnp.where(screens, screened, averages)
+        next_state = State(particles, state.episode + 1, state.key, following)
+        return next_state, summarize(cost, jnp.ones_like(cost), copied.astype(jnp.int32))
+
+    def _screens(self, state: State) -> jax.Array:
+        """Whether the episode is one of random designs, drawn or simulated again."""
+        return state.episode < self.screening + self.retests
+
+    def _asked(self, state: State, mask: ArrayLike) -> tuple[jax.Array, Any, dict[str, Any]]:
+        """The average and the strategy's points, its state with them, and what was remembered."""
+        assert state.memory is not None
+        begun = jnp.all(mask == state.memory["mask"]) & (
+            state.episode > self.screening + self.retests
+        )
+        first = self._start(state)
+        memory = jax.tree.map(
+            partial(jnp.where, begun), {name: state.memory[name] for name in first}, first
+        )
+        algorithm, params = self._strategy(state)
+        strategy = algorithm.init(state.key, memory["average"], params).replace(
+            **memory["strategy"]
+        )
+        points, strategy = algorithm.ask(episode_key(state, STREAM_MOVE), strategy, params)
+        return jnp.concatenate([memory["average"][None], points]), strategy, memory
+
+    def _start(self, state: State) -> dict[str, Any]:
+        """Average and strategy as they start, at particle 0."""
+        algorithm, params = self._strategy(state)
+        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        unit = (state.particles[0] - low) / jnp.where(high > low, high - low, 1)
+        strategy = arrays(algorithm.init(state.key, unit, params))
+        return {"average": unit, "averaged": jnp.zeros((), jnp.int32), "strategy": strategy}
+
+    def _design(self, unit: jax.Array) -> jax.Array:
+        """Designs at unit coordinates, mirrored at the bounds."""
+        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        return reflect(low + unit * (high - low), low, high)
+
+    def _strategy(self, state: State) -> Strategy:
+        n, width = state.particles.shape
+        return build("cma-es", n - 1, width, self.sigma, str(state.particles.dtype))

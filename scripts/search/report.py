@@ -1,0 +1,91 @@
+"""The table and the figure of docs/notes/search.md, from the files that `scripts.search` wrote."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign_jax.report.statistics import wilson
+from codesign_jax.report.verdicts import RELIABLE
+from scripts.shared import figures, tables
+
+PAGE, FIGURE = Path("docs/notes/search.md"), Path("docs/figures/search.png")
+
+
+def reached(row: dict[str, Any], share: float) -> str:
+    """Grasps after which this share of the seeds keeps `RELIABLE`, and stays there."""
+    good = np.array([np.mean(np.array(kept) >= RELIABLE) for kept in row["kept"]])
+    below = np.flatnonzero(good < share)
+    first = 0 if below.size == 0 else int(below[-1]) + 1
+    return f"{row['grasps'][first]:,}" if first < len(good) else "not reached"
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """A row for each optimiser: what its recommended designs keep at its last mark."""
+    head = [
+        "optimiser",
+        "preset",
+        "seeds",
+        "grasps of a seed",
+        "median kept",
+        "5 % of the seeds below",
+    ]
+    head += ["share of seeds that keep 95 % (95 % interval)", "grasps until 90 % of the seeds do"]
+    found = [head]
+    for row in rows:
+        kept = np.array(row["kept"][-1])
+        good = int((kept >= RELIABLE).sum())
+        share = wilson(good, kept.size)
+        found.append(
+            [
+                f"`{row['optimizer']}`",
+                row["preset"],
+                str(kept.size),
+                f"{row['grasps'][-1]:,}",
+                f"{np.median(kept):.3f}",
+                f"{np.quantile(kept, 0.05):.3f}",
+                f"{good / kept.size:.2f} ({share.low:.2f} to {share.high:.2f})",
+                reached(row, 0.9),
+            ]
+        )
+    return tables.markdown(found)
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> Path:
+    """Kept share of the recommended design against grasps: medians and 25 to 75 % of the seeds."""
+    presets = sorted({row["preset"] for row in rows})
+    figure = figures.new(4.6 * len(presets), 3.4)
+    for place, preset in enumerate(presets):
+        axes = figure.add_subplot(1, len(presets), place + 1)
+        for row in (r for r in rows if r["preset"] == preset):
+            low, middle, high = np.quantile(np.array(row["kept"]), [0.25, 0.5, 0.75], axis=1)
+            (line,) = axes.plot(row["grasps"], middle, ".-", label=row["optimizer"])
+            axes.fill_between(row["grasps"], low, high, alpha=0.15, color=line.get_color(), lw=0)
+        axes.axhline(RELIABLE, color="0.6", lw=0.8)
+        axes.set(xscale="log", xlabel="grasps of a seed, all counted", title=preset, ylim=(0, 1.01))
+        axes.set_ylabel("share of fresh grasps kept")
+        axes.legend(fontsize=7, loc="lower right")
+    return figures.save(figure, path)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the command and returns the exit status."""
+    parser = argparse.ArgumentParser(prog="scripts.search.report", description=__doc__)
+    parser.add_argument("folder", type=Path, help="what `scripts.search --out` wrote")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--figure", type=Path, default=FIGURE)
+    args = parser.parse_args(arguments)
+    rows = [json.loads(path.read_text()) for path in sorted(args.folder.glob("*.json"))]
+    if not rows:
+        print(f"error: {args.folder} has no results of scripts.search", file=sys.stderr)
+        return 2
+    tables.fill(args.page, table(rows), "search")
+    print(args.page, draw(rows, args.figure))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,250 @@
+"""One optimiser over many seeds at once, and how its recommended designs do on fresh trials.
+
+At every mark the optimiser's best particles meet fresh trials, the same number of them whatever the
+optimiser, and the one that costs least in these is what it recommends there.  These trials count as
+the search's; those by which the recommended design is judged do not.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import codesign, optimize, rollout, runs
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.cost import particle_cost
+from codesign_jax.engines import Engine
+from codesign_jax.optimize import Optimizer, State
+from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
+from codesign_jax.types import Outcome, failed
+from scripts.shared.output import write_arrays
+
+CANDIDATES, ROUNDS = 24, 12
+"""Particles that are tested at a mark, and trials of each."""
+STREAM_JUDGE = 0x6A756467
+"""Stream of the trials that judge a recommended design ("judg")."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """An optimiser with its sizes, by a name such as `screened-cma-es:sigma=0.25,particles=12`.
+
+    Attributes:
+      name: The name.
+      optimizer: The optimiser.
+      particles: Its particles.
+      trials: Trials of each in an episode.
+    """
+
+    name: str
+    optimizer: Optimizer
+    particles: int
+    trials: int
+
+    @property
+    def worlds(self) -> int:
+        """Grasps of an episode of a seed."""
+        return self.particles * self.trials
+
+
+def make_case(name: str, space: DesignSpace, preset: str) -> Case:
+    """A case by its name; what the name does not change has the command's defaults.
+
+    Args:
+      name: Name of an optimiser, and after a colon its fields, `particles` or `trials`.
+      space: The design space.
+      preset: Its name.
+    """
+    kind, _, changes = name.partition(":")
+    given = dict(pair.split("=") for pair in changes.split(",") if pair)
+    sizes = {n: int(given.pop(n)) for n in ("particles", "trials") if n in given}
+    usual = runs.make_settings(
+        preset, "concurrent", "morphology", "structured", 0, optimizer=kind, **sizes
+    )
+    made: Any = codesign.make_optimizer(kind, space)
+    own = {n: type(getattr(made, n))(float(v)) for n, v in given.items()}
+    return Case(name, dataclasses.replace(made, **own), usual.particles, usual.trials)
+
+
+class Study:
+    """The episodes of one case over many seeds, from a file and back to it."""
+
+    def __init__(
+        self,
+        case: Case,
+        scene: Scene,
+        engine: Engine,
+        space: DesignSpace,
+        *,
+        seeds: int,
+        budget: int,
+        tests: int,
+        marks: int = 9,
+        chunk: int,
+        path: Path,
+    ):
+        """Reads what is done.
+
+        Args:
+          case: The case.
+          scene: The scene.
+          engine: The engine.
+          space: The design space.
+          seeds: Number of seeds.
+          budget: Grasps of a seed after which the search ends.
+          tests: Trials that judge a recommended design.
+          marks: Number of times at which one is recommended.
+          chunk: Most grasps of a call.
+          path: File of what is done.
+        """
+        self.case, self.scene, self.engine, self.space = case, scene, engine, space
+        self.tests, self.chunk, self.path = tests, chunk, path
+        self.keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+        self.mask = jnp.ones(space.num_parameters, bool)
+        self.simulate = jax.jit(self._simulate, static_argnums=2)
+        self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
+        self.tell = jax.jit(
+            jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
+        )
+        episodes = max(1, int((budget - self.before - self.tested) / case.worlds))
+        first = getattr(case.optimizer, "screening", 0) + getattr(case.optimizer, "retests", 0) + 1
+        self.marks = sorted(
+            {*np.geomspace(min(first, episodes), episodes, marks).round().astype(int)}
+        )
+        self.kept: dict[int, np.ndarray] = {}
+        self.designs: dict[int, np.ndarray] = {}
+        self.state, self.last = self._restore() if path.exists() else (self._start(), None)
+
+    @property
+    def before(self) -> int:
+        """Grasps that find a poor seed particle."""
+        return 0 if getattr(self.case.optimizer, "screens", False) else self.case.worlds
+
+    @property
+    def tested(self) -> int:
+        """Grasps by which a mark chooses."""
+        return min(CANDIDATES, self.case.particles) * ROUNDS
+
+    @property
+    def done(self) -> int:
+        """Finished episodes."""
+        return int(self.state.episode[0])
+
+    @property
+    def finished(self) -> bool:
+        """Whether every mark is judged."""
+        return len(self.kept) == len(self.marks)
+
+    def step(self) -> int:
+        """Simulates an episode, or judges the designs of a mark; returns its grasps."""
+        if self.done in self.marks and self.done not in self.kept:
+            grasps = self._mark()
+            self.save()
+            return grasps
+        population = self.ask(self.state)
+        outcome = self._all(
+            population, self._noise(codesign.STREAM_TRIAL, self.done), self.case.trials
+        )
+        cost = self._costs(outcome)
+        self.last = population, cost
+        self.state = self.tell(self.state, population, cost)
+        return cost.size * self.case.trials
+
+    def save(self) -> None:
+        """Writes what is done."""
+        arrays = {f"state{i}": leaf for i, leaf in enumerate(self._leaves())}
+        for name, values in (("kept", self.kept), ("designs", self.designs)):
+            arrays |= {f"{name}{mark}": value for mark, value in values.items()}
+        if self.last is not None:
+            arrays |= {"population": self.last[0], "cost": self.last[1]}
+        write_arrays(self.path, {n: np.asarray(v) for n, v in arrays.items()})
+
+    def row(self) -> dict[str, Any]:
+        """Grasps of a seed at each mark, all counted, and the share that its design keeps."""
+        found = sorted(self.kept)
+        return {
+            "optimizer": self.case.name,
+            "particles": self.case.particles,
+            "trials": self.case.trials,
+            "grasps": [int(self.before + e * self.case.worlds + self.tested) for e in found],
+            "kept": [np.round(self.kept[e], 4).tolist() for e in found],
+        }
+
+    def _start(self) -> State:
+        space, first = self.case.optimizer.space, np.arange(self.case.particles)
+        drawn = jax.jit(jax.vmap(lambda key: optimize.candidates(key, space, first)))(self.keys)
+        rows = jnp.zeros(len(self.keys), int)
+        if self.before:
+            noise = self._noise(codesign.STREAM_SCREEN, 0)
+            poor = self._costs(self._all(drawn, noise, self.case.trials)) > codesign.SEED_COST
+            if not np.asarray(poor.any(1)).all():
+                raise RuntimeError("a seed has no poor particle among its first candidates")
+            rows = poor.argmax(1)
+        init = jax.vmap(lambda k, x: self.case.optimizer.init(k, x, self.case.particles))
+        return jax.jit(init)(self.keys, drawn[jnp.arange(len(rows)), rows])
+
+    def _mark(self) -> int:
+        """Chooses by fresh trials what is recommended now, and judges it by others."""
+        assert self.last is not None
+        chosen = self.state.particles
+        if not self.case.optimizer.keeps_best:
+            best = jnp.argsort(self.last[1], axis=1)[..., None]
+            chosen = jnp.take_along_axis(self.last[0], best, 1)
+        chosen = chosen[:, :CANDIDATES]
+        tested = self._costs(
+            self._all(chosen, self._noise(codesign.STREAM_TEST, self.done), ROUNDS)
+        )
+        design = chosen[jnp.arange(len(chosen)), tested.argmin(1)][:, None]
+        outcome = self._all(design, self._noise(STREAM_JUDGE, 0), self.tests)
+        kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
+        self.kept[self.done] = kept[:, 0].mean(-1)
+        self.designs[self.done] = np.asarray(design[:, 0])
+        return tested.size * ROUNDS + kept.size
+
+    def _noise(self, stream: int, index: int) -> jax.Array:
+        return jax.vmap(lambda key: codesign.stream_key(key, stream, index))(self.keys)
+
+    def _costs(self, outcome: Outcome) -> jax.Array:
+        return jax.jit(lambda found: particle_cost(self.scene, found))(outcome)
+
+    def _all(self, populations: jax.Array, keys: jax.Array, trials: int) -> Outcome:
+        """Outcomes of shape (seed, particle, trial), simulated in calls of equal size."""
+        count, size = len(keys), max(1, self.chunk // (populations.shape[1] * trials))
+        size, parts = min(size, count), []
+        for start in range(0, count, size):
+            rows = jnp.minimum(jnp.arange(start, start + size), count - 1)
+            parts.append(self.simulate(populations[rows], keys[rows], trials))
+        return jax.tree.map(lambda *v: jnp.concatenate(v)[:count], *parts)
+
+    def _simulate(self, populations: jax.Array, keys: jax.Array, trials: int) -> Outcome:
+        def one(population: jax.Array, key: jax.Array) -> Outcome:
+            drawn = rollout.sample_trials(self.scene, key, trials)
+            hands = jax.vmap(self.space.params)(population)
+            return rollout.evaluate(self.scene, self.engine, hands, drawn)
+
+        return jax.vmap(one)(populations, keys)
+
+    def _leaves(self) -> list[jax.Array]:
+        state = self.state._replace(key=jax.vmap(jax.random.key_data)(self.state.key))
+        return jax.tree.leaves(state)
+
+    def _restore(self) -> tuple[State, Any]:
+        """What a file holds of the study; the arrays' order is that of a state."""
+        n, zeros = self.case.particles, jnp.zeros(self.mask.shape)
+        like = jax.eval_shape(jax.vmap(lambda k: self.case.optimizer.init(k, zeros, n)), self.keys)
+        with np.load(self.path) as stored:
+            shapes = jax.tree.leaves(like._replace(key=np.zeros(0)))
+            leaves = [jnp.asarray(stored[f"state{i}"]) for i in range(len(shapes))]
+            for name in stored:
+                for word, values in (("kept", self.kept), ("designs", self.designs)):
+                    if name.startswith(word):
+                        values[int(name.removeprefix(word))] = stored[name]
+            last = [jnp.asarray(stored[n]) for n in ("population", "cost") if n in stored]
+        state = jax.tree.unflatten(jax.tree.structure(like), leaves)
+        if state.particles.shape != like.particles.shape:
+            raise ValueError(f"{self.path} is of other seeds or sizes: choose another folder")
+        return state._replace(key=jax.vmap(jax.random.wrap_key_data)(state.key)), (*last,) or None

@@ -38,14 +38,15 @@ def main() -> None:
         results[name] = STUDIES[name](scene.load("paper"), **more)
         results[name]["provenance"] = provenance.measurement(options.commit)
         output.write_json(options.json, results)
-    if set(STUDIES) <= set(results):
+    if {"identify", "hold"} <= set(results):
         draw(results, options.figure)
 
 
 def draw(results: dict[str, Any], path: Path) -> None:
-    """A panel for each study."""
-    figure = figures.new(12, 3.4)
-    axes = figure.subplots(1, 3)
+    """A panel for each study that was run."""
+    count = len(results)
+    figure = figures.new(4 * count, 3.4)
+    axes = figure.subplots(1, count)
     found = results["identify"]["seeds"]
     largest = lambda errors: 100 * np.abs(errors).max()  # noqa: E731
     columns = {
@@ -62,6 +63,9 @@ def draw(results: dict[str, Any], path: Path) -> None:
     paths |= {k: v["slip"] for k, v in results["hold"]["methods"].items()}
     axes[1].boxplot([1e3 * np.array(v) for v in paths.values()], tick_labels=list(paths))
     axes[1].set(ylabel="path of the object in the palm [mm]", ylim=(0, None), title="held still")
+    if "seeds" not in results:
+        figures.save(figure, path)
+        return
     found = results["seeds"]
     counts = {"drawn": found["published"], "by shape": found["simulations"]}
     for k, values in enumerate(counts.values()):

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-
+from codesign_jax import types
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings
 from codesign_jax.runs.choice import Chosen
@@ -50,5 +49,5 @@ class Run(NamedTuple):
     def history(self) -> History:
         """Reports of the finished episodes."""
         h, done = self.record.history, self.record.done
-        trials = jax.tree.map(lambda v: v[:done], h.trials)
+        trials = types.Outcome(*(v[:done] for v in h.trials))
         return History(h.population[:done], trials, *(v[:done] for v in h[2:]))

@@ -62,7 +62,7 @@ def rollout(
         return trace, (fields, ctrl, path, trace.speed)
 
     def backward(saved: tuple, cotangent: Trace):
-        return adjoint(*saved, cotangent._replace(status=None, residual=None))
+        return adjoint(*saved, cotangent._replace(status=None))
 
     run.defvjp(forward, backward)
     return run(fields, ctrl)
@@ -122,7 +122,7 @@ def _adjoint(
       ctrl: Its controls.
       path: Its steps.
       speed: Its largest velocities, as in `Trace`.
-      cotangent: Cotangent of its trace, without status and residual.
+      cotangent: Cotangent of its trace, without the status.
     """
     scene = engine.scene
     program = AdjointProgram.here(scene, engine.limits, ctrl.dtype, len(ctrl))

@@ -1,7 +1,7 @@
 """Progress on the terminal: a live bar where there is one, plain lines where not.
 
-Where there is no terminal and nothing else is said, a line on the standard error says after a few
-seconds what goes on and for how long, and then ever less often.
+Where there is no terminal, a line on the standard error reports what goes on and for how long,
+whenever nothing else was printed for a few seconds.
 """
 
 import sys
@@ -23,14 +23,14 @@ def duration(seconds: float) -> str:
 class Ticker:
     """Says on the standard error what goes on, when nothing has been said for a while."""
 
-    FIRST, LAST = 5.0, 60.0
-    """Silence before the first line, and the longest one; each is twice the one before [s]."""
+    SILENCE = 5.0
+    """Time without a line after which one is printed [s]."""
 
     def __init__(self, *, disable: bool = False):
         """Starts nothing yet; with `disable` it never says anything."""
         self._disable, self._stop = disable, threading.Event()
         self._text, self._about = "", ""
-        self._since, self._spoken, self._gap = 0.0, 0.0, self.FIRST
+        self._since, self._spoken = 0.0, 0.0
 
     def __enter__(self) -> "Ticker":
         """Starts."""
@@ -54,13 +54,13 @@ class Ticker:
 
     def spoke(self) -> None:
         """Something was said by somebody else."""
-        self._spoken, self._gap = time.monotonic(), self.FIRST
+        self._spoken = time.monotonic()
 
     def tick(self) -> None:
         """Says what goes on if nothing has been said for so long."""
         now = time.monotonic()
-        if self._text and now - self._spoken >= self._gap:
-            self._spoken, self._gap = now, min(2 * self._gap, self.LAST)
+        if self._text and now - self._spoken >= self.SILENCE:
+            self._spoken = now
             words = f"{self._text}: {duration(now - self._since)}{self._about}"
             print(words, file=sys.stderr, flush=True)
 
@@ -214,7 +214,7 @@ class Progress:
         pace = self._pace(grasps, seconds, max(self._test - self._tested, 0) + self._after)
         line = f"final test {self._tested}/{self._test} grasps  {pace}"
         self._bar.update(self._task, description=line)
-        if not self.console.is_terminal and time.monotonic() - self._told >= Ticker.FIRST:
+        if not self.console.is_terminal and time.monotonic() - self._told >= Ticker.SILENCE:
             self._told = time.monotonic()
             self.message(line)
 

@@ -67,7 +67,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
         figures.save(figure, path)
         return
     found = results["seeds"]
-    counts = {"drawn": found["published"], "by shape": found["simulations"]}
+    counts = found["simulations"]
     for k, values in enumerate(counts.values()):
         axes[2].plot(k + np.linspace(-0.15, 0.15, len(values)), np.sort(values), ".")
     axes[2].set_xticks(range(len(counts)), counts)

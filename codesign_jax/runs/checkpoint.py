@@ -10,12 +10,13 @@ or another step of this one, is refused, and so is one that cannot be read for a
 pass: neither is damaged, and only what is damaged may be deleted.
 """
 
+import asyncio
+import contextlib
 import errno
 import functools
 import hashlib
 import logging
 import os
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -122,7 +123,8 @@ class Checkpoints:
         """
         labelled = arrays if self._run is None else arrays | {_LABEL: _label(self._run, step)}
         try:
-            saved = self._manager.save(step, args=self._args.StandardSave(labelled))
+            with _patient_loops():
+                saved = self._manager.save(step, args=self._args.StandardSave(labelled))
             if saved:
                 self._write_digests(step, labelled)
         except (OSError, ValueError) as error:  # the latter is how tensorstore says it
@@ -314,24 +316,45 @@ def _unsaved(place: Path, error: Exception) -> OSError:
 def _silence() -> None:
     """Keeps tracebacks of a failed save off the terminal: `Checkpoints.save` raises the error.
 
-    Orbax logs it from each of its threads, asyncio from each task that nobody asked how it ended,
-    and tensorstore finds the tasks' event loop closed. Some come long after the save, so that this
-    is for the rest of the process.
+    Orbax logs it from each of its threads, and asyncio from each task that nobody asked how it
+    ended.  Some come long after the save, so that this is for the rest of the process.
     """
-    unraisable, printed = sys.unraisablehook, sys.excepthook
-
-    def hook(event: Any) -> None:
-        if str(event.exc_value) != "Event loop is closed":
-            unraisable(event)
-
-    def print_hook(kind: Any, error: BaseException, trace: Any) -> None:
-        """Threads of newer tensorstores print an error as the main thread does."""
-        if str(error) != "Event loop is closed":
-            printed(kind, error, trace)
-
-    sys.unraisablehook, sys.excepthook = hook, print_hook
     for name in ("absl", "asyncio"):
         logging.getLogger(name).addFilter(_is_news)
+
+
+class _Loop(asyncio.SelectorEventLoop):
+    """An event loop that may be called when it is closed.
+
+    When a write fails, orbax closes its loop while tensorstore still writes other arrays.  Their
+    threads then call the loop, and print the traceback of its error past Python's hooks.
+    """
+
+    def call_soon_threadsafe(self, callback: Any, *args: Any, **options: Any) -> Any:
+        """Asks for a call of the function in the loop's thread; of a closed loop nobody asks."""
+        try:
+            return super().call_soon_threadsafe(callback, *args, **options)
+        except RuntimeError:
+            if not self.is_closed():
+                raise
+            return asyncio.Handle(callback, args, self)
+
+
+class _Loops(asyncio.DefaultEventLoopPolicy):
+    """Makes such loops."""
+
+    _loop_factory = _Loop
+
+
+@contextlib.contextmanager
+def _patient_loops() -> Iterator[None]:
+    """Event loops that orbax makes meanwhile may be called when they are closed."""
+    before = asyncio.get_event_loop_policy()
+    asyncio.set_event_loop_policy(_Loops())
+    try:
+        yield
+    finally:
+        asyncio.set_event_loop_policy(before)
 
 
 def _is_news(record: logging.LogRecord) -> bool:

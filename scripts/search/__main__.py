@@ -63,10 +63,10 @@ def main(arguments: list[str] | None = None) -> int:
         grasps, start = 0, time.monotonic()
         while not study.finished:
             if args.minutes is not None and time.monotonic() - begin > 60 * args.minutes:
-                study.save()
                 print(f"{name}: after {study.done} episodes; the same command goes on", flush=True)
                 return UNFINISHED
             grasps += study.step()
+            study.save()  # the next command goes on here, whatever ends this one
             rate = grasps / (time.monotonic() - start)
             print(
                 f"{name}: episode {study.done}/{study.marks[-1]}, {rate:.0f} grasps/s", flush=True

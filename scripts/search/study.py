@@ -142,9 +142,7 @@ class Study:
     def step(self) -> int:
         """Simulates an episode, or judges the designs of a mark; returns its grasps."""
         if self.done in self.marks and self.done not in self.kept:
-            grasps = self._mark()
-            self.save()
-            return grasps
+            return self._mark()
         population = self.ask(self.state)
         outcome = self._all(
             population, self._noise(codesign.STREAM_TRIAL, self.done), self.case.trials

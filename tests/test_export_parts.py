@@ -165,5 +165,5 @@ def test_command_refuses_in_words(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "manifold3d", None)
     assert cli.main(["export", *out]) == 2
     [line] = capsys.readouterr().err.splitlines()
-    assert "the parts need manifold3d: pip install 'codesign-jax[export]'" in line
+    assert "the parts need manifold3d: pip install '.[export]' in the checkout" in line
     assert not (tmp_path / "out").exists()

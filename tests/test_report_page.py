@@ -167,4 +167,4 @@ def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly", None)
     assert cli.main(["report", str(run)]) == 2
     [line] = capsys.readouterr().err.splitlines()
-    assert "plotly" in line and "pip install 'codesign-jax[report]'" in line
+    assert "plotly" in line and "pip install '.[report]' in the checkout" in line

@@ -310,4 +310,4 @@ def test_missing_extra_is_one_line(monkeypatch, capsys):
     for name in ("render", "replay"):
         assert cli.main([name, *DESIGN]) == 2
         [line] = capsys.readouterr().err.splitlines()
-        assert "PIL" in line and "pip install 'codesign-jax[viz]'" in line
+        assert "PIL" in line and "pip install '.[viz]' in the checkout" in line

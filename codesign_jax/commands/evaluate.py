@@ -153,7 +153,7 @@ def _render(case: Case, engine: engines.Engine, options: "Evaluate", console: Co
     try:
         from codesign_jax.report import animation
     except ImportError as error:
-        message = f"--render needs {error.name}: pip install 'codesign-jax[viz]'"
+        message = f"--render needs {error.name}: pip install '.[viz]' in the checkout"
         raise SceneError([message]) from error
     count = min(options.trials, len(case.scene.objects.object))
     trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)

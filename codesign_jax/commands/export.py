@@ -113,7 +113,7 @@ def _missing(options: "Export") -> list[str]:
         if absent and not unwanted[what]:
             found.append(
                 f"the {what} need{'s' * (what == 'sheet')} {' and '.join(absent)}: "
-                f"pip install 'codesign-jax[export]', or give --no-{what}"
+                f"pip install '.[export]' in the checkout, or give --no-{what}"
             )
     return found
 

@@ -87,7 +87,7 @@ def simulate(asked: Asked) -> "Replay":
     try:
         from codesign_jax.report import animation
     except ImportError as error:
-        message = f"pictures need {error.name}: pip install 'codesign-jax[viz]'"
+        message = f"pictures need {error.name}: pip install '.[viz]' in the checkout"
         raise SceneError([message]) from error
     case = asked.case
     params = case.space.params(jnp.asarray(case.design, jnp.float32))

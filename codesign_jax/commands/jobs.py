@@ -102,7 +102,8 @@ def _submitit() -> Any:
     try:
         import submitit
     except ImportError as error:
-        raise SceneError(["--jobs needs submitit: pip install 'codesign-jax[cluster]'"]) from error
+        message = "--jobs needs submitit: pip install '.[cluster]' in the checkout"
+        raise SceneError([message]) from error
     finally:
         if ours:  # jobs log as submitit does by default
             del os.environ["SUBMITIT_LOG_LEVEL"]

@@ -250,7 +250,7 @@ def _write(case: Case, found: Landscape, folder: Path, console: Console) -> None
     try:
         from codesign_jax.report import figures
     except ImportError:
-        console.print("no figure: pip install 'codesign-jax[viz]'", markup=False)
+        console.print("no figure: pip install '.[viz]' in the checkout", markup=False)
         return
     path = folder / "figures" / "landscape.png"
     with files.naming(path):

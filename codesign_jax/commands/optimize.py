@@ -1,5 +1,6 @@
 """`codesign optimize`."""
 
+import dataclasses
 import functools
 import shlex
 import signal
@@ -193,14 +194,16 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     scene, settings = plan.scene, plan.settings
     for name, text in scene_texts(scene).items():
         print(f"# ---- {name}\n{text}")
-    print(f"# ---- settings\n{settings}\n")
+    values = dataclasses.asdict(settings).items()
+    print("# ---- settings", *(f"{name}: {value}" for name, value in values), "", sep="\n")
     space = design_space(scene.hand, settings.preset)
     batch = settings.particles * settings.trials
     seed = batch if runs.needs_poor_seed(plan) else 0
     print(f"grasps: {settings.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
-    if settings.test_trials % settings.trials:
-        tested = settings.test_rounds * settings.trials
-        print(f"final test: {tested} trials of each particle, in whole rounds of {settings.trials}")
+    if tested := settings.test_rounds * settings.trials:
+        whole = f", in whole rounds of {settings.trials}" if tested != settings.test_trials else ""
+        many = settings.particles * tested
+        print(f"final test: {many} of these grasps, {tested} trials of each particle{whole}")
     if count > 1:
         how = f"{options.jobs} at a time" if options.jobs else "in one batch"
         print(f"runs: {count}, {how}; grasps and disk are those of each")
@@ -271,7 +274,7 @@ def _figures(result: RunResult, folder: Path, console: Console) -> None:
     try:
         from codesign_jax.report import figures
     except ImportError:
-        console.print("no figures: pip install 'codesign-jax[viz]'", markup=False)
+        console.print("no figures: pip install '.[viz]' in the checkout", markup=False)
         return
     assert result.record is not None
     path = folder / "figures" / "cost_evolution.png"

@@ -35,7 +35,7 @@ def main(options: "Report") -> int:
         from codesign_jax.report import page
         from codesign_jax.report.of_run import Run
     except ImportError as error:
-        message = f"a report needs {error.name}: pip install 'codesign-jax[report]'"
+        message = f"a report needs {error.name}: pip install '.[report]' in the checkout"
         raise SceneError([message]) from error
     path = options.out or options.folder / "report.html"
     common.check_place("--out", path)

@@ -51,7 +51,8 @@ def main(options: "Sample") -> int:
     notes = common.preflight_notes(scene, question.space, designs, details=options.dry_run)
     for note in [*notes, *common.mesh_notes(scene)]:
         console.print(note, markup=False)
-    console.print(f"{_amount(options)} in {question.shards(options.designs)} calls")
+    count = question.shards(options.designs)
+    console.print(f"{_amount(options)} in {count} call{'s' * (count > 1)}")
     if options.dry_run:
         _dry_run(options, question, console)
         return 0

@@ -219,15 +219,28 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
     """Refuses to resume another run, and says what differs."""
     problems, extension = [], []
     for name, value in dataclasses.asdict(settings).items():
-        before = stored["settings"].get(name)
+        stood = stored["settings"].get(name)
         if name == "episodes":
-            extension = _extension_problems(scene, settings, before)
-        elif before != value:
+            extension = _extension_problems(scene, settings, stood)
+        elif stood != value:
             flag = name.replace("_", "-")
-            problems.append(f"--{flag}: the run has {before}, asked for is {value}")
+            problems.append(f"--{flag}: the run has {stood}, asked for is {value}")
     manifest.refuse_changed(path, stored)
-    if scenes.load(path / "scene.toml") != scene:
+    before = scenes.load(path / "scene.toml")
+    if before != scene:
+        other = {
+            f"{word}.toml": f"--{word}: the run has {was}, asked for is {now}"
+            for word, was, now in (
+                ("scene", before.name, scene.name),
+                ("hand", before.hand.name, scene.hand.name),
+                ("objects", before.objects.name, scene.objects.name),
+            )
+            if was != now
+        }
+        problems += other.values()
         for name, text in scene_files.scene_texts(scene).items():
+            if name in other:  # every line of it may differ
+                continue
             old = (path / name).read_text(encoding="utf-8").splitlines()
             diff = difflib.unified_diff(old, text.splitlines(), f"run/{name}", f"asked/{name}", n=0)
             problems += _beginning([*diff])

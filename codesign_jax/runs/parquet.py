@@ -58,7 +58,7 @@ def library(what: str) -> ModuleType:
         import pyarrow
         import pyarrow.parquet
     except ModuleNotFoundError as error:
-        message = f"{what} needs {error.name}: pip install 'codesign-jax[parquet]'"
+        message = f"{what} needs {error.name}: pip install '.[parquet]' in the checkout"
         raise SceneError([message]) from error
     return pyarrow
 

@@ -34,10 +34,9 @@ def dry_run(capsys, command, *arguments):
 
 def test_optimize_says_that_the_test_has_whole_rounds(workplace, capsys):
     sizes = ["--trials", 4, "--test-trials"]
-    words = "8 trials of each particle, in whole rounds of 4"
-    assert words in dry_run(capsys, "optimize", *sizes, 6)
-    whole = dry_run(capsys, "optimize", *sizes, 8)
-    assert "8 trials of each particle\n" in whole and "whole rounds" not in whole
+    words = "final test: 96 of these grasps, 8 trials of each particle"
+    assert f"{words}, in whole rounds of 4\n" in dry_run(capsys, "optimize", *sizes, 6)
+    assert f"{words}\n" in dry_run(capsys, "optimize", *sizes, 8)
 
 
 def test_optimize_counts_the_test_at_reference(workplace, capsys):

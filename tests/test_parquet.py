@@ -112,7 +112,7 @@ def test_a_landscape_s_rows_name_their_point(tmp_path):
 
 def test_without_pyarrow_nothing_is_simulated(finished, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(SceneError, match=r"pip install '.\[parquet\]'"):
+    with pytest.raises(SceneError, match=r"pip install '\.\[parquet\]' in the checkout"):
         parquet.write_strategies(tmp_path / "x.parquet", PLAN, tiny()[1], finished, NOTES)
     arguments = ["experiments", "2d", "--size", "tiny", "--engine", "mujoco"]
     arguments += ["--out", str(tmp_path / "out"), "--parquet", str(tmp_path / "x.parquet")]

@@ -331,7 +331,7 @@ class _Loop(asyncio.SelectorEventLoop):
     """
 
     def call_soon_threadsafe(self, callback: Any, *args: Any, **options: Any) -> Any:
-        """Asks for a call of the function in the loop's thread; of a closed loop nobody asks."""
+        """As the base class's, but a closed loop drops the callback and raises nothing."""
         try:
             return super().call_soon_threadsafe(callback, *args, **options)
         except RuntimeError:
@@ -343,7 +343,9 @@ class _Loop(asyncio.SelectorEventLoop):
 class _Loops(asyncio.DefaultEventLoopPolicy):
     """Makes such loops."""
 
-    _loop_factory = _Loop
+    def new_event_loop(self) -> _Loop:
+        """A loop that may be called when it is closed."""
+        return _Loop()
 
 
 @contextlib.contextmanager

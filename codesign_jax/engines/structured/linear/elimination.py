@@ -127,9 +127,14 @@ def eliminate_and_keep(
 
 
 def eliminate_again(
-    run: Stages, axes: jax.Array, kept: Kept, r: jax.Array, r_object: jax.Array
+    run: Stages,
+    axes: jax.Array,
+    kept: Kept,
+    r: jax.Array,
+    r_object: jax.Array,
+    tau: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array, Factors]:
-    """`eliminate` of the same matrix with other forces and none on the joint.
+    """`eliminate` of the same matrix with other forces.
 
     Since r - U z = r - (D^-1 U')'y it takes a sixth of the operations.
 
@@ -139,6 +144,7 @@ def eliminate_again(
       kept: What the elimination left.
       r: Force on the subtree's base link, shape (6, finger, world).
       r_object: Force on the object, same shape.
+      tau: Force on the joint, shape (axis, finger, world); None for none.
 
     Returns:
       The forces in the parent's acceleration, and the factors for `substitute`.
@@ -150,6 +156,7 @@ def eliminate_again(
         return r - contract(w, y[:, None], 0), ro, contract(kept.inverse, y[None], 1)
 
     y = run(lambda s, r: contract(s, r[None], 1), axes, r)
+    y = y if tau is None else y + tau
     r, r_object, z = run(reduce, y, kept, r, r_object)
     return r, r_object, kept.factors._replace(z=z)
 

@@ -33,6 +33,8 @@ _PRESCRIBED = (
 
 _SKIN = "its geoms are rigid parts of single bodies"
 
+_IMPEDANCE = "MuJoCo's impedance grows with depth in the elastic force as well"
+
 EFFECTS: Mapping[str, Effect] = {
     "lateral_bending": Effect("fingers bend sideways"),
     "twist": Effect("fingers twist about their length"),
@@ -54,6 +56,10 @@ EFFECTS: Mapping[str, Effect] = {
     "friction": Effect(
         "of all contacts: none, coulomb, or full with torsion and rolling",
         {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},
+    ),
+    "soft_touch": Effect(
+        "damping and friction of a contact grow with its depth, from none at first touch",
+        {"mujoco": {True: _IMPEDANCE}, "mjx": {True: _IMPEDANCE}},
     ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),

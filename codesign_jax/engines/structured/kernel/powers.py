@@ -245,7 +245,7 @@ def between_spheres(
     """
     balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
     one, other = sections.between(*balls)
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in (one, other)]
     return _between(ends, mine[0][2:], theirs[0][2:])
 
@@ -262,7 +262,7 @@ def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, w
       which: Number of the sphere on the link.
     """
     ball = sphere_ball(mine[0], mine[1], mine[2], which)
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     found = sections.ball_on_palm(ball, (*palm[:2], size))
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in found]
     return _between(ends, mine[0][2:], palm[2:])
@@ -297,7 +297,7 @@ def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
 
 def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
     """Power of a row on another finger's row; mine and theirs: sides before and behind."""
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
     moves = [
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
@@ -325,7 +325,7 @@ def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:
 
 
 def _cone(scene: Scene, name: str, at: dict) -> contact.Cone:
-    return cone_of(scene.effects.friction, at[f"cone.{which_cone(name)}"])
+    return cone_of(scene, at[f"cone.{which_cone(name)}"])
 
 
 def _item(values: jax.Array, which: jax.Array) -> jax.Array:

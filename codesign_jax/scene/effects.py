@@ -35,6 +35,8 @@ _SKIN = "its geoms are rigid parts of single bodies"
 
 _IMPEDANCE = "MuJoCo's impedance grows with depth in the elastic force as well"
 
+_SPRINGS = "the springs of its joints are constants of a rollout"
+
 EFFECTS: Mapping[str, Effect] = {
     "lateral_bending": Effect("fingers bend sideways"),
     "twist": Effect("fingers twist about their length"),
@@ -64,6 +66,10 @@ EFFECTS: Mapping[str, Effect] = {
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),
     "neo_hookean": Effect("rubber at large strain: fingers soften as they bend"),
+    "lateral_threshold": Effect(
+        "pressure resists sideways bending up to a moment",
+        {"mujoco": {True: _SPRINGS}, "mjx": {True: _SPRINGS}},
+    ),
     "pressure_dynamics": Effect("chambers fill with a lag and under the supply's limits"),
     "gravity": Effect("everything has weight"),
 }

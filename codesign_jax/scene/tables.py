@@ -32,6 +32,7 @@ class Effects:
     disturb: bool = True
     ungrasp: bool = True
     neo_hookean: bool = False
+    lateral_threshold: bool = False
     pressure_dynamics: bool = False
     gravity: bool = True
 

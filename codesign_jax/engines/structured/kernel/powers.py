@@ -168,11 +168,11 @@ def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dic
 TABLE = "object_table"
 
 
-def of_link(axes, chain: Chain, numbers: dict, joint: dict, still: dict):
+def of_link(scene: Scene, chain: Chain, numbers: dict, joint: dict, still: dict):
     """What a link hands on, and its power.
 
     Args:
-      axes: Names of a joint's axes.
+      scene: The scene.
       chain: What it inherits.
       numbers: Its constants, the finger's and the worlds', by name.
       joint: Angles and velocities of the joint before it, and the chamber's pressure, by name.
@@ -184,10 +184,13 @@ def of_link(axes, chain: Chain, numbers: dict, joint: dict, still: dict):
     forces = (
         numbers["gain"], joint["pressure"], numbers.get("section"), numbers.get("gravity")
     )  # fmt: skip
-    after, found = link_forces(axes, chain[:5], constants, at, forces)
+    if "threshold" in numbers:
+        forces += (numbers["threshold"], numbers["armature"])
+    after, found = link_forces(scene, chain[:5], constants, at, forces)
     along = next_motion(chain.along, found["axes"], still["virtual"])
     body = make_body(numbers["mass"], found["body_centre"], found["tensor"])
-    inertial = numbers["armature"] * still["acc"] - found["tau"]
+    armature = found.get("armature_now", numbers["armature"])
+    inertial = armature * still["acc"] - found["tau"]
     power = dot(body.times(after[4]) - found["smooth"], along) + dot(inertial, still["virtual"])
     return Chain(*after, along), dot(still["centre_bar"], found["body_centre"]) - power
 

@@ -31,6 +31,7 @@ class Kernel(NamedTuple):
       shared: Places of inputs of one block that all blocks read; their leading axis is 1.
       scratch: Places among the outputs of scratch memory. Scratch does not outlive a block, so one
         buffer a thread suffices on a CPU; on a GPU every block has its own.
+      level: LLVM's level of optimisation on a CPU, 1 or 2.
     """
 
     origin: str
@@ -38,6 +39,7 @@ class Kernel(NamedTuple):
     lanes: int
     shared: tuple[int, ...] = ()
     scratch: tuple[int, ...] = ()
+    level: int = 2
 
 
 def available(platform: str) -> str | None:
@@ -112,9 +114,13 @@ def launch(
     if reason := available(kernel.backend) or memory_maps.problem():
         raise KernelUnavailable(reason)
     if kernel.backend == "cpu":
-        from codesign_jax.compiler import cpu as device
+        from codesign_jax.compiler import cpu
+
+        register = functools.partial(cpu.register, level=kernel.level)
     else:
-        from codesign_jax.compiler import gpu as device
+        from codesign_jax.compiler import gpu
+
+        register = gpu.register
     layout = describe(inputs, outputs, kernel)
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in inputs]
 
@@ -124,7 +130,7 @@ def launch(
     code = sources.digest()
     # Of code that is not known no kernel is found again, neither on disk nor in this process.
     origin = f"{kernel.origin} {code or uuid.uuid4()} {jax.__version__}"
-    name = device.register(origin, trace, layout, keep=code is not None)
+    name = register(origin, trace, layout, keep=code is not None)
     made = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
     varying = _varying(inputs)
     shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]

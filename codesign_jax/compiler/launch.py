@@ -1,9 +1,11 @@
 """The one way to run a Pallas kernel: on a CPU through `cpu`, on an NVIDIA GPU through `gpu`."""
 
+import contextlib
 import functools
+import gc
 import importlib.metadata
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -130,7 +132,8 @@ def launch(
     code = sources.digest()
     # Of code that is not known no kernel is found again, neither on disk nor in this process.
     origin = f"{kernel.origin} {code or uuid.uuid4()} {jax.__version__}"
-    name = register(origin, trace, layout, keep=code is not None)
+    with _no_collection():
+        name = register(origin, trace, layout, keep=code is not None)
     made = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
     varying = _varying(inputs)
     shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]
@@ -138,6 +141,21 @@ def launch(
     for k, result in zip(made, jax.ffi.ffi_call(name, shapes)(*inputs), strict=True):
         results[k] = None if k in kernel.scratch else result
     return results
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without Python's search for garbage: of the millions of objects of a trace few are garbage.
+
+    The searches would be a tenth of the time that a kernel takes to compile.
+    """
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:

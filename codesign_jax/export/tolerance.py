@@ -6,6 +6,7 @@ the last step of an unbroken row of steps with at least `WANTED` successes and t
 steps further out are not simulated.
 """
 
+import dataclasses
 from collections.abc import Generator, Iterator, Mapping
 from typing import NamedTuple
 
@@ -136,7 +137,8 @@ def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, f
             moved = np.repeat(centre[None], steps, 0)
             moved[:, i] += shares * (end - centre[i])
             designs += [*moved]
-    return Study(whole, np.array(designs), low, high)
+    moving = dataclasses.replace(whole, bounds=(tuple(low.tolist()), tuple(high.tolist())))
+    return Study(moving, np.array(designs), low, high)
 
 
 def _limits(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from codesign_jax import files, types
-from codesign_jax.codesign import SUCCESS_COST, FinalTest
+from codesign_jax.codesign import VERDICTS, FinalTest, verdicts
 from codesign_jax.runs.columns import MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
@@ -132,19 +132,12 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
         drawn = [_number(float(v[t])) for v in noise.values()]
         numbers = [_number(float(one.cost)), _number(float(one.lost_time))]
         bad_step = int(one.bad_step)
-        ending = [ended(one), *numbers, status_names(one.status)]
+        ending = [VERDICTS[verdicts(one)], *numbers, status_names(one.status)]
         return [t, names[int(trials.shape[t])], *drawn, *ending, bad_step if bad_step >= 0 else ""]
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = (row(t) for t in range(len(outcomes.cost)))
     _replace(path, _text([[*MORE[REFERENCE].columns], *rows]))
-
-
-def ended(outcome: Outcome) -> str:
-    """How a trial ended, in a word: kept, lost, stuck or failed; its entries are numbers."""
-    if types.failed(int(outcome.status)):
-        return "stuck" if int(outcome.status) & Status.STUCK else "failed"
-    return "kept" if float(outcome.cost) < SUCCESS_COST else "lost"
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:

@@ -27,9 +27,10 @@ class Status(enum.IntFlag):
       NONFINITE: A number of the state was not finite.
       SPEED: A velocity beyond the scene's limit.
       PENETRATION: The object fell through the table.
-      SOLVER_CAP: The solver stopped at its cap of iterations in a step before the verdict. A
-        warning: each iteration lowers the convex objective, so the step taken is the best found,
-        and to exclude such trials would favour hands that touch little.
+      SOLVER_CAP: The solver stopped at its cap of iterations in a step before the verdict, with
+        more than `newton.residual` of force unbalanced where the engine tells how much; see
+        `Outcome`. A warning: each iteration lowers the convex objective, so the step taken is the
+        best found, and to exclude such trials would favour hands that touch little.
       CONTACT_OVERFLOW: The engine had no room for a contact: MuJoCo C in its arena, the
         structured engine for those between fingers.
       INVALID_START: Bad model fields, or bodies deep inside one another before the first step.
@@ -57,7 +58,8 @@ MEANINGS = {
     Status.NONFINITE: "a number of the state was not finite",
     Status.SPEED: "a velocity beyond the scene's limit",
     Status.PENETRATION: "the object fell through the table",
-    Status.SOLVER_CAP: "a warning only: the contact solver stopped at its cap of iterations",
+    Status.SOLVER_CAP: "a warning only: the contact solver stopped at its cap of iterations, with "
+    "more force unbalanced than the accuracy allows for",
     Status.CONTACT_OVERFLOW: "more contacts than the engine has room for",
     Status.INVALID_START: "bodies deep inside one another before the first step",
     Status.STUCK: "the hand did not let go: the released object neither left it nor rests on the "
@@ -168,6 +170,8 @@ class Trace(NamedTuple):
         CONTACT_OVERFLOW), shape (time,) int32, or None if it does not tell.
       last: Generalized positions and velocities at the end, those in which a decided world stays,
         shape (nq + nv,), or None.
+      residual: Force that the step's last Newton iteration found unbalanced, see
+        `Outcome.residual`, shape (time,), or None if the engine does not tell.
 
     An object that leaves the hand after six seconds, as its cost sees it:
 
@@ -186,6 +190,7 @@ class Trace(NamedTuple):
     qpos: jax.Array
     status: jax.Array | None = None
     last: jax.Array | None = None
+    residual: jax.Array | None = None
 
     def at(self, scene: Phased, phase: str | None = None) -> "Trace":
         """The trace in the last time step of a phase, without the axis time.
@@ -201,7 +206,7 @@ class Trace(NamedTuple):
             `effects.disturb` is off.
 
         Returns:
-          A trace whose arrays have lost their axis time; `last` is None.
+          A trace whose arrays have lost their axis time; `last` and `residual` are None.
 
         Raises:
           SceneError: If the grasp has no such phase.
@@ -237,9 +242,18 @@ class Outcome(NamedTuple):
       status: Bits of `Status`, shape () int32; the trial counts unless it `failed`.
       lost_time: First time at which the object was lost [s], infinite if never, shape ().
       bad_step: First time step of a failed world, or -1, shape () int32.
+      capped: Share of the steps before the verdict in which the solver stopped at its cap of
+        iterations, shape ().
+      residual: Largest force that the last Newton iteration of such a step found unbalanced, as a
+        share of the weight of palm and object: sqrt(g' H^-1 g / s), g the forces, H the inertia
+        with the contacts' and s the solver's scale, 100 m^2/s^4 times the mass of both.  What the
+        iteration leaves is less.  Shape (); NaN if the engine does not tell.  Both are None of
+        outcomes that no engine simulated.
     """
 
     cost: jax.Array
     status: jax.Array
     lost_time: jax.Array
     bad_step: jax.Array
+    capped: jax.Array | None = None
+    residual: jax.Array | None = None

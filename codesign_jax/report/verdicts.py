@@ -147,6 +147,22 @@ def mean_cost(scene: Scene, outcomes: Outcome) -> str:
     return f"{mean} with {scene.cost.maximum:g} for each of the {count} that failed"
 
 
+def solver(outcomes: Outcome) -> list[str]:
+    """Says in a line how the solver ended where it stopped at its limit; no line if it never did.
+
+    Args:
+      outcomes: Outcomes, arrays of any shape.
+    """
+    if outcomes.capped is None or not np.nanmax(outcomes.capped, initial=0.0) > 0:
+        return []
+    share = float(np.nanmean(outcomes.capped))
+    text = f"solver: {100 * share:.2g} % of the steps ended at the limit of iterations"
+    if outcomes.residual is not None and np.isfinite(outcomes.residual).any():
+        force = float(np.nanmax(outcomes.residual))
+        text += f"; the last iteration found at most {force:.2g} times the weight unbalanced"
+    return [text]
+
+
 def warnings(judged: Judged) -> list[str]:
     """Says in a line that many trials failed, and what may be done about it; no line if few did."""
     scene, found = judged.scene, tally(judged.outcomes)

@@ -87,6 +87,11 @@ TABLES = {
             f"{Status(WARNINGS).name} is a warning, every other bit makes the trial a failed one",
             "first_bad_step": "time step at which the trial failed, from 0; empty if it did "
             "not fail, and for STUCK, which is told by the end of the grasp",
+            "steps_at_limit": "share of the steps up to the verdict in which the solver stopped at "
+            "its limit of iterations; empty if an older version simulated the trial",
+            "residual_force": "largest force that the last iteration of such a step found "
+            "unbalanced, as a share of the weight of palm and object (`Outcome.residual`); empty "
+            "if the engine does not tell",
         },
     ),
     "tests.csv": Table(
@@ -171,6 +176,8 @@ GRASPS = {
     "lost_time_s": ("float32", "s", TABLES["trials.csv"].columns["lost_time_s"]),
     "status": ("name", "", TABLES["trials.csv"].columns["status"]),
     "first_bad_step": ("int32", "", TABLES["trials.csv"].columns["first_bad_step"]),
+    "steps_at_limit": ("float32", "", TABLES["trials.csv"].columns["steps_at_limit"]),
+    "residual_force": ("float32", "", TABLES["trials.csv"].columns["residual_force"]),
 }
 """Columns of the Parquet file of `codesign sample`: type, unit and meaning, by name; those of the
 design follow."""

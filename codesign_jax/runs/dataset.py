@@ -279,6 +279,8 @@ def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[s
         "lost_time_s": found.lost_time,
         "status": Names(index.reshape(status.shape), [status_names(s) for s in texts]),
         "first_bad_step": np.ma.masked_less(bad_step, 0),
+        "steps_at_limit": np.ma.masked_invalid(np.asarray(found.capped)),
+        "residual_force": np.ma.masked_invalid(np.asarray(found.residual)),
     }
     designs = question.space.in_units(drawn.designs)
     own = design_columns(question.space)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from codesign_jax import files, types
@@ -128,12 +129,13 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
     names, noise = [s.name for s in scene.objects.object], noise_values(trials)
 
     def row(t: int) -> list:
-        one = Outcome(*(np.asarray(v)[t] for v in outcomes))
+        one = jax.tree.map(lambda v: np.asarray(v)[t], outcomes)
         drawn = [_number(float(v[t])) for v in noise.values()]
         numbers = [_number(float(one.cost)), _number(float(one.lost_time))]
         bad_step = int(one.bad_step)
         ending = [ended(one), *numbers, status_names(one.status)]
-        return [t, names[int(trials.shape[t])], *drawn, *ending, bad_step if bad_step >= 0 else ""]
+        ending += [bad_step if bad_step >= 0 else "", *_solved(one)]
+        return [t, names[int(trials.shape[t])], *drawn, *ending]
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = (row(t) for t in range(len(outcomes.cost)))
@@ -197,7 +199,14 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
             status = status_names(trials.status[e, i, t])
             bad_step = int(trials.bad_step[e, i, t])
             row = [e + 1, i, t, names[t % len(names)], *numbers, status]
-            yield [*row, bad_step if bad_step >= 0 else ""]
+            one = jax.tree.map(lambda v: v[e, i, t], trials)  # noqa: B023
+            yield [*row, bad_step if bad_step >= 0 else "", *_solved(one)]
+
+
+def _solved(outcome: Outcome) -> list[str]:
+    """How the solver ended in a trial; empty cells for what is not known."""
+    numbers = outcome.capped, outcome.residual
+    return ["" if v is None or np.isnan(v) else _number(float(v)) for v in numbers]
 
 
 def _designs(space: DesignSpace, population: np.ndarray) -> list[list[str]]:

@@ -203,12 +203,16 @@ class Newton:
       evaluations: Largest number of line-search evaluations of an iteration; where no kernel runs
         a line search has at most six.
       decrement: Relative Newton decrement at which a world has converged, a share of the cost's
-        scale; a step that ends above it sets the bit SOLVER_CAP.
+        scale; the root of it is a share of the weight of palm and object. A step that ends above
+        it has stopped at the limit of iterations.
+      residual: Unbalanced force of such a step, as a share of that weight, from which on the trial
+        has the warning SOLVER_CAP; see `Outcome.residual`.
     """
 
     iterations: int = quantity("", 1, 1000, structure=True, default=24)
     evaluations: int = quantity("", 1, 1000, structure=True, default=14)
     decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-6)
+    residual: float = quantity("", 1e-8, 1e8, structure=True, default=0.01)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 
 from codesign_jax import verdict
 from codesign_jax.scene import Scene
-from codesign_jax.types import WARNINGS, Outcome, Status, Trace, Trial, failed
+from codesign_jax.types import Outcome, Status, Trace, Trial, failed
 
 _ROUNDING = 1.001
 """A ball's centre rests just as high as its radius: in float32 it may be a little higher."""
@@ -55,8 +55,9 @@ def outcome(
     stuck = verdict.as_bit(_stuck(scene, trace, trial) & ~lost & ~bad, Status.STUCK)
     status = bad * bits[jnp.minimum(bad_step, steps - 1)] | stuck
     capped, residual = _solved(trace, jnp.minimum(bad_step, lost_step))
-    above = residual > scene.newton.residual if trace.residual is not None else capped > 0
-    status |= verdict.as_bit(above, WARNINGS)
+    # An engine that does not tell how much is left warns of any step at its limit.
+    above = capped > 0 if trace.residual is None else residual > scene.newton.residual
+    status |= verdict.as_bit(above, Status.SOLVER_CAP)
     cost = jnp.where(failed(status), scene.cost.maximum, cost).astype(dtype)
     return Outcome(cost, status, lost_time, jnp.where(bad, bad_step, -1), capped, residual)
 
@@ -165,15 +166,16 @@ def _solved(trace: Trace, decided: jax.Array) -> tuple[jax.Array, jax.Array]:
       `Outcome.capped` and `Outcome.residual`.
     """
     dtype = trace.distance.dtype
+    untold = jnp.full((), jnp.nan, dtype)
     if trace.status is None:
-        return jnp.zeros((), dtype), jnp.full((), jnp.nan, dtype)
+        return untold, untold
     # The last entry's step leads to a state that nothing reads.
     steps = trace.status.shape[0]
     counts = np.arange(steps) < jnp.minimum(decided, steps - 1)
-    capped = counts & ((trace.status & int(WARNINGS)) != 0)
+    capped = counts & ((trace.status & int(Status.SOLVER_CAP)) != 0)
     share = (capped.sum() / jnp.maximum(counts.sum(), 1)).astype(dtype)
     if trace.residual is None:
-        return share, jnp.full((), jnp.nan, dtype)
+        return share, untold
     return share, jnp.where(capped, trace.residual, 0.0).max().astype(dtype)
 
 

@@ -27,10 +27,10 @@ class Status(enum.IntFlag):
       NONFINITE: A number of the state was not finite.
       SPEED: A velocity beyond the scene's limit.
       PENETRATION: The object fell through the table.
-      SOLVER_CAP: The solver stopped at its cap of iterations in a step before the verdict, with
-        more than `newton.residual` of force unbalanced where the engine tells how much; see
-        `Outcome`. A warning: each iteration lowers the convex objective, so the step taken is the
-        best found, and to exclude such trials would favour hands that touch little.
+      SOLVER_CAP: The solver stopped at its limit of iterations in a step before the verdict, with
+        a residual above `newton.residual` if the engine tells it, see `Outcome`. A warning: each
+        iteration lowers the convex objective, so the step taken is the best found, and to exclude
+        such trials would favour hands that touch little.
       CONTACT_OVERFLOW: The engine had no room for a contact: MuJoCo C in its arena, the
         structured engine for those between fingers.
       INVALID_START: Bad model fields, or bodies deep inside one another before the first step.
@@ -58,8 +58,8 @@ MEANINGS = {
     Status.NONFINITE: "a number of the state was not finite",
     Status.SPEED: "a velocity beyond the scene's limit",
     Status.PENETRATION: "the object fell through the table",
-    Status.SOLVER_CAP: "a warning only: the contact solver stopped at its cap of iterations, with "
-    "more force unbalanced than the accuracy allows for",
+    Status.SOLVER_CAP: "a warning only: the contact solver stopped at its limit of iterations, "
+    "with a larger residual than the accuracy allows for",
     Status.CONTACT_OVERFLOW: "more contacts than the engine has room for",
     Status.INVALID_START: "bodies deep inside one another before the first step",
     Status.STUCK: "the hand did not let go: the released object neither left it nor rests on the "
@@ -166,12 +166,13 @@ class Trace(NamedTuple):
       speed: Largest absolute generalized velocity [rad/s or m/s], shape (time,); not finite if any
         state is not.
       qpos: Generalized positions if they were recorded, shape (time, nq), else shape (time, 0).
-      status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP,
-        CONTACT_OVERFLOW), shape (time,) int32, or None if it does not tell.
+      status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP if it
+        ended at the limit of iterations, CONTACT_OVERFLOW), shape (time,) int32, or None if it does
+        not tell.
       last: Generalized positions and velocities at the end, those in which a decided world stays,
         shape (nq + nv,), or None.
-      residual: Force that the step's last Newton iteration found unbalanced, see
-        `Outcome.residual`, shape (time,), or None if the engine does not tell.
+      residual: Residual of the step taken from each state, see `Outcome`, shape (time,), or None
+        if the engine does not tell.
 
     An object that leaves the hand after six seconds, as its cost sees it:
 
@@ -242,13 +243,16 @@ class Outcome(NamedTuple):
       status: Bits of `Status`, shape () int32; the trial counts unless it `failed`.
       lost_time: First time at which the object was lost [s], infinite if never, shape ().
       bad_step: First time step of a failed world, or -1, shape () int32.
-      capped: Share of the steps before the verdict in which the solver stopped at its cap of
-        iterations, shape ().
-      residual: Largest force that the last Newton iteration of such a step found unbalanced, as a
-        share of the weight of palm and object: sqrt(g' H^-1 g / s), g the forces, H the inertia
-        with the contacts' and s the solver's scale, 100 m^2/s^4 times the mass of both.  What the
-        iteration leaves is less.  Shape (); NaN if the engine does not tell.  Both are None of
-        outcomes that no engine simulated.
+      capped: Share of the steps before the verdict in which the solver stopped at its limit of
+        iterations, shape (); NaN if the engine does not tell (mjx).
+      residual: Largest residual of these steps, 0 if there are none, shape (); NaN if the engine
+        does not tell (mujoco, mjx). It is the norm sqrt(g' H^-1 g / s) of the forces g that the
+        last Newton iteration found unbalanced, before its own step: H is the inertia with that of
+        the contacts, and s the solver's scale (`newton.decrement` bounds its square). A force on
+        palm and object together counts in units of their weight; one on a link, which is lighter,
+        counts for more.
+
+    The last two are None where no engine simulated the outcome.
     """
 
     cost: jax.Array

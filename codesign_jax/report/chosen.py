@@ -26,6 +26,7 @@ def design(run: Run) -> str:
     parts = [
         markup.paragraph(trials, "key"),
         *(markup.paragraph(words, "warning") for words in verdicts.warnings(judged)),
+        *(markup.paragraph(words, "note") for words in verdicts.solver(judged.outcomes)),
         markup.paragraph(note + "More fresh trials: ", "note", again),
         _by_object(run, judged),
         _parameters(run),

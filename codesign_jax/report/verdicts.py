@@ -148,19 +148,25 @@ def mean_cost(scene: Scene, outcomes: Outcome) -> str:
 
 
 def solver(outcomes: Outcome) -> list[str]:
-    """Says in a line how the solver ended where it stopped at its limit; no line if it never did.
+    """Says in a line how often the solver stopped at its limit; no line if it never did.
 
     Args:
       outcomes: Outcomes, arrays of any shape.
     """
-    if outcomes.capped is None or not np.nanmax(outcomes.capped, initial=0.0) > 0:
+    shares, residuals = (_told(v) for v in (outcomes.capped, outcomes.residual))
+    if not shares.any():
         return []
-    share = float(np.nanmean(outcomes.capped))
-    text = f"solver: {100 * share:.2g} % of the steps ended at the limit of iterations"
-    if outcomes.residual is not None and np.isfinite(outcomes.residual).any():
-        force = float(np.nanmax(outcomes.residual))
-        text += f"; the last iteration found at most {force:.2g} times the weight unbalanced"
+    text = f"solver: {100 * shares.mean():.2g} % of the steps ended at the limit of iterations"
+    if residuals.size:
+        middle, most = np.median(residuals), residuals.max()
+        text += f"; largest residual of a trial: median {middle:.2g}, most {most:.2g} weights"
     return [text]
+
+
+def _told(values: Any) -> np.ndarray:
+    """The numbers among values; none for None."""
+    numbers = np.ravel(np.asarray(values, float))
+    return numbers[np.isfinite(numbers)]
 
 
 def warnings(judged: Judged) -> list[str]:

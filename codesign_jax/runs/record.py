@@ -58,7 +58,10 @@ def empty_history(settings: Settings, num_parameters: int) -> History:
     return History(
         population=np.zeros((e, n, num_parameters), real),
         trials=Outcome(
-            *(trials(t) for t in (real, whole, real, whole)),
+            cost=trials(real),
+            status=trials(whole),
+            lost_time=trials(real),
+            bad_step=trials(whole),
             capped=trials(real),
             residual=trials(real),
         ),
@@ -155,9 +158,9 @@ def from_arrays(arrays: dict) -> Record:
 
 
 def _outcomes(arrays: dict) -> Outcome:
-    """Outcomes; those of an older version do not tell how the solver ended."""
-    missing = {n: arrays["cost"] * np.float32(np.nan) for n in ("capped", "residual")}
-    return Outcome(**(missing | arrays))
+    """Outcomes; checkpoints of an older version do not tell how the solver ended."""
+    untold = np.full_like(arrays["cost"], np.nan)
+    return Outcome(**({"capped": untold, "residual": untold} | arrays))
 
 
 def refuse_other(
@@ -184,9 +187,7 @@ def refuse_other(
         "they are of another seed": not np.array_equal(jax.random.key_data(record.state.key), seed),
         f"they are not of {n} particles of {d} parameters": particles != (n, d)
         or history.population.shape != (room, n, d),
-        f"they are not of {t} trials": any(
-            v.shape != (room, n, t) for v in jax.tree.leaves(history.trials)
-        ),
+        f"they are not of {t} trials": any(v.shape != (room, n, t) for v in history.trials),
         f"checkpoint {step} holds episode {record.done}": own != step,
         f"they have {record.done} episodes of {e}": not 0 <= record.done <= min(room, e),
     }

@@ -134,7 +134,7 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
         numbers = [_number(float(one.cost)), _number(float(one.lost_time))]
         bad_step = int(one.bad_step)
         ending = [ended(one), *numbers, status_names(one.status)]
-        ending += [bad_step if bad_step >= 0 else "", *_solved(one)]
+        ending += [bad_step if bad_step >= 0 else "", _told(one.capped), _told(one.residual)]
         return [t, names[int(trials.shape[t])], *drawn, *ending]
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -199,14 +199,13 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
             status = status_names(trials.status[e, i, t])
             bad_step = int(trials.bad_step[e, i, t])
             row = [e + 1, i, t, names[t % len(names)], *numbers, status]
-            one = jax.tree.map(lambda v: v[e, i, t], trials)  # noqa: B023
-            yield [*row, bad_step if bad_step >= 0 else "", *_solved(one)]
+            solved = (_told(v[e, i, t]) for v in (trials.capped, trials.residual))
+            yield [*row, bad_step if bad_step >= 0 else "", *solved]
 
 
-def _solved(outcome: Outcome) -> list[str]:
-    """How the solver ended in a trial; empty cells for what is not known."""
-    numbers = outcome.capped, outcome.residual
-    return ["" if v is None or np.isnan(v) else _number(float(v)) for v in numbers]
+def _told(value: Any) -> str:
+    """A number; empty if it is not one, or none was told."""
+    return "" if value is None or np.isnan(value) else _number(float(value))
 
 
 def _designs(space: DesignSpace, population: np.ndarray) -> list[list[str]]:

@@ -203,10 +203,9 @@ class Newton:
       evaluations: Largest number of line-search evaluations of an iteration; where no kernel runs
         a line search has at most six.
       decrement: Relative Newton decrement at which a world has converged, a share of the cost's
-        scale; the root of it is a share of the weight of palm and object. A step that ends above
-        it has stopped at the limit of iterations.
-      residual: Unbalanced force of such a step, as a share of that weight, from which on the trial
-        has the warning SOLVER_CAP; see `Outcome.residual`.
+        scale. A step that ends above it has stopped at the limit of iterations.
+      residual: Residual of such a step, the root of its decrement, above which the trial has the
+        warning SOLVER_CAP; see `Outcome`.
     """
 
     iterations: int = quantity("", 1, 1000, structure=True, default=24)

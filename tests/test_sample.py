@@ -130,9 +130,8 @@ def test_a_row_has_design_noise_and_outcome(place, capsys):
         rows["verdict"] == "lost", ~bad & np.isfinite(rows["lost_time_s"])
     )
     assert [v is None for v in rows["first_bad_step"]] == (~bad).tolist()
-    shares = np.concatenate([np.ravel(call.capped) for call in calls])[:20]
-    np.testing.assert_array_equal(rows["steps_at_limit"], shares)
-    assert set(rows["residual"]) == {None}  # MuJoCo C does not tell
+    # The toy engine has no solver: nothing is told of it.
+    assert {*rows["steps_at_limit"], *rows["residual"]} == {None}
     counts = {name: int((rows["verdict"] == name).sum()) for name in dataset.VERDICTS}
     said = ", ".join(f"{name} {n} ({5 * n:.1f} %)" for name, n in counts.items())
     assert f"of 20 grasps: {said}" in capsys.readouterr().out and counts["lost"] > 0

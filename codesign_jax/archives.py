@@ -152,7 +152,7 @@ class Store(Parts):
 
 
 def _packed(arrays: Mapping[str, Any], compressed: bool) -> bytes:
-    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    arrays = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
     buffer = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(
         buffer, **arrays, **{DIGEST: np.array(_digest(arrays))}

@@ -163,6 +163,19 @@ def test_many_designs_are_judged_at_once():
     assert verdicts.tally(found) == (3, 0, 1, 0)
 
 
+def test_a_line_says_how_the_solver_ended():
+    """Of the trials whose engine tells; none if no step ended at the limit, or nobody tells."""
+    found = trials_of([0.0] * 3, [0] * 3)
+    nan = np.full(3, np.nan)
+    for shares, residuals in ((None, None), (nan, nan), (np.zeros(3), np.zeros(3))):
+        assert verdicts.solver(found._replace(capped=shares, residual=residuals)) == []
+    some = found._replace(capped=np.array([0.5, 0.1, 0.0]), residual=nan)
+    said = "solver: 20 % of the steps ended at the limit of iterations"
+    assert verdicts.solver(some) == [said]
+    [line] = verdicts.solver(some._replace(residual=np.array([7.0, 3.0, 0.0])))
+    assert line == f"{said}; largest residual of a trial: median 3, most 7 weights"
+
+
 def trials_of(cost, status, lost=()):
     """Outcomes of trials; the indices in `lost` lost their objects at 1 s."""
     times = np.where(np.isin(np.arange(len(cost)), list(lost)), 1.0, np.inf)

@@ -128,7 +128,7 @@ def _evaluate(
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
         console.print(f"{name:>12}: {verdicts.of_object(case.scene, own)}", markup=False)
     judged = verdicts.Judged(case.scene, one, options.accuracy)
-    for line in [f"{'all':>12}: {judged}", *verdicts.warnings(judged)]:
+    for line in [f"{'all':>12}: {judged}", *verdicts.solver(one), *verdicts.warnings(judged)]:
         console.print(line, markup=False)
     if options.out:
         drawn = rollout.sample_trials(case.scene, jax.random.key(options.seed), options.trials)

@@ -143,6 +143,28 @@ def mean_cost(scene: Scene, outcomes: Outcome) -> str:
     return f"{mean} with {scene.cost.maximum:g} for each of the {count} that failed"
 
 
+def solver(outcomes: Outcome) -> list[str]:
+    """Says in a line how often the solver stopped at its limit; no line if it never did.
+
+    Args:
+      outcomes: Outcomes, arrays of any shape.
+    """
+    shares, residuals = (_told(v) for v in (outcomes.capped, outcomes.residual))
+    if not shares.any():
+        return []
+    text = f"solver: {100 * shares.mean():.2g} % of the steps ended at the limit of iterations"
+    if residuals.size:
+        middle, most = np.median(residuals), residuals.max()
+        text += f"; largest residual of a trial: median {middle:.2g}, most {most:.2g} weights"
+    return [text]
+
+
+def _told(values: Any) -> np.ndarray:
+    """The numbers among values; none for None."""
+    numbers = np.ravel(np.asarray(values, float))
+    return numbers[np.isfinite(numbers)]
+
+
 def warnings(judged: Judged) -> list[str]:
     """Says in a line that many trials failed, and what may be done about it; no line if few did."""
     scene, found = judged.scene, tally(judged.outcomes)

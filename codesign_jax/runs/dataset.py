@@ -24,7 +24,7 @@ from codesign_jax import archives, files, sampling, sources
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.provenance import environment
 from codesign_jax.runs import parquet
-from codesign_jax.runs.columns import DESIGNS, GRASPS
+from codesign_jax.runs.columns import DESIGNS, GRASPS, MAY_BE_EMPTY
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.parquet import Column, Names
 from codesign_jax.runs.scene_files import contents, scene_texts
@@ -239,7 +239,7 @@ def open_shards(path: Path, question: Question) -> Iterator[Shards]:
 def columns(space: DesignSpace) -> dict[str, Column]:
     """The columns of a file, by name."""
     found = {
-        name: Column(kind, text, {"unit": unit} if unit else {}, nullable=name == "first_bad_step")
+        name: Column(kind, text, {"unit": unit} if unit else {}, nullable=name in MAY_BE_EMPTY)
         for name, (kind, unit, text) in GRASPS.items()
     }
     names = zip(design_columns(space), space.names, space.units, strict=True)
@@ -270,6 +270,8 @@ def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[s
         "lost_time_s": found.lost_time,
         "status": Names(index.reshape(status.shape), [status_names(s) for s in texts]),
         "first_bad_step": np.ma.masked_less(bad_step, 0),
+        "steps_at_limit": np.ma.masked_invalid(np.asarray(found.capped)),
+        "residual": np.ma.masked_invalid(np.asarray(found.residual)),
     }
     designs = question.space.in_units(drawn.designs)
     own = design_columns(question.space)

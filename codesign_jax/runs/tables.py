@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from codesign_jax import files, types
@@ -128,12 +129,13 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
     names, noise = [s.name for s in scene.objects.object], noise_values(trials)
 
     def row(t: int) -> list:
-        one = Outcome(*(np.asarray(v)[t] for v in outcomes))
+        one = jax.tree.map(lambda v: np.asarray(v)[t], outcomes)
         drawn = [_number(float(v[t])) for v in noise.values()]
         numbers = [_number(float(one.cost)), _number(float(one.lost_time))]
         bad_step = int(one.bad_step)
         ending = [VERDICTS[verdicts(one)], *numbers, status_names(one.status)]
-        return [t, names[int(trials.shape[t])], *drawn, *ending, bad_step if bad_step >= 0 else ""]
+        ending += [bad_step if bad_step >= 0 else "", _told(one.capped), _told(one.residual)]
+        return [t, names[int(trials.shape[t])], *drawn, *ending]
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = (row(t) for t in range(len(outcomes.cost)))
@@ -190,7 +192,13 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
             status = status_names(trials.status[e, i, t])
             bad_step = int(trials.bad_step[e, i, t])
             row = [e + 1, i, t, names[t % len(names)], *numbers, status]
-            yield [*row, bad_step if bad_step >= 0 else ""]
+            solved = (_told(v[e, i, t]) for v in (trials.capped, trials.residual))
+            yield [*row, bad_step if bad_step >= 0 else "", *solved]
+
+
+def _told(value: Any) -> str:
+    """A number; empty if it is not one, or none was told."""
+    return "" if value is None or np.isnan(value) else _number(float(value))
 
 
 def _designs(space: DesignSpace, population: np.ndarray) -> list[list[str]]:

@@ -208,12 +208,15 @@ class Newton:
       evaluations: Largest number of line-search evaluations of an iteration; where no kernel runs
         a line search has at most six.
       decrement: Relative Newton decrement at which a world has converged, a share of the cost's
-        scale; a step that ends above it sets the bit SOLVER_CAP.
+        scale. A step that ends above it has stopped at the limit of iterations.
+      residual: Residual of such a step, the root of its decrement, above which the trial has the
+        warning SOLVER_CAP; see `Outcome`.
     """
 
     iterations: int = quantity("", 1, 1000, structure=True, default=24)
     evaluations: int = quantity("", 1, 1000, structure=True, default=14)
     decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-6)
+    residual: float = quantity("", 1e-8, 1e8, structure=True, default=0.01)
 
 
 @dataclasses.dataclass(frozen=True)

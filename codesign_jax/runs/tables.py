@@ -192,7 +192,9 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
             status = status_names(trials.status[e, i, t])
             bad_step = int(trials.bad_step[e, i, t])
             row = [e + 1, i, t, names[t % len(names)], *numbers, status]
-            solved = (_told(v[e, i, t]) for v in (trials.capped, trials.residual))
+            solved = (
+                _told(v if v is None else v[e, i, t]) for v in (trials.capped, trials.residual)
+            )
             yield [*row, bad_step if bad_step >= 0 else "", *solved]
 
 

@@ -168,7 +168,8 @@ class Discretization:
       hull_rings: Rings of vertices of a link, only with `effects.surface = "hull"`.
       hull_points: Vertices of a ring, a multiple of four, only with `effects.surface = "hull"`.
       spring_damping: How much of the time step h the implicit springs add to a joint's damping time
-        beta: "added" acts as beta + h, "least" as max(beta, h); see docs/physics.md.
+        beta: "added" acts as beta + h, "least" as max(beta, h), "reduced" as max(beta, 2/3 h); see
+        docs/physics.md.
     """
 
     timestep: float = quantity("s", 1e-5, 0.05, structure=True)
@@ -176,7 +177,7 @@ class Discretization:
     spheres_per_link: int = quantity("", 1, 20, structure=True)
     hull_rings: int = quantity("", 1, 20, structure=True, default=2)
     hull_points: int = quantity("", 4, 80, structure=True, default=8)
-    spring_damping: str = choice("added", "least", default="added")
+    spring_damping: str = choice("added", "least", "reduced", default="added")
 
 
 @dataclasses.dataclass(frozen=True)

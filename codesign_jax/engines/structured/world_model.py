@@ -55,8 +55,8 @@ class WorldModel(NamedTuple):
       gravity: Magnitude of gravity [m/s^2], shape (1, world); None without the effect.
       section: Height, wall, segment length and width of the fingers, shape (4, finger, world); None
         without the effect `neo_hookean` and the surface "hull".
-      threshold: Numbers of `model.morphology.thresholds`, shape (3, finger, world); None without the
-        effect `lateral_threshold`.
+      threshold: Numbers of `model.morphology.thresholds`, shape (3, finger, world); None without
+        the effect `lateral_threshold`.
     """
 
     mount: jax.Array

@@ -207,14 +207,13 @@ def test_natural_frequencies():
         ("added", 6e-3, 7e-3),
         ("least", 6e-3, 6e-3),
         ("least", 5e-4, 1e-3),
-        ("reduced", 5e-4, 2e-3 / 3),
     ],
 )
 def test_ring_down(damping, beta, acts):
     """Log decrement 2 pi zeta / sqrt(1 - zeta^2) with zeta = omega / 2 times a Kelvin-Voigt time.
 
-    That time is beta + h, max(beta, h) or max(beta, 2/3 h) by `spring_damping`, to first order in
-    h omega, which is 7e-3 here.
+    That time is beta + h or max(beta, h) by `spring_damping`, to first order in h omega,
+    which is 7e-3 here.
     """
     finger = Finger(5, timestep=1e-3, length=0.3, damping=damping, beta=beta)
     omega, shape = eigenfrequencies(finger)

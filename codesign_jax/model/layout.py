@@ -113,21 +113,13 @@ def wrist_springs(scene: Scene) -> tuple[list[Any], list[Any]]:
     return stiffness, [w.linear_damping] * 3 + [w.angular_damping] * 3
 
 
-SPRING_SHARE = {"least": 1.0, "reduced": 2 / 3}
-"""Share r of h K that the damping C of a joint is at least, by `discretization.spring_damping`.
-
-A joint without inertia moves by -q / r in a step, to 1 - 1 / r of its angle: to rest with r = 1,
-and past it by half with r = 2/3.  Any r from 1/2 on is stable, whatever the inertia.
-"""
-
-
 def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
     """Damping C of a joint whose spring acts implicitly, (M + h C) a = tau - K q - C v.
 
     With the new velocity v + h a that is the spring's force at the step's start and all of the
     damping at its end.  C = D + h K is the implicit Euler step of both.  A joint without inertia
     moves by -h K / C q in a step: C = max(D, h K) never overshoots, and where D >= h K the joint
-    keeps its own damping.  `SPRING_SHARE` has what is less than h K.
+    keeps its own damping.
 
     Args:
       scene: The scene.
@@ -137,12 +129,11 @@ def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
     Returns:
       C by `discretization.spring_damping`, shaped as the stiffness.
     """
-    kind, added = scene.discretization.spring_damping, scene.discretization.timestep * stiffness
-    if kind == "added":
+    added = scene.discretization.timestep * stiffness
+    if scene.discretization.spring_damping == "added":
         return damping + added
-    least = SPRING_SHARE[kind] * added
     # Not jnp.maximum: NumPy's numbers, as a MuJoCo spec takes them, stay NumPy's.
-    return damping + (least - damping) * (least > damping)
+    return damping + (added - damping) * (added > damping)
 
 
 def contact_invweight(scene: Scene) -> Any:

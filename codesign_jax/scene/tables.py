@@ -168,8 +168,7 @@ class Discretization:
       hull_rings: Rings of vertices of a link, only with `effects.surface = "hull"`.
       hull_points: Vertices of a ring, a multiple of four, only with `effects.surface = "hull"`.
       spring_damping: How much of the time step h the implicit springs add to a joint's damping time
-        beta: "added" acts as beta + h, "least" as max(beta, h), "reduced" as max(beta, 2/3 h); see
-        docs/physics.md.
+        beta: "added" acts as beta + h, "least" as max(beta, h); see docs/physics.md.
     """
 
     timestep: float = quantity("s", 1e-5, 0.05, structure=True)
@@ -177,7 +176,7 @@ class Discretization:
     spheres_per_link: int = quantity("", 1, 20, structure=True)
     hull_rings: int = quantity("", 1, 20, structure=True, default=2)
     hull_points: int = quantity("", 4, 80, structure=True, default=8)
-    spring_damping: str = choice("added", "least", "reduced", default="added")
+    spring_damping: str = choice("added", "least", default="added")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,12 +208,15 @@ class Newton:
       evaluations: Largest number of line-search evaluations of an iteration; where no kernel runs
         a line search has at most six.
       decrement: Relative Newton decrement at which a world has converged, a share of the cost's
-        scale; a step that ends above it sets the bit SOLVER_CAP.
+        scale. A step that ends above it has stopped at the limit of iterations.
+      residual: Residual of such a step, the root of its decrement, above which the trial has the
+        warning SOLVER_CAP; see `Outcome`.
     """
 
     iterations: int = quantity("", 1, 1000, structure=True, default=24)
     evaluations: int = quantity("", 1, 1000, structure=True, default=14)
     decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-6)
+    residual: float = quantity("", 1e-8, 1e8, structure=True, default=0.01)
 
 
 @dataclasses.dataclass(frozen=True)

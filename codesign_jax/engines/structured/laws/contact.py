@@ -128,7 +128,7 @@ class Contacts(NamedTuple):
         the step h.  A contact with c = 0 would be an explicit spring on a link of a few grams.
         """
         cone = self.cone
-        if cone.growth is None:
+        if cone.growth is None or cone.least is None:
             return cone
         share = jnp.minimum(jnp.maximum(-self.distance * cone.growth, 0.0), 1.0)
         share = cone.least + (1.0 - cone.least) * share

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, State
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, turn_columns
-from codesign_jax.model.layout import SPRING_SHARE
 from codesign_jax.model.morphology import softening, threshold_moments
 from codesign_jax.scene import Scene
 
@@ -217,10 +216,10 @@ def springs(
     h = scene.discretization.timestep
     more, moment = threshold_moments(tuple(threshold), pressure, q[0], q[1])
     stiffness = _with_lateral(stiffness, stiffness[1] + more)
-    if (kind := scene.discretization.spring_damping) == "added":
+    if scene.discretization.spring_damping == "added":
         lateral = damping[1] + h * more, armature[1] + h * h * more
     else:
-        least = SPRING_SHARE[kind] * h * stiffness[1]
+        least = h * stiffness[1]
         lateral = jnp.maximum(damping[1], least), jnp.maximum(armature[1], h * least)
     damping, armature = map(_with_lateral, (damping, armature), lateral)
     return Springs(stiffness, damping, armature, moment[None])

@@ -151,6 +151,8 @@ def test_contacts_have_the_declared_stiffness(friction):
 def test_what_plain_mujoco_does_not_simulate_is_named():
     [rubber] = plain.obstacles(pinch(effects__neo_hookean=True))
     assert "effects.neo_hookean = true" in rubber
+    ours = pinch(effects__lateral_threshold=True, effects__soft_touch=True)
+    assert len(plain.obstacles(ours)) == 2
     household = scene.load("paper", object_set="household")
     assert any("'mug' is a mesh" in text for text in plain.obstacles(household))
     assert not plain.obstacles(pinch()) and not plain.stand_in(pinch())

@@ -23,7 +23,7 @@ from tests.planted import Fault, planted, simulate
 STEPS = 8
 
 # Stages of the kernel: functions that it evaluates lane by lane.
-PALM, LINK = "Step._palm.<locals>.compute", "link_forces"
+PALM, LINK = "palm_and_object", "link_forces"
 JAR = "BoundContacts.begin.<locals>.jar"
 RESPONSE = "BoundContacts._push.<locals>.response"
 RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"

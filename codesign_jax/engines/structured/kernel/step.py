@@ -95,27 +95,16 @@ class Step:
           Trace entries distance, height, residual, iterations and, with slots, overflow; speed
           after the step; worlds that have moved, and so go on.
         """
-        p, scene = self.p, self.p.scene
-        state = {
-            n: p.world_state.read(self.world_state, n, 0, self.block.world)
-            for n in p.world_state.groups
-        }
-        geometry = self._palm(state, arm)
-        hand, world = (p.hand, self.hand), (p.world, self.world)
-        thing = objects.read(scene, self.block, world, hand, self.grid)
-        bound = {c.name: c.bind(p.scratch, self.scratch, self.constant) for c in p.sets}
-        memory = Memory(
-            p.hand, self.hand, p.finger_state, self.finger_state, p.scratch, self.scratch, bound
-        )
-        now, centre = self._forward(state, geometry, pressure, memory, thing)
-        rigid = not scene.effects.wrist
+        p = self.p
+        state, geometry, _, memory, now, centre = self.assemble(arm, pressure)
+        rigid = not p.scene.effects.wrist
         problem = Problem(p.links, self.block, memory, geometry["palm"], rigid=rigid)
         now, quality = Newton(problem).solve(now, waiting, *p.limits)
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
         goes_on, slots = waiting & undecided(distance, height), []
         if p.slotted:
-            slots = [self._overflow(bound, waiting)]
+            slots = [self._overflow(memory.contacts, waiting)]
             goes_on &= slots[0] == 0
         new_speed, good = advance.advance(self, state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
@@ -123,22 +112,38 @@ class Step:
         residual = jnp.where(waiting, quality.residual.lane, 0.0)
         return (distance, height, residual, count, *slots), new_speed, good
 
+    def assemble(self, arm: Lanes, pressure: Lanes) -> tuple:
+        """Reads the state, and leaves bodies, forces and contacts in the scratch table.
+
+        Args:
+          arm: As in `advance`.
+          pressure: As in `advance`.
+
+        Returns:
+          The state of wrist and object by name, what `palm_and_object` finds, the objects, the
+          memory, the warm start, and the hand's centre from the object's.
+        """
+        p, hand, world = self.p, (self.p.hand, self.hand), (self.p.world, self.world)
+        read = partial(p.world_state.read, self.world_state, item=0, world=self.block.world)
+        state = {name: read(name) for name in p.world_state.groups}
+        run = partial(palm_and_object, p.scene.discretization.timestep)
+        at = lanewise(run, state, arm, *self.palm_constants())
+        thing = objects.read(p.scene, self.block, world, hand, self.grid)
+        bound = {c.name: c.bind(p.scratch, self.scratch, self.constant) for c in p.sets}
+        state_table, scratch = (p.finger_state, self.finger_state), (p.scratch, self.scratch)
+        memory = Memory(*hand, *state_table, *scratch, bound)
+        return state, at, thing, memory, *self._forward(state, at, pressure, memory, thing)
+
+    def palm_constants(self) -> list[Lanes | None]:
+        """Those of `PALM_CONSTANTS`; None for what the scene lacks."""
+        names = self.p.world.groups
+        return [self.constant(n) if n in names else None for n in PALM_CONSTANTS]
+
     def _overflow(self, bound: dict[str, Any], waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
         lists = [c.overflow() for c in bound.values() if isinstance(c, BoundSlots)]
         most = self.block.fold(total(lists), jnp.maximum)
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
-
-    def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
-        """Kinematics, inertia and smooth forces of palm, wrist and object."""
-        names = self.p.world.groups
-        constants = [self.constant(n) if n in names else None for n in PALM_CONSTANTS]
-        timestep = self.p.scene.discretization.timestep
-
-        def compute(state: dict, arm: jax.Array, *constants: Any) -> dict[str, Any]:
-            return palm_and_object(timestep, state, arm, *constants)
-
-        return lanewise(compute, state, arm, *constants)
 
     def keep(self, i: Any, chain: tuple) -> None:
         """Called with origin, frame, velocity, bias and motion of the link before each joint.

@@ -14,7 +14,7 @@ from codesign_jax.engines.structured.kernel.powers import Chain
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
 from codesign_jax.engines.structured.kernel.slots import any_of
-from codesign_jax.engines.structured.kernel.step import PALM_CONSTANTS, Step
+from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kernel.sweep import Sweep
 from codesign_jax.engines.structured.kernel.virtual import Virtual, palm_problem
 from codesign_jax.engines.structured.lanes import dot
@@ -144,9 +144,7 @@ class ReverseStep(Step):
         height = plus(own["height"], lanes([shown.height], (), wide=False))
         bars = base, own["columns"], own["object_vel"], height, acc, one
         found, arm_bar, constant_bars = pull(run, given, (still,), bars)
-        self.bars.add_once(
-            {n: v for n, v in zip(PALM_CONSTANTS, constant_bars, strict=True) if v is not None}
-        )
+        self.bars.add_once(constant_bars)
         for name, value in plus(found, before).items():
             p.world_state.write(self.bars.world_state, name, value, 0, self.block.world)
         any_of(shown.speed != 0, lambda: speed.add(self, state, shown.speed))

@@ -28,8 +28,8 @@ class Status(enum.IntFlag):
       SPEED: A velocity beyond the scene's limit.
       PENETRATION: The object fell through the table.
       SOLVER_CAP: The solver stopped at its cap of iterations in a step before the verdict. A
-        warning: each iteration lowers the convex objective, so the step taken is the best found,
-        and to exclude such trials would favour hands that touch little.
+        warning: each iteration lowers the convex objective, so the step taken is the best found.
+        Only trials in contact reach the cap: to exclude them would favour hands that touch little.
       CONTACT_OVERFLOW: The engine had no room for a contact: MuJoCo C in its arena, the
         structured engine for those between fingers.
       INVALID_START: Bad model fields, or bodies deep inside one another before the first step.
@@ -165,7 +165,8 @@ class Trace(NamedTuple):
         state is not.
       qpos: Generalized positions if they were recorded, shape (time, nq), else shape (time, 0).
       status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP,
-        CONTACT_OVERFLOW), shape (time,) int32, or None if it does not tell.
+        CONTACT_OVERFLOW), shape (time,) int32, or None if the
+        engine does not report them.
       last: Generalized positions and velocities at the end, those in which a decided world stays,
         shape (nq + nv,), or None.
 

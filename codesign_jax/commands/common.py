@@ -23,6 +23,7 @@ __all__ = [
     "SceneFlags",
     "check_engine",
     "check_place",
+    "counted",
     "load_scene",
     "mesh_notes",
     "parse_design",
@@ -250,6 +251,11 @@ def preflight_notes(
     if report.refusals:
         raise SceneError(report.refusals)
     return [f"warning: {text}" for text in report.warnings] + report.notes
+
+
+def counted(number: int, noun: str) -> str:
+    """A number of things in words, such as "1 call" and "2 calls"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _number(text: str) -> float | None:

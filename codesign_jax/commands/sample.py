@@ -53,7 +53,7 @@ def main(options: "Sample") -> int:
     for note in [*notes, *common.mesh_notes(scene)]:
         console.print(note, markup=False)
     count = question.shards(options.designs)
-    console.print(f"{_amount(options)} in {count} call{'s' * (count > 1)}")
+    console.print(f"{_amount(options)} in {common.counted(count, 'call')}")
     if options.dry_run:
         _dry_run(options, question, console)
         return 0
@@ -109,7 +109,9 @@ def _question(options: "Sample", scene: Scene) -> Question:
 
 def _amount(options: "Sample") -> str:
     """Designs and grasps in words."""
-    return f"{options.designs} designs x {options.trials} trials: {_grasps(options)} grasps"
+    sizes = (options.designs, "design"), (options.trials, "trial")
+    each = " x ".join(common.counted(*size) for size in sizes)
+    return f"{each}: {common.counted(_grasps(options), 'grasp')}"
 
 
 def _grasps(options: "Sample") -> int:
@@ -182,7 +184,9 @@ def _simulate(
                 meter.found(tally.add(question, shard, designs, kept))
         if len(missing) < total:
             done = total - len(missing)
-            words = f"going on after {done} of {total} calls, from {shards.folder}"
+            words = (
+                f"going on after {done} of {common.counted(total, 'call')}, from {shards.folder}"
+            )
             console.print(words, markup=False)
         for shard in missing:
             start = time.perf_counter()

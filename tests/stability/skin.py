@@ -133,4 +133,10 @@ box = "corner of a box, 5 mm in the hull, between its vertices"
 case(
     36, box, "error of the force, 256 points a link, against a continuous skin, relative", **at_rest
 )(corner_force)
-case(36, box, "places at which the default mesh does not feel it", **at_rest)(corner_unseen)
+case(
+    36,
+    box,
+    "places at which the default mesh does not feel it",
+    failures={(1.0, "float64"): unseen},
+    **at_rest,
+)(corner_unseen)

@@ -240,6 +240,10 @@ def late():
     return json.loads((DATA / "late_designs.json").read_text())
 
 
+def made():
+    return f"stored result, commit {late()['commit'][:7]}"
+
+
 def verdicts(setting):
     """Letters of the trials of a setting, shape (design, trial)."""
     return np.array([list(row) for row in late()["settings"][setting]["trials"]])
@@ -257,7 +261,7 @@ def refinements(finer):
     flips = f"{(change != 0).mean():.1%} of the verdicts flip"
     stuck = f"STUCK {(one == 's').mean():.2%} and {(two == 's').mean():.2%}"
     size = f"{one.shape[0]} designs in {one.shape[1]} trials"
-    note = f"{size}: {shares}, {flips}, {stuck}, stored result, commit {late()['commit'][:7]}"
+    note = f"{size}: {shares}, {flips}, {stuck}; {made()}"
     return Found(abs(change.mean()) / half, 1.0, note)
 
 
@@ -276,13 +280,10 @@ def late_stuck(engine, step, precision):
     """And how deep the fingers were in one another as the hand was told to let go."""
     found, depth = verdicts("h"), np.array(late()["settings"]["h"]["depth_mm"])
     stuck, free = depth[found == "s"], depth[found == "k"]
-    # Chance that a grasp that is stuck was the deeper one of a pair.
-    chance = (stats.rankdata(np.r_[stuck, free])[: len(stuck)].mean() - (len(stuck) + 1) / 2) / len(
-        free
-    )
+    above = stats.mannwhitneyu(stuck, free).statistic / (len(stuck) * len(free))
     note = (
         f"{len(stuck)} of {found.size:,}; deepest crossing of fingers at the release: "
         f"{np.median(stuck):.1f} mm where it is STUCK, {np.median(free):.1f} mm where it is not, "
-        f"the first is deeper in {chance:.0%} of pairs; stored result, commit {late()['commit'][:7]}"
+        f"the first is deeper in {above:.0%} of pairs; {made()}"
     )
     return Found((found == "s").mean(), 3e-3, note)

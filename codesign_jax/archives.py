@@ -117,7 +117,7 @@ def refusal(arrays: Mapping[str, np.ndarray], key: str) -> str:
     """
     found = {name: str(arrays.get(name)) for name in ("key", "code", "schema")}
     if found["schema"] == str(SCHEMA) and found["key"] != key:
-        return "is of another case"
+        return "is of another design or other settings"
     same = found["schema"] == str(SCHEMA) and found["code"] == sources.digest()
     return "" if same else "is of another version of the code"
 

@@ -161,8 +161,7 @@ def _render(case: Case, engine: engines.Engine, options: "Evaluate", console: Co
     with Busy(console, "simulating what is drawn"):
         grasps = animation.replay(case.scene, engine, params, trials)
     path: Path = options.render  # type: ignore[assignment]
-    if path.suffix == ".gif":
-        animation.write_gif(case.scene, grasps, path, notify=console.print)
-    else:
-        animation.write_strip(case.scene, grasps, path, notify=console.print)
+    write = animation.write_gif if path.suffix == ".gif" else animation.write_strip
+    with Busy(console, "drawing"):
+        write(case.scene, grasps, path, notify=console.print)
     console.print(f"picture: {path}", markup=False)

@@ -12,7 +12,7 @@ import numpy as np
 from codesign_jax import codesign, cost, runs
 from codesign_jax.report import statistics
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Status, failed
+from codesign_jax.types import Outcome, failed
 
 RELIABLE = 0.95
 """Share of all trials that a successful design keeps at least: the mean cost alone lets a design
@@ -50,11 +50,8 @@ class Tally(NamedTuple):
 
 def tally(outcomes: Outcome) -> Tally:
     """Counts trials, given as arrays of any shape."""
-    status, kept = np.asarray(outcomes.status), _kept(outcomes)
-    bad = failed(status)
-    stuck = bad & ((status & Status.STUCK) != 0)
-    numbers = (kept, ~kept & ~bad, stuck, bad & ~stuck)
-    return Tally(*(int(part.sum()) for part in numbers))
+    ends = codesign.verdicts(outcomes).ravel()
+    return Tally(*np.bincount(ends, minlength=len(codesign.VERDICTS)).tolist())
 
 
 def success(scene: Scene, outcomes: Outcome) -> Any:
@@ -72,8 +69,7 @@ def success(scene: Scene, outcomes: Outcome) -> Any:
 
 
 def _kept(outcomes: Outcome) -> np.ndarray:
-    good = ~failed(np.asarray(outcomes.status))
-    return good & (np.asarray(outcomes.cost) < codesign.SUCCESS_COST)
+    return codesign.verdicts(outcomes) == codesign.VERDICTS.index("kept")
 
 
 class Judged(NamedTuple):

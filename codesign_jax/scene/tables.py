@@ -28,9 +28,11 @@ class Effects:
     finger_palm: bool = False
     surface: str = choice("spheres", "hull", default="spheres")
     friction: str = choice("none", "coulomb", "full", default="coulomb")
+    soft_touch: bool = False
     disturb: bool = True
     ungrasp: bool = True
     neo_hookean: bool = False
+    lateral_threshold: bool = False
     pressure_dynamics: bool = False
     gravity: bool = True
 
@@ -122,6 +124,8 @@ class Contact:
       finger_palm_friction: Coulomb coefficient of fingers on the palm, only with
         `effects.finger_palm`.
       finger_palm_stiffness: As `normal_stiffness`, of fingers on the palm.
+      touch_depth: Depth over which damping and friction of a contact grow to their full strength,
+        only with `effects.soft_touch`.
     """
 
     normal_stiffness: float = quantity("N/m", 10, 1e6)
@@ -135,6 +139,7 @@ class Contact:
     finger_finger_friction_ratio: float = quantity("", 0.01, 1000, default=1.0)
     finger_palm_friction: float = quantity("", 0, 5, default=0.8)
     finger_palm_stiffness: float = quantity("N/m", 10, 1e6, default=20e3)
+    touch_depth: float = quantity("m", 1e-6, 0.01, default=0.3e-3)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,15 +1,20 @@
-"""Random designs first, then CMA-ES from the best, and the average of its means as the answer.
+"""Random designs first, then an evolution strategy from the best, and the average of its means.
 
 Grasps are noisy: a design that loses none of three objects may lose one in ten.  So no single
-particle is believed.  CMA-ES recombines the better half of a population, and its mean moves where
-particles keep their objects on the whole; the average of these means over the episodes, recent ones
-weighing more, has less noise still, and no trial chose it.  Each average is simulated as particle 0
-of the next episode, and the final test takes the last ones.
+particle is believed.  The mean of an evolution strategy moves where particles keep their objects on
+the whole; the average of these means over the episodes, recent ones weighing more, has less noise
+still, and no trial chose it.  Each average is simulated as particle 0 of the next episode, and the
+final test takes the last ones.
 
-Sources: Hansen (2016), "The CMA evolution strategy: a tutorial", arXiv:1604.00772, by evosax;
-Shamir and Zhang (2013), "Stochastic gradient descent for non-smooth optimization",
-arXiv:1212.1824, section 4 (polynomial-decay averaging).  docs/notes/search.md has what each part is
-worth.
+The strategy is OpenAI's.  Its draws come in mirrored pairs and designs of equal cost have equal
+weight, so that its mean stays where it is while all particles keep all of their objects; that of
+CMA-ES wanders then, as it follows whichever of them stand first.
+
+Sources: Salimans et al. (2017), "Evolution strategies as a scalable alternative to reinforcement
+learning", arXiv:1703.03864, and Hansen (2016), "The CMA evolution strategy: a tutorial",
+arXiv:1604.00772, both by evosax; Shamir and Zhang (2013), "Stochastic gradient descent for
+non-smooth optimization", arXiv:1212.1824, section 4 (polynomial-decay averaging).
+docs/notes/search.md has what each part is worth.
 """
 
 import dataclasses
@@ -21,7 +26,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space, reflect
-from codesign_jax.optimize.evolution import Strategy, arrays, build
+from codesign_jax.optimize.evolution import OPEN_SIGMA, Strategy, arrays, build, fitness
 from codesign_jax.optimize.protocol import (
     Info,
     State,
@@ -41,12 +46,14 @@ STREAM_TELL = 0x636D6174
 """Stream of its draws in ``tell`` ("cmat")."""
 LEAST = 3
 """Fewest particles: the average, and two for the strategy to rank."""
+STRATEGIES = {"open-es": OPEN_SIGMA, "cma-es": 0.2}
+"""The strategies, and the first standard deviation of each as a fraction of the parameter range."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
-class ScreenedCMA:
-    """CMA-ES from the best of random designs; its answer is an average of means.
+class Screened:
+    """An evolution strategy from the best of random designs; its answer is an average of means.
 
     The first episodes simulate random designs, uniform in the parameters that the schedule opens,
     and the next ones the best of these again, in other trials: a start in the wrong place costs
@@ -59,9 +66,12 @@ class ScreenedCMA:
         keeps_best: True: the final test counts new trials only; see ``Optimizer.keeps_best``.
         screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
         space: Bounds and constraint of the parameters.
+        strategy: One of ``STRATEGIES``. With "open-es", whose draws come in pairs, the last one of
+            an even number of particles is the strategy's mean.
         screening: Episodes of random designs.
         retests: Episodes that simulate the best of them again.
-        sigma: First standard deviation of CMA-ES as a fraction of the parameter range.
+        sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
+            that of ``STRATEGIES``.
         recency: After ``t`` episodes of the strategy its mean has weight ``recency / (t + recency
             - 1)`` in the average: 1 is the plain average, more forgets the first means sooner.
     """
@@ -70,9 +80,10 @@ class ScreenedCMA:
     screens = True
 
     space: Space
+    strategy: str = dataclasses.field(default="open-es", metadata={"static": True})
     screening: int = dataclasses.field(default=3, metadata={"static": True})
     retests: int = dataclasses.field(default=2, metadata={"static": True})
-    sigma: float = dataclasses.field(default=0.2, metadata={"static": True})
+    sigma: float = dataclasses.field(default=0.0, metadata={"static": True})
     recency: float = dataclasses.field(default=4.0, metadata={"static": True})
 
     def __post_init__(self) -> None:
@@ -81,8 +92,10 @@ class ScreenedCMA:
         Raises:
             ValueError: If one of them is out of its range.
         """
-        if not (min(self.screening, self.retests + 1, self.recency) >= 1 and self.sigma > 0):
-            raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma > 0: {self}")
+        if self.strategy not in STRATEGIES:
+            raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
+        if not (min(self.screening, self.retests + 1, self.recency) >= 1 and self.sigma >= 0):
+            raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma >= 0: {self}")
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0; see ``Optimizer.init``.
@@ -95,7 +108,7 @@ class ScreenedCMA:
         """
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST:
-            raise ValueError(f"{num_particles=}: screened-cma-es needs at least {LEAST}")
+            raise ValueError(f"{num_particles=}: a screened search needs at least {LEAST}")
         state = State(jnp.tile(seed, (num_particles, 1)), jnp.zeros((), jnp.int32), key)
         memory = {
             "mask": jnp.ones(seed.shape, bool),
@@ -138,11 +151,11 @@ class ScreenedCMA:
         # Later the average that was simulated comes before the earlier ones.
         averages = jnp.concatenate([population[:1], state.particles[:-1]])
         unit, asked, memory = self._asked(state, mask)
-        # CMA-ES knows ranks only; rows are a fair draw among equal costs, see `Evolution.tell`.
-        ranks = jnp.argsort(jnp.argsort(ranked[1:])).astype(unit.dtype)
         algorithm, params = self._strategy(state)
+        points = slice(1, 1 + algorithm.population_size)
+        told = fitness(self.strategy, ranked[points]).astype(unit.dtype)
         key = episode_key(state, STREAM_TELL)
-        new, _ = algorithm.tell(key, unit[1:], ranks, asked, params)
+        new, _ = algorithm.tell(key, unit[points], told, asked, params)
         weight = self.recency / (memory["averaged"] + self.recency)
         average = memory["average"] + weight * (new.mean - memory["average"])
         now = {"average": average, "averaged": memory["averaged"] + 1, "strategy": arrays(new)}
@@ -175,7 +188,8 @@ class ScreenedCMA:
             **memory["strategy"]
         )
         points, strategy = algorithm.ask(episode_key(state, STREAM_MOVE), strategy, params)
-        return jnp.concatenate([memory["average"][None], points]), strategy, memory
+        rest = jnp.tile(strategy.mean, (len(state.particles) - 1 - len(points), 1))
+        return jnp.concatenate([memory["average"][None], points, rest]), strategy, memory
 
     def _start(self, state: State) -> dict[str, Any]:
         """Average and strategy as they start, at particle 0."""
@@ -191,5 +205,7 @@ class ScreenedCMA:
         return reflect(low + unit * (high - low), low, high)
 
     def _strategy(self, state: State) -> Strategy:
-        n, width = state.particles.shape
-        return build("cma-es", n - 1, width, self.sigma, str(state.particles.dtype))
+        (n, width), dtype = state.particles.shape, str(state.particles.dtype)
+        count = n - 1 if self.strategy == "cma-es" else 2 * ((n - 1) // 2)
+        sigma = self.sigma or STRATEGIES[self.strategy]
+        return build(self.strategy, count, width, sigma, dtype)

@@ -6,6 +6,7 @@ the search's; those by which the recommended design is judged do not.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, failed
 from scripts.shared.output import write_arrays
 
-CANDIDATES, ROUNDS = 24, 12
+CANDIDATES, ROUNDS = 25, 12
 """Particles that are tested at a mark, and trials of each."""
 STREAM_JUDGE = 0x6A756467
 """Stream of the trials that judge a recommended design ("judg")."""
@@ -31,7 +32,7 @@ STREAM_JUDGE = 0x6A756467
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """An optimiser with its sizes, by a name such as `screened-cma-es:sigma=0.25,particles=12`.
+    """An optimiser with its sizes, by a name such as `screened-es:sigma=0.2,particles=12`.
 
     Attributes:
       name: The name.
@@ -84,6 +85,8 @@ class Study:
         budget: int,
         tests: int,
         marks: int = 9,
+        at: Sequence[int] = (),
+        first_seed: int = 0,
         chunk: int,
         path: Path,
     ):
@@ -98,26 +101,34 @@ class Study:
           budget: Grasps of a seed after which the search ends.
           tests: Trials that judge a recommended design.
           marks: Number of times at which one is recommended.
+          at: Grasps of a seed after which one is recommended, instead of `marks`; each mark is the
+            last episode that they allow.
+          first_seed: The first seed.
           chunk: Most grasps of a call.
           path: File of what is done.
         """
         self.case, self.scene, self.engine, self.space = case, scene, engine, space
         self.tests, self.chunk, self.path = tests, chunk, path
-        self.keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+        self.keys = jax.vmap(jax.random.key)(first_seed + jnp.arange(seeds))
         self.mask = jnp.ones(space.num_parameters, bool)
         self.simulate = jax.jit(self._simulate, static_argnums=2)
         self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
         self.tell = jax.jit(
             jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
         )
-        episodes = max(1, int((budget - self.before - self.tested) / case.worlds))
+        episodes = self._episodes(budget)
         first = getattr(case.optimizer, "screening", 0) + getattr(case.optimizer, "retests", 0) + 1
         self.marks = sorted(
-            {*np.geomspace(min(first, episodes), episodes, marks).round().astype(int)}
+            {*map(self._episodes, at)}
+            or {*np.geomspace(min(first, episodes), episodes, marks).round().astype(int)}
         )
         self.kept: dict[int, np.ndarray] = {}
         self.designs: dict[int, np.ndarray] = {}
         self.state, self.last = self._restore() if path.exists() else (self._start(), None)
+
+    def _episodes(self, grasps: int) -> int:
+        """Episodes of a seed after which no more than so many grasps have been simulated."""
+        return max(1, int((grasps - self.before - self.tested) / self.case.worlds))
 
     @property
     def before(self) -> int:

@@ -42,6 +42,9 @@ class Optimize:
     """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
     and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
+    robust: Flag = False
+    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
+    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control. Several, such as
     single,switch-4,concurrent: runs of each, simulated in one batch, and a comparison."""
@@ -273,6 +276,9 @@ class Sample:
     """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
     and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
+    robust: Flag = False
+    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
+    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
     engine: str = "structured"
     """Engine that simulates: structured, mujoco (C, float64) or mjx (stock)."""
     seed: int = 0

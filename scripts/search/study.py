@@ -21,11 +21,11 @@ from codesign_jax.engines import Engine
 from codesign_jax.optimize import Optimizer, State
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import Outcome, failed
+from codesign_jax.types import Outcome, Trial, failed
 from scripts.shared.output import write_arrays
 
 CANDIDATES, ROUNDS = 25, 12
-"""Particles that are tested at a mark, and trials of each."""
+"""Particles that are tested at a mark, and the fewest trials of each, in whole turns of objects."""
 STREAM_JUDGE = 0x6A756467
 """Stream of the trials that judge a recommended design ("judg")."""
 
@@ -87,6 +87,7 @@ class Study:
         marks: int = 9,
         at: Sequence[int] = (),
         first_seed: int = 0,
+        shapes: np.ndarray | None = None,
         chunk: int,
         path: Path,
     ):
@@ -104,6 +105,8 @@ class Study:
           at: Grasps of a seed after which one is recommended, instead of `marks`; each mark is the
             last episode that they allow.
           first_seed: The first seed.
+          shapes: Objects that the trials of each seed take turns with, shape (seed, object); None
+            for the scene's.
           chunk: Most grasps of a call.
           path: File of what is done.
         """
@@ -111,7 +114,10 @@ class Study:
         self.tests, self.chunk, self.path = tests, chunk, path
         self.keys = jax.vmap(jax.random.key)(first_seed + jnp.arange(seeds))
         self.mask = jnp.ones(space.num_parameters, bool)
-        self.simulate = jax.jit(self._simulate, static_argnums=2)
+        every = np.tile(np.arange(len(scene.objects.object)), (seeds, 1))
+        self.shapes = every if shapes is None else np.asarray(shapes)
+        self.rounds = -(-ROUNDS // self.shapes.shape[1]) * self.shapes.shape[1]
+        self.simulate = jax.jit(jax.vmap(self._simulate))
         self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
         self.tell = jax.jit(
             jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
@@ -138,7 +144,7 @@ class Study:
     @property
     def tested(self) -> int:
         """Grasps by which a mark chooses."""
-        return min(CANDIDATES, self.case.particles) * ROUNDS
+        return min(CANDIDATES, self.case.particles) * self.rounds
 
     @property
     def done(self) -> int:
@@ -205,14 +211,14 @@ class Study:
             chosen = jnp.take_along_axis(self.last[0], best, 1)
         chosen = chosen[:, :CANDIDATES]
         tested = self._costs(
-            self._all(chosen, self._noise(codesign.STREAM_TEST, self.done), ROUNDS)
+            self._all(chosen, self._noise(codesign.STREAM_TEST, self.done), self.rounds)
         )
         design = chosen[jnp.arange(len(chosen)), tested.argmin(1)][:, None]
         outcome = self._all(design, self._noise(STREAM_JUDGE, 0), self.tests)
         kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
         self.kept[self.done] = kept[:, 0].mean(-1)
         self.designs[self.done] = np.asarray(design[:, 0])
-        return tested.size * ROUNDS + kept.size
+        return tested.size * self.rounds + kept.size
 
     def _noise(self, stream: int, index: int) -> jax.Array:
         return jax.vmap(lambda key: codesign.stream_key(key, stream, index))(self.keys)
@@ -221,21 +227,43 @@ class Study:
         return jax.jit(lambda found: particle_cost(self.scene, found))(outcome)
 
     def _all(self, populations: jax.Array, keys: jax.Array, trials: int) -> Outcome:
-        """Outcomes of shape (seed, particle, trial), simulated in calls of equal size."""
-        count, size = len(keys), max(1, self.chunk // (populations.shape[1] * trials))
-        size, parts = min(size, count), []
+        """Outcomes of shape (seed, particle, trial) in the trials of these keys."""
+        return self.outcomes(populations, self.drawn(keys, trials, self.shapes, self.scene))
+
+    def outcomes(self, populations: jax.Array, trials: Trial) -> Outcome:
+        """Outcomes of shape (seed, particle, trial), simulated in calls of equal size.
+
+        Args:
+          populations: Particles of each seed, shape (seed, particle, parameter).
+          trials: Trials that these meet, leading axes (seed, trial).
+        """
+        count, worlds = len(populations), populations.shape[1] * trials.yaw.shape[1]
+        size, parts = min(max(1, self.chunk // worlds), count), []
         for start in range(0, count, size):
             rows = jnp.minimum(jnp.arange(start, start + size), count - 1)
-            parts.append(self.simulate(populations[rows], keys[rows], trials))
+            own = jax.tree.map(lambda v, rows=rows: v[rows], trials)
+            parts.append(self.simulate(populations[rows], own))
         return jax.tree.map(lambda *v: jnp.concatenate(v)[:count], *parts)
 
-    def _simulate(self, populations: jax.Array, keys: jax.Array, trials: int) -> Outcome:
-        def one(population: jax.Array, key: jax.Array) -> Outcome:
-            drawn = rollout.sample_trials(self.scene, key, trials)
-            hands = jax.vmap(self.space.params)(population)
-            return rollout.evaluate(self.scene, self.engine, hands, drawn)
+    def drawn(self, keys: jax.Array, trials: int, shapes: np.ndarray, scene: Scene) -> Trial:
+        """Trials of each key with a scene's noise, of objects that take turns.
 
-        return jax.vmap(one)(populations, keys)
+        Args:
+          keys: Typed keys, shape (seed,).
+          trials: Trials of each.
+          shapes: Objects of each, shape (seed, object).
+          scene: Scene with the noise.
+
+        Returns:
+          Trials with leading axes (seed, trial).
+        """
+        drawn = jax.vmap(lambda key: rollout.sample_trials(scene, key, trials))(keys)
+        turns = shapes[:, np.arange(trials) % shapes.shape[1]]
+        return drawn._replace(shape=jnp.asarray(turns, drawn.shape.dtype))
+
+    def _simulate(self, population: jax.Array, trials: Trial) -> Outcome:
+        hands = jax.vmap(self.space.params)(population)
+        return rollout.evaluate(self.scene, self.engine, hands, trials)
 
     def _leaves(self) -> list[jax.Array]:
         state = self.state._replace(key=jax.vmap(jax.random.key_data)(self.state.key))

@@ -286,6 +286,9 @@ class Sample:
     chunk: Count = None
     """Most grasps of a call, after each of which the outcomes are saved; default: 512 on CPUs,
     16384 on a GPU. Results depend on it in the last bits only."""
+    outcomes: Flag = False
+    """Simulate and keep the outcomes alone, in the folder FILE.part; the same command without this
+    flag writes the file, here or where that folder was copied to."""
     dry_run: Flag = False
     """Print the number of grasps and an estimate of time and size; simulate and write nothing."""
 

@@ -1,6 +1,8 @@
 """`codesign sample`: rows that follow from keys, what a kill leaves, and other questions."""
 
 import json
+import shutil
+import sys
 
 import jax
 import numpy as np
@@ -194,6 +196,21 @@ def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):
     assert "going on after 2 of 3 calls, from a.parquet.part" in capsys.readouterr().out
     assert (place / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
     assert sorted(p.name for p in place.iterdir()) == ["a.parquet", "whole.parquet"]
+
+
+def test_outcomes_from_elsewhere_make_the_file(place, monkeypatch, capsys):
+    """A machine without pyarrow simulates; where its folder was copied to, nothing simulates."""
+    assert run(out="whole.parquet") == 0
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pyarrow", None)
+        assert run("--outcomes") == 0
+    assert "outcomes: a.parquet.part (0.0 MB)" in capsys.readouterr().out
+    (place / "here").mkdir()
+    shutil.move(place / "a.parquet.part", place / "here" / "a.parquet.part")
+    monkeypatch.setattr(sample.sampling, "make_simulate", lambda *_: None)  # it cannot be called
+    assert run(out="here/a.parquet", chunk=None) == 0
+    assert (place / "here" / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
+    assert [p.name for p in (place / "here").iterdir()] == ["a.parquet"]
 
 
 def test_a_damaged_shard_is_simulated_again(place, monkeypatch):

@@ -78,6 +78,11 @@ def test_the_page_gets_a_table_and_a_figure(tmp_path):
     assert "| `ours` | 2d | 4 | 40 | 0.965 |" in line and "0.75 (0.30 to 0.95)" in line
     assert line.endswith("| not reached |") and figure.exists()
     assert report.reached(row | {"kept": row["kept"][:2]}, 0.9) == "20"
+    later = row | {"first_seed": 4, "kept": [[0.1], [0.2], [0.3]]}
+    [whole] = report.merged([later, row])
+    assert whole["kept"][0] == [0.5, 0.96, 0.2, 0.96, 0.1] and len(whole["kept"]) == 3
+    with pytest.raises(ValueError, match="overlap"):
+        report.merged([row, later | {"first_seed": 3}])
 
 
 def test_an_object_that_is_held_out_is_met_by_the_judge_alone(tmp_path):

@@ -52,23 +52,23 @@ class Optimize:
     """Domain of the first episode with single and switch-K; alternate: morphology for even seeds,
     control for odd ones, as in the paper's experiments."""
     optimizer: Text = None
-    """Optimiser: screened-cma-es, the default of a new run, particle-filter (the paper's), cma-es,
-    pso or random (docs/command_line.md); or MODULE:CLASS, one of your own. A run goes on with
-    its own."""
+    """Optimiser: screened-es, the default of a new run, particle-filter (the paper's),
+    screened-cma-es, cma-es, open-es, pso or random (docs/command_line.md); or MODULE:CLASS, one of
+    your own. A run goes on with its own."""
     cost: Text = None
     """MODULE:FUNCTION, a cost of your own instead of the scene's: a number from scene, trace and
     controls of a grasp (docs/command_line.md)."""
     engine: Text = None
     """Engine that simulates: structured (ours, the default), mujoco (C, float64) or mjx (stock)."""
     particles: Count = None
-    """Particles; default: 12 in 2d, 24 otherwise; the paper's are 10 and 60."""
+    """Particles; default: 13 in 2d, 25 otherwise; the paper's are 10 and 60."""
     trials: Count = None
     """Trials of a particle in an episode, best a multiple of the objects; default: one with each
     object; the paper's are 6."""
     episodes: Count = None
-    """Episodes; default: 24 in 2d, 29 otherwise; the paper's are 64 and 128."""
+    """Episodes; default: 23 in 2d, 30 otherwise; the paper's are 64 and 128."""
     test_trials: Count = None
-    """Further trials that test each final particle, in whole rounds of --trials; default: 12; the
+    """Further trials that test each final particle, in whole rounds of --trials; default: 6; the
     paper's are 36 in 2d, 72 otherwise; 0: none."""
     reference_trials: Count = None
     """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine

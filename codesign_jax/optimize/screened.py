@@ -1,4 +1,4 @@
-"""Random designs first, then an evolution strategy from the best, and the average of its means.
+"""Random designs first, then an evolution strategy from the best, whose means are averaged.
 
 Grasps are noisy: a design that loses none of three objects may lose one in ten.  So no single
 particle is believed.  The mean of an evolution strategy moves where particles keep their objects on
@@ -58,9 +58,9 @@ class Screened:
     The first episodes simulate random designs, uniform in the parameters that the schedule opens,
     and the next ones the best of these again, in other trials: a start in the wrong place costs
     more than they do.  Later ones simulate the average so far, as particle 0, and draws of the
-    strategy.  The state's particles are the averages of the last episodes, newest first, and before
-    there are enough of them the best random designs behind these.  When a schedule opens other
-    parameters, strategy and average start anew at particle 0.
+    strategy.  The first particles of the state are the averages of the last episodes, newest first,
+    before there are enough of them the best random designs behind these; all others are the newest.
+    When a schedule opens other parameters, strategy and average start anew at particle 0.
 
     Attributes:
         keeps_best: True: the final test counts new trials only; see ``Optimizer.keeps_best``.
@@ -72,6 +72,8 @@ class Screened:
         retests: Episodes that simulate the best of them again.
         sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
             that of ``STRATEGIES``.
+        finalists: Averages that the final test takes. Older ones are worse by more than a dozen
+            trials show, so that a test of many would choose one of them by luck.
         recency: After ``t`` episodes of the strategy its mean has weight ``recency / (t + recency
             - 1)`` in the average: 1 is the plain average, more forgets the first means sooner.
     """
@@ -84,6 +86,7 @@ class Screened:
     screening: int = dataclasses.field(default=3, metadata={"static": True})
     retests: int = dataclasses.field(default=2, metadata={"static": True})
     sigma: float = dataclasses.field(default=0.0, metadata={"static": True})
+    finalists: int = dataclasses.field(default=3, metadata={"static": True})
     recency: float = dataclasses.field(default=4.0, metadata={"static": True})
 
     def __post_init__(self) -> None:
@@ -94,8 +97,10 @@ class Screened:
         """
         if self.strategy not in STRATEGIES:
             raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
-        if not (min(self.screening, self.retests + 1, self.recency) >= 1 and self.sigma >= 0):
-            raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma >= 0: {self}")
+        least = min(self.screening, self.retests + 1, self.finalists, self.recency)
+        if not (least >= 1 and self.sigma >= 0):
+            needed = "screening, finalists, recency >= 1, retests >= 0 and sigma >= 0"
+            raise ValueError(f"need {needed}: {self}")
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0; see ``Optimizer.init``.
@@ -150,6 +155,7 @@ class Screened:
         screened = jnp.concatenate([population, state.particles])[best]
         # Later the average that was simulated comes before the earlier ones.
         averages = jnp.concatenate([population[:1], state.particles[:-1]])
+        averages = averages.at[self.finalists :].set(population[0])
         unit, asked, memory = self._asked(state, mask)
         algorithm, params = self._strategy(state)
         points = slice(1, 1 + algorithm.population_size)
@@ -163,8 +169,9 @@ class Screened:
             "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
             "cost": jnp.where(screens, costs[best], state.memory["cost"]),
         }
-        last = jnp.minimum(jnp.arange(len(cost)), 1)
-        copied = jnp.where(screens, jnp.where(best < len(cost), best, -1), -last)
+        rows = jnp.arange(len(cost))
+        copied = jnp.where((rows == 0) | (rows >= self.finalists), 0, -1)
+        copied = jnp.where(screens, jnp.where(best < len(cost), best, -1), copied)
         particles = jnp.where(screens, screened, averages)
         next_state = State(particles, state.episode + 1, state.key, following)
         return next_state, summarize(cost, jnp.ones_like(cost), copied.astype(jnp.int32))

@@ -25,7 +25,8 @@ from codesign_jax.types import Outcome, Trial, failed
 from scripts.shared.output import write_arrays
 
 CANDIDATES, ROUNDS = 25, 12
-"""Particles that are tested at a mark, and the fewest trials of each, in whole turns of objects."""
+"""Most particles that are tested at a mark, and most trials of each, but for whole turns of the
+objects; an optimiser whose runs have a shorter final test has that."""
 STREAM_JUDGE = 0x6A756467
 """Stream of the trials that judge a recommended design ("judg")."""
 
@@ -39,12 +40,14 @@ class Case:
       optimizer: The optimiser.
       particles: Its particles.
       trials: Trials of each in an episode.
+      tests: Trials of each that choose at a mark.
     """
 
     name: str
     optimizer: Optimizer
     particles: int
     trials: int
+    tests: int = ROUNDS
 
     @property
     def worlds(self) -> int:
@@ -67,8 +70,14 @@ def make_case(name: str, space: DesignSpace, preset: str) -> Case:
         preset, "concurrent", "morphology", "structured", 0, optimizer=kind, **sizes
     )
     made: Any = codesign.make_optimizer(kind, space)
-    own = {n: type(getattr(made, n))(float(v)) for n, v in given.items()}
-    return Case(name, dataclasses.replace(made, **own), usual.particles, usual.trials)
+    own = {n: _as(type(getattr(made, n)), v) for n, v in given.items()}
+    tests = min(ROUNDS, usual.test_trials)
+    return Case(name, dataclasses.replace(made, **own), usual.particles, usual.trials, tests)
+
+
+def _as(kind: type, text: str) -> Any:
+    """A field's value from its text; "4.0" is a whole number too."""
+    return text if kind is str else kind(float(text))
 
 
 class Study:
@@ -116,7 +125,7 @@ class Study:
         self.mask = jnp.ones(space.num_parameters, bool)
         every = np.tile(np.arange(len(scene.objects.object)), (seeds, 1))
         self.shapes = every if shapes is None else np.asarray(shapes)
-        self.rounds = -(-ROUNDS // self.shapes.shape[1]) * self.shapes.shape[1]
+        self.rounds = -(-case.tests // self.shapes.shape[1]) * self.shapes.shape[1]
         self.simulate = jax.jit(jax.vmap(self._simulate))
         self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
         self.tell = jax.jit(

@@ -64,9 +64,10 @@ def main(options: "Sample") -> int:
             except Stopped as stopped:
                 console.print("stopped; the same command goes on")
                 return 128 + stopped.signum
-        dataset.write(options.out, question, options.designs, shards)
-        shards.delete()
-    _report(options.out, found, console)
+        if not options.outcomes:
+            dataset.write(options.out, question, options.designs, shards)
+            shards.delete()
+    _report(shards.folder if options.outcomes else options.out, found, console)
     return 0
 
 
@@ -86,7 +87,8 @@ def _check(options: "Sample") -> None:
     if problems:
         raise SceneError(problems)
     common.check_engine(options.engine)
-    parquet.library("codesign sample")
+    if not options.outcomes:
+        parquet.library("codesign sample")
     common.check_place("--out", options.out)
 
 
@@ -215,4 +217,6 @@ def _report(path: Path, found: _Tally, console: Console) -> None:
     ends = zip(VERDICTS, found.counts.tolist(), strict=True)
     words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
     console.print(f"of {total} grasps: {words}")
-    console.print(f"table: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)
+    size = sum(file.stat().st_size for file in (path, *path.glob("*"))) / 1e6
+    what = "outcomes" if path.is_dir() else "table"
+    console.print(f"{what}: {path} ({size:.1f} MB)", markup=False)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import solver
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, direct, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
@@ -82,7 +82,7 @@ class Chord:
             r = r + push
             y = contract(axes, r[None], 1) + tau
             kept = el.Kept(el.Factors(kept[0], kept[1], kept[0]), kept[2])
-            r, ro, new = el.eliminate_again(direct, axes, kept, r, ro, tau)
+            r, ro, new = el.eliminate_again(axes, kept, r, ro, tau)
             r, ro = with_rows(r, ro, rows)
             return (r, ro, work + dot(y, new.z)), new.z
 
@@ -128,7 +128,7 @@ class Chord:
             ro = ro - wrench if name == "palm_object" else ro
             ro = ro + wrench if name == "object_table" else ro
         if done.hinges is None or done.slides is None:
-            obj = el.solve_object(direct, done.q, ro)
+            obj = el.solve_object(done.q, ro)
             none = jnp.zeros_like(obj)
             return Iterate(none, none, obj), work + dot(ro, obj)
         twist = palm.smooth_wrist - palm.armature * now.wrist
@@ -138,10 +138,10 @@ class Chord:
             (slides, done.slides, twist[:3]),
         ):
             y = contract(axes, r[None], 1) + tau
-            r, ro, new = el.eliminate_again(direct, axes, factors, r, ro, tau)
+            r, ro, new = el.eliminate_again(axes, factors, r, ro, tau)
             kept.append(new)
             work = work + dot(y, new.z)
-        obj = el.solve_object(direct, done.q, ro)
+        obj = el.solve_object(done.q, ro)
         first, motion = el.substitute(slides, kept[1], jnp.zeros_like(obj), obj)
         second, motion = el.substitute(palm.axes, kept[0], motion, obj)
         return Iterate(jnp.concatenate([first, second]), motion, obj), work + dot(ro, obj)

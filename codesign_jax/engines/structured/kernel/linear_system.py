@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, direct, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
 from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
@@ -68,7 +68,7 @@ class Elimination:
                 tau = tau if turned is None else tau + contract(axes[:, :3], turned[None], 1)
             node = el.add_link(node, el.link_terms(link.matrix(), push, pushes))
             y = contract(axes, node.r[None], 1) + tau
-            node, kept = el.eliminate_and_keep(direct, node, axes, armature, tau, terms)
+            node, kept = el.eliminate(node, axes, armature, tau, terms)
             if terms is not None:
                 y = y + terms.y
             return node, kept, dot(y, kept.factors.z)
@@ -213,7 +213,7 @@ class Elimination:
             matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
             node = el.add_palm(node, matrices, force, pushes)
             if rigid:
-                obj = el.solve_object(direct, node.q, node.r_object)
+                obj = el.solve_object(node.q, node.r_object)
                 none = jnp.zeros_like(obj)
                 step = Iterate(none, none, obj)
                 return step, Eliminated(None, None, node.q, dot(node.r_object, obj))
@@ -224,10 +224,10 @@ class Elimination:
                 axes, (armature[3:], armature[:3]), (force.wrist[3:], force.wrist[:3]), strict=True
             ):
                 y = contract(subspace, node.r[None], 1) + twist
-                node, new = el.eliminate_and_keep(direct, node, subspace, inertia, twist)
+                node, new = el.eliminate(node, subspace, inertia, twist)
                 kept.append(new)
                 work.append(dot(y, new.factors.z))
-            obj = el.solve_object(direct, node.q, node.r_object)
+            obj = el.solve_object(node.q, node.r_object)
             first, motion = el.substitute(axes[1], kept[1].factors, jnp.zeros_like(obj), obj)
             second, motion = el.substitute(axes[0], kept[0].factors, motion, obj)
             step = Iterate(jnp.concatenate([first, second]), motion, obj)

@@ -211,7 +211,7 @@ class Search:
             last = jnp.where(i == links - 1, self.like + 1.0, self.like)
 
             def inner(j: Any) -> None:
-                near = there & (lanewise(sections.overlap, self.read("ball", j), ball).lane > 0)
+                near = there & (lanewise(sections.apart, self.read("ball", j), ball).lane < 0)
 
                 def boxes() -> None:
                     own, kind = self._links(j), skin.kind_of(j, links)

@@ -8,7 +8,6 @@ exist in worlds that still iterate, not with those that are possible.
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -209,27 +208,17 @@ class BoundSlots(BoundContacts):
         """
         count, first = self.read("count", row).lane, row * (self.set.slots + 1)
         filled = count.astype(jnp.int32)
-        mine = jnp.where(which, jnp.minimum(filled, self.set.slots), self.set.slots)
-        scatter = partial(self._scatter, fields, first, lane)
-        if self.set.gathers:
-            scatter(mine)
-        else:
+        if not self.set.gathers:
             # Lanes without a contact in a slot have sound numbers there, and no touch.
-            last = jnp.minimum(jnp.max(filled), self.set.slots)
-            there = lanes([which & (filled == last)], (), wide=True)
+            fresh = first + jnp.minimum(jnp.max(filled), self.set.slots)
             for field, value in fields.items():
-                if field == "gap":
-                    value = lanewise(lambda there, gap: jnp.where(there, gap, 1.0), there, value)
-                self.write(field, value, first + last)
-            # Most lanes are done with that; a CPU's vectors scatter number by number.
-            behind = which & (filled < last)
-            any_of(behind, lambda: scatter(jnp.where(behind, mine, self.set.slots)))
+                away = lanewise(jnp.ones_like, value) if field == "gap" else value
+                self.write(field, away, fresh)
+        mine = jnp.where(which, jnp.minimum(filled, self.set.slots), self.set.slots)
+        for field, value in fields.items():
+            self.table.scatter(self.ref, f"{self.set.name}.{field}", value, first + mine, lane)
         more = jnp.where(which, count + 1.0, count)
         self.write("count", lanes([more], (), wide=True), row)
-
-    def _scatter(self, fields: dict, first: Any, lane: jax.Array, slot: jax.Array) -> None:
-        for field, value in fields.items():
-            self.table.scatter(self.ref, f"{self.set.name}.{field}", value, first + slot, lane)
 
     def fold(self, row: Any, body: Callable, start: Any) -> Any:
         """Folds body(item, tree of lanes) over the slots in use."""

@@ -26,12 +26,6 @@ def apart(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.sqrt(dot(away, away)) - (a[3] + b[3])
 
 
-def overlap(a: jax.Array, b: jax.Array) -> jax.Array:
-    """More than zero if two balls overlap: `apart` in squares, which takes no root."""
-    away, reach = a[:3] - b[:3], a[3] + b[3]
-    return reach * reach - dot(away, away)
-
-
 def between(a: jax.Array, b: jax.Array) -> tuple[tuple, tuple]:
     """Point, normal and gap of two balls, on either side; see `finger_pairs`."""
     away, reach = a[:3] - b[:3], a[3] + b[3]

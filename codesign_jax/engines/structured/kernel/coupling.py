@@ -34,7 +34,7 @@ TOLERANCE = 1e-2
 """Squared error of a step, relative to its squared size, both as measured by H.
 
 An exact solution gains little: Newton's method takes 3 % more iterations than with 1e-6, and
-conjugate gradients 40 % fewer (fingers that touch in 120 grasps of scene `paper`, commit 04d1fb0).
+conjugate gradients 40 % fewer (fingers that touch in 120 grasps of scene `paper`).
 """
 
 

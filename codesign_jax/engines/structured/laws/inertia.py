@@ -216,11 +216,11 @@ def springs(
     h = scene.discretization.timestep
     more, moment = threshold_moments(tuple(threshold), pressure, q[0], q[1])
     stiffness = _with_lateral(stiffness, stiffness[1] + more)
-    added = h * stiffness[1] if scene.discretization.spring_damping == "least" else h * more
-    if scene.discretization.spring_damping == "least":
-        lateral = jnp.maximum(damping[1], added), jnp.maximum(armature[1], h * added)
+    if scene.discretization.spring_damping == "added":
+        lateral = damping[1] + h * more, armature[1] + h * h * more
     else:
-        lateral = damping[1] + added, armature[1] + h * added
+        least = h * stiffness[1]
+        lateral = jnp.maximum(damping[1], least), jnp.maximum(armature[1], h * least)
     damping, armature = map(_with_lateral, (damping, armature), lateral)
     return Springs(stiffness, damping, armature, moment[None])
 

@@ -87,7 +87,7 @@ def _model(scene: Scene, params: Params, trial: Trial) -> mujoco.MjModel:
     """MuJoCo's model of a world, with which states are read."""
     from codesign_jax.engines.mujoco import world_model
 
-    return world_model(scene, jax.tree.map(np.asarray, _fields(scene.structure, params, trial)))
+    return world_model(scene, jax.tree.map(np.asarray, _fields(scene, params, trial)))
 
 
 @functools.partial(jax.jit, static_argnums=0)

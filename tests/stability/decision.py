@@ -236,7 +236,7 @@ def random_stuck_hulls(engine, step, precision):
 
 @functools.cache
 def late():
-    """What `python -m scripts.late_designs` found of final particles of 23D searches."""
+    """What `python -m scripts.accuracy.late_designs` found of final particles of 23D searches."""
     return json.loads((DATA / "late_designs.json").read_text())
 
 

@@ -1,6 +1,6 @@
 """Late designs of the default scene at finer steps, links and meshes, and how deep fingers cross.
 
-python -m scripts.accuracy.late_designs --json docs/data/late_designs.json     # 4 minutes of an H200
+python -m scripts.accuracy.late_designs --json docs/data/late_designs.json
 
 The designs are final particles of the 23-parameter searches in docs/data/paper_fingers, which were
 made before fingers touched the palm.  The table of the hard cases reads the file (case 24 and 35).

@@ -215,9 +215,12 @@ class StructuredEngine(Equal):
         series = found["distance"], found["height"], found["speed"]
         shape = (*series[0].shape, 0)
         qpos = found["qpos"] if trajectory else jnp.zeros(shape, series[0].dtype)
-        # The decrement is a share of forces times accelerations, its root one of forces.
-        force = jnp.sqrt(jnp.maximum(found["residual"], 0.0))
-        return Trace(*series, qpos, self._status(found), coordinates.flat(end), force)
+        # The decrement is a share of forces times accelerations, its root one of forces.  What a
+        # step that converged leaves is rounding.
+        left = jnp.where(found["residual"] > self.limits.tolerance, found["residual"], 0.0)
+        return Trace(
+            *series, qpos, self._status(found), coordinates.flat(end), residual=jnp.sqrt(left)
+        )
 
     @staticmethod
     def _run(program: Program, *args, **record) -> tuple[dict[str, jax.Array], State]:

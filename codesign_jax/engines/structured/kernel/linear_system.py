@@ -96,7 +96,7 @@ class Elimination:
                 new, kept, more = lanewise(how, node, *forces)
                 for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
                     problem.write(name, value, i)
-                if problem.pairs:
+                if problem.slotted:
                     problem.write("inverse", kept.inverse, i)
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 

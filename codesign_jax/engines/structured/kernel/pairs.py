@@ -23,7 +23,7 @@ from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, l
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet, any_of
 from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
-from codesign_jax.engines.structured.lanes import dot, sum_axis
+from codesign_jax.engines.structured.lanes import dot, sum_axis, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
 from codesign_jax.engines.structured.laws.contact import Contacts
@@ -255,6 +255,12 @@ class BoundPairs(BoundSlots):
 
         return jax.lax.fori_loop(0, self.set.rows, most, jnp.int32(0)) > 0
 
+    def touching_worlds(self) -> jax.Array:
+        """Lanes of the worlds that have filled any slot, bool, shape (lane,)."""
+        assert self._counts is not None
+        filled = total([jnp.where(word > 0, 1, 0) for word in self._counts.words])
+        return self.block.fold(filled, jnp.maximum) > 0
+
     # One side's part of a contact
 
     def relative(self, item: Any, pairing: Pairing) -> Lanes:
@@ -378,6 +384,22 @@ class BoundPairs(BoundSlots):
             self.load(item, own, force, pairing)
 
         self.do(store)
+
+    def update_wrenches(self, alpha: Lanes) -> None:
+        """Adds up wrenches where the last step has moved jar, which is kept."""
+        self.clear_wrenches()
+        contacts = self.set.contacts
+
+        def response(place, cone, alpha, jar, step):
+            return contact.constraint_update(contacts(place, cone), jar + alpha * step).force
+
+        def load(item: Any, pairing: Pairing) -> None:
+            own, jar, step = self.own_side(item), self.read("jar", item), self.read("step", item)
+            self.load(
+                item, own, lanewise(response, own.place, self.cone, alpha, jar, step), pairing
+            )
+
+        self.do(load)
 
     @staticmethod
     def stiff(hessian: Lanes, change: Lanes) -> Lanes:

@@ -249,6 +249,22 @@ class BoundSlots(BoundContacts):
         triangle, wrench = self.fold(item, add, self._zeros((45,), (9,)))
         return full(triangle), wrench
 
+    def wrench(self, item: Any, alpha: Lanes) -> Lanes:
+        """Wrench (9,) of the row's contacts where the last step has moved jar, which is kept."""
+
+        def add(slot: Any, sums: Lanes) -> Lanes:
+            return lanewise(jnp.add, sums, self._wrench(slot, alpha))
+
+        return self.fold(item, add, self._zeros((9,))[0])
+
+    def changes(self, item: Any, alpha: Lanes) -> Lanes:
+        """How many of the row's contacts the last step takes to another zone of the cone."""
+
+        def add(slot: Any, sums: Lanes) -> Lanes:
+            return lanewise(jnp.add, sums, self._changes(slot, alpha))
+
+        return self.fold(item, add, self._zeros(())[0])
+
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
         """Stores the contacts' cost along a relative motion (9, ...); returns its slope at 0."""
 

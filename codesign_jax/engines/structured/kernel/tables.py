@@ -158,6 +158,8 @@ class Tables:
             fields |= {"armature_now": (n, (a,))}
         for contacts in self.sets:
             fields |= contacts.groups()
+        if self.slotted:
+            fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
         if any(isinstance(s, PairSet) for s in self.sets):
-            fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))} | pair_search.fields(n, self.k)
+            fields |= pair_search.fields(n, self.k)
         self.scratch = MemoryLayout.by_item(True, **fields)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax.experimental import pallas as pl
 
-from codesign_jax.compiler import prefetch, thread, vector
+from codesign_jax.compiler import nvptx, prefetch, thread, vector
 from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.compiler.layout import Array, Layout
 
@@ -193,6 +193,42 @@ def test_angles_and_control(backend, dtype):
         compare(turns, (x, y), backend, dtype)
 
 
+def sum_of_pairs(x, y):
+    """Products of all lanes, summed as a block sums over its fingers."""
+    product, distance = x * y, 1
+    while distance < x.size:
+        product = product + jax.lax.rev(product.reshape(-1, 2, distance), (1,)).reshape(x.shape)
+        distance *= 2
+    return product
+
+
+def difference_of_pairs(x, y):
+    """What a lane's product has more than its partner's, where y is positive."""
+    product = x * y
+    theirs = jax.lax.rev(product.reshape(2, -1), (0,)).reshape(x.shape)
+    return product - jnp.where(y > 0, theirs, 0.0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_lanes_sum_after_an_exchange_has_the_same_bits_on_all(backend):
+    """No lane fuses its own product with another one's rounded product.
+
+    Fused the lanes' results differ in the last bit, and with it what all of them decide or store.
+    """
+    rng = np.random.default_rng(3)
+    x, y = rng.standard_normal((2, BLOCKS, lanes_of(backend))).astype(np.float32)
+    got = run([sum_of_pairs, difference_of_pairs], (x, np.abs(y)), np.float32, backend)
+    assert np.ptp(got[:, 0], axis=1).max() == 0
+    low, high = np.split(np.asarray(got[:, 1]), 2, axis=1)
+    np.testing.assert_array_equal(low, -high)
+    # LLVM fuses where it likes what it may: the text must not allow it.
+    for function, sign in ((sum_of_pairs, "fadd"), (difference_of_pairs, "fsub")):
+        for text in write(function, np.float32, np.float32):
+            assert sign in text and f"{sign} contract" not in text
+        ptx = nvptx.assembly(text)
+        assert f"{sign[1:]}.rn.f32" in ptx and "fma" not in ptx
+
+
 @pytest.mark.parametrize("dtype", [np.int32, np.int64])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_operations_on_integers(backend, dtype):
@@ -286,7 +322,6 @@ def test_what_has_no_instruction_is_named(function, kind, message):
 
 def test_text_is_valid_for_both_targets():
     """LLVM accepts it and makes PTX of it, with the instructions of a warp."""
-    from codesign_jax.compiler import nvptx
 
     def function(x, y):
         total = jax.lax.fori_loop(0, 3, lambda k, c: c + k * jnp.maximum(x, y), jnp.sin(x) / y)

@@ -3,6 +3,8 @@
 The CPU runs in CI; the same tests run on an NVIDIA GPU with the marker `gpu`.
 """
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 from jax.experimental import pallas as pl
 
 from codesign_jax.compiler import nvptx, prefetch, thread, vector
-from codesign_jax.compiler.launch import Kernel, launch
+from codesign_jax.compiler.launch import Kernel, describe, kernel_jaxpr, launch
 from codesign_jax.compiler.layout import Array, Layout
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
@@ -256,6 +258,7 @@ def test_operations_on_integers(backend, dtype):
         "shift right": lambda x, y: jax.lax.shift_right_logical(x, y),
         "shift right by 3": lambda x, y: jax.lax.shift_right_logical(x, jnp.full_like(x, 3)),
         "not": lambda x, y: ~x,
+        "bits": lambda x, y: jax.lax.population_count(x),
         "lt": lambda x, y: x < y,
         "ge": lambda x, y: x >= y,
         "ne": lambda x, y: x != y,
@@ -361,6 +364,71 @@ def test_lanes_meet_where_they_read_what_others_wrote():
         True,
         False,
     ]
+
+
+def exchange(lanes, backend):
+    """A kernel of two tables that lanes share columns of, the second one on a GPU's chip.
+
+    Each of four lanes stores a product and reads all four, twice from the same places.
+    """
+    columns = lanes // 4
+
+    def kernel(x, out, table, onchip):
+        lane = jax.lax.broadcasted_iota(jnp.int32, (lanes,), 0)
+        own, mate = jax.lax.rem(lane, columns), jax.lax.div(lane, columns)
+
+        def body(k, total):
+            for ref in (table, onchip):
+                ref[mate, own] = x[0, :] * (mate + k).astype(jnp.float32)
+                total = total + ref[0, own] + ref[1, own] * 2 + ref[2, own] * 4 + ref[3, own] * 8
+            return total
+
+        out[0, :] = jax.lax.fori_loop(0, 3, body, jnp.zeros(lanes))
+
+    def spec(rows, width):
+        return pl.BlockSpec((None, rows, width), lambda i: (i, 0, 0))
+
+    sizes = ((1, lanes), (4, columns), (4, columns))
+    outputs = [jax.ShapeDtypeStruct((BLOCKS, *size), jnp.float32) for size in sizes]
+    call = pl.pallas_call(
+        kernel,
+        grid=(BLOCKS,),
+        in_specs=[spec(1, lanes)],
+        out_specs=[spec(*size) for size in sizes],
+        out_shape=outputs,
+    )
+    return call, outputs, Kernel("exchange", backend, lanes, (), (1,), (2,), (1, 2))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_lanes_exchange_through_memory(backend):
+    """Of lanes that share a column each reads what the others have stored, in every round."""
+    lanes = lanes_of(backend)
+    call, outputs, kind = exchange(lanes, backend)
+    x = np.random.default_rng(4).integers(0, 99, (BLOCKS, 1, lanes)).astype(np.float32)
+    got = jax.jit(lambda x: launch(call, (x,), outputs, kind)[0])(x)
+    each = x.reshape(BLOCKS, 4, -1)
+    rounds = [each * (np.arange(4) + k)[:, None] for k in range(3)]
+    want = sum(2 * np.einsum("bmc,m->bc", r, [1, 2, 4, 8]) for r in rounds)
+    np.testing.assert_array_equal(got, np.tile(want[:, None], (1, 1, 4)))
+
+
+def test_a_gpu_exchanges_on_its_chip_between_barriers():
+    """Lanes meet between storing and reading, and between reading and storing again."""
+    call, outputs, kind = exchange(32, "gpu")
+    x = jax.ShapeDtypeStruct((BLOCKS, 1, 32), jnp.float32)
+    layout = describe((x,), outputs, kind)
+    assert [a.role for a in layout.arrays] == ["input", "output", "output", "onchip"]
+    text = thread.write(kernel_jaxpr(call, [x]), layout, "test")
+    steps = re.findall(r"call void @llvm.nvvm.(bar)|(store|load) float.*%v\d+, align", text)
+    steps = [meets or access for meets, access in steps]
+    once = ["bar", "store", "bar", *["load"] * 4]
+    assert steps == ["load", *once, "load", *once, "store"]
+    ptx = nvptx.assembly(text)
+    assert ".shared .align 16 .b8 s3[128]" in ptx and "st.shared" in ptx and "ld.shared" in ptx
+    _, large, _ = exchange(32, "gpu")
+    large[2] = jax.ShapeDtypeStruct((BLOCKS, 1000, 8), jnp.float32)
+    assert describe((x,), large, kind).arrays[3].role == "output"
 
 
 def loop_text(reverse, rows=128, count=60):

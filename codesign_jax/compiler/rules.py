@@ -279,6 +279,7 @@ RULES: dict[str, Rule] = {
     "select_n": _select_n,
     "convert_element_type": _convert,
     "iota": lambda w, e: w.lane_index(),
+    "population_count": lambda w, e, x: w.intrinsic("ctpop", x),
     "rev": _reverse,
     "reduce_max": _over_lanes("max"),
     "reduce_min": _over_lanes("min"),

@@ -107,6 +107,31 @@ class LineSearch:
         ]
         return [c.prepare_linesearch(row, motion) for c, motion in names]
 
+    def total(self, sums: list[Lanes]) -> list[Lanes]:
+        """What the lanes of a world have found, summed."""
+        return self.block.sum(sums)
+
+    def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
+        """First and second derivative of the contacts' cost by the step length, at alpha."""
+
+        def add(i: Any, sums: list, sets: list) -> list:
+            for contacts in sets:
+                new = contacts.slopes(i, alpha)
+                sums = lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
+            return sums
+
+        problem = self.problem
+        sums = [zeros((), self.like)] * 2
+        links, surface = (self.links, problem.fingers), (self.links + 1, problem.skin)
+        for count, sets in (links, surface):
+            if sets:
+                sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
+        for c in problem.slots:
+            sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
+        if problem.pairs:
+            sums = problem.pairs.slopes_of_all(alpha, sums)
+        return sums
+
     def find(
         self,
         slope: Lanes,
@@ -126,23 +151,7 @@ class LineSearch:
         """
 
         def evaluate(alpha: Lanes) -> tuple[Lanes, Lanes]:
-            def add(i: Any, sums: list, sets: list) -> list:
-                for contacts in sets:
-                    new = contacts.slopes(i, alpha)
-                    sums = lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
-                return sums
-
-            problem = self.problem
-            sums = [zeros((), self.like)] * 2
-            links, surface = (self.links, problem.fingers), (self.links + 1, problem.skin)
-            for count, sets in (links, surface):
-                if sets:
-                    sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
-            for c in problem.slots:
-                sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
-            if problem.pairs:
-                sums = problem.pairs.slopes_of_all(alpha, sums)
-            one, two = self.block.sum(sums)
+            one, two = self.total(self.contact_slopes(alpha))
             return lanewise(
                 lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
             )

@@ -12,6 +12,11 @@ from codesign_jax.engines.structured.kernel.linesearch import LINE_TOLERANCE, Li
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop, solid
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
 from codesign_jax.engines.structured.kernel.slots import only
+from codesign_jax.engines.structured.kernel.team_solver import (
+    TeamCoupling,
+    TeamElimination,
+    TeamLineSearch,
+)
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 
 
@@ -28,7 +33,10 @@ class Newton:
     def __init__(self, problem: Problem):
         """Takes the step's problem."""
         self.problem, self.block = problem, problem.block
-        self.elimination, self.search = Elimination(problem), LineSearch(problem)
+        one = problem.block.team == 1
+        self.elimination = (Elimination if one else TeamElimination)(problem)
+        self.search = (LineSearch if one else TeamLineSearch)(problem)
+        self.coupling = Coupling if one else TeamCoupling
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -90,7 +98,7 @@ class Newton:
         done = done._replace(work=lanewise(jnp.add, done.work, work))
 
         def correct() -> Iterate:
-            return Coupling(self.problem, pairs, done).correct(step, idle)
+            return self.coupling(self.problem, pairs, done).correct(step, idle)
 
         return choose(pairs.touching_now(), correct, step, self.block.size)
 

@@ -95,7 +95,7 @@ class Packing(Tables):
         blocks = jnp.moveaxis(ctrl.reshape(-1, self.block, steps, ctrl.shape[2]), 1, 3)
         arm, pressure = blocks[:, :, :6], blocks[:, :, 6:]
         pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]
-        return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.size)
+        return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.columns)
 
     def path_rows(self, states: bool) -> tuple[int, int]:
         """Numbers of rows of the state's tables that are recorded: all, or the positions."""

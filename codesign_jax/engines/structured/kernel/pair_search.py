@@ -147,7 +147,7 @@ class Search:
                 fields = pairs.begin(place, *moves)
             number = lanes([self.like + jnp.asarray(row, self.like.dtype)], (1, 1), wide=True)
             fields |= {"row": number} | pairs.remembered({"owner": 1.0, "sphere": sphere})
-            pairs.add(0, which, fields, self.block.lane)
+            pairs.add(0, which, fields, self.block.own)
 
         any_of(which, enter)
 
@@ -314,6 +314,10 @@ class Search:
             dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
             for place, value in zip(ends, (mine, theirs), strict=True)
         ]
+        if self.block.team > 1:  # each finger of a pair may have found another contact
+            for side, number in zip(kept, rows, strict=True):
+                side["row"] = lanes([number.astype(self.like.dtype)], (1, 1), wide=True)
+            return pairs.enter(row, which, owner, kept[0], kept[1], {"step": none})
         numbers = [v.astype(self.like.dtype) for v in rows]
         side = jnp.where(owner, self.like + numbers[0], self.like + numbers[1])
         alike = {"row": lanes([side], (1, 1), wide=True), "step": none}

@@ -22,6 +22,8 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Memory, Palm
 from codesign_jax.engines.structured.kernel.skin import Side, Skin
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.kernel.spheres import Spheres
+from codesign_jax.engines.structured.kernel.team_search import TeamSearch
+from codesign_jax.engines.structured.kernel.team_solver import team_rows
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws import inertia
@@ -63,11 +65,12 @@ class Step:
         world_state: Any,
         scratch: Any,
         grid: Any = None,
+        onchip: Any = None,
     ):
         """Takes the kernel's lanes and memory; grid: distances of all meshes, if there are any."""
         self.p, self.block, self.hand, self.world = program, block, hand, world
         self.finger_state, self.world_state, self.scratch = finger_state, world_state, scratch
-        self.grid = grid
+        self.grid, self.onchip = grid, onchip
 
     def constant(self, name: str) -> Lanes:
         """A constant of the worlds."""
@@ -107,6 +110,8 @@ class Step:
         memory = Memory(
             p.hand, self.hand, p.finger_state, self.finger_state, p.scratch, self.scratch, bound
         )
+        if p.team > 1:
+            memory = memory._replace(onchip=p.onchip, onchip_ref=self.onchip)
         now, centre = self._forward(state, geometry, pressure, memory, thing)
         rigid = not scene.effects.wrist
         problem = Problem(p.links, self.block, memory, geometry["palm"], rigid=rigid)
@@ -170,7 +175,8 @@ class Step:
         )
 
         pairs = m.contacts.get("finger_finger")
-        search = Search(self, pairs, at) if isinstance(pairs, BoundPairs) else None
+        looks = Search if p.team == 1 else TeamSearch
+        search = looks(self, pairs, at) if isinstance(pairs, BoundPairs) else None
         if search:
             search.start(motion, vel, frame, origin)
         spheres = Spheres(self, at, m, thing)
@@ -198,11 +204,16 @@ class Step:
                 forces,
             )
             carry, stored = out
+            centre = stored["body_centre"]
             stored |= {"step_acc": zeros((p.axes,), like), "step_motion": wide}
+            if p.team > 1:
+                body = constants[1], centre, stored["tensor"]
+                stored = team_rows(stored, body)
             for name, value in stored.items():
-                m.scratch.write(self.scratch, name, value, i)
+                table, ref = m.table(name)
+                table.write(ref, name, value, i)
             share = p.hand.read(self.hand, "share", i + 1)
-            middle = lanewise(lambda m, c, s: m + s * c, middle, stored["body_centre"], share)
+            middle = lanewise(lambda m, c, s: m + s * c, middle, centre, share)
             spheres.of_link(i, carry)
             if search:
                 search.link(i, carry[4], carry[2], carry[1], carry[0])

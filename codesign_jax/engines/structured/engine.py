@@ -166,7 +166,8 @@ class StructuredEngine(Equal):
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
     ) -> tuple[Trace, Path]:
         """`simulate`, and what a derivative reads of it."""
-        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
+        # A lane a finger, as the reverse pass has it, which simulates segments again.
+        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl), team=1)
         inputs = program.inputs(world_constants(self.scene, fields), self.reset(fields), ctrl)
         try:
             out = program.execute(inputs, trajectory=trajectory, states=self.segment or 1)
@@ -187,6 +188,8 @@ class StructuredEngine(Equal):
         def program(width: int) -> Program:
             return Program(self.scene, self.limits, backend=jax.default_backend(), width=width)
 
+        team = program(1).team  # lanes that share a column of a table
+
         def pack(fields: ModelFields, ctrl: jax.Array) -> tuple[tuple, tuple]:
             here = program(lanes or lanes_here(self.scene, ctrl.dtype))
             hand, state = world_constants(self.scene, fields), self.reset(fields)
@@ -195,16 +198,16 @@ class StructuredEngine(Equal):
             inputs = here.inputs(*jax.lax.optimization_barrier((hand, state, ctrl)))
             return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
 
-        # The last axis of the first table, in and out, are the lanes of a block.
+        # The last axis of the first table, in and out, are the fingers of a block.
         def launch(blocks: tuple, common: tuple) -> tuple:
             try:
-                here, inputs = program(blocks[0].shape[-1]), (*blocks, *common)
+                here, inputs = program(blocks[0].shape[-1] * team), (*blocks, *common)
                 return tuple(here.execute(inputs, trajectory=trajectory))
             except KernelUnavailable as error:
                 raise _unavailable(str(error)) from error
 
         def unpack(out: tuple, worlds: int) -> Trace:
-            here = program(out[0].shape[-1])
+            here = program(out[0].shape[-1] * team)
             outputs = here.outputs(out, worlds, trajectory=trajectory)
             found, end = jax.lax.optimization_barrier(outputs)
             return self._trace(found, end, trajectory)

@@ -71,10 +71,12 @@ class Program(Packing):
         self.trace = (*TRACE, "overflow") if self.slotted else TRACE
 
     @classmethod
-    def here(cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None) -> "Program":
+    def here(
+        cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None, **how: Any
+    ) -> "Program":
         """The program for this device, type and number of worlds, see `lanes_here`."""
         width = lanes_here(scene, dtype, worlds)
-        return cls(scene, limits, backend=jax.default_backend(), width=width)
+        return cls(scene, limits, backend=jax.default_backend(), width=width, **how)
 
     def run(self, hand: WorldModel, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
         """Runs a rollout; returns `trace` by name, shape (world, time)."""

@@ -4,11 +4,11 @@ from functools import partial
 
 from codesign_jax import verdict
 from codesign_jax.engines.structured.kernel import objects, pair_search, skin, teams
-from codesign_jax.engines.structured.kernel.team_slots import TeamHullSet, TeamPairSet
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_slots
+from codesign_jax.engines.structured.kernel.team_slots import TeamHullSet, TeamPairSet
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.model import layout
 from codesign_jax.model.layout import palm_touches

@@ -9,9 +9,8 @@ from codesign_jax.engines.structured.kernel.contact_sets import direct, zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.linesearch import LineSearch, _rest
-from codesign_jax.engines.structured.kernel.problem import relative
 from codesign_jax.engines.structured.kernel.memory import loop
-from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
+from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body, relative
 from codesign_jax.engines.structured.kernel.teams import (
     AGAIN,
     FORCES,
@@ -49,11 +48,11 @@ class Team:
         """A joint's motion subspace, all of it on all lanes, shape (axis, 6)."""
         return self.problem.read("axes", item=i)[0][:, :6]
 
-    def spread(self, name: str, columns: Lanes) -> Lanes:
-        """Columns (row,) of the lanes as a matrix on all lanes, shape (row, TEAM)."""
-        self.chip.put_rows(f"shared.{name}", columns)
-        (found,) = self.problem.read(f"shared.{name}")
-        return found
+    def spread(self, **columns: Lanes) -> list[Lanes]:
+        """Columns (row,) of the lanes as matrices on all lanes, shape (row, TEAM)."""
+        for name, value in columns.items():
+            self.chip.put_rows(f"shared.{name}", value)
+        return self.problem.read(*(f"shared.{name}" for name in columns))
 
     def vector(self, component: jax.Array) -> Lanes:
         """Components of lanes as a vector on all lanes, shape (6,)."""
@@ -106,9 +105,8 @@ class Team:
             return [p, c, q], w, g, work
 
         columns = lanewise(project, node[:2], axes, more[:2])
-        n = axes.shape[0]
-        u, h = (self.spread(*pair)[:, :6] for pair in zip("uh", columns, strict=True))
-        d = self.spread("d", more[2])[:, :n]
+        u, h, d = self.spread(u=columns[0], h=columns[1], d=more[2])
+        u, h, d = u[:, :6], h[:, :6], d[:, : axes.shape[0]]
         inverse = lanewise(invert, axes, u, armature, d)
         node, w, g, work = lanewise(reduce, node, u, h, columns, inverse, self.forces)
         return node, el.Kept(el.Factors(w, g, None), inverse), work  # type: ignore[arg-type]
@@ -258,13 +256,12 @@ class TeamElimination(Elimination):
             own = [team.chip.get("axes", row, k, TEAM) for k in range(6)]
             axis = lanes(own, (6,), wide=True)
             second = lanewise(lambda s: jnp.concatenate([-s, s[:3]]), axis)
-        whole, spin = zeros((9,), self.like), zeros((3,), self.like)
-        held = whole
+        held, found = zeros((9,), self.like), []
         for contacts in self.problem.skin:
-            found = contacts.columns(row, self.unit, second, team.forces)  # type: ignore[attr-defined]
-            whole, spin = lanewise(_plus, [whole, spin], found)
+            found.append(contacts.columns(row, self.unit, second, team.forces))  # type: ignore[attr-defined]
             if contacts.set.on_object:
-                held = found[0]
+                held = found[-1][0]
+        whole, spin = lanewise(lambda f: jax.tree.map(lambda *x: total(x), *f), found)
         return whole, held, spin
 
     def add_columns(self, node: list[Lanes], row: Lanes, held: Lanes) -> list[Lanes]:
@@ -313,7 +310,7 @@ class TeamElimination(Elimination):
             node, new, done = team.eliminate(node, axes[k], palm.armature[joint], (y, none, none))
             kept.append(new)
             work.append(done)
-        q = team.spread("q", node[2])
+        (q,) = team.spread(q=node[2])
         square, ro = team.narrowed(q[:, :6]), team.narrowed(q[:, FORCES])
         obj = lanewise(lambda q, r: el.solve_object(direct, q, r), square, ro)
         part = self.block.over_team(lanewise(lambda w: total(w), work).lane, jnp.add)

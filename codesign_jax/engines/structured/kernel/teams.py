@@ -1,14 +1,14 @@
 """Teams: several lanes of a GPU share the work of a finger, and its numbers lie on the chip.
 
 A warp of one world has 37 kB of numbers where one of eight worlds, a lane a finger, has half a
-megabyte, far more than a multiprocessor's cache.  The lanes of a team share a column of every table.
+megabyte, far more than a multiprocessor's cache.  The lanes of a team share a column of each table.
 What is not shared out is computed by all of them, with the same bits.
 
 * Matrices: lane k < 6 has column k of P, C and Q, and lane 6 has the forces r and r_o, see
-  `elimination`.  One recursion P -= U'W, Q -= H'G then updates the forces as well, if G of lane 6 is
-  -z.  Rows that all lanes need (U and H, three numbers a column) go through shared memory.
+  `elimination`.  One recursion P -= U'W, Q -= H'G then updates the forces as well, if G of lane 6
+  is -z.  Rows that all lanes need (U and H, three numbers a column) go through shared memory.
 * Right sides: lane k < 6 has component k; products are sums over the team.
-* Contacts: slot k is lane k modulo the team's.  The hull's are a list a finger, in order of the rows.
+* Contacts: slot k is lane k modulo the team's.  The hull's are a list a finger, row after row.
 """
 
 from typing import Any
@@ -16,8 +16,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.components import splat
+from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
 from codesign_jax.scene import Scene
 

@@ -60,8 +60,8 @@ def test_one_finger_is_one_team():
     ):
         programs = [Program(scene, limits, backend=backend, width=w) for w in (4, 8, 32)]
         assert {p.team for p in programs} == {want}
-    assert [p.size for p in (Program(paper, limits, width=w) for w in (4, 32))] == [32, 32]
     program = Program(paper, limits)
+    assert (program.block, program.size) == (1, 32)
     assert 4 * program.onchip.rows * program.columns <= launch.SHARED_BYTES
     pinch = Program(gpu_cases.short_scene("hull and fingers"), limits)
-    assert (pinch.fingers, pinch.block, pinch.columns, pinch.size) == (2, 2, 4, 32)
+    assert (pinch.fingers, pinch.block, pinch.columns, pinch.size) == (2, 1, 2, 16)

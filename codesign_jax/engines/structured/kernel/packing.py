@@ -53,6 +53,8 @@ class Packing(Tables):
         arrays["alive"] = jnp.ones((1, worlds), dtype)
         arrays["object_id"] = hand.object_id.astype(dtype)
         narrow = {k: arrays[k] for k in self.world.groups}
+        if self.team > 1:  # XLA rounds alike however many worlds it lays out
+            wide, narrow = jax.lax.optimization_barrier((wide, narrow))
         packed = self.world.pack(1, self.block, **narrow)
         ids = np.arange(packed.shape[0] * self.block).reshape(-1, 1, self.block)
         alive = np.arange(self.world.rows)[:, None] == self.world.offset["alive"]

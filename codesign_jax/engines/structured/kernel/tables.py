@@ -42,7 +42,10 @@ class Tables:
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()
         self.team = team or teams.lanes_of_a_finger(scene, backend, self.fingers)
-        self.num_fingers, self.block = n, max(1, width // (self.fingers * self.team))
+        # On a GPU a team's block is one world: nothing depends on what others do.
+        alone = self.team > 1 and backend == "gpu"
+        self.num_fingers = n
+        self.block = 1 if alone else max(1, width // (self.fingers * self.team))
         self.columns = self.fingers * self.block
         self.size = self.columns * self.team
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
@@ -175,5 +178,5 @@ class Tables:
         if self.team > 1:
             onchip = teams.fields(n, a)
             self.onchip = MemoryLayout.by_item(True, **onchip)
-            fields = {name: f for name, f in fields.items() if name not in onchip}
+            fields = {name: f for name, f in fields.items() if name not in {*onchip, *teams.UNUSED}}
         self.scratch = MemoryLayout.by_item(True, **fields)

@@ -15,6 +15,7 @@ from codesign_jax.engines.structured.kernel.teams import (
     AGAIN,
     FORCES,
     TEAM,
+    UNUSED,
     Parts,
     chosen,
     team_sum,
@@ -496,7 +497,7 @@ def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
         )
 
     axes, matrix = lanewise(wide, stored["axes"], *body)
-    unused = ("body_centre", "tensor")
+    unused = UNUSED
     return {k: v for k, v in stored.items() if k not in unused} | {"axes": axes, "matrix": matrix}
 
 

@@ -11,6 +11,7 @@ What is not shared out is computed by all of them, with the same bits.
 * Contacts: slot k is lane k modulo the team's.  The hull's are a list a finger, row after row.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.components import splat
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
-from codesign_jax.engines.structured.lanewise import Lanes, lanes
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
 
 TEAM = 8
@@ -26,6 +27,8 @@ TEAM = 8
 FORCES, AGAIN = 6, 7
 """Lanes of the forces, and of conjugate gradients' right side in the rows of w."""
 WARP = 32
+UNUSED = ("body_centre", "tensor", "z", "z_again")
+"""Rows of the links' scratch memory that only the solver of single lanes has."""
 
 
 def lanes_of_a_finger(scene: Scene, backend: str, fingers: int) -> int:
@@ -110,6 +113,12 @@ def team_sum(block: Block, value: Lanes) -> Lanes:
     """Sums over the team of components, wide."""
     parts = [block.over_team(p, jnp.add) for p in value.parts.ravel()]
     return lanes(parts, value.shape[:-2], wide=True)
+
+
+def where(mask: jax.Array, one: Any, other: Any) -> Any:
+    """One of two trees of lanes, by a condition of the lanes."""
+    which = lanes([mask], (), wide=True)
+    return lanewise(lambda w, a, b: jax.tree.map(partial(jnp.where, w), a, b), which, one, other)
 
 
 def chosen(block: Block, values: Lanes, otherwise: Any = 0.0) -> jax.Array:

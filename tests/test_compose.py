@@ -351,13 +351,27 @@ def slopes_by_vmap(value, x, broken):
     return jax.vmap(jax.grad(lambda x, b: value(x[None], b[None])[0]))(x, broken)
 
 
+def slopes_of_a_share(value, x, broken):
+    """Of one device's worlds, whose forward pass is repeated for the backward pass."""
+    slopes = partial(slopes_of_a_batch, jax.checkpoint(value))
+    part = jax.sharding.PartitionSpec("device")
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("device",))
+    how = {"mesh": mesh, "in_specs": part, "out_specs": part, "check_vma": False}
+    return jax.shard_map(slopes, **how)(x, broken)
+
+
 # A mapped derivative is traced twice, before and behind the map: that costs half a test more.
 @pytest.mark.parametrize(
-    "slopes", [slopes_of_a_batch, pytest.param(slopes_by_vmap, marks=pytest.mark.slow)]
+    "slopes",
+    [
+        slopes_of_a_batch,
+        slopes_of_a_share,
+        pytest.param(slopes_by_vmap, marks=pytest.mark.slow),
+    ],
 )
 def test_gradients_by_the_kernel_equal_central_differences(slopes):
-    """In float64, of a world that is lost and of one that fails."""
-    scene = small.pinch("sphere", **FREE)
+    """In float64, of a world that is lost and of one that fails, whose pressures lag."""
+    scene = small.pinch("sphere", **FREE, effects__pressure_dynamics=True)
     engine = StructuredEngine(scene, iterations=60, tolerance=1e-22)
     with jax.enable_x64(True):
         value = partial(bent, scene, engine, small.hand_world(scene, pressure=50e3))

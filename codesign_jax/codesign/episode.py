@@ -110,10 +110,11 @@ class Task:
           constants: Numbers instead of the scene's, leaves of shape () or (trial,).
 
         Raises:
-          SceneError: If the population or the constants do not fit.
+          SceneError: If the population or the constants do not fit, and see `DesignSpace.check`,
+            which warns of designs that are not legal.
         """
         self.space.refuse_population(population)
-        self.space.refuse_unit_slips(population)
+        self.space.check(population)
         return Program(self.scene, self._evaluation)(jnp.asarray(population), key, constants)
 
     def episode(

@@ -128,7 +128,7 @@ def _evaluate(
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
         console.print(f"{name:>12}: {verdicts.of_object(case.scene, own)}", markup=False)
     judged = verdicts.Judged(case.scene, one, options.accuracy)
-    for line in [f"{'all':>12}: {judged}", *verdicts.warnings(judged)]:
+    for line in [f"{'all':>12}: {judged}", *verdicts.solver(one), *verdicts.warnings(judged)]:
         console.print(line, markup=False)
     if options.out:
         drawn = rollout.sample_trials(case.scene, jax.random.key(options.seed), options.trials)
@@ -161,8 +161,7 @@ def _render(case: Case, engine: engines.Engine, options: "Evaluate", console: Co
     with Busy(console, "simulating what is drawn"):
         grasps = animation.replay(case.scene, engine, params, trials)
     path: Path = options.render  # type: ignore[assignment]
-    if path.suffix == ".gif":
-        animation.write_gif(case.scene, grasps, path, notify=console.print)
-    else:
-        animation.write_strip(case.scene, grasps, path, notify=console.print)
+    write = animation.write_gif if path.suffix == ".gif" else animation.write_strip
+    with Busy(console, "drawing"):
+        write(case.scene, grasps, path, notify=console.print)
     console.print(f"picture: {path}", markup=False)

@@ -206,7 +206,7 @@ def summarize(case: Case, made: Grid, found: Outcome, seed: int) -> Landscape:
     """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
     space, shape = case.space, tuple(len(axis) for axis in made.axes)
     counted = ~failed(found.status)
-    kept = counted & (found.cost < codesign.SUCCESS_COST)
+    kept = codesign.verdicts(found) == codesign.VERDICTS.index("kept")
     scale = np.asarray(space.scale)[[*made.columns]]
     return Landscape(
         names=np.array([space.names[k] for k in made.columns]),

@@ -82,9 +82,9 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
         work = rates.batch_work(case.scene, case.engine, trials, devices=1)
         with Busy(console, f"reference test, {trials} grasps", rates.seconds(work)):
             found = _simulate(case, settings, trials)
-        outcomes.save(folder / FILE, found, key)
-        drawn = rollout.sample_trials(case.scene, _noise(settings), trials)
-        tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
+            outcomes.save(folder / FILE, found, key)
+            drawn = rollout.sample_trials(case.scene, _noise(settings), trials)
+            tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
     return found
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import batch, sampling
+from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.commands import calls, common, estimate
 from codesign_jax.commands.calls import Meter
 from codesign_jax.engines import Engine, make_engine
@@ -144,14 +145,14 @@ def _dry_run(options: "Sample", question: Question, console: Console) -> None:
 
 @dataclasses.dataclass
 class _Tally:
-    """How grasps ended, numbers by `dataset.VERDICTS`."""
+    """How grasps ended, numbers by `codesign.VERDICTS`."""
 
     counts: np.ndarray
 
     def add(self, question: Question, shard: int, designs: int, found: Outcome) -> int:
         """Counts the wanted grasps of a shard; returns how many they are."""
         wanted = min(question.chunk, designs - shard * question.chunk)
-        ends = dataset.verdicts(found)[:wanted]
+        ends = verdicts(found)[:wanted]
         self.counts += np.bincount(ends.ravel(), minlength=len(self.counts))
         return ends.size
 
@@ -170,7 +171,7 @@ def _simulate(
       Stopped: If a signal came; what was simulated is saved.
     """
     simulate = sampling.make_simulate(question.scene, engine, question.space)
-    tally, missing = _Tally(np.zeros(len(dataset.VERDICTS), int)), []
+    tally, missing = _Tally(np.zeros(len(VERDICTS), int)), []
     total, seconds = question.shards(designs), []
     with Meter("sample", designs * question.trials, console) as meter:
         for shard in range(total):
@@ -207,7 +208,7 @@ def _record_rate(question: Question, seconds: list[float]) -> None:
 
 def _report(path: Path, found: _Tally, console: Console) -> None:
     total = int(found.counts.sum())
-    ends = zip(dataset.VERDICTS, found.counts.tolist(), strict=True)
+    ends = zip(VERDICTS, found.counts.tolist(), strict=True)
     words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
     console.print(f"of {total} grasps: {words}")
     console.print(f"table: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)

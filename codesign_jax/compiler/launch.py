@@ -1,9 +1,11 @@
 """The one way to run a Pallas kernel: on a CPU through `cpu`, on an NVIDIA GPU through `gpu`."""
 
+import contextlib
 import functools
+import gc
 import importlib.metadata
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +36,7 @@ class Kernel(NamedTuple):
       onchip: Places of further scratch memory that a GPU has in shared memory, if it is small
         enough.
       exchanged: Places of outputs where lanes read what other lanes write, see `Array`.
+      level: LLVM's level of optimisation on a CPU, 1 or 2.
     """
 
     origin: str
@@ -43,6 +46,7 @@ class Kernel(NamedTuple):
     scratch: tuple[int, ...] = ()
     onchip: tuple[int, ...] = ()
     exchanged: tuple[int, ...] = ()
+    level: int = 2
 
 
 SHARED_BYTES = 27_648
@@ -121,9 +125,13 @@ def launch(
     if reason := available(kernel.backend) or memory_maps.problem():
         raise KernelUnavailable(reason)
     if kernel.backend == "cpu":
-        from codesign_jax.compiler import cpu as device
+        from codesign_jax.compiler import cpu
+
+        register = functools.partial(cpu.register, level=kernel.level)
     else:
-        from codesign_jax.compiler import gpu as device
+        from codesign_jax.compiler import gpu
+
+        register = gpu.register
     layout = describe(inputs, outputs, kernel)
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in inputs]
 
@@ -133,7 +141,8 @@ def launch(
     code = sources.digest()
     # Of code that is not known no kernel is found again, neither on disk nor in this process.
     origin = f"{kernel.origin} {code or uuid.uuid4()} {jax.__version__}"
-    name = device.register(origin, trace, layout, keep=code is not None)
+    with _no_collection():
+        name = register(origin, trace, layout, keep=code is not None)
     made = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
     varying = _varying(inputs)
     shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]
@@ -141,6 +150,21 @@ def launch(
     for k, result in zip(made, jax.ffi.ffi_call(name, shapes)(*inputs), strict=True):
         results[k] = None if k in (*kernel.scratch, *kernel.onchip) else result
     return results
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without Python's search for garbage: of the millions of objects of a trace few are garbage.
+
+    The searches would be a tenth of the time that a kernel takes to compile.
+    """
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:

@@ -10,10 +10,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from codesign_jax import files, types
-from codesign_jax.codesign import SUCCESS_COST, FinalTest
+from codesign_jax.codesign import VERDICTS, FinalTest, verdicts
 from codesign_jax.runs.columns import MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
@@ -128,23 +129,17 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
     names, noise = [s.name for s in scene.objects.object], noise_values(trials)
 
     def row(t: int) -> list:
-        one = Outcome(*(np.asarray(v)[t] for v in outcomes))
+        one = jax.tree.map(lambda v: np.asarray(v)[t], outcomes)
         drawn = [_number(float(v[t])) for v in noise.values()]
         numbers = [_number(float(one.cost)), _number(float(one.lost_time))]
         bad_step = int(one.bad_step)
-        ending = [ended(one), *numbers, status_names(one.status)]
-        return [t, names[int(trials.shape[t])], *drawn, *ending, bad_step if bad_step >= 0 else ""]
+        ending = [VERDICTS[verdicts(one)], *numbers, status_names(one.status)]
+        ending += [bad_step if bad_step >= 0 else "", _told(one.capped), _told(one.residual)]
+        return [t, names[int(trials.shape[t])], *drawn, *ending]
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = (row(t) for t in range(len(outcomes.cost)))
     _replace(path, _text([[*MORE[REFERENCE].columns], *rows]))
-
-
-def ended(outcome: Outcome) -> str:
-    """How a trial ended, in a word: kept, lost, stuck or failed; its entries are numbers."""
-    if types.failed(int(outcome.status)):
-        return "stuck" if int(outcome.status) & Status.STUCK else "failed"
-    return "kept" if float(outcome.cost) < SUCCESS_COST else "lost"
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:
@@ -197,7 +192,15 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
             status = status_names(trials.status[e, i, t])
             bad_step = int(trials.bad_step[e, i, t])
             row = [e + 1, i, t, names[t % len(names)], *numbers, status]
-            yield [*row, bad_step if bad_step >= 0 else ""]
+            solved = (
+                _told(v if v is None else v[e, i, t]) for v in (trials.capped, trials.residual)
+            )
+            yield [*row, bad_step if bad_step >= 0 else "", *solved]
+
+
+def _told(value: Any) -> str:
+    """A number; empty if it is not one, or none was told."""
+    return "" if value is None or np.isnan(value) else _number(float(value))
 
 
 def _designs(space: DesignSpace, population: np.ndarray) -> list[list[str]]:

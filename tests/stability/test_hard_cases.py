@@ -9,6 +9,7 @@ import pytest
 from tests.stability import (  # noqa: F401  (they register their cases)
     beam,
     capstan,
+    crossed,
     decision,
     energy,
     grasp,

@@ -11,7 +11,7 @@ import jax
 from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.laws import finger_pairs, hull, shapes
 from codesign_jax.engines.structured.laws.contact import Contacts
-from codesign_jax.engines.structured.laws.inertia import bodies, smooth_forces
+from codesign_jax.engines.structured.laws.inertia import bodies, joint_springs, smooth_forces
 from codesign_jax.engines.structured.laws.integration import rigid_arm
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, State, kinematics
 from codesign_jax.engines.structured.linear.tree import Matrices, Problem, Spatial
@@ -34,6 +34,8 @@ def problem(
     h, palm_acc = scene.discretization.timestep, None
     if not scene.effects.wrist:
         palm_acc = rigid_arm(ctrl[:6, None], state.wrist, state.wrist_vel, h)
+    springs = joint_springs(scene, hand, state, ctrl[6:])
+    hand = hand._replace(armature=springs.armature)
     return Problem(hand, kin, body, matrix, smooth, found, palm_acc), velocity
 
 

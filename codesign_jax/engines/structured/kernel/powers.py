@@ -168,11 +168,11 @@ def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dic
 TABLE = "object_table"
 
 
-def of_link(axes, chain: Chain, numbers: dict, joint: dict, still: dict):
+def of_link(scene: Scene, chain: Chain, numbers: dict, joint: dict, still: dict):
     """What a link hands on, and its power.
 
     Args:
-      axes: Names of a joint's axes.
+      scene: The scene.
       chain: What it inherits.
       numbers: Its constants, the finger's and the worlds', by name.
       joint: Angles and velocities of the joint before it, and the chamber's pressure, by name.
@@ -184,10 +184,13 @@ def of_link(axes, chain: Chain, numbers: dict, joint: dict, still: dict):
     forces = (
         numbers["gain"], joint["pressure"], numbers.get("section"), numbers.get("gravity")
     )  # fmt: skip
-    after, found = link_forces(axes, chain[:5], constants, at, forces)
+    if "threshold" in numbers:
+        forces += (numbers["threshold"], numbers["armature"])
+    after, found = link_forces(scene, chain[:5], constants, at, forces)
     along = next_motion(chain.along, found["axes"], still["virtual"])
     body = make_body(numbers["mass"], found["body_centre"], found["tensor"])
-    inertial = numbers["armature"] * still["acc"] - found["tau"]
+    armature = found.get("armature_now", numbers["armature"])
+    inertial = armature * still["acc"] - found["tau"]
     power = dot(body.times(after[4]) - found["smooth"], along) + dot(inertial, still["virtual"])
     return Chain(*after, along), dot(still["centre_bar"], found["body_centre"]) - power
 
@@ -245,7 +248,7 @@ def between_spheres(
     """
     balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
     one, other = sections.between(*balls)
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in (one, other)]
     return _between(ends, mine[0][2:], theirs[0][2:])
 
@@ -262,7 +265,7 @@ def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, w
       which: Number of the sphere on the link.
     """
     ball = sphere_ball(mine[0], mine[1], mine[2], which)
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     found = sections.ball_on_palm(ball, (*palm[:2], size))
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in found]
     return _between(ends, mine[0][2:], palm[2:])
@@ -297,7 +300,7 @@ def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
 
 def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
     """Power of a row on another finger's row; mine and theirs: sides before and behind."""
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
     moves = [
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
@@ -325,7 +328,7 @@ def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:
 
 
 def _cone(scene: Scene, name: str, at: dict) -> contact.Cone:
-    return cone_of(scene.effects.friction, at[f"cone.{which_cone(name)}"])
+    return cone_of(scene, at[f"cone.{which_cone(name)}"])
 
 
 def _item(values: jax.Array, which: jax.Array) -> jax.Array:

@@ -91,7 +91,12 @@ class Problem:
         self.like = jnp.zeros((block.size,), palm.armature.dtype)
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
-        """Reads names from the table that has them."""
+        """Reads names from the table that has them.
+
+        Of the joints' armature that of this step, if it changes.
+        """
+        if "armature_now" in self.m.scratch.groups:
+            names = tuple("armature_now" if n == "armature" else n for n in names)
         found = []
         for name in names:
             table, ref = self.m.table(name)

@@ -33,6 +33,8 @@ from codesign_jax.engines.structured.laws.integration import rigid_arm
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
 from codesign_jax.engines.structured.world_model import apply_columns
+from codesign_jax.model.layout import joint_axes
+from codesign_jax.scene import Scene
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.program import Program
@@ -192,12 +194,15 @@ class Step:
             soft = p.scene.effects.neo_hookean
             section = p.hand.read(self.hand, "section") if soft else None
             forces = gain, pressure, section, gravity
+            if p.scene.effects.lateral_threshold:
+                more = (p.hand.read(self.hand, "threshold"), p.hand.read(self.hand, "armature", i))
+                forces += more
             joint = [
                 p.finger_state.read(self.finger_state, n, i)
                 for n in ("finger", "finger_vel", "acc")
             ]
             out = lanewise(
-                partial(link_forces, self.p.lay.axes),
+                partial(link_forces, self.p.scene),
                 (origin, frame, vel, bias, motion),
                 constants,
                 joint,
@@ -292,25 +297,26 @@ def palm_and_object(
     }
 
 
-def link_forces(names: tuple[str, ...], parent: tuple, constants: Any, joint: Any, forces: Any):
+def link_forces(scene: Scene, parent: tuple, constants: Any, joint: Any, forces: Any):
     """A link's kinematics, inertia and forces.
 
     Args:
-      names: Names of a joint's axes.
+      scene: The scene.
       parent: Origin, frame, velocity, bias and motion of the link before it.
       constants: Offset, mass, centre, inertia, stiffness and damping.
       joint: Angles, velocities and accelerations of the joint before it.
-      forces: Gain and pressure of the chamber, the section or None, gravity or None.
+      forces: Gain and pressure of the chamber, the section or None, gravity or None; with the
+        effect `lateral_threshold` its numbers and the joint's armature.
 
     Returns:
       Origin, frame, velocity, bias and motion of the link, and what the solver needs, by name.
     """
-    gain, pressure, section, gravity = forces
+    gain, pressure, section, gravity, *more = forces
     origin, frame, vel, bias, motion = parent
     offset, mass, centre, principal, stiffness, damping = constants
     q, rate, acc = joint
     cos, sin = jnp.cos(q), jnp.sin(q)
-    origin, frame, axes = kin._turn_link(names, origin, frame, offset, cos, sin)
+    origin, frame, axes = kin._turn_link(joint_axes(scene), origin, frame, offset, cos, sin)
     vel, bias = kin._link_velocity(vel, bias, axes, rate)
     motion = next_motion(motion, axes, acc)
     body = Body(
@@ -318,8 +324,12 @@ def link_forces(names: tuple[str, ...], parent: tuple, constants: Any, joint: An
         origin + apply_columns(frame, centre),
         inertia.principal_tensor(frame, principal),
     )
-    tau = -stiffness * q - damping * rate
+    threshold, armature = more or (None, None)
+    own = inertia.springs(scene, (stiffness, damping, armature), threshold, pressure, q)
+    tau = -own.stiffness * q - own.damping * rate
     bend = tau[:1] + gain * pressure
+    if own.moment is not None:
+        bend = bend + own.moment
     if section is not None:
         bend = bend + inertia.softening_moment(section, stiffness[:1], q[:1])
     tau = jnp.concatenate([bend, tau[1:]])
@@ -331,4 +341,6 @@ def link_forces(names: tuple[str, ...], parent: tuple, constants: Any, joint: An
         "smooth": body.smooth_force(vel, bias, gravity),
         "tau": tau,
     }
+    if own.moment is not None:
+        stored["armature_now"] = own.armature
     return (origin, frame, vel, bias, motion), stored

@@ -124,6 +124,8 @@ class Sweep:
         numbers = {n: p.hand.read(hand, n, i) for n in names} | {"gain": p.hand.read(hand, "gain")}
         if p.scene.effects.neo_hookean:
             numbers["section"] = p.hand.read(hand, "section")
+        if p.scene.effects.lateral_threshold:
+            numbers["threshold"] = p.hand.read(hand, "threshold")
         if (gravity := self.step.gravity()) is not None:
             numbers["gravity"] = gravity
         angles, rates, acc = self._joint("finger", i), self._joint("finger_vel", i), None
@@ -132,7 +134,7 @@ class Sweep:
         share = p.hand.read(hand, "share", i + 1)
         still = {"acc": acc, "virtual": self.m.scratch.read(self.m.scratch_ref, "virtual", i)}
         still["centre_bar"] = lanewise(jnp.multiply, centre_bar, share)
-        run = partial(powers.of_link, p.lay.axes)
+        run = partial(powers.of_link, p.scene)
         before, own, moved = pull(run, (self.chain(i), numbers, joint), (still,), (after, self.one))
         self.bars.add({n: own[n] for n in names}, i)
         self.bars.add({n: v for n, v in own.items() if n not in names})

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, State
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, turn_columns
-from codesign_jax.model.morphology import softening
+from codesign_jax.model.morphology import softening, threshold_moments
+from codesign_jax.scene import Scene
 
 
 class Body(NamedTuple):
@@ -178,6 +179,65 @@ def softening_moment(section: jax.Array, stiffness: jax.Array, angle: jax.Array)
     return stiffness * angle * softening(angle / segment, height, wall, width=width)
 
 
+class Springs(NamedTuple):
+    """A joint's springs, and what the threshold of sideways bending adds; (axis, ...).
+
+    Attributes:
+      stiffness: Of the hinges.
+      damping: With the implicit term.
+      armature: With the implicit terms.
+      moment: Further moment on the bend hinge, shape (1, ...); None without the effect.
+    """
+
+    stiffness: jax.Array
+    damping: jax.Array
+    armature: jax.Array
+    moment: jax.Array | None
+
+
+def springs(
+    scene: Scene, constants: tuple, threshold: jax.Array | None, pressure: jax.Array, q: jax.Array
+) -> Springs:
+    """A joint's springs at its angles.
+
+    The threshold is a spring that is implicit in the lateral hinge as its own one, see
+    `model.layout.implicit_damping`.
+
+    Args:
+      scene: The scene.
+      constants: Stiffness, damping and armature of the hinges, shape (axis, ...).
+      threshold: See `WorldModel`, shape (3, ...); None without the effect.
+      pressure: Chamber pressure.
+      q: Angles, shape (axis, ...); the second one is the lateral one.
+    """
+    stiffness, damping, armature = constants
+    if threshold is None:
+        return Springs(stiffness, damping, armature, None)
+    h = scene.discretization.timestep
+    more, moment = threshold_moments(tuple(threshold), pressure, q[0], q[1])
+    stiffness = _with_lateral(stiffness, stiffness[1] + more)
+    added = h * stiffness[1] if scene.discretization.spring_damping == "least" else h * more
+    if scene.discretization.spring_damping == "least":
+        lateral = jnp.maximum(damping[1], added), jnp.maximum(armature[1], h * added)
+    else:
+        lateral = damping[1] + added, armature[1] + h * added
+    damping, armature = map(_with_lateral, (damping, armature), lateral)
+    return Springs(stiffness, damping, armature, moment[None])
+
+
+def joint_springs(scene: Scene, hand: WorldModel, state: State, pressure: jax.Array) -> Springs:
+    """`springs` of all joints, arrays of shape (link, axis, finger, world)."""
+    each = hand.stiffness, hand.damping, hand.armature
+    if hand.threshold is None:
+        return springs(scene, each, None, pressure, state.finger)
+    run = jax.vmap(lambda c, q: springs(scene, c, hand.threshold, pressure, q))
+    return run(each, state.finger)
+
+
+def _with_lateral(axes: jax.Array, lateral: jax.Array) -> jax.Array:
+    return jnp.concatenate([axes[:1], lateral[None], axes[2:]])
+
+
 def smooth_forces(
     run: Stages,
     hand: WorldModel,
@@ -205,8 +265,11 @@ def smooth_forces(
     else:
         wrist = hand.wrist_stiffness * (arm - state.wrist)
         wrist = wrist - hand.wrist_damping * state.wrist_vel
-    finger = -hand.stiffness * state.finger - hand.damping * state.finger_vel
+    joint = joint_springs(scene, hand, state, pressure)
+    finger = -joint.stiffness * state.finger - joint.damping * state.finger_vel
     bend = finger[:, :1] + hand.gain * pressure
+    if joint.moment is not None:
+        bend = bend + joint.moment
     if scene.effects.neo_hookean:
         assert hand.section is not None
         bend = bend + softening_moment(hand.section, hand.stiffness[:, :1], state.finger[:, :1])

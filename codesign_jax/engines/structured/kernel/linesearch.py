@@ -84,17 +84,21 @@ class LineSearch:
         )
         tip = self.prepare_row(self.links, last, last, step)
         between = [problem.pairs.prepare_all()] if problem.pairs else []
-        touch = lanewise(lambda t: total(t), [touch, *tip, *between])
-        for contacts in problem.slots:
+        touch = self.prepare_slots(lanewise(lambda t: total(t), [touch, *tip, *between]), step)
+        slope, curvature, touch = self.block.sum((slope, curvature, touch))
+        slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
+        return slope, curvature, touch
+
+    def prepare_slots(self, touch: Lanes, step: Iterate) -> Lanes:
+        """Adds the slopes of the palm's and the object's contacts along the step."""
+        for contacts in self.problem.slots:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
                 rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)
                 return lanewise(jnp.add, sum_, contacts.prepare_linesearch(i, rel))
 
             touch = loop(contacts.set.count, add, touch, self.block.size)
-        slope, curvature, touch = self.block.sum((slope, curvature, touch))
-        slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
-        return slope, curvature, touch
+        return touch
 
     def prepare_row(self, row: Any, before: Lanes, after: Lanes, step: Iterate) -> list[Lanes]:
         """Slopes of a row's contacts along the step of the links before and behind it."""

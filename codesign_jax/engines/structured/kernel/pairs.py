@@ -363,19 +363,10 @@ class BoundPairs(BoundSlots):
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and adds up wrenches."""
         self.clear_wrenches()
-        contacts = self.set.contacts
-
-        def response(place, cone, jar):
-            found = contact.constraint_update(contacts(place, cone), jar)
-            return found.hessian, found.force
 
         def store(item: Any, pairing: Pairing) -> None:
             own = self.own_side(item)
-            jar = lanewise(tree_add_scaled, alpha, self.read("jar", item), self.read("step", item))
-            self.write("jar", jar, item)
-            hessian, force = lanewise(response, own.place, self.cone, jar)
-            self.write("hessian", hessian, item)
-            self.load(item, own, force, pairing)
+            self.load(item, own, self.update_constraint(item, own.place, alpha), pairing)
 
         self.do(store)
 

@@ -156,8 +156,6 @@ class Program(Packing):
 
     def inputs(self, hand: WorldModel, state: State, ctrl: jax.Array) -> tuple:
         """The kernel's arguments, which have a leading axis of blocks; the last may be shared."""
-        if self.team > 1:  # see `pack_hand`
-            hand, state, ctrl = jax.lax.optimization_barrier((hand, state, ctrl))
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         return inputs if hand.mesh is None else (*inputs, hand.mesh.values[None])
 

@@ -13,7 +13,6 @@ from codesign_jax.engines.structured.kernel.memory import Block, solid
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs, OwnSide, PairSet, _times
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet, Slot
-from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.kernel.teams import TEAM, Parts, ranks
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
@@ -125,18 +124,10 @@ class TeamHull(BoundSlots):
 
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and forces."""
-        contacts = self.set.contacts
-
-        def response(place, cone, jar):
-            found = contact.constraint_update(contacts(place, cone), jar)
-            return found.hessian, found.force
 
         def store(item: Any, nothing: list) -> list:
-            jar, step, place = self.read("jar", item), self.read("step", item), self.place(item)
-            jar = lanewise(tree_add_scaled, alpha, jar, step)
-            hessian, force = lanewise(response, place, self.cone, jar)
-            for name, value in (("jar", jar), ("hessian", hessian), ("force", force)):
-                self.write(name, value, item)
+            force = self.update_constraint(item, self.place(item), alpha)
+            self.write("force", force, item)
             return nothing
 
         self.fold(None, store, [])

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import direct, zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
-from codesign_jax.engines.structured.kernel.linear_system import Elimination
+from codesign_jax.engines.structured.kernel.linear_system import Elimination, with_palm
 from codesign_jax.engines.structured.kernel.linesearch import LineSearch, _rest
 from codesign_jax.engines.structured.kernel.memory import loop
-from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body, relative
+from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
 from codesign_jax.engines.structured.kernel.teams import (
     AGAIN,
     FORCES,
@@ -23,7 +23,6 @@ from codesign_jax.engines.structured.kernel.teams import (
 from codesign_jax.engines.structured.lanes import contract, dot, inverse_spd, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.linear import elimination as el
-from codesign_jax.engines.structured.linear.tree import Forces, Matrices
 
 
 class Team:
@@ -280,18 +279,11 @@ class TeamElimination(Elimination):
         team, rigid = self.team, self.problem.rigid
 
         def own(now, palm, pushes):
-            force = Forces(
-                palm.smooth_palm - palm.palm.times(now.palm_motion),
-                None,  # type: ignore[arg-type]
-                palm.smooth_object - palm.object.times(now.object_motion),
-                palm.smooth_wrist - palm.armature * now.wrist,
-                None,  # type: ignore[arg-type]
-            )
-            matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
-            none = jnp.zeros_like(force.palm)
+            none = jnp.zeros_like(palm.smooth_palm)
             square = jnp.zeros((6, *none.shape), none.dtype)
             empty = el.Quadratic(square, square, square, none, none)
-            return el.add_palm(empty, matrices, force, pushes), force.wrist
+            node, force = with_palm(now, palm, empty, pushes)
+            return node, force.wrist
 
         palm = self.problem.palm
         whole, twist = lanewise(own, now, palm, slots)
@@ -443,14 +435,7 @@ class TeamLineSearch(LineSearch):
         pairs.put_palm(wide)
         start = team.one(palm + 0 * obj), [zeros((), self.like)] * 2
         _, (slope, curvature) = loop(self.links, one, start, self.block.size)
-        touch = zeros((), self.like)
-        for contacts in problem.slots:
-
-            def add(i: Any, sum_: Lanes, contacts: Any = contacts) -> Lanes:
-                rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)  # type: ignore[arg-type]
-                return lanewise(jnp.add, sum_, contacts.prepare_linesearch(i, rel))
-
-            touch = loop(contacts.set.count, add, touch, self.block.size)
+        touch = self.prepare_slots(zeros((), self.like), step)
         terms = [lanewise(jnp.multiply, touch, first), pairs.prepare_all()]
         for contacts in problem.skin:
             terms.append(contacts.prepare_all(pairs, step.palm_motion, step.object_motion))  # type: ignore[attr-defined]

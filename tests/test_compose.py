@@ -118,7 +118,8 @@ def test_a_trace_means_the_same_on_every_engine(decided, trajectory):
     lost_at = 0.01 * first
     assert outcome.lost_time[0] == pytest.approx(lost_at)
     assert outcome.bad_step.tolist() == [-1, 0, 11]
-    for a, b in zip(ours, outcome, strict=True):
+    told = ours._replace(residual=None), outcome._replace(residual=None)  # MuJoCo C has none
+    for a, b in zip(*map(jax.tree.leaves, told), strict=True):
         np.testing.assert_allclose(a, b)
     for field in ("distance", "height", "speed", "qpos", "last"):
         # No contact but the object's with the table, where MuJoCo stops at its tolerance.

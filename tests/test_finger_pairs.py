@@ -9,7 +9,6 @@ import pytest
 from codesign_jax import model, scene
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.structured.kernel.pairs import pair_slots
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.laws import finger_pairs
 from tests import small
 
@@ -19,7 +18,7 @@ SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 
 @jax.jit
 def contacts(centre, radius):
     """The engine's contacts between spheres of fingers, without a friction cone."""
-    return finger_pairs.contacts(Stages(), None, centre, radius)
+    return finger_pairs.contacts(None, centre, radius)
 
 
 def curled(the_scene, seed, bend, height):

@@ -137,18 +137,17 @@ def test_it_needs_sideways_bending():
 def numbers_of(*factors):
     """Other numbers of the threshold."""
 
-    def stage(right, the_scene, parent, constants, joint, forces):
-        scale = jnp.asarray(factors).reshape(-1, *[1] * (forces[4].ndim - 1))
-        return right(
-            the_scene, parent, constants, joint, (*forces[:4], scale * forces[4], forces[5])
-        )
+    def stage(right, the_scene, parent, constants, joint):
+        numbers = constants["threshold"]
+        scale = jnp.asarray(factors).reshape(-1, *[1] * (numbers.ndim - 1))
+        return right(the_scene, parent, constants | {"threshold": scale * numbers}, joint)
 
     return Fault({"link_forces": stage})
 
 
-def explicit(right, *args):
-    carry, found = right(*args)
-    return carry, found | {"armature_now": args[-1][5]}
+def explicit(right, the_scene, parent, constants, joint):
+    carry, found = right(the_scene, parent, constants, joint)
+    return carry, found | {"armature_now": constants["armature"]}
 
 
 FAULTS = {

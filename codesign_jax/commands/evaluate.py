@@ -119,7 +119,8 @@ def _evaluate(
     task = codesign.Task(case.scene, case.space, options.trials, engine)
     population = jnp.asarray(case.design, jnp.float32)[None]
     work = rates.batch_work(case.scene, case.engine, options.trials, devices=1)
-    with Busy(console, f"simulating {options.trials} grasps", rates.seconds(work)):
+    many = common.counted(options.trials, "grasp")
+    with Busy(console, f"simulating {many}", rates.seconds(work)):
         found = interruptible(task.evaluate, population, jax.random.key(options.seed))
     outcomes = jax.tree.map(np.asarray, found)
     one = jax.tree.map(lambda v: v[0], outcomes)

@@ -185,7 +185,7 @@ def _models(case: Case, params: Params, folder: Path, options: "Export", console
     folder.mkdir(exist_ok=True)
     trials = _trials(case, options)
     built = _built(case, params, trials)
-    with Busy(console, f"simulating {len(trials)} grasps in plain MuJoCo"):
+    with Busy(console, f"simulating {common.counted(len(trials), 'grasp')} in plain MuJoCo"):
         for line in tables.write_grasps(folder, case.scene, trials, built):
             console.print(f"in plain MuJoCo: {line}", markup=False)
 

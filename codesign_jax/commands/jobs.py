@@ -264,7 +264,7 @@ class Processes:
         self._waiting = dict(calls)
 
     def ended(self) -> Iterator[tuple[Path, Any, str]]:
-        """Folder and job of each run that has ended since, and a word if it left no result."""
+        """Folder and job of each run that has ended since; "" or why it left no result."""
         while self._waiting and len(self._running) < self._most:
             folder = next(iter(self._waiting))
             # submitit's controller of a job tells every Ctrl-C with a traceback.

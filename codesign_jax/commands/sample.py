@@ -53,7 +53,7 @@ def main(options: "Sample") -> int:
     for note in [*notes, *common.mesh_notes(scene)]:
         console.print(note, markup=False)
     count = question.shards(options.designs)
-    console.print(f"{_amount(options)} in {count} call{'s' * (count > 1)}")
+    console.print(f"{_amount(options)} in {common.counted(count, 'call')}")
     if options.dry_run:
         _dry_run(options, question, console)
         return 0
@@ -64,9 +64,10 @@ def main(options: "Sample") -> int:
             except Stopped as stopped:
                 console.print("stopped; the same command goes on")
                 return 128 + stopped.signum
-        dataset.write(options.out, question, options.designs, shards)
-        shards.delete()
-    _report(options.out, found, console)
+        if not options.outcomes:
+            dataset.write(options.out, question, options.designs, shards)
+            shards.delete()
+    _report(shards.folder if options.outcomes else options.out, found, console)
     return 0
 
 
@@ -86,7 +87,8 @@ def _check(options: "Sample") -> None:
     if problems:
         raise SceneError(problems)
     common.check_engine(options.engine)
-    parquet.library("codesign sample")
+    if not options.outcomes:
+        parquet.library("codesign sample")
     common.check_place("--out", options.out)
 
 
@@ -109,7 +111,9 @@ def _question(options: "Sample", scene: Scene) -> Question:
 
 def _amount(options: "Sample") -> str:
     """Designs and grasps in words."""
-    return f"{options.designs} designs x {options.trials} trials: {_grasps(options)} grasps"
+    sizes = (options.designs, "design"), (options.trials, "trial")
+    each = " x ".join(common.counted(*size) for size in sizes)
+    return f"{each}: {common.counted(_grasps(options), 'grasp')}"
 
 
 def _grasps(options: "Sample") -> int:
@@ -182,7 +186,9 @@ def _simulate(
                 meter.found(tally.add(question, shard, designs, kept))
         if len(missing) < total:
             done = total - len(missing)
-            words = f"going on after {done} of {total} calls, from {shards.folder}"
+            words = (
+                f"going on after {done} of {common.counted(total, 'call')}, from {shards.folder}"
+            )
             console.print(words, markup=False)
         for shard in missing:
             start = time.perf_counter()
@@ -211,4 +217,6 @@ def _report(path: Path, found: _Tally, console: Console) -> None:
     ends = zip(VERDICTS, found.counts.tolist(), strict=True)
     words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
     console.print(f"of {total} grasps: {words}")
-    console.print(f"table: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)
+    size = sum(file.stat().st_size for file in (path, *path.glob("*"))) / 1e6
+    what = "outcomes" if path.is_dir() else "table"
+    console.print(f"{what}: {path} ({size:.1f} MB)", markup=False)

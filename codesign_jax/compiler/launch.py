@@ -74,7 +74,7 @@ def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
     work, blocks are half or a quarter of a warp, so that fewer worlds wait for one another
     (whole grasps of 1,728 worlds on an H200, half a warp and a whole one: 0.72 and 0.41 million
     world-steps/s with the hull and contact between fingers, 2.9 and 2.2 with the hull; of 7,200
-    worlds, where whole warps are kept, 1.15 and 1.04, 3.9 and 4.5; before commit 5a0020d).
+    worlds, where whole warps are kept, 1.15 and 1.04, 3.9 and 4.5; without contact with the palm).
 
     Args:
       platform: As `jax.default_backend` names it.
@@ -94,7 +94,7 @@ def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
 
 @functools.cache
 def _multiprocessors() -> int:
-    """Multiprocessors of this computer's first GPU; those of an A100 if it does not tell."""
+    """Multiprocessors of this computer's first GPU; those of an A100 if it cannot be asked."""
     try:
         return int(getattr(jax.local_devices(backend="gpu")[0], "core_count", 108))
     except RuntimeError:  # the kernel is compiled for another computer

@@ -110,7 +110,7 @@ class Judged(NamedTuple):
         """Whether that is a success."""
         if success(self.scene, self.outcomes):
             limit = codesign.SUCCESS_COST
-            return f"a success: at least {_RELIABLE} kept, mean cost below {limit}"
+            return f"a success in these trials: at least {_RELIABLE} kept, mean cost below {limit}"
         if _kept(self.outcomes).mean() < RELIABLE:
             return f"no success: less than {_RELIABLE} kept"
         return f"no success: the mean cost is not below {codesign.SUCCESS_COST}"

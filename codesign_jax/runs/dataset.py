@@ -2,7 +2,7 @@
 
 A row follows from the question (scene, design space, seed, ...) and the indices of design and
 trial, but for its outcome.  So the folder beside the unfinished file holds outcomes alone, a shard
-for each call of the engine, sixteen bytes a grasp; the rest is drawn again when the file is
+for each call of the engine, a few bytes a grasp; the rest is drawn again when the file is
 written, shard by shard.
 """
 
@@ -133,7 +133,7 @@ class Shards:
 
     def save(self, shard: int, found: Outcome) -> None:
         """Keeps outcomes of a shard, arrays of shape (design, trial)."""
-        archives.save(self.path(shard), {_KEY: self._key, **found._asdict()})
+        archives.save(self.path(shard), {_KEY: self._key, **found._asdict()}, compressed=True)
 
     def load(self, shard: int) -> Outcome | None:
         """Outcomes of a shard; None if they are not there, or damaged."""

@@ -10,6 +10,7 @@ from tests.stability import (  # noqa: F401  (they register their cases)
     beam,
     capstan,
     crossed,
+    curled,
     decision,
     energy,
     grasp,

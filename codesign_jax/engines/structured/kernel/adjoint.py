@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
 from codesign_jax import sources
-from codesign_jax.compiler.launch import Kernel, kernel_jaxpr, launch
+from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.engines.structured.kernel.bars import STEP, Bars
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet
@@ -134,11 +134,6 @@ class AdjointProgram(Program):
         masks = lane, some, lane, some, some[:, None], lane
         found = [jnp.where(mask, x, 0.0) for mask, x in zip(masks, bars, strict=False)]
         return (*found, *bars[6:])
-
-    def adjoint_jaxpr(self, inputs: tuple, path: Path, bars: Cotangents) -> Any:
-        """The jaxpr of a block of the kernel; arguments may be `jax.ShapeDtypeStruct`."""
-        given = self._arguments(inputs, path, bars)
-        return kernel_jaxpr(self._adjoint_call(given)[0], list(given))
 
     def _arguments(
         self, inputs: tuple, path: Path, bars: Cotangents, sums: tuple | None = None

@@ -273,8 +273,3 @@ def sphere_on_table(height, centre, radius):
     """Point, normal and gap of spheres (3, k, ...) against the table."""
     c = shapes.spheres_on_table(None, height, centre, radius)  # type: ignore[arg-type]
     return c.point, c.normal, c.distance[None]
-
-
-def direct(function: Callable, *args: Any) -> Any:
-    """Runs a stage: in a kernel nothing is computed twice."""
-    return function(*args)

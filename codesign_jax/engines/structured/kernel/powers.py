@@ -174,19 +174,12 @@ def of_link(scene: Scene, chain: Chain, numbers: dict, joint: dict, still: dict)
     Args:
       scene: The scene.
       chain: What it inherits.
-      numbers: Its constants, the finger's and the worlds', by name.
+      numbers: See `Step.link_constants`.
       joint: Angles and velocities of the joint before it, and the chamber's pressure, by name.
       still: Accelerations and virtual accelerations of the joint, and the cotangent of the centre
         of mass.
     """
-    constants = [numbers[n] for n in LINK]
-    at = joint["finger"], joint["finger_vel"], still["acc"]
-    forces = (
-        numbers["gain"], joint["pressure"], numbers.get("section"), numbers.get("gravity")
-    )  # fmt: skip
-    if "threshold" in numbers:
-        forces += (numbers["threshold"], numbers["armature"])
-    after, found = link_forces(scene, chain[:5], constants, at, forces)
+    after, found = link_forces(scene, chain[:5], numbers, joint | {"acc": still["acc"]})
     along = next_motion(chain.along, found["axes"], still["virtual"])
     body = make_body(numbers["mass"], found["body_centre"], found["tensor"])
     armature = found.get("armature_now", numbers["armature"])
@@ -195,22 +188,18 @@ def of_link(scene: Scene, chain: Chain, numbers: dict, joint: dict, still: dict)
     return Chain(*after, along), dot(still["centre_bar"], found["body_centre"]) - power
 
 
-LINK = ("offset", "mass", "centre", "inertia", "stiffness", "damping")
-"""Constants of a link in the order of `step.link_forces`."""
-
-
-def of_palm(timestep: float, state: dict, arm, constants: list, still: dict) -> tuple:
+def of_palm(timestep: float, state: dict, arm, constants: dict, still: dict) -> tuple:
     """Geometry and motions of palm and object, and the power of palm, wrist and object.
 
     Args:
       timestep: Time step [s].
       state: Positions and velocities of wrist and object, by name.
       arm: Commands of the arm frame.
-      constants: See `step.PALM_CONSTANTS`.
+      constants: See `Step.palm_constants`.
       still: Accelerations of wrist and object, and their virtual ones.
     """
     given = {name: still[name] for name in ("acc_wrist", "acc_object")}
-    found = palm_and_object(timestep, state | given, arm, *constants)
+    found = palm_and_object(timestep, state | given, arm, constants)
     palm, now, virtual = found["palm"], found["now"], still["virtual_wrist"]
     along = palm_motion(virtual, palm.axes)
     power = dot(palm.palm.times(now.palm_motion) - palm.smooth_palm, along)

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import direct, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination, with_palm
 from codesign_jax.engines.structured.kernel.linesearch import LineSearch, _rest
@@ -305,7 +305,7 @@ class TeamElimination(Elimination):
             work.append(done)
         (q,) = team.spread(q=node[2])
         square, ro = team.narrowed(q[:, :6]), team.narrowed(q[:, FORCES])
-        obj = lanewise(lambda q, r: el.solve_object(direct, q, r), square, ro)
+        obj = lanewise(el.solve_object, square, ro)
         part = self.block.over_team(lanewise(lambda w: total(w), work).lane, jnp.add)
         part = lanewise(lambda w, r, o: w + dot(r, o), lanes([part], (), wide=False), ro, obj)
         if rigid:
@@ -375,7 +375,7 @@ class TeamCoupling(Coupling):
             r, ro, new = team.again(parts, own, r, ro, 0.0)
             z.append(new)
         force = team.narrowed(team.vector(ro))
-        obj = lanewise(lambda q, r: el.solve_object(direct, q, r), done.q, force)
+        obj = lanewise(el.solve_object, done.q, force)
         if not z:
             none = lanewise(jnp.zeros_like, obj)
             return Iterate(none, none, obj)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
+from codesign_jax.engines.structured.lanes import cross, dot, once, spatial, total
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, State
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, turn_columns
 from codesign_jax.model.morphology import softening, threshold_moments
@@ -151,7 +151,7 @@ def turned_tensor(frame: jax.Array, tensor: jax.Array) -> jax.Array:
     return turn_columns(frame, jnp.moveaxis(turn_columns(frame, tensor), 0, 1))
 
 
-def bodies(run: Stages, hand: WorldModel, kin: Kinematics) -> Bodies:
+def bodies(hand: WorldModel, kin: Kinematics) -> Bodies:
     """Inertia of all bodies at the present positions."""
 
     def link(origin: jax.Array, frame: jax.Array):
@@ -165,10 +165,10 @@ def bodies(run: Stages, hand: WorldModel, kin: Kinematics) -> Bodies:
             principal_tensor(obj, hand.object_inertia),
         )
 
-    centre, tensor, object_tensor = run(rest, kin.palm, kin.object)
+    centre, tensor, object_tensor = once(rest, kin.palm, kin.object)
     return Bodies(
         palm=Body(hand.palm_mass, centre, tensor),
-        link=Body(hand.mass, *run(link, kin.origin, kin.link)),
+        link=Body(hand.mass, *once(link, kin.origin, kin.link)),
         object=Centred(hand.object_mass, object_tensor),
     )
 
@@ -216,11 +216,11 @@ def springs(
     h = scene.discretization.timestep
     more, moment = threshold_moments(tuple(threshold), pressure, q[0], q[1])
     stiffness = _with_lateral(stiffness, stiffness[1] + more)
-    added = h * stiffness[1] if scene.discretization.spring_damping == "least" else h * more
-    if scene.discretization.spring_damping == "least":
-        lateral = jnp.maximum(damping[1], added), jnp.maximum(armature[1], h * added)
+    if scene.discretization.spring_damping == "added":
+        lateral = damping[1] + h * more, armature[1] + h * h * more
     else:
-        lateral = damping[1] + added, armature[1] + h * added
+        least = h * stiffness[1]
+        lateral = jnp.maximum(damping[1], least), jnp.maximum(armature[1], h * least)
     damping, armature = map(_with_lateral, (damping, armature), lateral)
     return Springs(stiffness, damping, armature, moment[None])
 
@@ -239,7 +239,6 @@ def _with_lateral(axes: jax.Array, lateral: jax.Array) -> jax.Array:
 
 
 def smooth_forces(
-    run: Stages,
     hand: WorldModel,
     kin: Kinematics,
     body: Bodies,
@@ -250,7 +249,6 @@ def smooth_forces(
     """All forces that do not depend on the accelerations.
 
     Args:
-      run: Runs the stages.
       hand: The hand.
       kin: Kinematics of the state.
       body: Inertia of the state.
@@ -274,7 +272,7 @@ def smooth_forces(
         assert hand.section is not None
         bend = bend + softening_moment(hand.section, hand.stiffness[:, :1], state.finger[:, :1])
     finger = jnp.concatenate([bend, finger[:, 1:]], 1)
-    links = run(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
+    links = once(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
     return Smooth(
         palm=body.palm.smooth_force(kin.palm_vel, kin.palm_bias, g),
         link=links,

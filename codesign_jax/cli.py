@@ -66,9 +66,9 @@ class Optimize:
     """Trials of a particle in an episode, best a multiple of the objects; default: one with each
     object; the paper's are 6."""
     episodes: Count = None
-    """Episodes; default: 23 in 2d, 30 otherwise; the paper's are 64 and 128."""
+    """Episodes; default: 21 in 2d, 28 otherwise; the paper's are 64 and 128."""
     test_trials: Count = None
-    """Further trials that test each final particle, in whole rounds of --trials; default: 6; the
+    """Further trials that test each final particle, in whole rounds of --trials; default: 12; the
     paper's are 36 in 2d, 72 otherwise; 0: none."""
     reference_trials: Count = None
     """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine

@@ -4,7 +4,7 @@ Grasps are noisy: a design that loses none of three objects may lose one in ten.
 particle is believed.  The mean of an evolution strategy moves where particles keep their objects on
 the whole; the average of these means over the episodes, recent ones weighing more, has less noise
 still, and no trial chose it.  Each average is simulated as particle 0 of the next episode, and the
-final test takes the last ones.
+final test takes the newest one and an early one.
 
 The strategy is OpenAI's.  Its draws come in mirrored pairs and designs of equal cost have equal
 weight, so that its mean stays where it is while all particles keep all of their objects; that of
@@ -58,9 +58,10 @@ class Screened:
     The first episodes simulate random designs, uniform in the parameters that the schedule opens,
     and the next ones the best of these again, in other trials: a start in the wrong place costs
     more than they do.  Later ones simulate the average so far, as particle 0, and draws of the
-    strategy.  The first particles of the state are the averages of the last episodes, newest first,
-    before there are enough of them the best random designs behind these; all others are the newest.
-    When a schedule opens other parameters, strategy and average start anew at particle 0.
+    strategy.  Particle 1 of the state is the average after a third of these, at most as many ago as
+    there are particles: a guard against a mean that has left a good place.  All others are the
+    newest average; more finalists would only have one of them chosen by luck.  When a schedule
+    opens other parameters, strategy and average start anew at particle 0.
 
     Attributes:
         keeps_best: True: the final test counts new trials only; see ``Optimizer.keeps_best``.
@@ -72,8 +73,6 @@ class Screened:
         retests: Episodes that simulate the best of them again.
         sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
             that of ``STRATEGIES``.
-        finalists: Averages that the final test takes. Older ones are worse by more than a dozen
-            trials show, so that a test of many would choose one of them by luck.
         recency: After ``t`` episodes of the strategy its mean has weight ``recency / (t + recency
             - 1)`` in the average: 1 is the plain average, more forgets the first means sooner.
     """
@@ -86,7 +85,6 @@ class Screened:
     screening: int = dataclasses.field(default=3, metadata={"static": True})
     retests: int = dataclasses.field(default=2, metadata={"static": True})
     sigma: float = dataclasses.field(default=0.0, metadata={"static": True})
-    finalists: int = dataclasses.field(default=3, metadata={"static": True})
     recency: float = dataclasses.field(default=4.0, metadata={"static": True})
 
     def __post_init__(self) -> None:
@@ -97,10 +95,8 @@ class Screened:
         """
         if self.strategy not in STRATEGIES:
             raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
-        least = min(self.screening, self.retests + 1, self.finalists, self.recency)
-        if not (least >= 1 and self.sigma >= 0):
-            needed = "screening, finalists, recency >= 1, retests >= 0 and sigma >= 0"
-            raise ValueError(f"need {needed}: {self}")
+        if not (min(self.screening, self.retests + 1, self.recency) >= 1 and self.sigma >= 0):
+            raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma >= 0: {self}")
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0; see ``Optimizer.init``.
@@ -118,6 +114,7 @@ class Screened:
         memory = {
             "mask": jnp.ones(seed.shape, bool),
             "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
+            "way": state.particles,
         }
         return state._replace(memory=memory | self._start(state))
 
@@ -153,9 +150,6 @@ class Screened:
         costs = jnp.concatenate([ranked, jnp.where(tests > 0, jnp.inf, known)])
         best = jnp.argsort(costs)[: len(cost)]
         screened = jnp.concatenate([population, state.particles])[best]
-        # Later the average that was simulated comes before the earlier ones.
-        averages = jnp.concatenate([population[:1], state.particles[:-1]])
-        averages = averages.at[self.finalists :].set(population[0])
         unit, asked, memory = self._asked(state, mask)
         algorithm, params = self._strategy(state)
         points = slice(1, 1 + algorithm.population_size)
@@ -165,14 +159,19 @@ class Screened:
         weight = self.recency / (memory["averaged"] + self.recency)
         average = memory["average"] + weight * (new.mean - memory["average"])
         now = {"average": average, "averaged": memory["averaged"] + 1, "strategy": arrays(new)}
+        # The averages that were simulated, newest first, and which of them the final test takes.
+        way = jnp.concatenate([population[:1], state.memory["way"][:-1]])
+        rows, third = jnp.arange(len(cost)), 2 * now["averaged"] // 3
+        finalists = way[jnp.where(rows == 1, jnp.minimum(third, len(cost) - 1), 0)]
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
+            "way": jnp.where(screens, state.memory["way"], way),
             "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
             "cost": jnp.where(screens, costs[best], state.memory["cost"]),
         }
-        rows = jnp.arange(len(cost))
-        copied = jnp.where((rows == 0) | (rows >= self.finalists), 0, -1)
-        copied = jnp.where(screens, jnp.where(best < len(cost), best, -1), copied)
-        particles = jnp.where(screens, screened, averages)
+        copied = jnp.where(
+            screens, jnp.where(best < len(cost), best, -1), jnp.where(rows == 1, -1, 0)
+        )
+        particles = jnp.where(screens, screened, finalists)
         next_state = State(particles, state.episode + 1, state.key, following)
         return next_state, summarize(cost, jnp.ones_like(cost), copied.astype(jnp.int32))
 

@@ -5,12 +5,12 @@ import json
 import jax
 import numpy as np
 import pytest
-from toy import tiny
 
 from codesign_jax import codesign
 from codesign_jax.cost import particle_cost
 from scripts.search import report, study
 from scripts.search.study import Study, make_case
+from tests.helpers.toy_engine import tiny
 
 SIZES = "particles=4,trials=2"
 

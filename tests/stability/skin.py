@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from codesign_jax import model
-from tests import small
+from tests.helpers import grasps
 from tests.stability.bench import bench, pinch
 from tests.stability.oracle import Reader
 from tests.stability.table import Found, case
@@ -31,7 +31,7 @@ def pressed_forces(b):
 
     Hand and sphere are so heavy that the step moves nothing: the force is k times the depth.
     """
-    params, trial = small.hand_world(b.scene, length=0.1)
+    params, trial = grasps.hand_world(b.scene, length=0.1)
     fields = b.fields([params] * PLACES, [trial._replace(shape=np.int32(SPHERE))] * PLACES)
     fields.start[:, 2] = 1.0
     reader, lay = Reader(b.scene, fields), model.layout(b.scene)

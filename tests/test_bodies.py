@@ -6,19 +6,9 @@ import pytest
 import trimesh
 
 from codesign_jax import model
-from codesign_jax.report import animation, bodies
-from codesign_jax.types import Outcome
+from codesign_jax.report import bodies
 from tests.helpers import grasps
-
-
-def bent_grasp(the_scene):
-    """Three frames of a hand with random joint angles, as a replay."""
-    params, trial = grasps.hand_world(the_scene, length=0.11, height=0.018)
-    data = mujoco.MjData(model.compile_model(the_scene, params, trial))
-    turn = np.random.default_rng(0).uniform(-0.4, 0.4, (3, data.qpos.size - 7))
-    qpos = np.tile(data.qpos, (3, 1))
-    qpos[:, :-7] += turn
-    return animation.Replay(params, trial, Outcome(*np.zeros(4)), qpos)
+from tests.helpers.replays import bent_grasp
 
 
 def test_fingers_move_as_in_mujoco():

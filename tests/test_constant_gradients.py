@@ -11,7 +11,6 @@ import pytest
 from codesign_jax import rollout
 from codesign_jax.engines.structured import StructuredEngine
 from tests.helpers import grasps
-from tests.test_gradients import short_grasp
 
 # Forward it is one kernel; each of the two derivatives compiles in two minutes of a core's time.
 pytestmark = pytest.mark.slow
@@ -44,7 +43,7 @@ MOVING = {
 
 def grasp(dtype, **settings):
     """The scene's numbers, and the function from numbers of worlds, (world,), to their losses."""
-    scene = short_grasp()
+    scene = grasps.short_grasp()
     engine = StructuredEngine(scene, **settings)
     hand, trial = jax.tree.map(
         lambda v: jnp.asarray(v, dtype if v.dtype.kind == "f" else None), grasps.hand_world(scene)

@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 
 from codesign_jax import control, model
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.mujoco import MujocoEngine, world_model
+from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine, coordinates
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import effects, schema
 from codesign_jax.types import WARNINGS
 from tests.helpers import grasps, oracles
+from tests.helpers.effect_settings import inflated, setting
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
@@ -41,19 +42,6 @@ SETTINGS = {
     "no table": {"finger_table": False, "palm_table": False, "object_table": False},
 }
 TOGETHER = ("new models", "little")
-
-
-@jax.enable_x64(True)
-def setting(effects, shape="box", **changes):
-    """Scene, MuJoCo C's model, fields and controls of a pinch grasp, in float64."""
-    scene = grasps.pinch(shape, **{f"effects__{k}": v for k, v in effects.items()})
-    world, trial = grasps.hand_world(scene, **changes)
-    trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
-    fields, ctrl = grasps.world_inputs(scene, world, trial)
-    ctrl = np.asarray(ctrl)
-    oracle = world_model(scene, fields)
-    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
-    return scene, oracle, fields, ctrl
 
 
 @pytest.mark.parametrize(
@@ -133,16 +121,6 @@ def test_neo_hookean_is_inert_at_small_strain():
         angles.append(inflated(scene, fields, ctrl, 2.0))
     assert 0 < angles[0].max() < 1e-5
     np.testing.assert_allclose(angles[1], angles[0], rtol=1e-5)
-
-
-def inflated(scene, fields, ctrl, pressure, steps=400):
-    """Bend angles (finger, link) of fingers at rest under a pressure, by the engine `mujoco`."""
-    with jax.enable_x64(True):
-        held = np.broadcast_to(ctrl[:1], (1, steps, ctrl.shape[1])).copy()
-        held[..., 6:] = pressure
-        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-        trace = make_engine("mujoco", scene).rollout(batch, jnp.asarray(held), trajectory=True)
-    return np.asarray(trace.qpos)[0, -1][model.layout(scene).dofs[..., 0]]
 
 
 # --- off is absent -------------------------------------------------------------------------------

@@ -48,21 +48,6 @@ class Thrown(StructuredEngine):
         return state._replace(linear_vel=state.linear_vel.at[0, 0].set(self.velocity))
 
 
-def short_grasp():
-    """Half a second: the hand comes down beside the box, closes and begins to lift."""
-    return grasps.pinch(
-        "box",
-        phases__approach=0.2,
-        phases__inflate=0.35,
-        phases__lift=0.5,
-        effects__disturb=False,
-        effects__ungrasp=False,
-        effects__palm_object=False,
-        effects__palm_table=False,
-        arm__start_height=0.15,
-    )
-
-
 def world(scene, design, value):
     """Model fields and controls of one world from a design, its trial and the values of NAMES."""
     params, trial = design
@@ -99,7 +84,7 @@ def simulate(scene, design, values):
 @pytest.fixture(scope="module")
 def checked():
     """By case: gradients, central differences, final position of the object."""
-    scene, rows, where = short_grasp(), [], {}
+    scene, rows, where = grasps.short_grasp(), [], {}
     for case, (changes, names, _) in CASES.items():
         base = np.array([{**START, **changes}.get(n, 0.0) for n in NAMES])
         where[case] = len(rows)

@@ -19,7 +19,6 @@ from codesign_jax.engines.structured.linear.tree import Spatial, relative
 from codesign_jax.model import hull
 from codesign_jax.scene.schema import SceneError
 from tests.helpers import grasps
-from tests.test_structured import lanes_state
 
 LENGTH, HEIGHT = 0.11, 0.018
 
@@ -96,7 +95,7 @@ def test_velocities_are_derivatives_of_positions():
         @jax.jit
         def at(h):
             qpos = data.qpos + h * np.append(rate, 0.0)
-            state = lanes_state(engine, the_scene, fields, qpos, rate)
+            state = grasps.lanes_state(engine, the_scene, fields, qpos, rate)
             kin = kinematics(Stages(), lanes, model.layout(the_scene).axes, state)
             return kin, skin.vertices(the_scene, lanes, kin), state.position[:, 0, 0]
 

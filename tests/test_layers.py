@@ -247,3 +247,34 @@ def test_what_imports_are_seen_in_a_file():
     names = {"a", "a.b", "a.d"}
     assert list(imports(ast.parse(text), names)) == ["a.b", "a.b", "a", "a.d"]
     assert list(imports(ast.parse(text), names, inside=False)) == ["a.b", "a.b", "a"]
+
+
+def imported(tree):
+    """Dotted names of all that a file imports, also inside of functions."""
+    for node in statements(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def unshared(tree):
+    """Imports that would make a second module of a helper, or that take something of a test."""
+    own = {path.stem for path in (ROOT / "tests").rglob("*.py")}
+    for name in imported(tree):
+        first, *rest = name.split(".")
+        if first in own or (first == "tests" and rest[0].startswith("test_")):
+            yield name
+
+
+def test_tests_share_by_helpers_alone():
+    """A test module imports no other one, and a helper by its one name, `tests.helpers.NAME`."""
+    text = "from toy import TINY\nfrom tests.test_cost import a\nfrom tests import test_cost\n"
+    text += "from tests.helpers import grasps\n"
+    assert list(unshared(ast.parse(text.replace("toy", "toy_engine")))) == [
+        "toy_engine.TINY",
+        "tests.test_cost.a",
+        "tests.test_cost",
+    ]
+    found = {p.name: [*unshared(parse(p))] for p in sorted((ROOT / "tests").rglob("*.py"))}
+    assert not {name: names for name, names in found.items() if names}

@@ -9,11 +9,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from test_browser import browser, launch  # noqa: F401
 
 from codesign_jax import model
 from scripts import reference_page, site_pages
 from tests.helpers import grasps
+from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
 
 ROOT = Path(__file__).parent.parent
 BUILT_IN = {
@@ -146,7 +146,7 @@ def site(tmp_path_factory):
 
 
 @pytest.mark.browser
-def test_the_site_is_read_and_searched_without_a_network(site, browser):  # noqa: F811
+def test_the_site_is_read_and_searched_without_a_network(site, browser):
     page, complaints = browser.new_page(viewport={"width": 1300, "height": 900}), []
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("request", lambda r: None if r.url.startswith("file:") else complaints.append(r.url))

@@ -5,10 +5,8 @@ and the sound ones among worlds with planted faults (test_planted_faults, test_p
 """
 
 import dataclasses
-import functools
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -21,16 +19,6 @@ from tests.helpers import grasps, oracles
 pytestmark = pytest.mark.slow
 EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-24}
 """Limits at which the kernel solves a step to rounding in float64."""
-
-
-@functools.lru_cache(maxsize=4)
-def _placing(engine):
-    return jax.jit(lambda fields, qpos, qvel: engine.place(engine.reset(fields), qpos, qvel))
-
-
-def lanes_state(engine, scene, fields, qpos, qvel):
-    """The engine's state, one world, from MuJoCo's coordinates, with a cold start."""
-    return _placing(engine)(fields, jnp.asarray(qpos)[None], jnp.asarray(qvel)[None])
 
 
 def setting(shape, **params):

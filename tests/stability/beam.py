@@ -12,9 +12,9 @@ from codesign_jax.model import morphology
 from codesign_jax.types import Params
 from scripts.accuracy import beam
 from tests.helpers import grasps
+from tests.helpers.beams import Finger, finger_scene
 from tests.stability.bench import bench
 from tests.stability.table import Found, case
-from tests.test_beam_oracles import Finger, finger_scene
 
 HEIGHT, WALL = 0.020, 0.005
 

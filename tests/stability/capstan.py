@@ -8,10 +8,10 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.scene import hand
 from tests.helpers import grasps
+from tests.helpers.tables import GRAVITY
 from tests.stability.bench import bench
 from tests.stability.oracle import TIGHT
 from tests.stability.table import Found, case
-from tests.test_contact import GRAVITY
 
 RADIUS, FRICTION, LINKS = 0.05, 0.3, 30
 RUN_UP, HANGING = 0.03, 0.05  # straight parts before and behind the cylinder [m]

@@ -13,10 +13,10 @@ from codesign_jax.scene import parameters
 from codesign_jax.types import Params, failed
 from scripts.shared.work import NUDGE
 from tests.helpers import grasps
+from tests.helpers.grasps import GOOD
 from tests.stability.bench import CREEP, FIRM, bench, floats, refined
 from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
-from tests.test_grasp import GOOD
 
 
 @functools.cache

@@ -4,11 +4,11 @@ import numpy as np
 
 from codesign_jax import model
 from tests.helpers import grasps
+from tests.helpers.tables import GRAVITY
 from tests.stability.bench import CHUNK, CREEP, FIRM, bench, pinch
 from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
 from tests.stability.touch import at_height
-from tests.test_contact import GRAVITY
 
 # --- 12: pinch -------------------------------------------------------------------------------
 

@@ -7,11 +7,11 @@ from scipy import optimize
 
 from codesign_jax import model
 from tests.helpers import grasps
+from tests.helpers.closed_forms import moment
 from tests.stability.bench import bench, pinch
 from tests.stability.oracle import Reader, along, exact
 from tests.stability.table import Found, case
 from tests.stability.touch import SPHERE, at_height, held
-from tests.test_effects_physics import moment
 
 AGAINST_C = "accelerations along the path against MuJoCo C, relative"
 TWO = (1.0, 0.5)

@@ -8,12 +8,12 @@ from scipy import integrate
 
 from codesign_jax.scene import objects
 from tests.helpers import grasps
+from tests.helpers.tables import GRAVITY, MU
 from tests.stability.bench import bench, pinch
 from tests.stability.hold import lifted
 from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
 from tests.stability.touch import CUBOID, SPHERE, at_height, held, worlds
-from tests.test_contact import GRAVITY, MU
 
 HALF = 0.030  # half a side of the cuboid, and radius of the sphere [m]
 

@@ -9,9 +9,9 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from tests.helpers import grasps
+from tests.helpers.tables import GRAVITY, MASS, MU, Table
 from tests.stability.bench import bench, pinch
 from tests.stability.table import Found, case
-from tests.test_contact import GRAVITY, MASS, MU, Table
 
 CUBOID, CYLINDER, SPHERE = range(3)
 

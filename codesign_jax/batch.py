@@ -211,16 +211,16 @@ class Batch:
         """The blocks of all runs, dealt to the devices."""
         parts = _deal(tuple(p.blocks for p in packed), len(self.devices))
         return [
-            self._call(blocks, packed[0].common, device)
+            self.call(blocks, packed[0].common, device)
             for blocks, device in zip(parts, self.devices, strict=False)
         ]
 
     def _one_by_one(self, packed: Sequence[_Packed]) -> list[tuple]:
         """Every run by itself, in turn on each device."""
         turns = zip(packed, itertools.cycle(self.devices), strict=False)
-        return [self._call(p.blocks, p.common, device) for p, device in turns]
+        return [self.call(p.blocks, p.common, device) for p, device in turns]
 
-    def _call(self, blocks: tuple, common: tuple, device: Device) -> tuple:
+    def call(self, blocks: tuple, common: tuple, device: Device) -> tuple:
         """Begins to simulate on a device; returns at once."""
         blocks, common = jax.device_put((blocks, common), device)
         return self._launcher(blocks, common, device)(blocks, common)

@@ -64,16 +64,16 @@ class Program:
         return jax.tree.map(lambda v: jnp.asarray(v, float), numbers)
 
 
-_process = {"begun": False, "forked": False}
+process = {"begun": False, "forked": False}
 """Whether programs have run in this process, and whether it was forked from one in which they had.
 
 A child of `os.fork` has none of XLA's threads, for which its programs would wait for ever.
 """
 
 
-def _forked() -> None:
+def note_fork() -> None:
     """This process is a child."""
-    _process["forked"] = _process["begun"]
+    process["forked"] = process["begun"]
 
 
 def _begin() -> None:
@@ -82,16 +82,16 @@ def _begin() -> None:
     Raises:
       RuntimeError: If the process was forked from one in which programs had run.
     """
-    if _process["forked"]:
+    if process["forked"]:
         raise RuntimeError(
             "this process was forked from one that had simulated, and would wait for ever for "
             "XLA's threads, which it has not: begin processes by multiprocessing's `spawn`"
         )
-    _process["begun"] = True
+    process["begun"] = True
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forked)
+    os.register_at_fork(after_in_child=note_fork)
 
 
 def _again_if_stuck(call: Callable[[], Any]) -> Any:

@@ -56,7 +56,6 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish():
     """What was imported stays: no search for garbage looks at it again."""
     gc.freeze()
-    compile_flags.share_contexts()
 
 
 def pytest_sessionfinish():

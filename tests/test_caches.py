@@ -67,7 +67,7 @@ def use_all(monkeypatch):
     caches.use_compilation_cache()
     jax.jit(lambda v: v * 3.25)(jnp.ones(7))
     cache.kept("kernel", lambda: b"code")
-    monkeypatch.setattr(grid, "_WORTH_KEEPING", 0.0)
+    monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
     grid.cached("cube", *cube(), 1e-3)
     work = rates.Work("structured", "cpu x2", "hull", 1, 1, 1)
     rates.record(work, 1.0, 1.0)
@@ -105,7 +105,7 @@ def test_the_oldest_go_first(tmp_path):
 
 
 def test_a_grid_and_a_kernel_in_the_place_of_another_are_not_taken(place, monkeypatch):
-    monkeypatch.setattr(grid, "_WORTH_KEEPING", 0.0)
+    monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
     vertices, faces = cube()
     first = grid.cached("a", vertices, faces, 1e-3)
     grid.cached("b", 0.5 * vertices, faces, 1e-3)

@@ -261,13 +261,13 @@ def test_decided_worlds_are_not_simulated_further(hurried, monkeypatch):
     """MuJoCo leaves worlds that are lost or failed; their traces repeat the last entry."""
     the_scene, (fields, ctrl), _ = hurried
     engine = MujocoEngine(the_scene)
-    asked, advance = [], MujocoEngine._advance
+    asked, advance = [], MujocoEngine.advance
 
     def spy(self, batch, ids, *rest):
         asked.append(ids.tolist())
         return advance(self, batch, ids, *rest)
 
-    monkeypatch.setattr(MujocoEngine, "_advance", spy)
+    monkeypatch.setattr(MujocoEngine, "advance", spy)
     # World 0 keeps the object at the start; world 1 holds its hand up in the air: lost at once.
     away = ctrl.at[1, :, 2].set(0.3)
     trace = jax.tree.map(np.asarray, engine.rollout(nth(fields, slice(0, 2)), away[:2]))

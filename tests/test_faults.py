@@ -166,7 +166,7 @@ def test_the_number_makes_the_case():
 
     bench = SimpleNamespace(folder=None)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scripts.faults.kills._operations", lambda bench: 800)
+        patch.setattr("scripts.faults.kills.count_operations", lambda bench: 800)
         found = [_place(bench, n, 100) for n in range(300)]
     assert len(set(found[:100])) == 100 and set(found) <= {*range(1, 801)}
     assert len(set(found)) > 250

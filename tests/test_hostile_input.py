@@ -180,7 +180,7 @@ def test_thin_faces_are_not_cut_into_millions(monkeypatch):
     rod = trimesh.creation.cylinder(0.002, 0.2, sections=8)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
     usual = surface.prepare(rod.vertices, rod.faces)
-    monkeypatch.setattr(surface, "_MOST_PIECES", 500)
+    monkeypatch.setattr(surface, "MOST_PIECES", 500)
     few = surface.prepare(rod.vertices, rod.faces)
     assert len(few.piece) <= 500 < len(usual.piece)
     expected = surface.signed_distance(usual, points)

@@ -259,7 +259,7 @@ def test_a_device_without_kernels_is_told_of_other_engines(grasp, monkeypatch):
     monkeypatch.setattr(launch, "describe", refuse)
     with pytest.raises(launch.KernelUnavailable, match="XLA refused; engine mjx runs on every"):
         jax.eval_shape(engine.rollout, fields, ctrl)
-    monkeypatch.setattr(launch, "_available", lambda platform: "no compiler")
+    monkeypatch.setattr(launch, "available", lambda platform: "no compiler")
     with pytest.raises(launch.KernelUnavailable, match="no compiler; engine mjx runs on every"):
         make_engine("structured", scene)
     # What other engines need of this one's physics needs no kernel.

@@ -24,7 +24,7 @@ def test_the_system_tells_how_many_maps_there_are():
 def test_programs_go_when_many_maps_are_taken(monkeypatch):
     """All that nobody holds; a program that is held works on."""
     cleared, built, scene = [], [], types.SimpleNamespace(structure="s")
-    monkeypatch.setattr(memory_maps, "_forget", [])
+    monkeypatch.setattr(memory_maps, "forgetters", [])
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
     find = programs.shared(lambda *how: built.append(how) or (lambda v: v + 1))
 
@@ -75,8 +75,8 @@ def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     """Only of a process that had simulated; its own first call is then an error at once."""
     program = programs.Program(grasps.pinch("sphere", 2), lambda *_: 3)
     for begun in (False, True):
-        monkeypatch.setattr(programs, "_process", {"begun": begun, "forked": False})
-        programs._forked()
+        monkeypatch.setattr(programs, "process", {"begun": begun, "forked": False})
+        programs.note_fork()
         if begun:
             with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
                 program(0, 0)

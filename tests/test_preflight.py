@@ -52,7 +52,7 @@ def test_lowest_point_bounds_mujocos_geoms():
 def test_starts_inside_table_or_object_are_refused_and_those_called_clear_are_clear():
     scene = low_start()
     designs = hands(scene, 64)
-    exact = np.asarray(clearance._depths(*clearance._arguments(scene, single(designs))))[0]
+    exact = np.asarray(clearance.depths(*clearance._arguments(scene, single(designs))))[0]
     low = [clearance.lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
     clear = np.array(low) >= 0.06  # the box's height
     assert clear.any() and (exact[clear] <= 0).all()
@@ -113,7 +113,7 @@ def test_an_ordinary_start_needs_no_program(monkeypatch):
     def never(*arguments):
         raise AssertionError("a program was compiled")
 
-    monkeypatch.setattr(clearance, "_depths", never)
+    monkeypatch.setattr(clearance, "depths", never)
     for preset in ("2d", "full"):
         scene = pinch()
         space = parameters.design_space(scene.hand, preset)

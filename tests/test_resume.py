@@ -245,7 +245,7 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         raise AssertionError("simulated again")
 
     with monkeypatch.context() as patch:  # kept in the run folder
-        patch.setattr(reference, "_simulate", never)
+        patch.setattr(reference, "simulate", never)
         assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
         assert line in capsys.readouterr().out.splitlines()
         with pytest.raises(AssertionError, match="simulated again"):

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shutil
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -231,7 +232,7 @@ def test_a_step_that_cannot_be_read_now_is_kept(number, run, monkeypatch, capsys
     def refused(path):
         raise OSError(number, os.strerror(number), str(path))
 
-    monkeypatch.setattr(checkpoint, "_file_digest", refused)
+    monkeypatch.setattr(checkpoint, "file_digest", refused)
     assert command(*RUN, "--out", run) == 1
     error = capsys.readouterr().err
     assert f"checkpoint {NEWEST} in " in error and os.strerror(number) in error
@@ -387,10 +388,8 @@ def test_a_run_that_cannot_be_saved_says_why(run, tmp_path, monkeypatch, capsys)
 
     def full(store, step, arrays):
         text = "RESOURCE_EXHAUSTED: Failed writing: x" + "/x" * 300 + ": No space left on device"
-        monkeypatch.setattr(
-            store._manager, "save", lambda *a, **k: (_ for _ in ()).throw(ValueError(text))
-        )
-        save(store, step, arrays)
+        with mock.patch("orbax.checkpoint.CheckpointManager.save", side_effect=ValueError(text)):
+            save(store, step, arrays)
 
     def full_log(folder, message):
         if message.startswith("failed"):

@@ -440,7 +440,7 @@ def old_driver(monkeypatch):
 )
 def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
     """Each reason is named, and launching says the same."""
-    launch._available.cache_clear()
+    launch.available.cache_clear()
     gpu.driver.cache_clear()
     cause(monkeypatch)
     try:
@@ -450,7 +450,7 @@ def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
             kernels.run(*kernels.numbers(2), backend=platform)
     finally:
         monkeypatch.undo()
-        launch._available.cache_clear()
+        launch.available.cache_clear()
         gpu.driver.cache_clear()
         ffi.installed_version.cache_clear()
     assert launch.available("cpu") is None

@@ -30,7 +30,7 @@ def code(tmp_path, monkeypatch):
 
 def imported(monkeypatch):
     """A process begins."""
-    monkeypatch.setattr(sources, "_imported", sources._state())
+    monkeypatch.setattr(sources, "at_import", sources._state())
     sources._read.cache_clear()
 
 

@@ -51,9 +51,9 @@ def main(options: "Evaluate") -> int:
     if options.dry_run:
         _dry_run(case, options, console)
         return 0
-    one = _evaluate(case, engine, options, console)
+    one = simulate(case, engine, options, console)
     if options.render:
-        _render(case, engine, options, console)
+        draw(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
 
 
@@ -112,7 +112,7 @@ def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
     console.print(estimate.text(parts), markup=False)
 
 
-def _evaluate(
+def simulate(
     case: Case, engine: engines.Engine, options: "Evaluate", console: Console
 ) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
@@ -149,7 +149,8 @@ def _untried(case: Case, options: "Evaluate") -> list[str]:
     ]
 
 
-def _render(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+    """Simulates grasps of the first objects and draws them."""
     try:
         from codesign_jax.report import animation
     except ImportError as error:

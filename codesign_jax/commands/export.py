@@ -52,7 +52,7 @@ def main(options: "Export") -> int:
         console.print(note, markup=False)
     try:
         with files.whole_folder(options.out, drift.PART) as folder:
-            _write(case, params, sizes, engine, folder, options, console)
+            write_files(case, params, sizes, engine, folder, options, console)
     except OSError as error:
         raise SceneError([f"--out {options.out}: {error.strerror}"]) from error
     except KeyboardInterrupt:
@@ -118,7 +118,7 @@ def _missing(options: "Export") -> list[str]:
     return found
 
 
-def _write(
+def write_files(
     case: Case,
     params: Params,
     sizes: list[Size],

@@ -69,7 +69,7 @@ def main(options: "Options") -> int:
         table = {"pressure": np.linspace(0.0, top, POINTS)}
         table |= {n: np.zeros(POINTS) for n in ("angle", "tip_force", "blocked_force")}
     try:
-        _compare(mine, table, options, console)
+        compare(mine, table, options, console)
     except ValueError as error:
         raise SceneError([str(error)]) from error
     return 0
@@ -85,7 +85,7 @@ def _about(mine: Finger, number: int, hand: str) -> str:
     )
 
 
-def _compare(
+def compare(
     mine: Finger, table: dict[str, np.ndarray], options: "Options", console: Console
 ) -> None:
     """Prints and writes what was measured, predicted and fitted."""

@@ -65,13 +65,13 @@ def main(options: "Options") -> int:
         return 0
     part = folder / PART
     try:
-        simulated = _simulate(case, made.designs, options, console, part)
+        simulated = simulated_designs(case, made.designs, options, console, part)
     except KeyboardInterrupt:
         console.print("stopped; the same command goes on")
         return 130
     found = summarize(case, made, simulated, options.seed)
-    _report(case, found, console)
-    _write(case, found, folder, console)
+    print_summary(case, found, console)
+    write_files(case, found, folder, console)
     part.unlink(missing_ok=True)
     return 0
 
@@ -178,7 +178,7 @@ def _trials(case: Case, options: "Options") -> Trials:
     return Trials(case.scene, case.engine, case.space, options.trials, options.seed)
 
 
-def _simulate(
+def simulated_designs(
     case: Case, designs: np.ndarray, options: "Options", console: Console, part: Path
 ) -> Outcome:
     """Simulates all designs in the same trials, some at a time; outcomes (design, trial).
@@ -222,7 +222,8 @@ def summarize(case: Case, made: Grid, found: Outcome, seed: int) -> Landscape:
     )
 
 
-def _report(case: Case, found: Landscape, console: Console) -> None:
+def print_summary(case: Case, found: Landscape, console: Console) -> None:
+    """Prints the number of good designs, the best one, and failed trials."""
     i, j = np.unravel_index(int(found.cost.argmin()), found.cost.shape)
     good = int((found.cost < codesign.SUCCESS_COST).sum())
     place = " ".join(
@@ -241,7 +242,8 @@ def _report(case: Case, found: Landscape, console: Console) -> None:
         console.print(f"{bad} of {found.cost.size * int(found.trials)} trials failed")
 
 
-def _write(case: Case, found: Landscape, folder: Path, console: Console) -> None:
+def write_files(case: Case, found: Landscape, folder: Path, console: Console) -> None:
+    """Writes the arrays, the figure, and the scene where no run has written it."""
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / PROVENANCE).exists():  # a run has its scene already
         write_scene(case.scene, folder)

@@ -81,7 +81,7 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
             console.print(f"{folder / FILE} {why}: simulated again", markup=False)
         work = rates.batch_work(case.scene, case.engine, trials, devices=1)
         with Busy(console, f"reference test, {trials} grasps", rates.seconds(work)):
-            found = _simulate(case, settings, trials)
+            found = simulate(case, settings, trials)
         outcomes.save(folder / FILE, found, key)
         drawn = rollout.sample_trials(case.scene, _noise(settings), trials)
         tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
@@ -141,7 +141,7 @@ def _case(folder: Path, settings: Settings, trials: int) -> tuple[Case, str]:
     return case, outcomes.key(case.scene, case.engine, case.design[None], trials, settings.seed)
 
 
-def _simulate(case: Case, settings: Settings, trials: int) -> Outcome:
+def simulate(case: Case, settings: Settings, trials: int) -> Outcome:
     """Outcomes of the design in fresh trials, shape (trial,)."""
     task = codesign.Task(case.scene, case.space, trials, make_engine(case.engine, case.scene))
     population = jnp.asarray(case.design, jnp.float32)[None]

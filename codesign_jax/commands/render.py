@@ -25,7 +25,7 @@ def main(options: "Render") -> int:
     late = [t for t in options.times if not 0 <= t <= end]
     if late:
         raise SceneError([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
-    _draw(asked, options, Console(highlight=False, soft_wrap=True))
+    draw(asked, options, Console(highlight=False, soft_wrap=True))
     return 0
 
 
@@ -41,7 +41,8 @@ def _check(options: "Render") -> None:
     common.check_place("--out", options.out)
 
 
-def _draw(asked: grasp.Asked, options: "Render", console: Console) -> None:
+def draw(asked: grasp.Asked, options: "Render", console: Console) -> None:
+    """Simulates the grasp and draws it."""
     with console.status("simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import animation

@@ -35,7 +35,7 @@ def main(options: "Replay") -> int:
     places = options.episode, options.particle, options.trial, options.object
     if options.run_folder is not None and places == (None,) * 4:
         failure.show_list(options.run_folder)
-    _write(asked, path, console)
+    write_page(asked, path, console)
     console.print(f"replay: {path} (for any browser, offline)", markup=False)
     if options.open:
         webbrowser.open(path.resolve().as_uri())
@@ -47,7 +47,8 @@ def _default(folder: Path | None) -> Path:
     return Path("replay.html") if folder is None else folder / "replay.html"
 
 
-def _write(asked: grasp.Asked, path: Path, console: Console) -> Path:
+def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
+    """Simulates the grasp and writes its page."""
     with console.status("simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import viewer

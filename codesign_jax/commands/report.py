@@ -52,14 +52,14 @@ def main(options: "Report") -> int:
     console = Console(highlight=False, soft_wrap=True)
     if why:
         console.print(f"{options.folder / reference.FILE} {why}: left out", markup=False)
-    shown = None if options.no_replay else _best_grasp(scene, settings, record, name, console)
+    shown = None if options.no_replay else best_grasp(scene, settings, record, name, console)
     page.write(run, shown, path)
     size = path.stat().st_size / 1e6
     console.print(f"report: {path} ({size:.1f} MB, for any browser, offline)", markup=False)
     return 0
 
 
-def _best_grasp(
+def best_grasp(
     scene: Scene, settings: Settings, record: Record, engine: str, console: Console
 ) -> "tuple[choice.Grasp, animation.Replay]":
     """The best grasp of the chosen design, simulated again to see how it moves."""

@@ -51,12 +51,15 @@ def save(found: Landscape, folder: Path) -> list[Path]:
         for n, u in zip(found.names, found.units, strict=True)
     ]
     with files.atomically(table) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*axes, *columns.MORE[TABLE].columns])
+        names = [*axes, *columns.MORE[TABLE].columns]
+        writer = csv.DictWriter(file, names, lineterminator="\n")
+        writer.writeheader()
         for i, j in np.ndindex(*found.cost.shape):
-            point = [f"{v:.9g}" for v in (found.first[i], found.second[j], found.cost[i, j])]
-            counts = [found.kept[i, j], found.counted[i, j], found.trials]
-            writer.writerow(point + [int(v) for v in counts])
+            place = dict(zip(axes, (found.first[i], found.second[j]), strict=True))
+            numbers = {n: f"{v:.9g}" for n, v in (place | {"mean_cost": found.cost[i, j]}).items()}
+            counts = {"kept_trials": found.kept[i, j], "counted_trials": found.counted[i, j]}
+            counts["trials"] = found.trials
+            writer.writerow(numbers | {name: int(v) for name, v in counts.items()})
     return [npz, table]
 
 

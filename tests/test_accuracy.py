@@ -19,7 +19,7 @@ from scripts.accuracy import beam, decision, impulse, oracle, steps, study, tip,
 from scripts.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
 from scripts.accuracy.store import Case, Store, merge
 from scripts.accuracy.timing import name
-from tests.small import pinch, still
+from tests.helpers.grasps import pinch, still
 
 ROOT = Path(__file__).parents[1]
 

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import TINY, tiny
 
 from codesign_jax import codesign, make_engine, rollout, scene
 from codesign_jax.scene import SceneError
+from tests.helpers.toy_engine import TINY, tiny
 
 SCENE, SPACE, ENGINE = tiny()
 HAND = jax.tree.map(np.asarray, SPACE.params(SPACE.default()))

@@ -7,7 +7,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from toy import TINY, tiny
 
 from codesign_jax import cli, codesign, runs
 from codesign_jax.batch import LIMIT, Batch, Request, take
@@ -16,6 +15,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
+from tests.helpers.toy_engine import TINY, tiny
 
 RUN = [
     *("optimize", "--scene", str(TINY), "--particles", "10", "--trials", "2", "--episodes", "2"),

@@ -15,7 +15,7 @@ from scipy import linalg, special
 
 from codesign_jax.scene import hand
 from scripts.accuracy import beam
-from tests.small import pinch
+from tests.helpers.grasps import pinch
 
 
 @functools.cache

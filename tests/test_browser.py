@@ -5,10 +5,10 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_run import small_run  # noqa: F401
 
 from codesign_jax.report import bodies, viewer
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.tiny_run import small_run  # noqa: F401
 from tests.test_bodies import bent_grasp
 
 pytest.importorskip("plotly", reason="the extra 'report' is not installed")
@@ -172,7 +172,7 @@ def test_a_browser_without_webgl_shows_a_film_strip(run, flat_browser, tmp_path)
 
 def test_browser_skins_as_python_does(browser, tmp_path):
     """Vertices on the page at its frames against those of `bodies`, and between them continuous."""
-    the_scene = small.pinch("box", links=4, effects__surface="hull")
+    the_scene = grasps.pinch("box", links=4, effects__surface="hull")
     grasp = bent_grasp(the_scene)
     path = viewer.write(the_scene, grasp, tmp_path / "r.html", title="<b>", text=["a & b"])
     page = browser.new_page()

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.interpolate
-from toy import ToyEngine, tiny
 
 from codesign_jax import codesign, rollout, scene
 from codesign_jax.archives import Store
@@ -23,6 +22,7 @@ from scripts.calibration import __main__ as calibrate
 from scripts.calibration import files, report, score, sets, summary, surrogate
 from scripts.calibration.wave import Size, Wave, keep, trial_costs
 from scripts.experiments.landscape import STREAM_GRID
+from tests.helpers.toy_engine import ToyEngine, tiny
 
 AXIS = np.arange(12.0)
 
@@ -90,9 +90,8 @@ def test_numbers_of_a_set_are_those_of_the_files():
 
 
 def test_factors_scale_the_stiffness_of_joints():
-    from small import hand_world
-
     from codesign_jax.model import morphology
+    from tests.helpers.grasps import hand_world
 
     plain = scene.load("paper_spheres").hand
     material = dataclasses.replace(plain.material, lateral_factor=0.29, torsion_factor=3.0)

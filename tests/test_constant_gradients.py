@@ -10,7 +10,7 @@ import pytest
 
 from codesign_jax import rollout
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small
+from tests.helpers import grasps
 from tests.test_gradients import short_grasp
 
 # Forward it is one kernel; each of the two derivatives compiles in two minutes of a core's time.
@@ -47,7 +47,7 @@ def grasp(dtype, **settings):
     scene = short_grasp()
     engine = StructuredEngine(scene, **settings)
     hand, trial = jax.tree.map(
-        lambda v: jnp.asarray(v, dtype if v.dtype.kind == "f" else None), small.hand_world(scene)
+        lambda v: jnp.asarray(v, dtype if v.dtype.kind == "f" else None), grasps.hand_world(scene)
     )
     trial = trial._replace(yaw=trial.yaw + 0.1, position=trial.position + 0.003)
 

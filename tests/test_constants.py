@@ -13,7 +13,7 @@ from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import schema
-from tests.small import hand_world, nth, pinch, random_constants, random_worlds, repeat
+from tests.helpers.grasps import hand_world, nth, pinch, random_constants, random_worlds, repeat
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}

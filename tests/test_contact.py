@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import model
-from tests.small import SHAPES, hand_world, pinch
+from tests.helpers.grasps import SHAPES, hand_world, pinch
 
 MASS, GRAVITY, MU = 0.1, 9.81, 0.5
 CORNERS = {"box": 4, "cylinder": 3, "capsule": 2, "sphere": 1}  # contact points of a resting object

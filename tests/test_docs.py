@@ -13,12 +13,12 @@ from typing import get_args
 import numpy as np
 import pytest
 import submitit
-import tiny_run
 import yaml
-from toy import TINY
 
 from codesign_jax import cli
 from codesign_jax.commands import evaluate, export, finger, landscape, render, replay, report
+from tests.helpers import tiny_run
+from tests.helpers.toy_engine import TINY
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "scripts/README.md")]

@@ -12,8 +12,8 @@ from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Status
-from tests import small
-from tests.small import batch_inputs, nth, pinch, stack, still, world_inputs
+from tests.helpers import grasps
+from tests.helpers.grasps import batch_inputs, nth, pinch, stack, still, world_inputs
 
 # Designs (length, arm_z) [m] at which two fingers of three links lift the object at 190 kPa.
 HOLDING = {"box": (0.09, 0.05), "cylinder": (0.10, 0.08), "sphere": (0.11, 0.025)}
@@ -225,7 +225,7 @@ EXPECTED = {
 def test_failing_worlds_are_flagged_alike(hurried, engine, request):
     the_scene, *_ = hurried
     trace = request.getfixturevalue(f"{engine}_traces")[1]
-    result = small.outcomes(the_scene, trace)
+    result = grasps.outcomes(the_scene, trace)
     for index, (status, step) in EXPECTED.items():
         assert result.status[index] == status and result.bad_step[index] == step
     # A finger under 1e12 Pa is fast in the first step, or beyond float32's numbers.
@@ -275,7 +275,7 @@ def test_decided_worlds_are_not_simulated_further(hurried, monkeypatch):
     last = (window // 25 + 1) * 25  # the end of the chunk in which the window opens
     assert asked[window // 25] == [0, 1] and asked[window // 25 + 1] == [0]
     np.testing.assert_array_equal(trace.distance[1, last:], trace.distance[1, last - 1])
-    result = small.outcome(the_scene, nth(trace, 1))
+    result = grasps.outcome(the_scene, nth(trace, 1))
     np.testing.assert_allclose(result.cost, the_scene.cost.maximum, rtol=1e-6)
 
 

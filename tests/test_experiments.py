@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import scipy.stats
 from rich.console import Console
-from toy import TINY, ToyEngine, tiny
 
 from codesign_jax import codesign, runs
 from codesign_jax import scene as scenes
@@ -25,6 +24,7 @@ from codesign_jax.types import Outcome
 from scripts.experiments import figures, landscape, plan, report, results, strategies, study
 from scripts.experiments.plan import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
+from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
 SEED = 5

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.polynomial import Polynomial
-from toy import TINY
 
 from codesign_jax import cli
 from codesign_jax.export import casting, meshes, process
 from codesign_jax.export.process import Process, Size
 from codesign_jax.scene import schema
+from tests.helpers.toy_engine import TINY
 
 USUAL, FLAT, SHORT = Size(95, 20, 20, 5, 5), Size(170, 20, 15, 7, 7), Size(12, 20, 25, 2, 2)
 # STL holds float32: seven digits of lengths of up to 200 mm.

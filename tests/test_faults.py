@@ -11,10 +11,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import tiny_run
 
 from scripts.faults import cases, damage, finished, page, shim
 from scripts.faults.store import Part, Result, Store, gather
+from tests.helpers import tiny_run
 
 needs_compiler = pytest.mark.skipif(shim.compiler() is None, reason="no C compiler")
 

@@ -10,7 +10,7 @@ from codesign_jax import model, scene
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.structured.kernel.pairs import pair_slots
 from codesign_jax.engines.structured.laws import finger_pairs
-from tests import small
+from tests.helpers import grasps
 
 SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 2}
 
@@ -23,8 +23,8 @@ def contacts(centre, radius):
 
 def curled(the_scene, seed, bend, height):
     """Model, data and lanes of a hand with random joint angles about a bend, object between."""
-    hand, trial = small.hand_world(the_scene, length=0.1)
-    fields, _ = small.world_inputs(the_scene, hand, trial)
+    hand, trial = grasps.hand_world(the_scene, length=0.1)
+    fields, _ = grasps.world_inputs(the_scene, hand, trial)
     oracle = model.compile_model(the_scene, hand, trial)
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
     data, random = mujoco.MjData(oracle), np.random.default_rng(seed)
@@ -108,7 +108,7 @@ def test_the_derivative_has_a_slot_for_whatever_touches_in_the_kernel():
 def test_mjx_equals_mujoco():
     """The same pairs in stock MJX; its Newton stops at the scene's tolerance of 1e-8."""
     with jax.enable_x64(True):
-        the_scene = small.pinch("sphere", **SETTINGS)
+        the_scene = grasps.pinch("sphere", **SETTINGS)
         oracle, data, fields = curled(the_scene, 0, bend=0.8, height=0.07)
         mujoco.mj_forward(oracle, data)
         engine = MjxEngine(the_scene)

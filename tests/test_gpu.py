@@ -15,7 +15,7 @@ import pytest
 from codesign_jax.compiler import launch
 from codesign_jax.engines.base import staged
 from codesign_jax.engines.structured import StructuredEngine
-from tests import gpu_cases, small
+from tests.helpers import gpu_cases, grasps
 
 pytestmark = pytest.mark.gpu
 
@@ -129,7 +129,7 @@ def test_staged_blocks_are_narrow_for_few_worlds():
 
 def test_the_default_is_float32_and_the_kernel():
     """What a user gets on a GPU without asking."""
-    scene = small.pinch("cylinder", links=2)
+    scene = grasps.pinch("cylinder", links=2)
     fields, ctrl = gpu_cases.inputs(scene, 3)
     engine = StructuredEngine(scene)
     assert engine.rollout(fields, ctrl[:, :20]).distance.dtype == np.float32

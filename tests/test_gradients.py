@@ -11,7 +11,7 @@ import pytest
 
 from codesign_jax import control, model
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small
+from tests.helpers import grasps
 
 # One program, but its derivative compiles in two minutes of a core's time.
 pytestmark = pytest.mark.slow
@@ -50,7 +50,7 @@ class Thrown(StructuredEngine):
 
 def short_grasp():
     """Half a second: the hand comes down beside the box, closes and begins to lift."""
-    return small.pinch(
+    return grasps.pinch(
         "box",
         phases__approach=0.2,
         phases__inflate=0.35,
@@ -107,7 +107,7 @@ def checked():
         for name in names:
             for step in (STEP, -STEP):
                 rows.append(base + step * (np.array(NAMES) == name))
-    design = small.hand_world(scene)
+    design = grasps.hand_world(scene)
     with jax.enable_x64(True):
 
         def loss(values):

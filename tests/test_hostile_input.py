@@ -11,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from command_runs import command, own_workplace  # noqa: F401  (a fixture)
-from solids import box, object_file
 
 from codesign_jax import engines, make_engine, rollout, scene
 from codesign_jax.engines.structured.laws import meshes as lanes
@@ -20,6 +18,8 @@ from codesign_jax.scene import SceneError, constants, library, meshes, objects, 
 from codesign_jax.scene.meshes import reading, surface
 from codesign_jax.scene.parameters import design_space
 from scripts.faults import fuzz
+from tests.helpers.command_runs import command, own_workplace  # noqa: F401  (a fixture)
+from tests.helpers.solids import box, object_file
 
 PAPER = library.available("scenes")["paper_spheres"]
 

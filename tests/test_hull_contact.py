@@ -11,21 +11,21 @@ from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.model import hull
-from tests import small, steps
+from tests.helpers import grasps, oracles
 
 TINY = 1e-12  # [m] radius of MuJoCo's stand-ins for points
 
 
 def hull_scene(shape, links=3, **density):
     settings = {f"discretization__{k}": v for k, v in density.items()}
-    return small.pinch(shape, links=links, effects__surface="hull", **settings)
+    return grasps.pinch(shape, links=links, effects__surface="hull", **settings)
 
 
 def world(scene, **params):
     """Parameters, trial, model fields, oracle model and commands of one hand, in float64."""
-    hand, trial = small.hand_world(scene, **params)
+    hand, trial = grasps.hand_world(scene, **params)
     trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
-    fields, ctrl = small.world_inputs(scene, hand, trial)
+    fields, ctrl = grasps.world_inputs(scene, hand, trial)
     return hand, trial, fields, world_model(scene, fields), np.asarray(ctrl)
 
 
@@ -85,7 +85,7 @@ def test_rigid_rings_equal_mujoco(shape):
         oracle = with_points(scene, hand, trial)
         fields = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
         engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
-        found = steps.path(engine, fields, ctrl[None, :420])
+        found = oracles.path(engine, fields, ctrl[None, :420])
     data, touched, h = mujoco.MjData(oracle), set(), scene.discretization.timestep
     for k in range(1, 419):
         qvel, after = found.qvel[0, k : k + 2]
@@ -94,7 +94,7 @@ def test_rigid_rings_equal_mujoco(shape):
         error = np.linalg.norm((after - qvel) / h - data.qacc)
         # As with spheres: a difference of velocities loses two of 16 digits, and MuJoCo's own
         # Newton stops at rounding of its cost.
-        assert error < 1e-8 * max(np.linalg.norm(data.qacc), steps.FLOOR), (k, data.ncon, error)
+        assert error < 1e-8 * max(np.linalg.norm(data.qacc), oracles.FLOOR), (k, data.ncon, error)
         names = {mujoco.mj_id2name(oracle, 5, int(g)) for g in data.contact.geom.ravel()}
         touched |= {n for n in names if n.startswith("point")}
     assert len(touched) > 4

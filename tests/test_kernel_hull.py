@@ -16,8 +16,8 @@ from codesign_jax.engines.structured.kernel import Limits, Program, tables
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import layout
 from codesign_jax.types import Status
-from tests import small
 from tests import test_hull_contact as oracle
+from tests.helpers import grasps
 
 # The quick tests have one state against the same dense solve, and states with too few slots, among
 # worlds with planted faults (test_planted_contacts), and rigid rings against MuJoCo C.
@@ -36,7 +36,7 @@ class Runs(NamedTuple):
 
     def along(self, count, start=None, ctrl=None):
         """The trace and qpos of worlds that repeat the fields."""
-        fields = small.repeat(self.fields, count)
+        fields = grasps.repeat(self.fields, count)
         start = self.engine.reset(fields) if start is None else start(fields)
         ctrl = np.repeat(self.ctrl[None], count, 0) if ctrl is None else ctrl
         return jax.tree.map(np.asarray, self.run(fields, start, jnp.asarray(ctrl)))
@@ -137,14 +137,14 @@ def test_a_belt_around_a_cylinder_equals_a_dense_solve():
     """A finger wound about a cylinder by most of a turn, rubbing on it: one step."""
     with jax.enable_x64(True):
         scene = oracle.hull_scene("cylinder", links=7, hull_rings=2, hull_points=8)
-        hand, trial = small.hand_world(scene, length=0.15)
-        fields, ctrl = small.world_inputs(scene, hand, trial)
+        hand, trial = grasps.hand_world(scene, length=0.15)
+        fields, ctrl = grasps.world_inputs(scene, hand, trial)
         model = world_model(scene, fields)
         qpos, qvel = wound(scene, model, np.array(fields.start))
         engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
         start = engine.place(engine.reset(batch), qpos[None], qvel[None])
-        lanes = small.lanes(scene, batch)
+        lanes = grasps.lanes(scene, batch)
         new, info = jax.jit(engine.step)(lanes, start, jnp.asarray(ctrl[0])[:, None])
         data, h = mujoco.MjData(model), scene.discretization.timestep
         data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl[0]

@@ -9,8 +9,8 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import hull, layout
-from tests import small
 from tests import test_hull_contact as oracle
+from tests.helpers import grasps
 from tests.test_finger_pairs import SETTINGS, curled, kinds
 
 
@@ -44,10 +44,12 @@ pytestmark = pytest.mark.slow
 def test_accelerations_equal_mujoco_on_curled_hands(friction):
     """Fingers touch one another and the object, sliding at up to a metre a second; or nothing."""
     with jax.enable_x64(True):
-        scene = small.pinch("sphere", effects__friction=friction, **SETTINGS)
+        scene = grasps.pinch("sphere", effects__friction=friction, **SETTINGS)
         worlds = [curled(scene, s, bend=0.75 + 0.05 * s, height=0.07) for s in range(6)]
         # Fingers apart: the accelerations of MuJoCo's model that has no such pairs.
-        bare = small.pinch("sphere", effects__friction=friction, discretization__spheres_per_link=2)
+        bare = grasps.pinch(
+            "sphere", effects__friction=friction, discretization__spheres_per_link=2
+        )
         without, data, _ = curled(bare, 0, bend=0.1, height=0.12)
         worlds.append((without, data, curled(scene, 0, bend=0.1, height=0.12)[2]))
         for model, data, _ in worlds:
@@ -243,8 +245,8 @@ def test_hulls_equal_a_dense_solve():
     with jax.enable_x64(True):
         settings = {"effects__finger_finger": True, "effects__surface": "hull"}
         density = {"discretization__hull_rings": 2, "discretization__hull_points": 8}
-        scene = small.pinch("sphere", links=2, **settings, **density)
-        hand, _ = small.hand_world(scene, length=0.1)
+        scene = grasps.pinch("sphere", links=2, **settings, **density)
+        hand, _ = grasps.hand_world(scene, length=0.1)
         bends = [(1, 0.8), (3, 1.0), (3, 1.2), (7, 0.8)]
         worlds = [curled(scene, seed, bend, height=0.07) for seed, bend in bends]
         inputs, step, order = batched(worlds), one_step(scene), np.array([2, 0, 3, 1])

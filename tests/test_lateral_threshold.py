@@ -13,9 +13,9 @@ from scipy import integrate, optimize
 from codesign_jax import model, scene
 from codesign_jax.model import morphology
 from codesign_jax.scene import schema
-from tests import small
 from tests import test_kernel_pairs as oracle
-from tests.planted import Fault, planted, simulate
+from tests.helpers import grasps
+from tests.helpers.planted_faults import Fault, planted, simulate
 from tests.test_finger_pairs import curled
 
 BOUND = 1e-8
@@ -25,7 +25,7 @@ SETTINGS = {"effects__lateral_threshold": True}
 
 def hand_and_numbers(the_scene):
     """Parameters of the hand, and the numbers of its first finger's joints."""
-    params, _ = small.hand_world(the_scene, length=0.1)
+    params, _ = grasps.hand_world(the_scene, length=0.1)
     beams = morphology.finger_beams(the_scene.hand, params)
     links = the_scene.discretization.links
     return params, beams, morphology.thresholds(the_scene.hand, params, beams, links)[0]
@@ -182,7 +182,7 @@ def stiffen(the_scene, model_, data, fields):
 def simulated(damping):
     """Relative errors of a step's accelerations, of each fault's world and of a sound one."""
     with jax.enable_x64(True):
-        the_scene = small.pinch(
+        the_scene = grasps.pinch(
             "sphere", links=2, discretization__spring_damping=damping, **SETTINGS
         )
         model_, data, fields = curled(the_scene, 3, 0.4, 0.09)

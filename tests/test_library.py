@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet
 import pytest
-from toy import TINY
 
 import codesign_jax
 from codesign_jax import Task, engines, parameters, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.types import Trace
+from tests.helpers.toy_engine import TINY
 
 ROOT = Path(__file__).parents[1]
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from solids import box, bracket, object_file
 
 from codesign_jax import scene
 from codesign_jax.commands import common
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.scene import meshes, objects, schema
 from codesign_jax.scene.meshes import grid, mass, repair, surface
+from tests.helpers.solids import box, bracket, object_file
 
 
 def solid(tmp_path, mesh, *, unit="m", repaired=False, voxel_error=5e-4):

@@ -11,7 +11,7 @@ from codesign_jax import model, scene
 from codesign_jax.commands import clearance, preflight
 from codesign_jax.scene import constants, hand, schema
 from codesign_jax.types import Params
-from tests.small import DATA, hand_world
+from tests.helpers.grasps import DATA, hand_world
 
 SPREADS = np.deg2rad([0.0, 30.0, 60.0, 90.0, 110.0])
 CORNERS = list(itertools.product((0.010, 0.180), (0.015, 0.025)))  # lengths and heights of Table I

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from command_runs import assert_same_run, snapshot
-from toy import TINY
 
 from codesign_jax import cli, codesign, own, parameters, runs, scene
+from tests.helpers.command_runs import assert_same_run, snapshot
+from tests.helpers.toy_engine import TINY
 
 MINE = '''
 import dataclasses

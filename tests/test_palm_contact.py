@@ -11,9 +11,9 @@ import pytest
 
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
-from tests import small
 from tests import test_kernel_pairs as oracle
-from tests.planted import Fault, cone_of, planted, simulate
+from tests.helpers import grasps
+from tests.helpers.planted_faults import Fault, cone_of, planted, simulate
 from tests.test_finger_pairs import curled
 
 BOUND = 1e-8
@@ -63,7 +63,7 @@ FAULTS = {
 def scene_of(surface):
     density = {"discretization__hull_rings": 2, "discretization__hull_points": 4}
     density = density if surface == "hull" else {"discretization__spheres_per_link": 2}
-    return small.pinch("sphere", links=2, effects__surface=surface, **SETTINGS, **density)
+    return grasps.pinch("sphere", links=2, effects__surface=surface, **SETTINGS, **density)
 
 
 def accelerations(scene, model, data):
@@ -71,7 +71,7 @@ def accelerations(scene, model, data):
     mujoco.mj_forward(model, data)
     if scene.effects.surface == "hull":
         with jax.enable_x64(True):
-            hand, _ = small.hand_world(scene, length=0.1)
+            hand, _ = grasps.hand_world(scene, length=0.1)
         dense = oracle.Dense(scene, model, data, hand)
         assert dense.on_palm > 2 and dense.pairs > 3 and dense.num_hull > 20
         return dense.solve()
@@ -120,7 +120,7 @@ def test_spheres_equal_mujoco_on_curled_hands(friction, between):
     """Up to eight spheres on the palm, with and without contact between fingers."""
     settings = SETTINGS | {"effects__finger_finger": between, "effects__friction": friction}
     with jax.enable_x64(True):
-        scene = small.pinch("sphere", discretization__spheres_per_link=2, **settings)
+        scene = grasps.pinch("sphere", discretization__spheres_per_link=2, **settings)
         bends = (1.3, 1.5, 1.6, 1.2, 1.8, 0.3)
         worlds = [curled(scene, s, bend, height=0.12) for s, bend in enumerate(bends)]
         inputs = oracle.batched(worlds)

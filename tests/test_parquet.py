@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 import pytest
-from toy import tiny
 
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Status, failed
 from scripts.experiments import parquet
 from scripts.experiments.plan import Strategies
+from tests.helpers.toy_engine import tiny
 
 ROOT = Path(__file__).parents[1]
 PLAN = Strategies("2d", "2d", ("single", "switch-1", "concurrent"), 2, 4, 3, 3, 6)

@@ -12,7 +12,7 @@ from codesign_jax import model, scene, start
 from codesign_jax.commands import clearance, preflight
 from codesign_jax.scene import parameters
 from codesign_jax.types import Params
-from tests.small import hand_world, pinch, random_worlds, still
+from tests.helpers.grasps import hand_world, pinch, random_worlds, still
 
 
 def low_start():

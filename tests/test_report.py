@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from toy import TINY
 
 from codesign_jax import cli, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, figures
 from codesign_jax.scene import parameters
+from tests.helpers.toy_engine import TINY
 
 TIMES = np.array([0.0, 0.5, 1.2])
 

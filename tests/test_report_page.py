@@ -10,7 +10,6 @@ import sys
 import numpy as np
 import pytest
 from scipy import stats
-from tiny_run import small_run  # noqa: F401
 
 from codesign_jax import cli, runs
 from codesign_jax.commands import reference
@@ -18,6 +17,7 @@ from codesign_jax.report import landscape
 from codesign_jax.runs import choice, outcomes
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Outcome, Status, failed
+from tests.helpers.tiny_run import small_run  # noqa: F401
 
 pytest.importorskip("plotly", reason="the extra 'report' is not installed")
 

@@ -5,14 +5,14 @@ import os
 import shutil
 
 import pytest
-from command_runs import command, own_workplace, snapshot, without  # noqa: F401
-from tiny_run import RUN, copied
-from toy import TINY, tiny
 
 from codesign_jax import runs, scene
 from codesign_jax.runs import belongings, manifest, scene_files
 from codesign_jax.runs.directory import open_run
 from codesign_jax.scene.schema import SceneError
+from tests.helpers.command_runs import command, own_workplace, snapshot, without  # noqa: F401
+from tests.helpers.tiny_run import RUN, copied
+from tests.helpers.toy_engine import TINY, tiny
 
 SETTINGS = runs.make_settings("2d", "concurrent", "control", "mujoco", 0, particles=4, episodes=2)
 

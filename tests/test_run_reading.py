@@ -7,8 +7,6 @@ import shutil
 
 import numpy as np
 import pytest
-from command_runs import command, own_workplace, snapshot, stored  # noqa: F401
-from tiny_run import RUN, copied
 
 from codesign_jax import runs
 from codesign_jax.batch import Batch
@@ -16,6 +14,8 @@ from codesign_jax.commands import status
 from codesign_jax.runs import checkpoint, choice, directory, manifest, tables
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.scene.schema import SceneError
+from tests.helpers.command_runs import command, own_workplace, snapshot, stored  # noqa: F401
+from tests.helpers.tiny_run import RUN, copied
 
 NEWEST = 4  # the final test, after three episodes
 

@@ -8,7 +8,6 @@ import jax
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from toy import TINY, ToyEngine, tiny
 
 from codesign_jax import cli, codesign, objects, rollout, sampling, scene
 from codesign_jax.commands import sample
@@ -16,7 +15,8 @@ from codesign_jax.runs import dataset
 from codesign_jax.runs.tables import design_columns
 from codesign_jax.scene import parameters
 from codesign_jax.types import Outcome, Status
-from tests.small import nth
+from tests.helpers.grasps import nth
+from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
 KEY = jax.random.key(3)
 THREE = scene.load(TINY, object_set="paper")  # three objects, of which toy engines know nothing

@@ -12,7 +12,7 @@ from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import hand, keypaths, library, objects, parameters, schema
-from tests.small import DATA, batch_inputs, nth, repeat, stack, still
+from tests.helpers.grasps import DATA, batch_inputs, nth, repeat, stack, still
 
 HANDS, OBJECTS = sorted(library.available("hands")), sorted(library.available("objects"))
 

@@ -12,8 +12,6 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_run import small_run  # noqa: F401
-from toy import TINY
 
 from codesign_jax import cli, codesign, runs, scene, sources
 from codesign_jax.commands import calls, failure, replay, status
@@ -24,6 +22,8 @@ from codesign_jax.report import animation, landscape
 from codesign_jax.runs import choice
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome, Status, failed
+from tests.helpers.tiny_run import small_run  # noqa: F401
+from tests.helpers.toy_engine import TINY
 
 DESIGN = ["--scene", str(TINY), "--engine", "mujoco", "--design", "length=100", "arm_z=0"]
 

@@ -13,7 +13,7 @@ from test_browser import browser, launch  # noqa: F401
 
 from codesign_jax import model
 from scripts import reference_page, site_pages
-from tests import small
+from tests.helpers import grasps
 
 ROOT = Path(__file__).parent.parent
 BUILT_IN = {
@@ -78,7 +78,7 @@ def test_a_key_without_a_meaning_is_an_error():
 
 
 def test_the_layout_of_qpos_is_that_of_mujocos_model():
-    scene = small.pinch()
+    scene = grasps.pinch()
     compiled = model.compile_template(scene)
     sizes = {"F": scene.num_fingers, "N": scene.discretization.links}
     sizes["A"] = (compiled.nv - 12) // (sizes["F"] * sizes["N"])

@@ -13,8 +13,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from slurm_cluster import MISSING, PATH, cluster
-from toy import TINY
 
 from codesign_jax import cli, runs
 from codesign_jax.commands import jobs, slurm
@@ -22,6 +20,8 @@ from codesign_jax.runs import checkpoint
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
 from codesign_jax.scene.schema import SceneError
+from tests.helpers.slurm_cluster import MISSING, PATH, cluster
+from tests.helpers.toy_engine import TINY
 
 RUN = [
     *("optimize", "--scene", str(TINY), "--engine", "mujoco", "--particles", "4", "--trials", "2"),

@@ -12,7 +12,7 @@ import pytest
 
 from codesign_jax import programs, sources
 from codesign_jax.engines.structured import lanewise
-from tests import kernels
+from tests.helpers import kernels
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from scripts.winners import (
     variants as winners,
 )
 from scripts.winners.variants import STANDARD, VARIANTS, Finals, Task, Variant
-from tests import small
+from tests.helpers import grasps
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "data" / "reproduction"
@@ -51,7 +51,7 @@ def test_friction_and_stiffness_reach_mujoco_s_model():
     )
     space, trial = parameters.design_space(plain.hand), rollout.nominal_trial(plain)
     params = space.params(space.default())
-    before, after = (small.world_inputs(s, params, trial)[0] for s in (plain, changed))
+    before, after = (grasps.world_inputs(s, params, trial)[0] for s in (plain, changed))
     # In float32, to some roundings.
     np.testing.assert_allclose(after.pair_friction[:, :2], 1.3 * before.pair_friction[:, :2], 1e-5)
     np.testing.assert_allclose(after.jnt_stiffness, 0.8 * before.jnt_stiffness, 1e-5)

@@ -12,7 +12,7 @@ from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Trial
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 # The primitives, which are also the names of the one-object sets in data/.
 SHAPES = ("box", "cylinder", "capsule", "sphere")
 

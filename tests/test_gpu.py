@@ -29,11 +29,9 @@ def on_cpu(tmp_path):
     started = []
 
     def start(case):
-        path, here = tmp_path / "result.npz", Path(__file__)
-        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-        environment["PYTHONPATH"] = f"{here.parents[1]}:{environment.get('PYTHONPATH', '')}"
-        command = [sys.executable, str(here.with_name("gpu_cases.py")), case, str(path)]
-        process = subprocess.Popen(command, env=environment)
+        path, environment = tmp_path / "result.npz", {**os.environ, "JAX_PLATFORMS": "cpu"}
+        command = [sys.executable, "-m", "tests.helpers.gpu_cases", case, str(path)]
+        process = subprocess.Popen(command, env=environment, cwd=Path(__file__).parents[1])
         started.append(process)
 
         def read():

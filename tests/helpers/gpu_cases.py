@@ -1,11 +1,10 @@
 """What the GPU suite simulates on both devices; run as a program it stores the CPU's results.
 
-python tests/gpu_cases.py short/spheres RESULTS.npz
+python -m tests.helpers.gpu_cases short/spheres RESULTS.npz
 """
 
 import sys
 from functools import partial
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -104,5 +103,4 @@ def main(case, path):
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[2]))
     main(*sys.argv[1:])

@@ -12,13 +12,14 @@ CHECKED := codesign_jax scripts tests notebooks
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs test quick test-browser test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo docs test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make quick       a minute of them, for another Python: PYTHON=python3.13 VENV=.venv-python3.13"
 	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
+	@echo "make test-ptx    kernels for GPUs, assembled without one"
 	@echo "make test-browser  the report in a headless Chromium"
 	@echo "make stability   the hard cases and their margins, docs/notes/stability.md"
 	@echo "make faults      kills, full disks, damage, hostile input, counted: docs/faults.md"
@@ -43,6 +44,10 @@ quick: $(STAMP)
 # What needs a browser: the report and its 3D replay in a headless Chromium.
 test-browser: $(STAMP)
 	$(BIN)/python -m pytest -q -m browser -rs $$(grep -l mark.browser tests/test_*.py)
+
+# Kernels for GPUs by NVIDIA's assembler, without a GPU: half a minute.
+test-ptx: $(STAMP)
+	$(BIN)/python -m pytest -q -rs -m slow tests/test_reverse.py -k assembler
 
 # Everything that needs a GPU; GPU=docs/data/gpu_suite_h200.json keeps what it found.
 GPU ?= runs/gpu_suite.json

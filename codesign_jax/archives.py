@@ -117,7 +117,7 @@ def refusal(arrays: Mapping[str, np.ndarray], key: str) -> str:
     """
     found = {name: str(arrays.get(name)) for name in ("key", "code", "schema")}
     if found["schema"] == str(SCHEMA) and found["key"] != key:
-        return "is of another case"
+        return "is of another design or other settings"
     same = found["schema"] == str(SCHEMA) and found["code"] == sources.digest()
     return "" if same else "is of another version of the code"
 
@@ -152,7 +152,7 @@ class Store(Parts):
 
 
 def _packed(arrays: Mapping[str, Any], compressed: bool) -> bytes:
-    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    arrays = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
     buffer = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(
         buffer, **arrays, **{DIGEST: np.array(_digest(arrays))}

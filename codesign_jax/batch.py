@@ -1,10 +1,10 @@
 """Episodes of many runs at once, on every device of the host.
 
-Each run has the bits that it has alone: what is computed for a run by itself (moves, noise, model
-fields, verdicts, resampling) is a program of one run's size, called once for each, and only the
-engine's blocks, which do not depend on each other (`engines.base.Staged`), are joined over the runs
-and dealt to the devices.  One larger program for everything would be no faster, and XLA would round
-it differently in the last bit, after which contact goes its own way.
+The results are bitwise those of running each seed alone: what is computed for a run by itself
+(moves, noise, model fields, verdicts, resampling) is a program of one run's size, called once for
+each, and only the engine's blocks, which do not depend on each other (`engines.base.Staged`), are
+joined over the runs and dealt to the devices.  One larger program for everything would be no
+faster, and XLA would round it differently in the last bit, after which contact goes its own way.
 """
 
 import itertools

@@ -42,6 +42,9 @@ class Optimize:
     """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
     and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
+    robust: Flag = False
+    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
+    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control. Several, such as
     single,switch-4,concurrent: runs of each, simulated in one batch, and a comparison."""
@@ -49,23 +52,23 @@ class Optimize:
     """Domain of the first episode with single and switch-K; alternate: morphology for even seeds,
     control for odd ones, as in the paper's experiments."""
     optimizer: Text = None
-    """Optimiser: screened-cma-es, the default of a new run, particle-filter (the paper's), cma-es,
-    pso or random (docs/command_line.md); or MODULE:CLASS, one of your own. A run goes on with
-    its own."""
+    """Optimiser: screened-es, the default of a new run, particle-filter (the paper's),
+    screened-cma-es, cma-es, open-es, pso or random (docs/command_line.md); or MODULE:CLASS, one of
+    your own. A run goes on with its own."""
     cost: Text = None
     """MODULE:FUNCTION, a cost of your own instead of the scene's: a number from scene, trace and
     controls of a grasp (docs/command_line.md)."""
     engine: Text = None
     """Engine that simulates: structured (ours, the default), mujoco (C, float64) or mjx (stock)."""
     particles: Count = None
-    """Particles; default: 12 in 2d, 24 otherwise; the paper's are 10 and 60."""
+    """Particles; default: 13 in 2d, 25 otherwise; the paper's are 10 and 60."""
     trials: Count = None
     """Trials of a particle in an episode, best a multiple of the objects; default: one with each
     object; the paper's are 6."""
     episodes: Count = None
-    """Episodes; default: 24 in 2d, 29 otherwise; the paper's are 64 and 128."""
+    """Episodes; default: 23 in 2d, 30 otherwise; the paper's are 64 and 128."""
     test_trials: Count = None
-    """Further trials that test each final particle, in whole rounds of --trials; default: 12; the
+    """Further trials that test each final particle, in whole rounds of --trials; default: 6; the
     paper's are 36 in 2d, 72 otherwise; 0: none."""
     reference_trials: Count = None
     """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine
@@ -273,6 +276,9 @@ class Sample:
     """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
     and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
+    robust: Flag = False
+    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
+    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
     engine: str = "structured"
     """Engine that simulates: structured, mujoco (C, float64) or mjx (stock)."""
     seed: int = 0
@@ -280,6 +286,9 @@ class Sample:
     chunk: Count = None
     """Most grasps of a call, after each of which the outcomes are saved; default: 512 on CPUs,
     16384 on a GPU. Results depend on it in the last bits only."""
+    outcomes: Flag = False
+    """Simulate and keep the outcomes alone, in the folder FILE.part; the same command without this
+    flag writes the file, here or where that folder was copied to."""
     dry_run: Flag = False
     """Print the number of grasps and an estimate of time and size; simulate and write nothing."""
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from codesign_jax import verdict
 from codesign_jax.scene import Scene
-from codesign_jax.types import WARNINGS, Outcome, Status, Trace, Trial, failed
+from codesign_jax.types import Outcome, Status, Trace, Trial, failed
 
 _ROUNDING = 1.001
 """A ball's centre rests just as high as its radius: in float32 it may be a little higher."""
@@ -54,9 +54,12 @@ def outcome(
     cost = scene.cost.maximum * (end - jnp.where(lost, lost_time, end)) / (end - start)
     stuck = verdict.as_bit(_stuck(scene, trace, trial) & ~lost & ~bad, Status.STUCK)
     status = bad * bits[jnp.minimum(bad_step, steps - 1)] | stuck
-    status |= _warnings(trace, jnp.minimum(bad_step, lost_step))
-    cost = jnp.where(failed(status), scene.cost.maximum, cost)
-    return Outcome(cost.astype(dtype), status, lost_time, jnp.where(bad, bad_step, -1))
+    capped, residual = _solved(trace, jnp.minimum(bad_step, lost_step))
+    # An engine that does not tell how much is left warns of any step at its limit.
+    above = capped > 0 if trace.residual is None else residual > scene.newton.residual
+    status |= verdict.as_bit(above, Status.SOLVER_CAP)
+    cost = jnp.where(failed(status), scene.cost.maximum, cost).astype(dtype)
+    return Outcome(cost, status, lost_time, jnp.where(bad, bad_step, -1), capped, residual)
 
 
 def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
@@ -156,15 +159,24 @@ def _first(condition: jax.Array) -> jax.Array:
     return jnp.where(condition.any(), jnp.argmax(condition), steps).astype(jnp.int32)
 
 
-def _warnings(trace: Trace, decided: jax.Array) -> jax.Array:
-    """Warnings of the steps before the one at which the trial was decided, shape () int32."""
+def _solved(trace: Trace, decided: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """How the solver ended in the steps before the one at which the trial was decided.
+
+    Returns:
+      `Outcome.capped` and `Outcome.residual`.
+    """
+    dtype = trace.distance.dtype
+    untold = jnp.full((), jnp.nan, dtype)
     if trace.status is None:
-        return jnp.zeros((), jnp.int32)
+        return untold, untold
     # The last entry's step leads to a state that nothing reads.
     steps = trace.status.shape[0]
     counts = np.arange(steps) < jnp.minimum(decided, steps - 1)
-    warned = counts & ((trace.status & int(WARNINGS)) != 0)
-    return verdict.as_bit(warned.any(), WARNINGS)
+    capped = counts & ((trace.status & int(Status.SOLVER_CAP)) != 0)
+    share = (capped.sum() / jnp.maximum(counts.sum(), 1)).astype(dtype)
+    if trace.residual is None:
+        return share, untold
+    return share, jnp.where(capped, trace.residual, 0.0).max().astype(dtype)
 
 
 def _stuck(scene: Scene, trace: Trace, trial: Trial | None) -> jax.Array:

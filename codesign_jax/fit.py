@@ -24,7 +24,6 @@ import optax
 
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.laws.kinematics import kinematics
 from codesign_jax.engines.structured.world_model import apply_columns, world_constants
 from codesign_jax.model import ModelFields, layout
@@ -89,7 +88,7 @@ def tip_positions(scene: Scene, fields: ModelFields, qpos: jax.Array) -> jax.Arr
     # Times stand in for worlds: all of them see the same hand.
     still = jnp.zeros((len(qpos), world.dof_damping.shape[-1]), qpos.dtype)
     state = reset(scene, world._replace(start=jnp.concatenate([qpos, still], 1)))
-    kin = kinematics(Stages(), hand, layout(scene).axes, state)
+    kin = kinematics(hand, layout(scene).axes, state)
     half = jnp.zeros_like(kin.origin[:, -1]).at[0].set(0.5 * hand.offset[-1])
     tip = kin.origin[:, -1] + apply_columns(kin.link[:, :, -1], half) + state.position
     return jnp.moveaxis(tip, 0, -1).swapaxes(0, 1)

@@ -1,9 +1,9 @@
 """Jitted programs that every scene of one structure shares within a process.
 
-A program takes the scene's numbers (`Scene.constants`) and the optimiser as arguments, so that
-neither JAX nor XLA sees what hand, objects or bounds they come from.  Another file of the same
-structure, whose preset fixes the same values, traces and compiles nothing, and a new process finds
-the program in JAX's cache on disk.
+A program takes the scene's numbers (`Scene.constants`) and the optimiser as arguments: hands,
+objects and bounds of other numbers are other arguments, not other programs.  Another file of the
+same structure, whose preset fixes the same values, traces and compiles nothing, and a new process
+finds the program in JAX's cache on disk.
 """
 
 import functools

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.assembly import contacts
 from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.world_model import (
@@ -73,7 +72,7 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     alone = dataclasses.replace(scene.effects, finger_finger=False)
     hand, kin, height = _straight(scene.structure, fields)
     scene = dataclasses.replace(scene, effects=alone)
-    every = contacts(scene, Stages(), hand, kin, height)
+    every = contacts(scene, hand, kin, height)
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
     if not found:
         return jnp.zeros(fields.body_mass.shape[0], fields.body_mass.dtype)

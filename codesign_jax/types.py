@@ -27,9 +27,10 @@ class Status(enum.IntFlag):
       NONFINITE: A number of the state was not finite.
       SPEED: A velocity beyond the scene's limit.
       PENETRATION: The object fell through the table.
-      SOLVER_CAP: The solver stopped at its cap of iterations in a step before the verdict. A
-        warning: each iteration lowers the convex objective, so the step taken is the best found,
-        and to exclude such trials would favour hands that touch little.
+      SOLVER_CAP: The solver stopped at its limit of iterations in a step before the verdict, with
+        a residual above `newton.residual` if the engine tells it, see `Outcome`. A warning: each
+        iteration lowers the convex objective, so the step taken is the best found, and to exclude
+        such trials would favour hands that touch little.
       CONTACT_OVERFLOW: The engine had no room for a contact: MuJoCo C in its arena, the
         structured engine for those between fingers.
       INVALID_START: Bad model fields, or bodies deep inside one another before the first step.
@@ -57,7 +58,8 @@ MEANINGS = {
     Status.NONFINITE: "a number of the state was not finite",
     Status.SPEED: "a velocity beyond the scene's limit",
     Status.PENETRATION: "the object fell through the table",
-    Status.SOLVER_CAP: "a warning only: the contact solver stopped at its cap of iterations",
+    Status.SOLVER_CAP: "a warning only: the contact solver stopped at its limit of iterations, "
+    "with a larger residual than the accuracy allows for",
     Status.CONTACT_OVERFLOW: "more contacts than the engine has room for",
     Status.INVALID_START: "bodies deep inside one another before the first step",
     Status.STUCK: "the hand did not let go: the released object neither left it nor rests on the "
@@ -164,10 +166,13 @@ class Trace(NamedTuple):
       speed: Largest absolute generalized velocity [rad/s or m/s], shape (time,); not finite if any
         state is not.
       qpos: Generalized positions if they were recorded, shape (time, nq), else shape (time, 0).
-      status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP,
-        CONTACT_OVERFLOW), shape (time,) int32, or None if it does not tell.
+      status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP if it
+        ended at the limit of iterations, CONTACT_OVERFLOW), shape (time,) int32, or None if it does
+        not tell.
       last: Generalized positions and velocities at the end, those in which a decided world stays,
         shape (nq + nv,), or None.
+      residual: Residual of the step taken from each state, see `Outcome`, shape (time,), or None
+        if the engine does not tell.
 
     An object that leaves the hand after six seconds, as its cost sees it:
 
@@ -186,6 +191,7 @@ class Trace(NamedTuple):
     qpos: jax.Array
     status: jax.Array | None = None
     last: jax.Array | None = None
+    residual: jax.Array | None = None
 
     def at(self, scene: Phased, phase: str | None = None) -> "Trace":
         """The trace in the last time step of a phase, without the axis time.
@@ -201,7 +207,7 @@ class Trace(NamedTuple):
             `effects.disturb` is off.
 
         Returns:
-          A trace whose arrays have lost their axis time; `last` is None.
+          A trace whose arrays have lost their axis time; `last` and `residual` are None.
 
         Raises:
           SceneError: If the grasp has no such phase.
@@ -237,9 +243,21 @@ class Outcome(NamedTuple):
       status: Bits of `Status`, shape () int32; the trial counts unless it `failed`.
       lost_time: First time at which the object was lost [s], infinite if never, shape ().
       bad_step: First time step of a failed world, or -1, shape () int32.
+      capped: Share of the steps before the verdict in which the solver stopped at its limit of
+        iterations, shape (); NaN if the engine does not tell (mjx).
+      residual: Largest residual of these steps, 0 if there are none, shape (); NaN if the engine
+        does not tell (mujoco, mjx). It is the norm sqrt(g' H^-1 g / s) of the forces g that the
+        last Newton iteration found unbalanced, before its own step: H is the inertia with that of
+        the contacts, and s the solver's scale (`newton.decrement` bounds its square). A force on
+        palm and object together counts in units of their weight; one on a link, which is lighter,
+        counts for more.
+
+    The last two are None where no engine simulated the outcome.
     """
 
     cost: jax.Array
     status: jax.Array
     lost_time: jax.Array
     bad_step: jax.Array
+    capped: jax.Array | None = None
+    residual: jax.Array | None = None

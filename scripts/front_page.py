@@ -38,8 +38,8 @@ STATEMENTS = (
     "the best designs keep {kept_23d_concurrent:.0f} %",
     "With {parameters:.0f} parameters",
     "best designs with {parameters:.0f} parameters",
-    "{paper_2d:,.0f} simulations to convergence are {converged_2d:,.0f} here, its "
-    "{paper_23d:,.0f} are {converged_23d:,.0f}",
+    "takes {converged_2d:,.0f} simulated grasps with two parameters ({paper_2d:,.0f} in the paper) "
+    "and {converged_23d:,.0f} with {parameters:.0f} ({paper_23d:,.0f})",
     "takes {install_seconds:.0f} seconds or more and {install_gb:.1f} GB",
     "{c_ratio:.0f} times as many grasps a second as MuJoCo C on two cores",
     "{c_ratio_here:.0f} times as many steps in contact",
@@ -67,6 +67,8 @@ NAMES = (
     "10 ms",
     "1 ms",
     "10 links",
+    "24 fresh grasps",
+    "at least 95 %",
     "20 links",
     "Apache-2.0",
     "--seeds 0-29",

@@ -18,7 +18,6 @@ import tyro
 
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines.structured import StructuredEngine, assembly
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import parameters
 from codesign_jax.types import Trial
@@ -67,7 +66,7 @@ class Case:
 
         @jax.jit
         def total(hand, state, u):
-            found = assembly.problem(self.scene, Stages(), hand, state, u)[0]
+            found = assembly.problem(self.scene, hand, state, u)[0]
             c = found.contacts["hull_object"]
             push = c.cone.normal * c.cone.spring * jnp.maximum(-c.distance, 0.0)
             return push.sum((0, 1, 2)), (push > 0).sum((0, 1, 2))

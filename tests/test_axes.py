@@ -120,6 +120,15 @@ CASES = {
         lambda: episode(np.ones(3, bool)),
         r"mask has shape \(3,\), not \(2,\)",
     ),
+    "a preset's name for a space": (
+        lambda: codesign.Task(SCENE, "2d", 2, ENGINE),  # type: ignore[arg-type]
+        r"space is '2d', not a DesignSpace; parameters.design_space\(scene.hand, '2d'\) makes one",
+    ),
+    "no trial of a task": (lambda: codesign.Task(SCENE, SPACE, 0, ENGINE), "trials = 0 must be a"),
+    "no number": (
+        lambda: evaluate([[0.09, 0.02], [0.09, np.nan]]),
+        "arm_z = nan is not a finite number",
+    ),
     "millimetres": (lambda: evaluate([[97.0, 0.02]]), "length = 97.0 .* did you mean 0.097"),
     "millimetres at the start": (
         lambda: OPTIMIZER.init(jax.random.key(0), np.array([97.0, 20.0]), 3),

@@ -154,7 +154,11 @@ def test_natural_frequencies():
 
 @pytest.mark.parametrize(
     "damping, beta, acts",
-    [("added", 6e-3, 7e-3), ("least", 6e-3, 6e-3), ("least", 5e-4, 1e-3)],
+    [
+        ("added", 6e-3, 7e-3),
+        ("least", 6e-3, 6e-3),
+        ("least", 5e-4, 1e-3),
+    ],
 )
 def test_ring_down(damping, beta, acts):
     """Log decrement 2 pi zeta / sqrt(1 - zeta^2) with zeta = omega / 2 times a Kelvin-Voigt time.

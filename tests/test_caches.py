@@ -341,7 +341,7 @@ def test_results_are_those_of_one_case_and_one_code(tmp_path, monkeypatch):
     for k in range(2):
         store.append({"k": np.array(k)})
     assert found() == ([0, 1], "")
-    assert found("b") == ([], "is of another case")
+    assert found("b") == ([], "is of another design or other settings")
     for name, value in (("SCHEMA", 0), ("sources", SimpleNamespace(digest=lambda: "other"))):
         with monkeypatch.context() as patch:
             patch.setattr(archives, name, value)

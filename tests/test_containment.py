@@ -137,6 +137,30 @@ def test_steps_after_the_verdict_do_not_warn():
     assert outcome(the_scene, last).status == Status.OK
 
 
+def test_a_trial_tells_how_its_solver_ended_and_warns_above_the_scene_s_threshold():
+    """Share and largest residual of the capped steps before the verdict."""
+    the_scene = pinch("box", newton__residual=0.5)
+    trace = with_status(the_scene, {100: Status.SOLVER_CAP, 200: Status.SOLVER_CAP})
+    steps = the_scene.num_steps
+
+    def told(residual, **changes):
+        values = np.zeros(steps, np.float32)
+        values[[*residual]] = [*residual.values()]
+        return outcome(the_scene, trace._replace(residual=jnp.asarray(values), **changes))
+
+    quiet = told({100: 0.3, 200: 0.5, 300: 9.0})  # that of a solved step is no news
+    assert quiet.status == Status.OK and float(quiet.residual) == 0.5
+    assert float(quiet.capped) == pytest.approx(2 / (steps - 1))  # nothing reads the last step
+    assert told({100: 0.3, 200: 0.51}).status == Status.SOLVER_CAP
+    trace = with_status(the_scene, {100: Status.SOLVER_CAP, 500: Status.SOLVER_CAP})
+    early = told({100: 0.3, 500: 0.9}, distance=trace.distance.at[400].set(1.0))
+    assert early.status == Status.OK and float(early.capped) == pytest.approx(1 / 400)
+    steps_only = outcome(the_scene, trace)  # as of MuJoCo C: any such step is a warning
+    assert steps_only.status == Status.SOLVER_CAP and np.isnan(steps_only.residual)
+    nothing = outcome(the_scene, trace._replace(status=None))  # as of MJX
+    assert nothing.status == Status.OK and np.isnan([nothing.capped, nothing.residual]).all()
+
+
 def test_an_overflow_fails_the_trial_at_its_step():
     the_scene = pinch("box")
     trace = with_status(the_scene, {100: Status.CONTACT_OVERFLOW, 50: Status.SOLVER_CAP})

@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.laws import shapes
 from tests.helpers import grasps
 
@@ -76,7 +75,7 @@ def engine_contacts(kind, position, quat, centre):
         ]  # column, row, 1, world
         kin = SimpleNamespace(object=jnp.asarray(frames))
         return shapes.spheres_on_object(
-            alone, hand, kin, Stages(), jnp.asarray((centre - position).T[:, None]), RADIUS
+            alone, hand, kin, jnp.asarray((centre - position).T[:, None]), RADIUS
         )
 
 

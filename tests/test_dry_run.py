@@ -1,10 +1,11 @@
 """`--dry-run`: how many grasps and how long, with nothing simulated and nothing written."""
 
+import dataclasses
 import re
 
 import pytest
 
-from codesign_jax import cli, scene
+from codesign_jax import cli, objects, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import rates
 from tests.helpers.toy_engine import TINY
@@ -51,6 +52,15 @@ def test_optimize_counts_the_test_at_reference(workplace, capsys):
     output = dry_run(capsys, "optimize")  # this engine has no such test by default
     assert "reference" not in output.split("---- settings")[1]
     assert list(workplace.iterdir()) == []
+
+
+def test_robust_widens_the_noise_of_the_scene_and_set_still_holds(workplace, capsys):
+    noise = dataclasses.asdict(objects.ROBUST) | {"mass": 0.02}
+    output = dry_run(capsys, "optimize", "--robust", "--set", "objects.noise.mass=0.02")
+    table = output.split("[noise]")[1].split("[table]")[0]
+    assert {n: float(v) for n, v in re.findall(r"(\w+) = ([\d.]+)", table)} == noise
+    usual = dataclasses.asdict(scene.load(TINY).objects.noise)
+    assert all(noise[name] > usual[name] for name in noise if name != "mass")
 
 
 def test_evaluate_and_landscape(workplace, capsys):

@@ -270,11 +270,16 @@ COMBINATIONS = st.fixed_dictionaries(
 def check_combination(values, shape):
     """Every engine takes a step that is finite, or traces one, or says what it cannot do.
 
-    The hull has no friction with torsion and rolling.
+    The hull has no friction with torsion and rolling, and the threshold of sideways bending needs
+    that hinge.
     """
     chosen = {f"effects__{k}": v for k, v in values.items()}
     if values["surface"] == "hull" and values["friction"] == "full":
         with pytest.raises(schema.SceneError, match="effects.surface = 'hull' needs friction"):
+            grasps.pinch(shape, links=1, **chosen)
+        return
+    if values["lateral_threshold"] and not values["lateral_bending"]:
+        with pytest.raises(schema.SceneError, match="lateral_bending = false leaves out"):
             grasps.pinch(shape, links=1, **chosen)
         return
     scene = grasps.pinch(shape, links=1, **chosen)

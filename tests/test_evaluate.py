@@ -35,7 +35,7 @@ def test_what_is_not_given_is_said_to_be_a_default(capsys):
     assert command("evaluate", "--dry-run", *every) == 0
     shown = capsys.readouterr().out
     assert "length[0]=95 mm length[1]=95 mm length[2]=95 mm length[3]=95 mm" in shown
-    assert "defaults: height, wall, spread, arm_roll" in shown and "explicit springs" in shown
+    assert "defaults: height, wall, spread, arm_roll" in shown and "are implicit" in shown
     twice = ["--preset", "23d", "--design", "length=95", "length[1]=90"]
     assert command("evaluate", "--dry-run", *twice) == 2
     assert "'length[1]' is given more than once: 95, 90" in capsys.readouterr().err
@@ -161,6 +161,19 @@ def test_many_designs_are_judged_at_once():
     found = trials_of([[0.0, 0.0], [0.0, 3.0]], [[0, 0], [0, int(Status.STUCK)]])
     np.testing.assert_array_equal(verdicts.success(tiny, found), [True, False])
     assert verdicts.tally(found) == (3, 0, 1, 0)
+
+
+def test_a_line_says_how_the_solver_ended():
+    """Of the trials whose engine tells; none if no step ended at the limit, or nobody tells."""
+    found = trials_of([0.0] * 3, [0] * 3)
+    nan = np.full(3, np.nan)
+    for shares, residuals in ((None, None), (nan, nan), (np.zeros(3), np.zeros(3))):
+        assert verdicts.solver(found._replace(capped=shares, residual=residuals)) == []
+    some = found._replace(capped=np.array([0.5, 0.1, 0.0]), residual=nan)
+    said = "solver: 20 % of the steps ended at the limit of iterations"
+    assert verdicts.solver(some) == [said]
+    [line] = verdicts.solver(some._replace(residual=np.array([7.0, 3.0, 0.0])))
+    assert line == f"{said}; largest residual of a trial: median 3, most 7 weights"
 
 
 def trials_of(cost, status, lost=()):

@@ -222,7 +222,7 @@ def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
     again, found = points(tmp_path / "x.part")
     assert found == 60, "two calls of six points"
     assert all(np.array_equal(again[name], value) for name, value in whole.items())
-    with pytest.raises(SceneError, match="x.part is of another case"):
+    with pytest.raises(SceneError, match="x.part is of another design or other settings"):
         points(tmp_path / "x.part", seed=1)
     scene, space, _ = tiny()
     kept = results.of_landscape(scene, space, whole)

@@ -114,11 +114,14 @@ def test_the_player_needs_mujoco_and_numpy_alone(grasped, tmp_path):
     list(tables.write_grasps(tmp_path, the_scene, [("lost", worlds[2][1])], [found]))
     tree = ast.parse((tmp_path / "play.py").read_text())
     imports = [n for n in ast.walk(tree) if isinstance(n, (ast.Import, ast.ImportFrom))]
-    assert {a.name for n in imports for a in n.names} == {"sys", "mujoco", "numpy"}
+    assert {a.name for n in imports for a in n.names} == {"os", "sys", "mujoco", "numpy"}
     program = [sys.executable, "play.py", "lost.xml", "lost.mjb"]
     done = subprocess.run(program, cwd=tmp_path, check=True, capture_output=True, text=True)
     when = f"lost at {judged.lost_time[2]:.2f} s"
     assert done.stdout.splitlines() == [f"lost.xml: {when}", f"lost.mjb: {when}"]
+    for wrong in ([], ["--help"]):
+        said = subprocess.run([*program[:2], *wrong], cwd=tmp_path, capture_output=True, text=True)
+        assert said.returncode == 1 and said.stderr.startswith("Plays exported grasps")
     [row] = read(tmp_path / "grasps.csv")
     assert float(row["lost_time_s"]) == pytest.approx(judged.lost_time[2], abs=1e-9)
 
@@ -151,6 +154,8 @@ def test_contacts_have_the_declared_stiffness(friction):
 def test_what_plain_mujoco_does_not_simulate_is_named():
     [rubber] = plain.obstacles(pinch(effects__neo_hookean=True))
     assert "effects.neo_hookean = true" in rubber
+    ours = pinch(effects__lateral_threshold=True, effects__soft_touch=True)
+    assert len(plain.obstacles(ours)) == 2
     household = scene.load("paper", object_set="household")
     assert any("'mug' is a mesh" in text for text in plain.obstacles(household))
     assert not plain.obstacles(pinch()) and not plain.stand_in(pinch())

@@ -9,7 +9,6 @@ import pytest
 from codesign_jax import model, scene
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.structured.kernel.pairs import pair_slots
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.laws import finger_pairs
 from tests.helpers import grasps
 from tests.helpers.curled_hands import SETTINGS, curled, kinds
@@ -18,7 +17,7 @@ from tests.helpers.curled_hands import SETTINGS, curled, kinds
 @jax.jit
 def contacts(centre, radius):
     """The engine's contacts between spheres of fingers, without a friction cone."""
-    return finger_pairs.contacts(Stages(), None, centre, radius)
+    return finger_pairs.contacts(None, centre, radius)
 
 
 def test_candidates_are_all_pairs_of_different_fingers():

@@ -10,7 +10,6 @@ import trimesh
 from codesign_jax import model, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.laws import hull as skin
 from codesign_jax.engines.structured.laws.cones import make_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
@@ -96,7 +95,7 @@ def test_velocities_are_derivatives_of_positions():
         def at(h):
             qpos = data.qpos + h * np.append(rate, 0.0)
             state = grasps.lanes_state(engine, the_scene, fields, qpos, rate)
-            kin = kinematics(Stages(), lanes, model.layout(the_scene).axes, state)
+            kin = kinematics(lanes, model.layout(the_scene).axes, state)
             return kin, skin.vertices(the_scene, lanes, kin), state.position[:, 0, 0]
 
         kin, points, _ = at(0.0)

@@ -124,6 +124,21 @@ def test_scatter(numbers, dtype):
             np.testing.assert_array_equal(got[block, :ROWS, column], want)
 
 
+def test_lanes_of_one_world_store_in_one_place(numbers):
+    """As those of a hand whose fingers fill the block: all lanes have the same number."""
+    x = np.repeat(numbers["x"][..., :1], LANES, 2).astype(np.float32)
+
+    def kernel(x, out):
+        world = jax.lax.rem(lane(), jnp.int32(1))
+        out[0, world] = x[0, :]
+        out[1, world] = 2 * out[0, world] + x[1, :]
+
+    (got,) = run("one world", kernel, (x,), jax.ShapeDtypeStruct((BLOCKS, 2, 1), np.float32))
+    np.testing.assert_array_equal(got[:, 0, 0], x[:, 0, 0])
+    # A product and a sum in one instruction round once.
+    np.testing.assert_allclose(got[:, 1, 0], 2 * x[:, 0, 0] + x[:, 1, 0], rtol=1e-6)
+
+
 def test_what_memory_cannot_do_is_named(numbers):
     """A vector for each lane, and elements that are neither floats nor int32."""
     x, rows = numbers["x"].astype(np.float32), numbers["rows"]

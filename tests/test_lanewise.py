@@ -41,7 +41,7 @@ def test_components_equal_arrays():
         eye = 6.0 * jnp.eye(6)[:, :, None, None]
         p = eye + 0.1 * (node[0] + jnp.swapaxes(node[0], 0, 1))
         quadratic = elimination.Quadratic(p, *node[1:])
-        return elimination.eliminate(lambda f, *a: f(*a), quadratic, axes, arm**2 + 1.0, tau)
+        return elimination.eliminate(quadratic, axes, arm**2 + 1.0, tau)
 
     want = jax.jit(step)([n[0] for n in node], axes[0], arm[0], tau[0])
     got = lanewise.lanewise(step, [n[1] for n in node], axes[1], arm[1], tau[1])

@@ -6,6 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from scipy import stats
 
@@ -15,7 +16,7 @@ from codesign_jax.optimize import (
     NAMES,
     Evolution,
     ParticleFilter,
-    ScreenedCMA,
+    Screened,
     Space,
     evolution,
     make_optimizer,
@@ -107,6 +108,12 @@ def test_populations_are_those_of_evosax_called_directly(name):
         own = algorithms.CMA_ES(PARTICLES, zeros)
         params = own.default_params.replace(std_init=jnp.float32(0.25))
         state = own.init(key(0, 0), unit, params)
+    elif name == "open-es":
+        descent = optax.sgd(np.sqrt(2 * np.pi * WIDTH) * 2 / 3 * 0.15**2)
+        std = {"std_schedule": optax.constant_schedule(0.15)}
+        own = algorithms.Open_ES(PARTICLES, zeros, optimizer=descent, **std)
+        params = own.default_params
+        state = own.init(key(0, 0), unit, params)
     elif name == "pso":
         own = algorithms.PSO(PARTICLES, zeros)
         params = own.default_params
@@ -130,11 +137,13 @@ def test_populations_are_those_of_evosax_called_directly(name):
         state, _ = own.tell(*told, state, params)
 
 
-def test_the_default_screens_then_averages_the_means_of_evosax():
-    """Random designs, the best of them again, evosax's CMA-ES from there; particle 0 averages."""
+@pytest.mark.parametrize("name", optimize.SCREENED)
+def test_screened_searches_average_the_means_of_evosax(name):
+    """Random designs, the best of them again, a strategy from there; particle 0 averages."""
     from evosax import algorithms
 
-    made = ScreenedCMA(SPACE)
+    made = make_optimizer(name, SPACE)
+    assert isinstance(made, Screened)
     state, populations, infos = run(made, start(made), OPEN[:5])
     free = np.arange(WIDTH) != LIMITED
     drawn = ((populations[:3] - LOW) / (HIGH - LOW)).reshape(-1, WIDTH)
@@ -142,8 +151,15 @@ def test_the_default_screens_then_averages_the_means_of_evosax():
     costs = np.array([info.cost for info in infos])
     best, kept = drawn[costs[:3].argmin()], np.sort(costs[:3], axis=None)[:PARTICLES]
     np.testing.assert_allclose(costs[3:], [kept, kept], rtol=1e-6)  # sorted: no noise here
-    own = algorithms.CMA_ES(PARTICLES - 1, jnp.zeros(WIDTH))
-    params = own.default_params.replace(std_init=jnp.float32(0.2))
+    count = PARTICLES - 1 if made.strategy == "cma-es" else PARTICLES - 2
+    if made.strategy == "cma-es":
+        own = algorithms.CMA_ES(count, jnp.zeros(WIDTH))
+        params = own.default_params.replace(std_init=jnp.float32(0.2))
+    else:
+        descent = optax.sgd(evolution.learning_rate(0.15, WIDTH))
+        std = {"std_schedule": optax.constant_schedule(0.15)}
+        own = algorithms.Open_ES(count, jnp.zeros(WIDTH), optimizer=descent, **std)
+        params = own.default_params
     keys = [
         jax.random.fold_in(jax.random.fold_in(jax.random.key(0), stream), 5)
         for stream in (screened.STREAM_MOVE, screened.STREAM_TELL)
@@ -158,20 +174,25 @@ def test_the_default_screens_then_averages_the_means_of_evosax():
         near(unit[0, free], 1 - np.abs(1 - average[free] % 2))  # mirrors at 0 and 1
         mean = np.asarray(state.memory["strategy"]["mean"])
         if t == 1:  # later ones draw along eigenvectors, whose sign hangs on the last bit
-            near(unit[1:, free], 1 - np.abs(1 - np.asarray(asked)[:, free] % 2))
-            near(mean, own.tell(keys[1], asked, info.cost[1:], strategy, params)[0].mean)
+            drawn, costs = unit[1 : count + 1], info.cost[1 : count + 1]
+            near(drawn[:, free], 1 - np.abs(1 - np.asarray(asked)[:, free] % 2))
+            near(mean, own.tell(keys[1], asked, costs, strategy, params)[0].mean)
+            rest = np.broadcast_to(best, (PARTICLES - 1 - count, WIDTH))
+            near(unit[count + 1 :, free], rest[:, free])
         average = average + 4 / (t + 3) * (mean - average)
 
 
 def test_the_particles_of_the_default_are_what_was_simulated_as_particle_0():
-    """The averages newest first, before the best random designs: those that the run can show."""
-    made = ScreenedCMA(SPACE)
+    """The averages newest first, before the best random design: those that the run can show."""
+    made = Screened(SPACE)
     state, populations, infos = run(made, start(made), OPEN[:7])
     np.testing.assert_array_equal(state.particles[:2], populations[[6, 5], 0])
     random = populations[:3].reshape(-1, WIDTH)
     order = np.argsort([info.cost for info in infos[:3]], axis=None)
-    np.testing.assert_array_equal(state.particles[2:], random[order[: PARTICLES - 2]])
-    assert infos[-1].ancestors[0] == 0 and (infos[-1].ancestors[1:] == -1).all()
+    np.testing.assert_array_equal(state.particles[2], random[order[0]])
+    newest = np.tile(populations[6, 0], (PARTICLES - 3, 1))
+    np.testing.assert_array_equal(state.particles[3:], newest)
+    np.testing.assert_array_equal(infos[-1].ancestors, [0, -1, -1, *[0] * (PARTICLES - 3)])
 
 
 def test_an_optimiser_of_the_package_needs_no_evosax(monkeypatch):
@@ -182,7 +203,7 @@ def test_an_optimiser_of_the_package_needs_no_evosax(monkeypatch):
     made = make_optimizer("wide", SPACE)
     assert isinstance(made, ParticleFilter) and made.sigma == 0.5
     assert names.problem("wide") is None
-    assert set(NAMES) - set(EVOSAX) == {"particle-filter", "screened-cma-es"}
+    assert set(NAMES) - set(EVOSAX) == {"particle-filter", *optimize.SCREENED}
 
 
 def test_bounds_and_constraint_hold(optimizer):
@@ -297,7 +318,7 @@ def test_a_whole_run_is_its_episodes_with_one_compile(name):
 
 
 def test_unknown_names_and_wrong_numbers_are_answered_in_words():
-    with pytest.raises(ValueError, match=r"'cma_es'; did you mean 'cma-es'\? Valid: screened-cma"):
+    with pytest.raises(ValueError, match=r"'cma_es'; did you mean 'cma-es'\? Valid: screened-es"):
         make_optimizer("cma_es", SPACE)
     with pytest.raises(ValueError, match="at least 2"):
         make_optimizer("cma-es", SPACE).init(jax.random.key(0), SEED, 1)
@@ -315,3 +336,19 @@ def test_a_missing_extra_is_one_line_with_the_command(monkeypatch):
     assert str(error.value) == "pso needs evosax: pip install evosax"
     assert optimize.problem("pso") == str(error.value)  # what the command says
     assert make_optimizer("particle-filter", SPACE).space is SPACE
+
+
+def test_steps_of_openai_es_go_two_thirds_of_the_way():
+    """On a bowl without noise, near its minimum, and nowhere on a plateau: ties share a rank."""
+    made = make_optimizer("open-es", Space(np.zeros(WIDTH), np.ones(WIDTH)))
+    middle, count = np.full(WIDTH, 0.5), 4000
+    state = made.init(jax.random.key(0), middle + np.eye(WIDTH)[0] * 0.03, count)
+    population = made.ask(state, np.ones(WIDTH, bool))
+    flat, _ = made.tell(state, population, np.zeros(count))
+    moved, _ = made.tell(state, population, ((population - middle) ** 2).sum(1))
+    assert state.memory and flat.memory and moved.memory
+    start, steady, mean = (s.memory["strategy"]["mean"] for s in (state, flat, moved))
+    np.testing.assert_allclose(steady, start, atol=1e-6)
+    # The step's own noise is learning_rate * std(rank) / sqrt(count) / sigma, 0.005 of 0.02.
+    np.testing.assert_allclose(mean[0] - start[0], -0.02, atol=0.015)
+    assert mean[0] < start[0]

@@ -88,11 +88,36 @@ def test_designs_outside_of_the_bounds_are_converted_with_a_warning():
     words = re.escape("length = 0.095 is outside [10, 180] mm; did you mean 95? (m given where mm")
     with pytest.warns(UserWarning, match=words):
         np.testing.assert_allclose(space.from_units([0.095, 30.0]), [95e-6, 0.03])
-    words = r"length = 190.0 is outside .*; arm_z = nan is outside \[-60, 200\] mm"
+    words = r"length = 190.0 is outside .*; arm_z = -70.0 is outside \[-60, 200\] mm"
     with pytest.warns(UserWarning, match=words):
-        space.from_units([[100.0, 30.0], [190.0, np.nan]])
+        space.from_units([[100.0, 30.0], [190.0, -70.0]])
     for end in space.bounds:  # float32's rounding of a bound is none
         space.from_units(space.in_units(np.array(end, np.float32)))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_design_that_is_no_number_is_refused(bad):
+    space = parameters.design_space(HAND, "2d")
+    for check in (space.from_units, space.check):
+        with pytest.raises(schema.SceneError, match=f"arm_z = {bad} is not a finite number"):
+            check([[0.1, 0.03], [0.1, bad]])
+
+
+def test_designs_that_are_not_legal_are_simulated_with_a_warning():
+    """Uniform draws between the bounds break the pressure limit, `sample` does not."""
+    key = jax.random.key(0)
+    FULL.check(FULL.sample(key, 50))
+    uniform = np.random.default_rng(0).uniform(FULL.low, FULL.high, (50, 23))
+    legal = np.asarray(jax.vmap(FULL.project)(uniform))
+    FULL.check(legal)
+    above = int((uniform - legal > 1.0).any(1).sum())  # Pa, beyond float32's rounding
+    assert 5 < above < 25
+    with pytest.warns(UserWarning, match=f"{above} of 50 designs with a pressure above the limit"):
+        FULL.check(uniform)
+    wide = FULL.default() + (FULL.high - FULL.low) * (np.asarray(FULL.names) == "arm_z")
+    with pytest.warns(UserWarning, match=r"arm_z = 0.295\d* is outside \[-0.05, 0.15\] m"):
+        FULL.check(wide)
+    jax.eval_shape(lambda design: FULL.check(design), uniform)  # traced: the shape alone
 
 
 def test_pressures_that_may_be_kilopascals_are_hinted_at():

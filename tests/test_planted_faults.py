@@ -23,7 +23,7 @@ from tests.helpers.planted_faults import Fault, planted, simulate
 STEPS = 8
 
 # Stages of the kernel: functions that it evaluates lane by lane.
-PALM, LINK = "Step._palm.<locals>.compute", "link_forces"
+PALM, LINK = "palm_and_object", "link_forces"
 JAR = "BoundContacts.begin.<locals>.jar"
 RESPONSE = "BoundContacts._push.<locals>.response"
 RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
@@ -33,26 +33,26 @@ CENTRE = "Step._forward.<locals>.link.<locals>.<lambda>"
 
 def link(**wrong: Callable):
     """A wrong `_link`: functions of some of its constants, joint states and forces, by name."""
-    places = {"stiffness": (0, 4), "damping": (0, 5), "mass": (0, 1), "angle": (1, 0)}
-    places |= {"pressure": (2, 1), "gravity": (2, 3)}
+    names = {"angle": "finger"}
 
-    def stage(right, names, parent, *groups):
-        new = [list(g) for g in groups]
+    def stage(right, the_scene, parent, constants, joint):
+        new = dict(constants), dict(joint)
         for name, change in wrong.items():
-            group, k = places[name]
-            new[group][k] = change(groups[group][k])
-        return right(names, parent, *new)
+            name = names.get(name, name)
+            group = next(g for g in new if name in g)
+            group[name] = change(group[name])
+        return right(the_scene, parent, *new)
 
     return {LINK: stage}
 
 
-def without_gyroscopic(right, names, parent, constants, joint, forces):
+def without_gyroscopic(right, the_scene, parent, constants, joint):
     """Of the links' forces those that velocities cause."""
     origin, frame, vel, bias, motion = parent
-    q, rate, acc = joint
-    still = (origin, frame, 0 * vel, 0 * bias, motion), constants, (q, 0 * rate, acc), forces
-    carry, stored = right(names, parent, constants, joint, forces)
-    return carry, stored | {"smooth": right(names, *still)[1]["smooth"]}
+    still = (origin, frame, 0 * vel, 0 * bias, motion)
+    slow = joint | {"finger_vel": 0 * joint["finger_vel"]}
+    carry, stored = right(the_scene, parent, constants, joint)
+    return carry, stored | {"smooth": right(the_scene, still, constants, slow)[1]["smooth"]}
 
 
 def cones(change: Callable):
@@ -77,13 +77,13 @@ def without_reaction(right, node, *rest):
 
 def at_palm(**change: Callable):
     """A wrong stage of palm, wrist and object: functions of the wrist's stiffness or gravity."""
-    places = {"stiffness": -2, "gravity": -1}
+    names = {"stiffness": "wrist_stiffness"}
 
-    def stage(right, *args):
-        new = list(args)
+    def stage(right, timestep, state, arm, constants):
+        new = dict(constants)
         for name, f in change.items():
-            new[places[name]] = f(args[places[name]])
-        return right(*new)
+            new[names.get(name, name)] = f(constants[names.get(name, name)])
+        return right(timestep, state, arm, new)
 
     return {PALM: stage}
 
@@ -123,8 +123,11 @@ FAULTS = {
     # stale state
     "angles of the step before": Fault(
         {
-            LINK: lambda f, names, parent, constants, joint, forces: f(
-                names, parent, constants, (joint[0] - H * joint[1], *joint[1:]), forces
+            LINK: lambda f, the_scene, parent, constants, joint: f(
+                the_scene,
+                parent,
+                constants,
+                joint | {"finger": joint["finger"] - H * joint["finger_vel"]},
             )
         }
     ),

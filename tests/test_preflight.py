@@ -1,6 +1,7 @@
 """Preflight: what it refuses without simulating, and that an ordinary start costs no program."""
 
 import dataclasses
+import re
 
 import jax
 import mujoco
@@ -152,3 +153,14 @@ def test_fingers_inside_one_another_are_refused(surface):
     )
     alone = scene.load("paper_spheres", overrides={"effects": {"surface": surface}})
     assert not preflight.check(alone, designs).refusals
+
+
+def test_a_tilt_in_radians_is_warned_of():
+    """It is a legal number of degrees."""
+    hand = scene.load("paper").hand
+    for tilt, warned in ((1.22, True), (-1.22, True), (0.0, False), (70.0, False)):
+        fingers = (dataclasses.replace(hand.finger[0], tilt=tilt), *hand.finger[1:])
+        tilted = dataclasses.replace(pinch(), hand=dataclasses.replace(hand, finger=fingers))
+        words = f"hand.finger.0.tilt = {tilt:g} deg .* did you mean {np.degrees(tilt):.3g}?"
+        found = [text for text in preflight._scene_warnings(tilted) if re.match(words, text)]
+        assert len(found) == warned

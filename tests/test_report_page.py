@@ -168,3 +168,10 @@ def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
     assert cli.main(["report", str(run)]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert "plotly" in line and "pip install '.[report]' in the checkout" in line
+
+
+@pytest.mark.parametrize(("episodes", "step"), [(1, 1), (4, 1), (24, 5), (29, 5), (128, 20)])
+def test_axes_of_episodes_have_ticks_at_whole_ones(episodes, step):
+    from codesign_jax.report import charts  # needs plotly
+
+    assert charts.failures(np.full((episodes, 2, 3), Status.STUCK)).layout.xaxis.dtick == step

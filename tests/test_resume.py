@@ -308,7 +308,7 @@ def test_the_default_search_goes_on_and_a_run_keeps_its_optimiser(finished, tmp_
     for episodes in ("2", "4", "6", "8"):  # within the random designs, and after them
         assert command(*run, "--episodes", episodes, "--out", grown) == 0
     assert_same_run(grown, long)
-    assert runs.read_run(grown)[1].optimizer == "screened-cma-es"
+    assert runs.read_run(grown)[1].optimizer == "screened-es"
     # The design that was found was simulated in an episode, whose grasp can be shown.
     scene, record = runs.read_run(grown)[0], choice.read_record(grown)
     chosen, grasp = choice.choose(scene, record), choice.find_grasp(scene, record)

@@ -2,7 +2,11 @@
 
 import contextlib
 import functools
+import importlib.util
+import os
 import pathlib
+import shutil
+import subprocess
 from functools import partial
 from typing import NamedTuple
 
@@ -24,7 +28,7 @@ from codesign_jax.engines.structured.kernel import (
 )
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Path
 from codesign_jax.engines.structured.kernel.bars import Bars
-from codesign_jax.engines.structured.kernel.program import Limits
+from codesign_jax.engines.structured.kernel.program import Limits, Program
 from codesign_jax.engines.structured.kernel.virtual import Virtual
 from codesign_jax.engines.structured.lanewise import lanewise
 from tests.helpers import grasps
@@ -40,6 +44,8 @@ EVERYTHING = {
     "effects__surface": "hull",
     "effects__finger_finger": True,
     "effects__neo_hookean": True,
+    "effects__soft_touch": True,
+    "contact__touch_depth": 2.7e-3,  # within the depths of the state, and of none exactly
     "contact__finger_finger_friction": 0.6,  # not the object's
     "discretization__hull_rings": 2,
     "discretization__hull_points": 4,
@@ -380,10 +386,8 @@ def test_derivatives_of_scenes(name, tmp_path):
 # --- on a GPU, in segments, of many worlds -------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["paper", pytest.param("paper_spheres", marks=pytest.mark.slow)])
-def test_the_kernel_is_valid_for_gpus(name):
-    """LLVM makes PTX of the reverse pass, without a stack in memory."""
-    the_scene = scene.load(name, overrides={"discretization": {"links": 3}})
+def ptx(the_scene):
+    """PTX of the reverse pass, and then of the forward pass that records its states."""
     program = AdjointProgram(the_scene, Limits(9, 9, 1e-6), backend="gpu", width=32)
     blocks, steps = 1, 2
 
@@ -398,12 +402,50 @@ def test_the_kernel_is_valid_for_gpus(name):
     whole = shape(steps, rows[0], size), shape(steps, rows[1], block)
     path = Path(*whole, *ends, shape(1, 1, block))
     given = program._arguments(inputs, path, Cotangents(*ends, shape(steps, 3, block)))
-    call, outputs = program._adjoint_call(given)
-    kernel = launch.Kernel("reverse", "gpu", size, scratch=(6, 7, 8))
-    code = gpu.device_code(
-        launch.kernel_jaxpr(call, list(given)), launch.describe(given, outputs, kernel)
-    )
-    assert ".target sm_80" in code and "shfl.sync.bfly.b32" in code and "__local_depot" not in code
+
+    def code(call, outputs, given, scratch):
+        layout = launch.describe(
+            given, outputs, launch.Kernel("test", "gpu", size, scratch=scratch)
+        )
+        return gpu.device_code(launch.kernel_jaxpr(call, list(given)), layout)
+
+    yield code(*program._adjoint_call(given), given, (6, 7, 8))
+    forward = Program(the_scene, program.limits, backend="gpu", width=32)
+    yield code(*forward._call(inputs, False, 1), inputs, (2,))
+
+
+def valid(code):
+    """Whether it is for the oldest GPU, and without a stack in memory."""
+    return ".target sm_80" in code and "shfl.sync.bfly.b32" in code and "__local_depot" not in code
+
+
+@pytest.mark.parametrize("name", ["paper", pytest.param("paper_spheres", marks=pytest.mark.slow)])
+def test_the_kernel_is_valid_for_gpus(name):
+    """LLVM makes PTX of the reverse pass."""
+    assert valid(next(ptx(scene.load(name, overrides={"discretization": {"links": 3}}))))
+
+
+def assembler():
+    """NVIDIA's assembler for PTX, of its package on PyPI or of a CUDA that is installed."""
+    package = importlib.util.find_spec("nvidia")
+    places = package.submodule_search_locations if package else None
+    folders = [f"{place}/cuda_nvcc/bin" for place in places or ()]
+    return shutil.which("ptxas", path=os.pathsep.join([*folders, os.environ["PATH"]]))
+
+
+@pytest.mark.slow  # quick: LLVM makes PTX; .ci/run has this one
+@pytest.mark.skipif(assembler() is None, reason="ptxas, NVIDIA's assembler, is not installed")
+@pytest.mark.parametrize("name", ["paper", "paper_spheres"])
+def test_nvidias_assembler_takes_the_kernels(name, tmp_path):
+    """Without a GPU: the driver's assembler is the same program. And it refuses another text."""
+    for number, code in enumerate(ptx(scene.load(name))):
+        assert valid(code)
+        (tmp_path / "right.ptx").write_text(code)
+        (tmp_path / "wrong.ptx").write_text(code.replace("fma.rn.f32", "fma.rn.f31", 1))
+        for text, accepted in ("wrong", False), ("right", True):
+            command = [assembler(), "-arch=sm_80", f"{text}.ptx", "-o", f"{text}.cubin"]
+            done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+            assert (done.returncode == 0) == accepted, (number, done.stderr)
 
 
 SHORT = {"effects__palm_object": False, "effects__palm_table": False, "effects__twist": False}

@@ -1,6 +1,7 @@
 """How kernels reach XLA on a CPU: threads, checks, versions, fallback, and kept machine code."""
 
 import ctypes
+import gc
 import importlib.metadata
 import os
 import shutil
@@ -254,6 +255,20 @@ def test_missing_memory_is_an_error(threads):
     code, message = xla.call(loaded.function("large"), [x, table], [out])
     xla.run_late()
     assert code == ffi.RESOURCE_EXHAUSTED and "scratch" in message
+
+
+def test_garbage_is_not_searched_for_while_a_kernel_is_compiled(monkeypatch):
+    """And is again afterwards, also if it cannot be compiled."""
+    found = []
+
+    def register(*args, **kwargs):
+        found.append(gc.isenabled())
+        raise NotImplementedError("no instruction")
+
+    monkeypatch.setattr(cpu, "register", register)
+    with pytest.raises(NotImplementedError, match="no instruction"):
+        kernels.run(*kernels.numbers(2))
+    assert found == [False] and gc.isenabled()
 
 
 def test_wrong_arguments_of_a_launch():

@@ -163,6 +163,16 @@ def test_a_start_that_is_refused_leaves_no_folder(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
+def test_a_dry_run_tells_where_jobs_start_and_what_is_not_used_there(monkeypatch):
+    monkeypatch.setenv("PATH", "/nowhere")  # no SLURM
+    partition = SimpleNamespace(jobs=2, job_set=(("slurm_partition=gpu",),))
+    words = "local; not used, as there is no SLURM here: slurm_partition"
+    assert jobs.plan(partition) == words
+    wrong = SimpleNamespace(jobs=2, job_set=(("gpu=8",),))
+    with pytest.raises(SceneError, match="--job-set: .*gpu"):
+        jobs.plan(wrong)
+
+
 @WITHOUT
 @pytest.mark.slow
 def test_runs_are_cancelled_queued_again_resumed_and_those_of_one_batch(on_cluster, capfd):

@@ -5,13 +5,15 @@ and the sound ones among worlds with planted faults (test_planted_faults, test_p
 """
 
 import dataclasses
+import functools
 
 import jax
 import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import rollout
+from codesign_jax import rollout, scene
+from codesign_jax.compiler import host
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from tests.helpers import grasps, oracles
@@ -97,3 +99,22 @@ def test_worlds_that_end_early():
     for field, whole in zip(short, long, strict=True):
         np.testing.assert_array_equal(field, whole)
     np.testing.assert_array_equal(reverse.distance[::-1], early.distance)
+
+
+# Quick: test_lanes_of_one_world_store_in_one_place.
+def test_a_world_fills_a_block(monkeypatch):
+    """Five fingers do on CPUs with vectors of eight float32: here three on four lanes."""
+    the_scene = scene.load("paper_spheres", hand_name="tripod3")
+    params, trials = grasps.random_worlds(the_scene, 0, 3)
+
+    def simulated():
+        engine = StructuredEngine(the_scene)
+        grasp = functools.partial(rollout.grasp, the_scene, engine, steps=30)
+        return jax.tree.map(np.asarray, jax.jit(jax.vmap(grasp))(params, trials))
+
+    two = simulated()
+    monkeypatch.setattr(host, "vector_bytes", lambda: 16)
+    one = simulated()
+    assert np.ptp(one.distance) > 0.01  # m: they move
+    # Vectors of another length round otherwise, 1e-7 a step.
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4), one, two)

@@ -30,6 +30,7 @@ from codesign_jax.codesign.experiment import (
     STREAM_SCREEN,
     STREAM_TEST,
     SUCCESS_COST,
+    VERDICTS,
     FinalTest,
     convergence_episode,
     final_test,
@@ -37,6 +38,7 @@ from codesign_jax.codesign.experiment import (
     seed_search,
     summarize_test,
     testing,
+    verdicts,
 )
 from codesign_jax.codesign.optimizers import make_filter, make_optimizer
 from codesign_jax.cost import particle_cost
@@ -48,6 +50,7 @@ __all__ = [
     "STREAM_TEST",
     "STREAM_TRIAL",
     "SUCCESS_COST",
+    "VERDICTS",
     "EpisodeFunction",
     "EpisodeInfo",
     "EvaluateFunction",
@@ -66,4 +69,5 @@ __all__ = [
     "stream_key",
     "summarize_test",
     "testing",
+    "verdicts",
 ]

@@ -36,7 +36,7 @@ class EpisodeInfo(NamedTuple):
       trials: Cost, status, time of loss and first bad step, each of shape (particle, trial).
       selection: Particle costs, and weights and ancestors of a resampling; see `optimize.Info`.
       last: States at which the worlds ended, failed ones frozen at their last good one, shape
-        (particle, trial, nq + nv), or None if the engine does not tell.
+        (particle, trial, nq + nv), or None if the engine does not report them.
       drawn: The trials themselves, leading axis (trial,), of episodes that `batch.Batch` ran.
     """
 
@@ -83,9 +83,17 @@ class Task:
         """Makes the engine.
 
         Raises:
-          SceneError: If the engine is that of a scene of another structure, or worlds are to be
-            recorded and to stop.
+          SceneError: If the space is none, or there are no trials, or the engine is that of a scene
+            of another structure, or worlds are to be recorded and to stop.
         """
+        problems = []
+        if not isinstance(self.space, DesignSpace):
+            hint = "parameters.design_space(scene.hand, '2d') makes one"
+            problems.append(f"space is {self.space!r:.40}, not a DesignSpace; {hint}")
+        if not isinstance(self.trials, int | np.integer) or self.trials < 1:
+            problems.append(f"trials = {self.trials!r} must be a whole number, at least 1")
+        if problems:
+            raise SceneError(problems)
         if self.engine is None:
             object.__setattr__(self, "engine", engines.make_engine(engines.DEFAULT, self.scene))
         axes.refuse_other(self.scene, self.engine)
@@ -110,10 +118,11 @@ class Task:
           constants: Numbers instead of the scene's, leaves of shape () or (trial,).
 
         Raises:
-          SceneError: If the population or the constants do not fit.
+          SceneError: If the population or the constants do not fit, and see `DesignSpace.check`,
+            which warns of designs that are not legal.
         """
         self.space.refuse_population(population)
-        self.space.refuse_unit_slips(population)
+        self.space.check(population)
         return Program(self.scene, self._evaluation)(jnp.asarray(population), key, constants)
 
     def episode(

@@ -11,7 +11,7 @@ from codesign_jax.codesign.episode import EvaluateFunction, stream_key
 from codesign_jax.cost import particle_cost
 from codesign_jax.optimize import Optimizer, answer, rejection, translated
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome
+from codesign_jax.types import Outcome, Status, failed
 
 # Four ASCII letters each, see `episode.STREAM_TRIAL`.
 STREAM_SCREEN = 0x7363726E
@@ -25,6 +25,8 @@ CONVERGED_COST = 1.0
 """Mean particle cost of an episode below which a run counts as converged (section VI.4)."""
 SEED_COST = 2.0
 """Cost that a seed particle must exceed, so that no run starts with a solution (section VI.4)."""
+VERDICTS = ("kept", "lost", "stuck", "failed")
+"""How a trial ends, see `verdicts`."""
 
 
 class FinalTest(NamedTuple):
@@ -157,6 +159,24 @@ def summarize_test(scene: Scene, trials: Outcome) -> FinalTest:
     """
     cost = particle_cost(scene, trials)
     return FinalTest(trials, cost, cost < SUCCESS_COST)
+
+
+def verdicts(outcomes: Outcome) -> np.ndarray:
+    """How trials ended, as indices of `VERDICTS`: the one rule of tables, reports and commands.
+
+    Kept is what did not fail and costs less than `SUCCESS_COST`.  Of the trials that failed, stuck
+    are those in which the hand did not let go; the others are faults of the simulation.
+
+    Args:
+      outcomes: Outcomes, arrays of any shape.
+
+    Returns:
+      Indices, of the same shape.
+    """
+    status = np.asarray(outcomes.status)
+    lost = ~(np.asarray(outcomes.cost) < SUCCESS_COST)
+    bad = np.where(status & Status.STUCK, VERDICTS.index("stuck"), VERDICTS.index("failed"))
+    return np.where(failed(status), bad, lost.astype(int))
 
 
 def convergence_episode(

@@ -115,7 +115,7 @@ class Meter:
         )
         self._task = self._bar.add_task(text, total=total)
         self._ticker = Ticker(disable=console.is_terminal)
-        self._ticker.begin(text)
+        self._ticker.begin(f"{text}: compiling, then {total} grasps")
         self.done, self._since, self._told = 0, None, time.monotonic()
 
     def __enter__(self) -> "Meter":

@@ -10,7 +10,7 @@ from codesign_jax import engines, runs
 from codesign_jax.commands import common
 from codesign_jax.runs import choice
 from codesign_jax.runs.reading import Tell
-from codesign_jax.scene import Scene, keypaths
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import SceneError
 
@@ -29,6 +29,7 @@ class Options(Protocol):
     scene: str | None
     accuracy: str | None
     overrides: tuple[tuple[str, ...], ...]
+    robust: bool
     engine: str | None
 
 
@@ -83,7 +84,7 @@ def _from_run(options: Options, tell: Tell) -> Case:
         folder,
         object_set=options.objects,
         accuracy=options.accuracy,
-        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
+        overrides=common.changes(options),
     )
     # By the run's own rule for failed trials, whatever --set says.
     own_rule = runs.read_run(folder)[0]

@@ -1,5 +1,6 @@
 """What the commands share: designs, notes and JAX's compilation cache."""
 
+import dataclasses
 import math
 import sys
 import tempfile
@@ -7,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,14 +16,16 @@ from codesign_jax import engines
 from codesign_jax import scene as scenes
 from codesign_jax.caches import use_compilation_cache
 from codesign_jax.commands import preflight
-from codesign_jax.scene import Scene, keypaths, library, schema
+from codesign_jax.scene import Scene, keypaths, library, objects, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import SceneError
 
 __all__ = [
     "SceneFlags",
+    "changes",
     "check_engine",
     "check_place",
+    "counted",
     "load_scene",
     "mesh_notes",
     "parse_design",
@@ -46,6 +49,25 @@ class SceneFlags(Protocol):
     objects: str | None
     accuracy: str | None
     overrides: tuple[tuple[str, ...], ...]
+    robust: bool
+
+
+class Overriding(Protocol):
+    """Flags that replace values of a scene; `flags.Subject` has their meaning."""
+
+    overrides: tuple[tuple[str, ...], ...]
+    robust: bool
+
+
+def changes(options: Overriding) -> dict[keypaths.Path, Any]:
+    """Values by key path that --robust and --set replace; what --set names holds.
+
+    Raises:
+      SceneError: If an argument of --set is no pair of key and value.
+    """
+    noise = dataclasses.asdict(objects.ROBUST) if options.robust else {}
+    given = keypaths.parse(chain.from_iterable(options.overrides))
+    return {("objects", "noise", name): value for name, value in noise.items()} | given
 
 
 def load_scene(options: SceneFlags) -> Scene:
@@ -59,7 +81,7 @@ def load_scene(options: SceneFlags) -> Scene:
         hand_name=options.hand,
         object_set=options.objects,
         accuracy=options.accuracy,
-        overrides=keypaths.parse(chain.from_iterable(options.overrides)),
+        overrides=changes(options),
     )
 
 
@@ -250,6 +272,11 @@ def preflight_notes(
     if report.refusals:
         raise SceneError(report.refusals)
     return [f"warning: {text}" for text in report.warnings] + report.notes
+
+
+def counted(number: int, noun: str) -> str:
+    """A number of things in words, such as "1 call" and "2 calls"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _number(text: str) -> float | None:

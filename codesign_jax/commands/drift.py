@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from codesign_jax.commands import calls, estimate
+from codesign_jax.commands import calls, common, estimate
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case
 from codesign_jax.engines import Engine
@@ -46,7 +46,7 @@ def simulate(
     if run.refused:
         console.print(f"{folder / PART} {run.refused}: simulated again", markup=False)
     if run.found:
-        console.print(f"going on after {run.found * count} grasps")
+        console.print(f"going on after {common.counted(run.found * count, 'grasp')}")
     with Meter("tolerance", planned.most * count, console) as meter:
 
         def reply(asked: tolerance.Round) -> list[Interval]:

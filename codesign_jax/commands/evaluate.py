@@ -119,7 +119,8 @@ def simulate(
     task = codesign.Task(case.scene, case.space, options.trials, engine)
     population = jnp.asarray(case.design, jnp.float32)[None]
     work = rates.batch_work(case.scene, case.engine, options.trials, devices=1)
-    with Busy(console, f"simulating {options.trials} grasps", rates.seconds(work)):
+    many = common.counted(options.trials, "grasp")
+    with Busy(console, f"simulating {many}", rates.seconds(work)):
         found = interruptible(task.evaluate, population, jax.random.key(options.seed))
     outcomes = jax.tree.map(np.asarray, found)
     one = jax.tree.map(lambda v: v[0], outcomes)
@@ -128,7 +129,7 @@ def simulate(
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
         console.print(f"{name:>12}: {verdicts.of_object(case.scene, own)}", markup=False)
     judged = verdicts.Judged(case.scene, one, options.accuracy)
-    for line in [f"{'all':>12}: {judged}", *verdicts.warnings(judged)]:
+    for line in [f"{'all':>12}: {judged}", *verdicts.solver(one), *verdicts.warnings(judged)]:
         console.print(line, markup=False)
     if options.out:
         drawn = rollout.sample_trials(case.scene, jax.random.key(options.seed), options.trials)
@@ -162,8 +163,7 @@ def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Conso
     with Busy(console, "simulating what is drawn"):
         grasps = animation.replay(case.scene, engine, params, trials)
     path: Path = options.render  # type: ignore[assignment]
-    if path.suffix == ".gif":
-        animation.write_gif(case.scene, grasps, path, notify=console.print)
-    else:
-        animation.write_strip(case.scene, grasps, path, notify=console.print)
+    write = animation.write_gif if path.suffix == ".gif" else animation.write_strip
+    with Busy(console, "drawing"):
+        write(case.scene, grasps, path, notify=console.print)
     console.print(f"picture: {path}", markup=False)

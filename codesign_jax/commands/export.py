@@ -18,6 +18,7 @@ from codesign_jax.commands.case import Case, find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
+from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import SceneError
 from codesign_jax.types import Params, Trial
@@ -135,7 +136,8 @@ def write_files(
         _parts(sizes, folder, options, console)
     if not options.no_sheet:
         found = drift.simulate(case, engine, options, folder, console) if engine else None
-        _sheet(case, params, sizes, found, folder, options)
+        with Busy(console, "writing the build sheet"):
+            _sheet(case, params, sizes, found, folder, options)
 
 
 def _tell(options: "Export", console: Console) -> None:
@@ -159,9 +161,11 @@ def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console)
 
     folder, how = folder / meshes.FOLDER, _process(options)
     folder.mkdir(exist_ok=True)
-    for part in meshes.write(folder, sizes, how):
-        edges = " x ".join(f"{v:.1f}" for v in part.extents)
-        console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3", markup=False)
+    with Busy(console, "making fingers and moulds"):
+        for part in meshes.write(folder, sizes, how):
+            edges = " x ".join(f"{v:.1f}" for v in part.extents)
+            line = f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3"
+            console.print(line, markup=False)
     for i, size in enumerate(sizes):
         if how.inlet and not process.inlet(size, how):
             low = min(size.chamber[1:])
@@ -181,8 +185,9 @@ def _models(case: Case, params: Params, folder: Path, options: "Export", console
     folder.mkdir(exist_ok=True)
     trials = _trials(case, options)
     built = _built(case, params, trials)
-    for line in tables.write_grasps(folder, case.scene, trials, built):
-        console.print(f"in plain MuJoCo: {line}", markup=False)
+    with Busy(console, f"simulating {common.counted(len(trials), 'grasp')} in plain MuJoCo"):
+        for line in tables.write_grasps(folder, case.scene, trials, built):
+            console.print(f"in plain MuJoCo: {line}", markup=False)
 
 
 def _built(case: Case, params: Params, trials: list[tuple[str, Trial]]) -> Iterator[grasps.Grasp]:

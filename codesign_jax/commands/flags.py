@@ -99,6 +99,9 @@ class Subject:
     """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
     and costs: docs/accuracy.md), or a .toml."""
     overrides: Overrides = ()
+    robust: Flag = False
+    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
+    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
     engine: Text = None
     """Engine that simulates; default: the run's, or structured."""
 

@@ -12,6 +12,7 @@ import secrets
 import shutil
 import signal
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -64,6 +65,24 @@ def executor(options: "Optimize", folder: Path) -> Any:
     except (AssertionError, NameError, TypeError, ValueError, RuntimeError) as error:
         raise SceneError([f"--job-set: {error}"]) from error
     return made
+
+
+def where(made: Any, options: "Optimize") -> str:
+    """Where an executor starts the runs, and which parameters are of no use there, in words."""
+    given = parameters([*chain.from_iterable(options.job_set)])
+    idle = [name for name in given if name.startswith("slurm_") and made.cluster != "slurm"]
+    reason = "there is no SLURM here" if "cluster" not in given else "that is not SLURM"
+    return made.cluster + (f"; not used, as {reason}: {', '.join(idle)}" if idle else "")
+
+
+def plan(options: "Optimize") -> str:
+    """Says where the runs would start; nothing is started or left behind.
+
+    Raises:
+      SceneError: See `executor`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return where(executor(options, Path(folder)), options)
 
 
 @contextlib.contextmanager
@@ -185,7 +204,8 @@ def run(
     with private_folder(options.out or Path("runs")) as own:
         made = executor(options, own)
         console.print(
-            f"{len(calls)} runs, {options.jobs} at a time, on {made.cluster}; logs: {made.folder}",
+            f"{len(calls)} runs, {options.jobs} at a time, on {where(made, options)}; logs: "
+            f"{made.folder}",
             markup=False,
         )
         if made.cluster == "slurm":
@@ -244,7 +264,7 @@ class Processes:
         self._waiting = dict(calls)
 
     def ended(self) -> Iterator[tuple[Path, Any, str]]:
-        """Folder and job of each run that has ended since, and a word if it left no result."""
+        """Folder and job of each run that has ended since; "" or why it left no result."""
         while self._waiting and len(self._running) < self._most:
             folder = next(iter(self._waiting))
             # submitit's controller of a job tells every Ctrl-C with a traceback.

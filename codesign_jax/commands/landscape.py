@@ -170,7 +170,7 @@ def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Conso
     trials = _trials(case, options)
     size = calls.equal(len(designs), calls.most_designs(trials))
     grasps = len(designs) * trials.count
-    console.print(f"grasps: {grasps} in {-(-len(designs) // size)} calls")
+    console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
     console.print(estimate.text([estimate.Part("", calls.work(trials, size), grasps)]))
 
 
@@ -190,12 +190,12 @@ def simulated_designs(
     grasps = len(designs) * trials.count
     engine = make_engine(case.engine, case.scene)
     simulate = Calls(trials, engine, size, part, designs)
-    console.print(f"grasps: {grasps} in {-(-len(designs) // size)} calls")
+    console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
     if simulate.refused:
         console.print(f"{part} {simulate.refused}: simulated again", markup=False)
     if simulate.found:
         done = simulate.found // size
-        console.print(f"going on after {done} calls, from {part}", markup=False)
+        console.print(f"going on after {common.counted(done, 'call')}, from {part}", markup=False)
     with Meter("landscape", grasps, console) as meter:
         found = simulate(designs, meter)
     simulate.record_rate()
@@ -206,7 +206,7 @@ def summarize(case: Case, made: Grid, found: Outcome, seed: int) -> Landscape:
     """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
     space, shape = case.space, tuple(len(axis) for axis in made.axes)
     counted = ~failed(found.status)
-    kept = counted & (found.cost < codesign.SUCCESS_COST)
+    kept = codesign.verdicts(found) == codesign.VERDICTS.index("kept")
     scale = np.asarray(space.scale)[[*made.columns]]
     return Landscape(
         names=np.array([space.names[k] for k in made.columns]),

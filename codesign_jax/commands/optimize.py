@@ -19,6 +19,7 @@ from codesign_jax.commands.estimate import Part
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, rates
+from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
@@ -207,6 +208,8 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     if count > 1:
         how = f"{options.jobs} at a time" if options.jobs else "in one batch"
         print(f"runs: {count}, {how}; grasps and disk are those of each")
+    if options.jobs:
+        print(f"processes: on {jobs.plan(options)}")
     row = 40 + 12 * space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
@@ -271,13 +274,14 @@ def _say_places(result: RunResult, folder: Path, console: Console) -> None:
 
 
 def _figures(result: RunResult, folder: Path, console: Console) -> None:
+    assert result.record is not None
+    path = folder / "figures" / "cost_evolution.png"
     try:
-        from codesign_jax.report import figures
+        with Busy(console, "drawing"), files.naming(path):
+            from codesign_jax.report import figures
+
+            figures.cost_evolution(result.record.history.cost, path)
     except ImportError:
         console.print("no figures: pip install '.[viz]' in the checkout", markup=False)
         return
-    assert result.record is not None
-    path = folder / "figures" / "cost_evolution.png"
-    with files.naming(path):
-        figures.cost_evolution(result.record.history.cost, path)
     console.print(f"figure: {path}", markup=False)

@@ -3,6 +3,7 @@
 The scene's own checks look at one number at a time; these look at what a design makes of them.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -148,6 +149,12 @@ def _scene_warnings(scene: Scene) -> list[str]:
             f"arm.shake_frequency = {rate:g} Hz has {1 / (rate * h):.1f} time steps of {h:g} s in "
             f"a period: below {SHAKE_STEPS} the shaking is not the sine asked for"
         )
+    for i, finger in enumerate(scene.hand.finger):
+        if 0 < abs(finger.tilt) <= math.pi / 2:
+            found.append(
+                f"hand.finger.{i}.tilt = {finger.tilt:g} deg leaves the palm nearly flat; did you "
+                f"mean {math.degrees(finger.tilt):.3g}? (radians given where degrees are expected)"
+            )
     for shape in scene.objects.object:
         stiffness = scene.contact.normal_stiffness
         sunk = shape.mass * scene.gravity / (2 * stiffness)
@@ -242,8 +249,8 @@ def _step_note(scene: Scene, designs: Params) -> str:
     low, high = min(v.slowest for v in limits), max(v.fastest for v in limits)
     bare, damped = min(v.undamped_step for v in limits), min(v.damped_step for v in limits)
     return (
-        f"finger frequencies {low:.3g} to {high:.3g} Hz; explicit springs would need steps below "
-        f"{1e3 * bare:.2g} ms ({1e3 * damped:.2g} ms with the material's damping), implicit ones "
-        f"are stable at {1e3 * h:g} ms and act there as a damping time of {1e3 * (beta + h):g} ms "
-        f"instead of {1e3 * beta:g} ms"
+        f"fingers vibrate at {low:.2g} to {high:,.0f} Hz; their springs are implicit, so stable at "
+        f"steps of {1e3 * h:g} ms, which act as a damping time of {1e3 * (beta + h):g} ms instead "
+        f"of {1e3 * beta:g} ms (explicit springs: below {1e3 * bare:.2g} ms, damped "
+        f"{1e3 * damped:.2g} ms)"
     )

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, engines, rollout
 from codesign_jax.commands.case import Case, find_case
+from codesign_jax.commands.common import counted
 from codesign_jax.commands.estimate import Part
 from codesign_jax.commands.flags import Subject
 from codesign_jax.engines import make_engine
@@ -80,11 +81,12 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
         if why:
             console.print(f"{folder / FILE} {why}: simulated again", markup=False)
         work = rates.batch_work(case.scene, case.engine, trials, devices=1)
-        with Busy(console, f"reference test, {trials} grasps", rates.seconds(work)):
+        words = f"reference test, {counted(trials, 'grasp')}"
+        with Busy(console, words, rates.seconds(work)):
             found = simulate(case, settings, trials)
-        outcomes.save(folder / FILE, found, key)
-        drawn = rollout.sample_trials(case.scene, _noise(settings), trials)
-        tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
+            outcomes.save(folder / FILE, found, key)
+            drawn = rollout.sample_trials(case.scene, _noise(settings), trials)
+            tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
     return found
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from codesign_jax.commands import common, grasp
+from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import SceneError
 
@@ -43,17 +44,18 @@ def _check(options: "Render") -> None:
 
 def draw(asked: grasp.Asked, options: "Render", console: Console) -> None:
     """Simulates the grasp and draws it."""
-    with console.status("simulating the grasp"):
+    with Busy(console, "simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import animation
 
     console.print("\n".join(grasp.description(asked, shown)), markup=False)
     scene, size = asked.case.scene, (options.size, options.size)
-    if options.out.suffix == ".gif":
-        animation.write_gif(scene, [shown], options.out, size=size, notify=console.print)
-    else:
-        times = options.times or None
-        animation.write_strip(
-            scene, [shown], options.out, times=times, size=size, notify=console.print
-        )
+    with Busy(console, "drawing"):
+        if options.out.suffix == ".gif":
+            animation.write_gif(scene, [shown], options.out, size=size, notify=console.print)
+        else:
+            times = options.times or None
+            animation.write_strip(
+                scene, [shown], options.out, times=times, size=size, notify=console.print
+            )
     console.print(f"picture: {options.out}", markup=False)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from codesign_jax.commands import common, failure, grasp
+from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import SceneError
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def _default(folder: Path | None) -> Path:
 
 def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
     """Simulates the grasp and writes its page."""
-    with console.status("simulating the grasp"):
+    with Busy(console, "simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import viewer
 

@@ -11,6 +11,7 @@ from codesign_jax.commands import common, reference
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.manifest import read_provenance
+from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.record import Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
@@ -53,7 +54,8 @@ def main(options: "Report") -> int:
     if why:
         console.print(f"{options.folder / reference.FILE} {why}: left out", markup=False)
     shown = None if options.no_replay else best_grasp(scene, settings, record, name, console)
-    page.write(run, shown, path)
+    with Busy(console, "writing the report"):
+        page.write(run, shown, path)
     size = path.stat().st_size / 1e6
     console.print(f"report: {path} ({size:.1f} MB, for any browser, offline)", markup=False)
     return 0
@@ -66,7 +68,7 @@ def best_grasp(
     from codesign_jax.report import animation
 
     grasp = choice.find_grasp(scene, record)
-    with console.status("simulating the best grasp again"):
+    with Busy(console, "simulating the best grasp again"):
         params = design_space(scene.hand, settings.preset).params(jnp.asarray(grasp.design))
         trials = jax.tree.map(lambda v: v[None], grasp.trial)
         [replay] = animation.replay(scene, make_engine(engine, scene), params, trials)

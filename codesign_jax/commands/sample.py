@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import batch, sampling
+from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.commands import calls, common, estimate
 from codesign_jax.commands.calls import Meter
 from codesign_jax.engines import Engine, make_engine
@@ -52,7 +53,7 @@ def main(options: "Sample") -> int:
     for note in [*notes, *common.mesh_notes(scene)]:
         console.print(note, markup=False)
     count = question.shards(options.designs)
-    console.print(f"{_amount(options)} in {count} call{'s' * (count > 1)}")
+    console.print(f"{_amount(options)} in {common.counted(count, 'call')}")
     if options.dry_run:
         _dry_run(options, question, console)
         return 0
@@ -63,9 +64,10 @@ def main(options: "Sample") -> int:
             except Stopped as stopped:
                 console.print("stopped; the same command goes on")
                 return 128 + stopped.signum
-        dataset.write(options.out, question, options.designs, shards)
-        shards.delete()
-    _report(options.out, found, console)
+        if not options.outcomes:
+            dataset.write(options.out, question, options.designs, shards)
+            shards.delete()
+    _report(shards.folder if options.outcomes else options.out, found, console)
     return 0
 
 
@@ -85,7 +87,8 @@ def _check(options: "Sample") -> None:
     if problems:
         raise SceneError(problems)
     common.check_engine(options.engine)
-    parquet.library("codesign sample")
+    if not options.outcomes:
+        parquet.library("codesign sample")
     common.check_place("--out", options.out)
 
 
@@ -108,7 +111,9 @@ def _question(options: "Sample", scene: Scene) -> Question:
 
 def _amount(options: "Sample") -> str:
     """Designs and grasps in words."""
-    return f"{options.designs} designs x {options.trials} trials: {_grasps(options)} grasps"
+    sizes = (options.designs, "design"), (options.trials, "trial")
+    each = " x ".join(common.counted(*size) for size in sizes)
+    return f"{each}: {common.counted(_grasps(options), 'grasp')}"
 
 
 def _grasps(options: "Sample") -> int:
@@ -144,14 +149,14 @@ def _dry_run(options: "Sample", question: Question, console: Console) -> None:
 
 @dataclasses.dataclass
 class _Tally:
-    """How grasps ended, numbers by `dataset.VERDICTS`."""
+    """How grasps ended, numbers by `codesign.VERDICTS`."""
 
     counts: np.ndarray
 
     def add(self, question: Question, shard: int, designs: int, found: Outcome) -> int:
         """Counts the wanted grasps of a shard; returns how many they are."""
         wanted = min(question.chunk, designs - shard * question.chunk)
-        ends = dataset.verdicts(found)[:wanted]
+        ends = verdicts(found)[:wanted]
         self.counts += np.bincount(ends.ravel(), minlength=len(self.counts))
         return ends.size
 
@@ -170,7 +175,7 @@ def _simulate(
       Stopped: If a signal came; what was simulated is saved.
     """
     simulate = sampling.make_simulate(question.scene, engine, question.space)
-    tally, missing = _Tally(np.zeros(len(dataset.VERDICTS), int)), []
+    tally, missing = _Tally(np.zeros(len(VERDICTS), int)), []
     total, seconds = question.shards(designs), []
     with Meter("sample", designs * question.trials, console) as meter:
         for shard in range(total):
@@ -181,7 +186,9 @@ def _simulate(
                 meter.found(tally.add(question, shard, designs, kept))
         if len(missing) < total:
             done = total - len(missing)
-            words = f"going on after {done} of {total} calls, from {shards.folder}"
+            words = (
+                f"going on after {done} of {common.counted(total, 'call')}, from {shards.folder}"
+            )
             console.print(words, markup=False)
         for shard in missing:
             start = time.perf_counter()
@@ -207,7 +214,9 @@ def _record_rate(question: Question, seconds: list[float]) -> None:
 
 def _report(path: Path, found: _Tally, console: Console) -> None:
     total = int(found.counts.sum())
-    ends = zip(dataset.VERDICTS, found.counts.tolist(), strict=True)
+    ends = zip(VERDICTS, found.counts.tolist(), strict=True)
     words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
     console.print(f"of {total} grasps: {words}")
-    console.print(f"table: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)
+    size = sum(file.stat().st_size for file in (path, *path.glob("*"))) / 1e6
+    what = "outcomes" if path.is_dir() else "table"
+    console.print(f"{what}: {path} ({size:.1f} MB)", markup=False)

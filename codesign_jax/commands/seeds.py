@@ -189,14 +189,15 @@ def _values(scene: Scene, run: Compared) -> dict[str, object]:
     if run.result is None or run.result.record is None or run.result.test is None:
         return found
     test = run.result.test
-    costs, trials = np.asarray(test.cost), np.asarray(test.trials.cost)
+    costs = np.asarray(test.cost)
     best = int(costs.argmin())
-    counted = cost.counts(scene, np.asarray(test.trials.status)[best])
+    own = jax.tree.map(lambda v: np.asarray(v)[best], test.trials)
+    counted = cost.counts(scene, own.status)
     return found | {
         "best_test_cost": f"{costs[best]:.9g}",
-        "kept_trials": int((counted & (trials[best] < codesign.SUCCESS_COST)).sum()),
+        "kept_trials": verdicts.tally(own).kept,
         "counted_trials": int(counted.sum()),
-        "trials": trials.shape[1],
+        "trials": counted.size,
         "successful_particles": int(np.asarray(test.success).sum()),
         "particles": costs.size,
     }

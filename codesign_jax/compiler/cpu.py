@@ -52,7 +52,9 @@ def handler_code(name: str, layout: Layout) -> str:
     return _DECLARATIONS + _work(layout) + _task() + _drop() + _handler(name, layout)
 
 
-def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: bool = True) -> str:
+def register(
+    origin: str, trace: Callable[[], Any], layout: Layout, *, keep: bool = True, level: int = 2
+) -> str:
     """Compiles a kernel and makes it known to XLA; returns the name to call it by.
 
     Args:
@@ -61,16 +63,17 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: boo
       trace: Returns the kernel's jaxpr; its arguments are references to a block of each array.
       layout: Its arrays.
       keep: Whether its machine code may be kept on disk and be found there.
+      level: LLVM's level of optimisation, see `host.compile`.
 
     Raises:
       KernelUnavailable: If XLA does not take the handler.
       NotImplementedError: If the kernel does something that has no instruction.
     """
-    name = cache.key("cpu", origin, layout, *host.identity())
+    name = cache.key("cpu", origin, layout, level, *host.identity())
 
     def build() -> bytes:
         text = block_code(trace(), layout) + handler_code(name, layout)
-        return host.compile(_declared_once(text))
+        return host.compile(_declared_once(text), level)
 
     with host.LOCK:
         if not host.known(name):

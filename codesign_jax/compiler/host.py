@@ -1,7 +1,8 @@
 """Machine code of this computer's processor, made and loaded by LLVM.  Needs llvmlite.
 
 The environment variable CODESIGN_KERNEL_OPTIMIZATION says how much LLVM optimises: 2, the default,
-or 0, which takes half of LLVM's time, for programs that run for milliseconds.
+or 0, which takes half of LLVM's time, for programs that run for milliseconds.  A kernel may ask for
+less than the default, see `launch.Kernel`.
 """
 
 import ctypes
@@ -55,26 +56,31 @@ def _level() -> int:
     return int(text)
 
 
-def _machine() -> Any:
+def _machine(level: int = 2) -> Any:
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     return binding.Target.from_default_triple().create_target_machine(
         cpu=binding.get_host_cpu_name(),
         features=binding.get_host_cpu_features().flatten(),
-        opt=2,
+        opt=level,
         jit=True,
     )
 
 
-def compile(text: str) -> bytes:
-    """Object file of a program in LLVM's language."""
-    # At level 0 the machine code is still chosen at level 2. At 0 that would take a fourth of the
-    # time, but multiplications and additions are fused here and not there, and the bits of a world
-    # then depend on its neighbours.
-    machine = _machine()
+def compile(text: str, level: int = 2) -> bytes:
+    """Object file of a program in LLVM's language.
+
+    Args:
+      text: The program.
+      level: Level at which machine code is chosen, 1 or 2, and the highest of other passes.
+    """
+    # Where the environment says 0, machine code is still chosen at this level. At 0 that would take
+    # a fourth of the time, but multiplications and additions are fused here and not there, and the
+    # bits of a world then depend on its neighbours.
+    machine = _machine(level)
     module = binding.parse_assembly(text)
     module.triple = machine.triple
-    options = binding.create_pipeline_tuning_options(speed_level=_level())
+    options = binding.create_pipeline_tuning_options(speed_level=min(level, _level()))
     # Everything is in vectors already, and loops over links are to stay loops.
     options.slp_vectorization = options.loop_vectorization = options.loop_unrolling = False
     builder = binding.create_pass_builder(machine, options)

@@ -1,9 +1,11 @@
 """The one way to run a Pallas kernel: on a CPU through `cpu`, on an NVIDIA GPU through `gpu`."""
 
+import contextlib
 import functools
+import gc
 import importlib.metadata
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -31,6 +33,7 @@ class Kernel(NamedTuple):
       shared: Places of inputs of one block that all blocks read; their leading axis is 1.
       scratch: Places among the outputs of scratch memory. Scratch does not outlive a block, so one
         buffer a thread suffices on a CPU; on a GPU every block has its own.
+      level: LLVM's level of optimisation on a CPU, 1 or 2.
     """
 
     origin: str
@@ -38,6 +41,7 @@ class Kernel(NamedTuple):
     lanes: int
     shared: tuple[int, ...] = ()
     scratch: tuple[int, ...] = ()
+    level: int = 2
 
 
 @functools.cache
@@ -64,7 +68,7 @@ def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
     work, blocks are half or a quarter of a warp, so that fewer worlds wait for one another
     (whole grasps of 1,728 worlds on an H200, half a warp and a whole one: 0.72 and 0.41 million
     world-steps/s with the hull and contact between fingers, 2.9 and 2.2 with the hull; of 7,200
-    worlds, where whole warps are kept, 1.15 and 1.04, 3.9 and 4.5; before commit 5a0020d).
+    worlds, where whole warps are kept, 1.15 and 1.04, 3.9 and 4.5; without contact with the palm).
 
     Args:
       platform: As `jax.default_backend` names it.
@@ -84,7 +88,7 @@ def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
 
 @functools.cache
 def multiprocessors() -> int:
-    """Multiprocessors of this computer's first GPU; those of an A100 if it does not tell."""
+    """Multiprocessors of this computer's first GPU; those of an A100 if it cannot be asked."""
     try:
         return int(getattr(jax.local_devices(backend="gpu")[0], "core_count", 108))
     except RuntimeError:  # the kernel is compiled for another computer
@@ -115,9 +119,13 @@ def launch(
     if reason := available(kernel.backend) or memory_maps.problem():
         raise KernelUnavailable(reason)
     if kernel.backend == "cpu":
-        from codesign_jax.compiler import cpu as device
+        from codesign_jax.compiler import cpu
+
+        register = functools.partial(cpu.register, level=kernel.level)
     else:
-        from codesign_jax.compiler import gpu as device
+        from codesign_jax.compiler import gpu
+
+        register = gpu.register
     layout = describe(inputs, outputs, kernel)
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in inputs]
 
@@ -127,7 +135,8 @@ def launch(
     code = sources.digest()
     # Of code that is not known no kernel is found again, neither on disk nor in this process.
     origin = f"{kernel.origin} {code or uuid.uuid4()} {jax.__version__}"
-    name = device.register(origin, trace, layout, keep=code is not None)
+    with _no_collection():
+        name = register(origin, trace, layout, keep=code is not None)
     made = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
     varying = _varying(inputs)
     shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]
@@ -135,6 +144,21 @@ def launch(
     for k, result in zip(made, jax.ffi.ffi_call(name, shapes)(*inputs), strict=True):
         results[k] = None if k in kernel.scratch else result
     return results
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without Python's search for garbage: of the millions of objects of a trace few are garbage.
+
+    The searches would be a tenth of the time that a kernel takes to compile.
+    """
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:

@@ -91,8 +91,9 @@ class VectorWriter(Writer):
             return
         address, align = self._address(ref, indices), SIZES[ref.kind]
         if not lane.wide:
-            if value.wide:
-                raise NotImplementedError("a kernel stores a value of each lane in one place")
+            if value.wide:  # as below, the first of the lanes that share a place
+                text = self.emit(f"extractelement {self.typed(value)}, i32 0")
+                value = Value(value.kind, False, text)
             self.lines.append(f"store {self.typed(value)}, ptr {address}, align {align}")
             return
         value = self.splat(value)

@@ -76,9 +76,7 @@ class MujocoEngine(Equal):
         fields, bounds, wide = jax.tree.map(lambda v: np.asarray(v, np.float64), inputs)
         with self._lock:
             trace = self._simulate(fields, bounds, wide, trajectory)
-        return Trace(
-            *(v if v.dtype == np.int32 else v.astype(dtype) for v in trace)  # type: ignore[union-attr]
-        )
+        return jax.tree.map(lambda v: v if v.dtype == np.int32 else v.astype(dtype), trace)
 
     def _batch(self, num_worlds: int) -> mujoco.batch.Batch:
         if num_worlds not in self._batches:
@@ -112,7 +110,7 @@ class MujocoEngine(Equal):
             stopped = batch.warning[going, :, 0].any(1) | (taken == 0)
             count = part.stop - first
             new.speed[stopped[:, None] & (np.arange(count) >= taken[:, None])] = np.nan
-            for array, values in zip(series, new[:-1], strict=True):
+            for array, values in zip(series, new[: len(series)], strict=True):
                 array[going, part] = np.asarray(values)
             full = batch.warning[:, _FULL, 0].any(1)[going]
             status[going[full], first + taken[full] - 1] |= int(Status.CONTACT_OVERFLOW)

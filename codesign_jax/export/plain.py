@@ -31,6 +31,13 @@ _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 """Of (1 - d) / d, as MuJoCo keeps an impedance d between 0.0001 and 0.9999."""
 
 
+_OBSTACLES = {
+    "neo_hookean": "its moments follow the angles by a law that MuJoCo's joints do not have",
+    "lateral_threshold": "the stiffness of its joints follows pressure and angles",
+    "soft_touch": "in MuJoCo the elastic force grows with the impedance",
+}
+"""Effects that plain MuJoCo does not have, and why."""
+
 NONE: Mapping[str, float] = MappingProxyType({})
 
 
@@ -40,12 +47,11 @@ class Inexpressible(ValueError):
 
 def obstacles(scene: Scene) -> list[str]:
     """What of a scene plain MuJoCo does not simulate, a sentence each; empty if nothing."""
-    found = []
-    if scene.effects.neo_hookean:
-        found.append(
-            "effects.neo_hookean = true (its moments follow the angles by a law that MuJoCo's "
-            "joints do not have); --set effects.neo_hookean=false exports another scene"
-        )
+    found = [
+        f"effects.{name} = true ({why}); --set effects.{name}=false exports another scene"
+        for name, why in _OBSTACLES.items()
+        if getattr(scene.effects, name)
+    ]
     return found + [
         f"object {shape.name!r} is a mesh (MuJoCo takes its convex hull); leave it out by --objects"
         for shape in scene.objects.object

@@ -1,5 +1,6 @@
 """Plays exported grasps in plain MuJoCo: python play.py box.xml (or box.mjb; several at once)."""
 
+import os
 import sys
 
 import mujoco
@@ -26,6 +27,8 @@ def play(model, controls):
 
 
 if __name__ == "__main__":
+    if not sys.argv[1:] or not all(map(os.path.isfile, sys.argv[1:])):
+        sys.exit(__doc__)
     for path in sys.argv[1:]:
         binary = path.endswith(".mjb")
         load = mujoco.MjModel.from_binary_path if binary else mujoco.MjModel.from_xml_path

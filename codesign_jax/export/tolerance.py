@@ -6,18 +6,19 @@ the last step of an unbroken row of steps with at least `WANTED` successes and t
 steps further out are not simulated.
 """
 
+import dataclasses
 from collections.abc import Generator, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.report import statistics
 from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import Scene
 from codesign_jax.scene.hand import UNITS
 from codesign_jax.scene.parameters import DesignSpace, design_space
-from codesign_jax.types import Outcome, failed
+from codesign_jax.types import Outcome
 
 WANTED = 0.9
 """Share of successful grasps below which a design has drifted too far."""
@@ -136,7 +137,8 @@ def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, f
             moved = np.repeat(centre[None], steps, 0)
             moved[:, i] += shares * (end - centre[i])
             designs += [*moved]
-    return Study(whole, np.array(designs), low, high)
+    moving = dataclasses.replace(whole, bounds=(tuple(low.tolist()), tuple(high.tolist())))
+    return Study(moving, np.array(designs), low, high)
 
 
 def _limits(
@@ -172,7 +174,7 @@ def shares(outcomes: Outcome) -> list[Interval]:
     Args:
       outcomes: Outcomes, arrays of shape (design, trial).
     """
-    kept = (np.asarray(outcomes.cost) < SUCCESS_COST) & ~failed(np.asarray(outcomes.status))
+    kept = verdicts(outcomes) == VERDICTS.index("kept")
     return [statistics.wilson(int(n), kept.shape[1]) for n in kept.sum(1)]
 
 

@@ -32,7 +32,8 @@ class ModelFields(NamedTuple):
     Every array has MuJoCo's name and shape for one world, `gravity` and `impratio` those of
     mjOption, but for three: `start` is the initial qpos, shape (nq,), or qpos and qvel, (nq + nv,),
     as `Trace.last` has them; `section` has height, wall, segment length and width of the fingers
-    [m], shape (finger, 4), with the effect `neo_hookean` or the surface "hull", None without; and
+    [m], shape (finger, 4), with the effect `neo_hookean` or the surface "hull", None without;
+    `threshold` has the numbers of `morphology.thresholds`, with the effect `lateral_threshold`; and
     `constants` are the world's numbers with the trial's factors, from which engines take what
     MuJoCo has no field for: limits, the cost's window, and friction by pair of bodies.
     """
@@ -62,6 +63,7 @@ class ModelFields(NamedTuple):
     start: jax.Array
     constants: Constants
     section: jax.Array | None = None
+    threshold: jax.Array | None = None
 
     @property
     def qpos(self) -> jax.Array:
@@ -77,7 +79,7 @@ class ModelFields(NamedTuple):
     @property
     def of_model(self) -> dict[str, jax.Array]:
         """The fields of mjModel by name, those of its mjOption as "opt.name"."""
-        others, options = ("start", "section", "constants"), ("gravity", "impratio")
+        others, options = ("start", "section", "threshold", "constants"), ("gravity", "impratio")
         fields = {k: v for k, v in self._asdict().items() if k not in others}
         return {f"opt.{k}" if k in options else k: v for k, v in fields.items()}
 
@@ -168,6 +170,11 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         start=_start(scene, params, trial, rest),
         constants=scene.constants(),
         section=_section(scene, params),
+        threshold=(
+            morphology.thresholds(scene.hand, params, beam, lay.links)
+            if scene.effects.lateral_threshold
+            else None
+        ),
     )
 
 

@@ -7,7 +7,7 @@ of shear modulus G that the hoop threads hold in plane strain, hence the modulus
 they model the actuator of Deimel and Brock (2016) that the paper refers to as [2].
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -148,6 +148,65 @@ def joint_springs(
     by_axis = {"bend": beams.bending, "lateral": beams.lateral, "twist": beams.torsion}
     stiffness = numpy.stack([by_axis[name] / (params.length / links) for name in axes], -1)
     return stiffness, hand.material.damping_time * stiffness
+
+
+SLACK = 0.01
+"""Strain of the bottom layer over which one of its edges goes slack as a finger bends sideways
+[ours]: a fabric that could not stretch at all would let go at once."""
+
+
+def thresholds(hand: Hand, params: Params, beams: Beam, links: int) -> jax.Array:
+    """Numbers of the moment with which a pressurised finger resists bending sideways.
+
+    The bottom layer resists tension only.  Bent sideways by lambda it is taut at one edge, so that
+    a fibre at height y and z from the middle has the strain kappa y - |lambda| (w/2 +- z), kappa
+    the finger's bending, and the chamber of area A_c shrinks by A_c |lambda| w/2.  What pressure
+    and walls store is then, beside the two springs of `beam`,
+      |lambda| w/2 T,  T = p A_c - 4 G kappa S,
+    with S = A h/2 the walls' moment of area about the bottom layer: T is the layer's tension, and
+    nothing bends sideways below the moment T w/2.  See `threshold_moments`.
+
+    Args:
+      hand: The hand.
+      params: Parameters.
+      beams: Of `finger_beams`.
+      links: Links of a finger.
+
+    Returns:
+      Of each finger's joints the moment per pressure A_c w/2 [m^3], its loss by the bend angle
+      4 G S w/2 / l [N m/rad], and the angle of `SLACK` [rad], shape (finger, 3).
+    """
+    numpy = beams.bending.__array_namespace__()
+    height, width = params.height, numpy.asarray(hand.section.width)
+    segment = params.length / links
+    area = beams.line_density / hand.material.density
+    loss = 4 * hand.material.shear_modulus * area * height / 2 * width / 2 / segment
+    angle = SLACK / width * segment
+    return numpy.stack([beams.moment_per_pressure * width / height, loss, angle], -1)
+
+
+def threshold_moments(numbers: tuple, pressure: Any, bend: Any, lateral: Any) -> tuple[Any, Any]:
+    """What the bottom layer's tension adds to a joint, see `thresholds`.
+
+    The stored energy P (sqrt(q^2 + q_0^2) - q_0) has P = max(T w/2, 0), q the lateral angle and q_0
+    that of `SLACK`.  Its moment on the lateral hinge is that of a spring P / sqrt(q^2 + q_0^2)
+    through zero, the stiffest of the springs that never overshoot; what it loses by the bend angle
+    bends the finger further.
+
+    Args:
+      numbers: The three of `thresholds`.
+      pressure: Of the chamber [Pa].
+      bend: Bend angle [rad].
+      lateral: Lateral angle [rad].
+
+    Returns:
+      Stiffness of the lateral hinge [N m/rad] and moment on the bend hinge [N m].
+    """
+    per_pressure, loss, angle = numbers
+    moment = per_pressure * pressure - loss * bend
+    taut = moment > 0
+    length = lateral.__array_namespace__().sqrt(lateral**2 + angle**2)
+    return moment * taut / length, loss * (length - angle) * taut
 
 
 def softening(

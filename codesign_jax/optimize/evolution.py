@@ -1,12 +1,14 @@
-"""evosax's CMA-ES, particle swarm and random search as optimisers of a design space.
+"""evosax's CMA-ES, OpenAI-ES, particle swarm and random search as optimisers of a design space.
 
 The strategies work on unit coordinates, 0 at a parameter's lower and 1 at its upper bound. They are
 told the points that they asked for, while what is evaluated is their mirror image inside the bounds
 with the constraint applied, so that they see a periodic landscape without walls (as in Hansen's
 pycma, ``BoundTransform``).
 
-Sources: Hansen (2016), "The CMA evolution strategy: a tutorial", arXiv:1604.00772; Kennedy and
-Eberhart (1995), "Particle swarm optimization"; Lange (2022), "evosax", arXiv:2212.04180.
+Sources: Hansen (2016), "The CMA evolution strategy: a tutorial", arXiv:1604.00772; Salimans et al.
+(2017), "Evolution strategies as a scalable alternative to reinforcement learning",
+arXiv:1703.03864; Kennedy and Eberhart (1995), "Particle swarm optimization"; Lange (2022),
+"evosax", arXiv:2212.04180.
 """
 
 import dataclasses
@@ -15,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space, reflect
@@ -36,8 +39,12 @@ STREAM_TELL = 0x74656C6C
 STREAM_START = 0x73747274
 """Stream of a swarm's first positions ("strt")."""
 
-LEAST = {"cma-es": 2, "pso": 1, "random": 1}
+LEAST = {"cma-es": 2, "open-es": 2, "pso": 1, "random": 1}
 """The strategies, and the fewest particles that each can rank."""
+OPEN_SIGMA = 0.15
+"""Standard deviation of OpenAI-ES as a fraction of the parameter range; docs/notes/search.md."""
+GAIN = 2 / 3
+"""Share of the way to the minimum of a bowl that the mean of OpenAI-ES goes in an episode."""
 EVOSAX = tuple(LEAST)
 """Names of the optimisers that are evosax's."""
 
@@ -55,10 +62,10 @@ class Evolution:
     Attributes:
         keeps_best: True: the state's particles are the best so far; see ``Optimizer.keeps_best``.
         space: Bounds and constraint of the parameters.
-        name: "cma-es", from the seed particle; "pso", a swarm over the whole box that the seed
-            particle attracts first; "random", uniform in the box.
-        sigma: First standard deviation of CMA-ES as a fraction of the parameter range; pycma's
-            documentation advises a quarter of the domain.
+        name: "cma-es" and "open-es", from the seed particle; "pso", a swarm over the whole box that
+            the seed particle attracts first; "random", uniform in the box.
+        sigma: First standard deviation of CMA-ES, and that of OpenAI-ES, as a fraction of the
+            parameter range; pycma's documentation advises a quarter of the domain.
     """
 
     keeps_best = True
@@ -92,6 +99,8 @@ class Evolution:
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST[self.name]:
             raise ValueError(f"{num_particles=}: {self.name} needs at least {LEAST[self.name]}")
+        if self.name == "open-es" and num_particles % 2:
+            raise ValueError(f"{num_particles=}: open-es draws pairs, and needs an even number")
         particles = jnp.tile(seed, (num_particles, 1))
         state = State(particles, jnp.zeros((), jnp.int32), key)
         memory = {
@@ -123,9 +132,7 @@ class Evolution:
         assert state.memory is not None
         cost = check_told(state, population, cost)
         ranked = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
-        # CMA-ES knows ranks only. evosax gives equal costs a common weight below their share, which
-        # shrinks the steps on a plateau such as "every grasp is lost"; rows are a fair draw.
-        told = jnp.argsort(jnp.argsort(ranked)) if self.name == "cma-es" else ranked
+        told = fitness(self.name, ranked)
         strategy, (unit, asked) = self._strategy(state), self._asked(state, mask)
         key = episode_key(state, STREAM_TELL)
         new, _ = strategy.algorithm.tell(key, unit, told.astype(unit.dtype), asked, strategy.params)
@@ -179,7 +186,8 @@ class Strategy(NamedTuple):
 @functools.lru_cache(maxsize=32)
 def build(name: str, particles: int, width: int, sigma: float, dtype: str) -> Strategy:
     """A strategy; one for each size, as JAX tells them apart by identity."""
-    from evosax.algorithms import CMA_ES, PSO, RandomSearch
+    import optax
+    from evosax.algorithms import CMA_ES, PSO, Open_ES, RandomSearch
 
     # Its numbers must not be tracers of the program that happens to ask for it first.
     with jax.ensure_compile_time_eval():
@@ -187,6 +195,9 @@ def build(name: str, particles: int, width: int, sigma: float, dtype: str) -> St
         if name == "random":
             uniform = functools.partial(jax.random.uniform, shape=(width,), dtype=dtype)
             algorithm = RandomSearch(particles, point, uniform)
+        elif name == "open-es":
+            std, descent = jnp.asarray(sigma, dtype), optax.sgd(learning_rate(sigma, width))
+            algorithm = Open_ES(particles, point, optimizer=descent, std_schedule=lambda _: std)
         else:
             algorithm = (CMA_ES if name == "cma-es" else PSO)(particles, point)
         params = algorithm.default_params
@@ -195,7 +206,34 @@ def build(name: str, particles: int, width: int, sigma: float, dtype: str) -> St
         return Strategy(algorithm, params)
 
 
+def fitness(name: str, cost: jax.Array) -> jax.Array:
+    """What a strategy is told of costs, shape (particle,).
+
+    CMA-ES knows ranks only.  evosax gives equal costs a common weight below their share, which
+    shrinks the steps on a plateau such as "every grasp is lost"; rows are a fair draw.
+    """
+    return jnp.argsort(jnp.argsort(cost)) if name == "cma-es" else cost
+
+
+def learning_rate(sigma: float, width: int) -> float:
+    """Step of OpenAI-ES along its gradient, ``sqrt(2 pi width) GAIN sigma**2``.
+
+    The strategy's gradient is the mean of ``rank z / sigma`` over draws ``mean + sigma z``, with
+    ranks from -1/2 to 1/2.  At the distance ``d`` from the minimum of a bowl, ``d`` far below
+    ``sigma``, costs are ``2 d sigma z_1`` beside ``sigma**2 |z|**2``, whose standard deviation is
+    ``sigma**2 sqrt(2 width)``; a rank has the correlation ``sqrt(2 / width) d / sigma`` with the
+    draw along ``d``, and their mean product is that over ``2 sqrt(pi)``.
+
+    Args:
+        sigma: Standard deviation of the draws.
+        width: Number of parameters.
+    """
+    return float(np.sqrt(2 * np.pi * width) * GAIN * sigma**2)
+
+
 def arrays(state: Any) -> dict[str, jax.Array]:
     """A strategy's state as arrays by name; their types do not depend on where they come from."""
-    fields = {f.name: jnp.asarray(getattr(state, f.name)) for f in dataclasses.fields(state)}
+    fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
+    # What has no arrays, such as the state of a plain gradient descent, never changes.
+    fields = {n: jnp.asarray(value) for n, value in fields.items() if jax.tree.leaves(value)}
     return {name: jax.lax.convert_element_type(v, v.dtype) for name, v in fields.items()}

@@ -3,20 +3,28 @@
 import difflib
 import importlib.util
 from collections.abc import Callable, Mapping
+from functools import partial
 
 from codesign_jax.optimize import screened
 from codesign_jax.optimize.bounds import Space
-from codesign_jax.optimize.evolution import EVOSAX, LEAST, Evolution
+from codesign_jax.optimize.evolution import EVOSAX, LEAST, OPEN_SIGMA, Evolution
 from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Optimizer
-from codesign_jax.optimize.screened import ScreenedCMA
+from codesign_jax.optimize.screened import Screened
 
-DEFAULT = "screened-cma-es"
+DEFAULT = "screened-es"
 """The optimiser of a run that names no other."""
 PAPER = "particle-filter"
 """The paper's optimiser."""
 
-OWN: Mapping[str, Callable[[Space], Optimizer]] = {DEFAULT: ScreenedCMA, PAPER: ParticleFilter}
+SCREENED = (DEFAULT, "screened-cma-es")
+"""The optimisers that screen random designs first."""
+
+OWN: Mapping[str, Callable[[Space], Optimizer]] = {
+    DEFAULT: Screened,
+    "screened-cma-es": partial(Screened, strategy="cma-es"),
+    PAPER: ParticleFilter,
+}
 """The optimisers that this package implements itself, by name: what makes each over a space."""
 
 NAMES = (*OWN, *EVOSAX)
@@ -36,7 +44,9 @@ def make_optimizer(name: str, space: Space) -> Optimizer:
     """
     if name not in NAMES:
         raise ValueError(problem(name))
-    return Evolution(space, name) if name in EVOSAX else OWN[name](space)
+    if name in EVOSAX:
+        return Evolution(space, name, **({"sigma": OPEN_SIGMA} if name == "open-es" else {}))
+    return OWN[name](space)
 
 
 def problem(name: str, num_particles: int | None = None) -> str | None:
@@ -50,9 +60,11 @@ def problem(name: str, num_particles: int | None = None) -> str | None:
         near = difflib.get_close_matches(name, NAMES, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         return f"unknown optimizer {name!r}; {hint}Valid: {', '.join(NAMES)}"
-    if name in (DEFAULT, *EVOSAX) and importlib.util.find_spec("evosax") is None:
+    if name in (*SCREENED, *EVOSAX) and importlib.util.find_spec("evosax") is None:
         return f"{name} needs evosax: pip install evosax"
-    least = screened.LEAST if name == DEFAULT else LEAST.get(name, 1)
+    least = screened.LEAST if name in SCREENED else LEAST.get(name, 1)
     if num_particles is not None and num_particles < least:
         return f"{name} ranks its particles: it needs at least {least}, got {num_particles}"
+    if name == "open-es" and num_particles is not None and num_particles % 2:
+        return f"{name} draws pairs of particles: it needs an even number, got {num_particles}"
     return None

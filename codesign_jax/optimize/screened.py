@@ -1,15 +1,20 @@
-"""Random designs first, then CMA-ES from the best, and the average of its means as the answer.
+"""Random designs first, then an evolution strategy from the best, whose means are averaged.
 
 Grasps are noisy: a design that loses none of three objects may lose one in ten.  So no single
-particle is believed.  CMA-ES recombines the better half of a population, and its mean moves where
-particles keep their objects on the whole; the average of these means over the episodes, recent ones
-weighing more, has less noise still, and no trial chose it.  Each average is simulated as particle 0
-of the next episode, and the final test takes the last ones.
+particle is believed.  The mean of an evolution strategy moves where particles keep their objects on
+the whole; the average of these means over the episodes, recent ones weighing more, has less noise
+still, and no trial chose it.  Each average is simulated as particle 0 of the next episode, and the
+final test takes the last ones.
 
-Sources: Hansen (2016), "The CMA evolution strategy: a tutorial", arXiv:1604.00772, by evosax;
-Shamir and Zhang (2013), "Stochastic gradient descent for non-smooth optimization",
-arXiv:1212.1824, section 4 (polynomial-decay averaging).  docs/notes/search.md has what each part is
-worth.
+The strategy is OpenAI's.  Its draws come in mirrored pairs and designs of equal cost have equal
+weight, so that its mean stays where it is while all particles keep all of their objects; that of
+CMA-ES wanders then, as it follows whichever of them stand first.
+
+Sources: Salimans et al. (2017), "Evolution strategies as a scalable alternative to reinforcement
+learning", arXiv:1703.03864, and Hansen (2016), "The CMA evolution strategy: a tutorial",
+arXiv:1604.00772, both by evosax; Shamir and Zhang (2013), "Stochastic gradient descent for
+non-smooth optimization", arXiv:1212.1824, section 4 (polynomial-decay averaging).
+docs/notes/search.md has what each part is worth.
 """
 
 import dataclasses
@@ -21,7 +26,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space, reflect
-from codesign_jax.optimize.evolution import Strategy, arrays, build
+from codesign_jax.optimize.evolution import OPEN_SIGMA, Strategy, arrays, build, fitness
 from codesign_jax.optimize.protocol import (
     Info,
     State,
@@ -41,27 +46,34 @@ STREAM_TELL = 0x636D6174
 """Stream of its draws in ``tell`` ("cmat")."""
 LEAST = 3
 """Fewest particles: the average, and two for the strategy to rank."""
+STRATEGIES = {"open-es": OPEN_SIGMA, "cma-es": 0.2}
+"""The strategies, and the first standard deviation of each as a fraction of the parameter range."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
-class ScreenedCMA:
-    """CMA-ES from the best of random designs; its answer is an average of means.
+class Screened:
+    """An evolution strategy from the best of random designs; its answer is an average of means.
 
     The first episodes simulate random designs, uniform in the parameters that the schedule opens,
     and the next ones the best of these again, in other trials: a start in the wrong place costs
     more than they do.  Later ones simulate the average so far, as particle 0, and draws of the
-    strategy.  The state's particles are the averages of the last episodes, newest first, and before
-    there are enough of them the best random designs behind these.  When a schedule opens other
-    parameters, strategy and average start anew at particle 0.
+    strategy.  The first particles of the state are the averages of the last episodes, newest first,
+    before there are enough of them the best random designs behind these; all others are the newest.
+    When a schedule opens other parameters, strategy and average start anew at particle 0.
 
     Attributes:
         keeps_best: True: the final test counts new trials only; see ``Optimizer.keeps_best``.
         screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
         space: Bounds and constraint of the parameters.
+        strategy: One of ``STRATEGIES``. With "open-es", whose draws come in pairs, the last one of
+            an even number of particles is the strategy's mean.
         screening: Episodes of random designs.
         retests: Episodes that simulate the best of them again.
-        sigma: First standard deviation of CMA-ES as a fraction of the parameter range.
+        sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
+            that of ``STRATEGIES``.
+        finalists: Averages that the final test takes. Older ones are worse by more than a dozen
+            trials show, so that a test of many would choose one of them by luck.
         recency: After ``t`` episodes of the strategy its mean has weight ``recency / (t + recency
             - 1)`` in the average: 1 is the plain average, more forgets the first means sooner.
     """
@@ -70,9 +82,11 @@ class ScreenedCMA:
     screens = True
 
     space: Space
+    strategy: str = dataclasses.field(default="open-es", metadata={"static": True})
     screening: int = dataclasses.field(default=3, metadata={"static": True})
     retests: int = dataclasses.field(default=2, metadata={"static": True})
-    sigma: float = dataclasses.field(default=0.2, metadata={"static": True})
+    sigma: float = dataclasses.field(default=0.0, metadata={"static": True})
+    finalists: int = dataclasses.field(default=3, metadata={"static": True})
     recency: float = dataclasses.field(default=4.0, metadata={"static": True})
 
     def __post_init__(self) -> None:
@@ -81,8 +95,12 @@ class ScreenedCMA:
         Raises:
             ValueError: If one of them is out of its range.
         """
-        if not (min(self.screening, self.retests + 1, self.recency) >= 1 and self.sigma > 0):
-            raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma > 0: {self}")
+        if self.strategy not in STRATEGIES:
+            raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
+        least = min(self.screening, self.retests + 1, self.finalists, self.recency)
+        if not (least >= 1 and self.sigma >= 0):
+            needed = "screening, finalists, recency >= 1, retests >= 0 and sigma >= 0"
+            raise ValueError(f"need {needed}: {self}")
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0; see ``Optimizer.init``.
@@ -95,7 +113,7 @@ class ScreenedCMA:
         """
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST:
-            raise ValueError(f"{num_particles=}: screened-cma-es needs at least {LEAST}")
+            raise ValueError(f"{num_particles=}: a screened search needs at least {LEAST}")
         state = State(jnp.tile(seed, (num_particles, 1)), jnp.zeros((), jnp.int32), key)
         memory = {
             "mask": jnp.ones(seed.shape, bool),
@@ -137,12 +155,13 @@ class ScreenedCMA:
         screened = jnp.concatenate([population, state.particles])[best]
         # Later the average that was simulated comes before the earlier ones.
         averages = jnp.concatenate([population[:1], state.particles[:-1]])
+        averages = averages.at[self.finalists :].set(population[0])
         unit, asked, memory = self._asked(state, mask)
-        # CMA-ES knows ranks only; rows are a fair draw among equal costs, see `Evolution.tell`.
-        ranks = jnp.argsort(jnp.argsort(ranked[1:])).astype(unit.dtype)
         algorithm, params = self._strategy(state)
+        points = slice(1, 1 + algorithm.population_size)
+        told = fitness(self.strategy, ranked[points]).astype(unit.dtype)
         key = episode_key(state, STREAM_TELL)
-        new, _ = algorithm.tell(key, unit[1:], ranks, asked, params)
+        new, _ = algorithm.tell(key, unit[points], told, asked, params)
         weight = self.recency / (memory["averaged"] + self.recency)
         average = memory["average"] + weight * (new.mean - memory["average"])
         now = {"average": average, "averaged": memory["averaged"] + 1, "strategy": arrays(new)}
@@ -150,8 +169,9 @@ class ScreenedCMA:
             "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
             "cost": jnp.where(screens, costs[best], state.memory["cost"]),
         }
-        last = jnp.minimum(jnp.arange(len(cost)), 1)
-        copied = jnp.where(screens, jnp.where(best < len(cost), best, -1), -last)
+        rows = jnp.arange(len(cost))
+        copied = jnp.where((rows == 0) | (rows >= self.finalists), 0, -1)
+        copied = jnp.where(screens, jnp.where(best < len(cost), best, -1), copied)
         particles = jnp.where(screens, screened, averages)
         next_state = State(particles, state.episode + 1, state.key, following)
         return next_state, summarize(cost, jnp.ones_like(cost), copied.astype(jnp.int32))
@@ -175,7 +195,8 @@ class ScreenedCMA:
             **memory["strategy"]
         )
         points, strategy = algorithm.ask(episode_key(state, STREAM_MOVE), strategy, params)
-        return jnp.concatenate([memory["average"][None], points]), strategy, memory
+        rest = jnp.tile(strategy.mean, (len(state.particles) - 1 - len(points), 1))
+        return jnp.concatenate([memory["average"][None], points, rest]), strategy, memory
 
     def _start(self, state: State) -> dict[str, Any]:
         """Average and strategy as they start, at particle 0."""
@@ -191,5 +212,7 @@ class ScreenedCMA:
         return reflect(low + unit * (high - low), low, high)
 
     def _strategy(self, state: State) -> Strategy:
-        n, width = state.particles.shape
-        return build("cma-es", n - 1, width, self.sigma, str(state.particles.dtype))
+        (n, width), dtype = state.particles.shape, str(state.particles.dtype)
+        count = n - 1 if self.strategy == "cma-es" else 2 * ((n - 1) // 2)
+        sigma = self.sigma or STRATEGIES[self.strategy]
+        return build(self.strategy, count, width, sigma, dtype)

@@ -81,6 +81,7 @@ def cost_evolution(history: History) -> go.Figure:
     )
     figure.add_hline(CONVERGED_COST, line={"dash": "dash", "width": 1})
     figure.update_layout(xaxis_title="episode", yaxis_title="cost", height=380, **_LAYOUT)
+    figure.update_xaxes(dtick=_step(episodes))
     return figure
 
 
@@ -144,6 +145,7 @@ def parameters(history: History, space: DesignSpace, chosen: np.ndarray) -> go.F
         legend={"orientation": "h", "y": 1.0 + 60 / (130 + 190 * rows), "yanchor": "bottom"}
     )
     figure.update_layout(margin_t=90)
+    figure.update_xaxes(dtick=_step(2 * len(values)))  # small axes
     return figure
 
 
@@ -213,4 +215,12 @@ def failures(status: np.ndarray) -> go.Figure:
             figure.add_bar(x=number, y=count, name=bit.name)
     figure.update_layout(barmode="stack", height=300, showlegend=True, **_LAYOUT)
     figure.update_layout(xaxis_title="episode", yaxis_title="trials")
+    figure.update_xaxes(dtick=_step(len(status)))
     return figure
+
+
+def _step(episodes: int) -> int:
+    """Episodes between two ticks of an axis: whole ones, and ten ticks at most or so."""
+    rough = max(episodes / 10, 1)
+    steps = (digit * 10**power for power in itertools.count() for digit in (1, 2, 5))
+    return next(step for step in steps if step >= rough)

@@ -1,12 +1,12 @@
 """The part of a report that shows the chosen design and how its trials ended."""
 
+import jax
 import numpy as np
 
 from codesign_jax.report import markup, verdicts
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.statistics import wilson
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.types import Outcome
 
 
 def design(run: Run) -> str:
@@ -26,6 +26,7 @@ def design(run: Run) -> str:
     parts = [
         markup.paragraph(trials, "key"),
         *(markup.paragraph(words, "warning") for words in verdicts.warnings(judged)),
+        *(markup.paragraph(words, "note") for words in verdicts.solver(judged.outcomes)),
         markup.paragraph(note + "More fresh trials: ", "note", again),
         _by_object(run, judged),
         _parameters(run),
@@ -42,7 +43,8 @@ def _by_object(run: Run, judged: Judged) -> str:
     for k, name in enumerate(names):
         own = turns % len(names) == k
         if own.any():
-            found = verdicts.tally(Outcome(*(np.asarray(v)[own] for v in judged.outcomes)))
+            mine = jax.tree.map(lambda v, own=own: np.asarray(v)[own], judged.outcomes)
+            found = verdicts.tally(mine)
             share = wilson(found.kept, found.total)
             span = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
             rows.append((name, f"{found.kept} of {found.total}", span, *found[1:]))

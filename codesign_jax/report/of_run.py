@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from codesign_jax import types
+import jax
+
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings
 from codesign_jax.runs.choice import Chosen
@@ -49,5 +50,5 @@ class Run(NamedTuple):
     def history(self) -> History:
         """Reports of the finished episodes."""
         h, done = self.record.history, self.record.done
-        trials = types.Outcome(*(v[:done] for v in h.trials))
+        trials = jax.tree.map(lambda v: v[:done], h.trials)
         return History(h.population[:done], trials, *(v[:done] for v in h[2:]))

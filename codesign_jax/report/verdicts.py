@@ -12,7 +12,7 @@ import numpy as np
 from codesign_jax import codesign, cost, runs
 from codesign_jax.report import statistics
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Status, failed
+from codesign_jax.types import Outcome, failed
 
 RELIABLE = 0.95
 """Share of all trials that a successful design keeps at least: the mean cost alone lets a design
@@ -50,11 +50,8 @@ class Tally(NamedTuple):
 
 def tally(outcomes: Outcome) -> Tally:
     """Counts trials, given as arrays of any shape."""
-    status, kept = np.asarray(outcomes.status), _kept(outcomes)
-    bad = failed(status)
-    stuck = bad & ((status & Status.STUCK) != 0)
-    numbers = (kept, ~kept & ~bad, stuck, bad & ~stuck)
-    return Tally(*(int(part.sum()) for part in numbers))
+    ends = codesign.verdicts(outcomes).ravel()
+    return Tally(*np.bincount(ends, minlength=len(codesign.VERDICTS)).tolist())
 
 
 def success(scene: Scene, outcomes: Outcome) -> Any:
@@ -72,8 +69,7 @@ def success(scene: Scene, outcomes: Outcome) -> Any:
 
 
 def _kept(outcomes: Outcome) -> np.ndarray:
-    good = ~failed(np.asarray(outcomes.status))
-    return good & (np.asarray(outcomes.cost) < codesign.SUCCESS_COST)
+    return codesign.verdicts(outcomes) == codesign.VERDICTS.index("kept")
 
 
 class Judged(NamedTuple):
@@ -114,7 +110,7 @@ class Judged(NamedTuple):
         """Whether that is a success."""
         if success(self.scene, self.outcomes):
             limit = codesign.SUCCESS_COST
-            return f"a success: at least {_RELIABLE} kept, mean cost below {limit}"
+            return f"a success in these trials: at least {_RELIABLE} kept, mean cost below {limit}"
         if _kept(self.outcomes).mean() < RELIABLE:
             return f"no success: less than {_RELIABLE} kept"
         return f"no success: the mean cost is not below {codesign.SUCCESS_COST}"
@@ -145,6 +141,28 @@ def mean_cost(scene: Scene, outcomes: Outcome) -> str:
     if scene.cost.failure == "exclude":
         return f"{mean} without the {count} that failed"
     return f"{mean} with {scene.cost.maximum:g} for each of the {count} that failed"
+
+
+def solver(outcomes: Outcome) -> list[str]:
+    """Says in a line how often the solver stopped at its limit; no line if it never did.
+
+    Args:
+      outcomes: Outcomes, arrays of any shape.
+    """
+    shares, residuals = (_told(v) for v in (outcomes.capped, outcomes.residual))
+    if not shares.any():
+        return []
+    text = f"solver: {100 * shares.mean():.2g} % of the steps ended at the limit of iterations"
+    if residuals.size:
+        middle, most = np.median(residuals), residuals.max()
+        text += f"; largest residual of a trial: median {middle:.2g}, most {most:.2g} weights"
+    return [text]
+
+
+def _told(values: Any) -> np.ndarray:
+    """The numbers among values; none for None."""
+    numbers = np.ravel(np.asarray(values, float))
+    return numbers[np.isfinite(numbers)]
 
 
 def warnings(judged: Judged) -> list[str]:

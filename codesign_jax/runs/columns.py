@@ -87,6 +87,11 @@ TABLES = {
             f"{Status(WARNINGS).name} is a warning, every other bit makes the trial a failed one",
             "first_bad_step": "time step at which the trial failed, from 0; empty if it did "
             "not fail, and for STUCK, which is told by the end of the grasp",
+            "steps_at_limit": "share of the steps up to the verdict in which the solver stopped at "
+            "its limit of iterations; empty if it is not known, as of engine mjx",
+            "residual": "largest residual of such a step: the forces that its last iteration found "
+            "unbalanced, in weights of palm and object (`Outcome.residual`), 0 without such a "
+            "step; empty if it is not known, as of engines mujoco and mjx",
         },
     ),
     "tests.csv": Table(
@@ -171,9 +176,13 @@ GRASPS = {
     "lost_time_s": ("float32", "s", TABLES["trials.csv"].columns["lost_time_s"]),
     "status": ("name", "", TABLES["trials.csv"].columns["status"]),
     "first_bad_step": ("int32", "", TABLES["trials.csv"].columns["first_bad_step"]),
+    "steps_at_limit": ("float32", "", TABLES["trials.csv"].columns["steps_at_limit"]),
+    "residual": ("float32", "", TABLES["trials.csv"].columns["residual"]),
 }
 """Columns of the Parquet file of `codesign sample`: type, unit and meaning, by name; those of the
 design follow."""
+MAY_BE_EMPTY = ("first_bad_step", "steps_at_limit", "residual")
+"""Those of `GRASPS` whose values may be missing."""
 
 MORE[REFERENCE] = Table(
     "a fresh trial of the chosen design at accuracy `reference`; `codesign evaluate --out` writes "

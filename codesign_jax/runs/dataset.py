@@ -2,7 +2,7 @@
 
 A row follows from the question (scene, design space, seed, ...) and the indices of design and
 trial, but for its outcome.  So the folder beside the unfinished file holds outcomes alone, a shard
-for each call of the engine, sixteen bytes a grasp; the rest is drawn again when the file is
+for each call of the engine, a few bytes a grasp; the rest is drawn again when the file is
 written, shard by shard.
 """
 
@@ -21,10 +21,10 @@ import jax
 import numpy as np
 
 from codesign_jax import archives, files, sampling, sources
-from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.provenance import environment
 from codesign_jax.runs import parquet
-from codesign_jax.runs.columns import DESIGNS, GRASPS
+from codesign_jax.runs.columns import DESIGNS, GRASPS, MAY_BE_EMPTY
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.parquet import Column, Names
 from codesign_jax.runs.scene_files import contents, scene_texts
@@ -33,13 +33,12 @@ from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import SceneError
-from codesign_jax.types import Outcome, Status, failed
+from codesign_jax.types import Outcome
 
 QUESTION = "question.json"
 """File of the folder of shards that says what they are of."""
 ROWS = 1 << 16
 """About as many rows are written at once: a row group of the file."""
-VERDICTS = ["kept", "lost", "stuck", "failed"]
 _LOCK, _KEY = ".lock", "key"
 _NAMES = ("engine", "preset", "trials", "seed", "chunk")
 _WORDS = {"chunk": "designs of a call (by --chunk)"}
@@ -134,7 +133,7 @@ class Shards:
 
     def save(self, shard: int, found: Outcome) -> None:
         """Keeps outcomes of a shard, arrays of shape (design, trial)."""
-        archives.save(self.path(shard), {_KEY: self._key, **found._asdict()})
+        archives.save(self.path(shard), {_KEY: self._key, **found._asdict()}, compressed=True)
 
     def load(self, shard: int) -> Outcome | None:
         """Outcomes of a shard; None if they are not there, or damaged."""
@@ -237,18 +236,10 @@ def open_shards(path: Path, question: Question) -> Iterator[Shards]:
         yield Shards(folder, question.key)
 
 
-def verdicts(found: Outcome) -> np.ndarray:
-    """How trials ended, indices of `VERDICTS`; of any shape."""
-    status = np.asarray(found.status)
-    lost = np.asarray(found.cost) >= SUCCESS_COST
-    bad = np.where(status & Status.STUCK, 2, 3)
-    return np.where(failed(status), bad, lost.astype(int))
-
-
 def columns(space: DesignSpace) -> dict[str, Column]:
     """The columns of a file, by name."""
     found = {
-        name: Column(kind, text, {"unit": unit} if unit else {}, nullable=name == "first_bad_step")
+        name: Column(kind, text, {"unit": unit} if unit else {}, nullable=name in MAY_BE_EMPTY)
         for name, (kind, unit, text) in GRASPS.items()
     }
     names = zip(design_columns(space), space.names, space.units, strict=True)
@@ -274,11 +265,13 @@ def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[s
         "trial": np.arange(question.trials),
         "object": Names(trials.shape, [s.name for s in question.scene.objects.object]),
         **noise_values(trials),
-        "verdict": Names(verdicts(found), VERDICTS),
+        "verdict": Names(verdicts(found), [*VERDICTS]),
         "cost": found.cost,
         "lost_time_s": found.lost_time,
         "status": Names(index.reshape(status.shape), [status_names(s) for s in texts]),
         "first_bad_step": np.ma.masked_less(bad_step, 0),
+        "steps_at_limit": np.ma.masked_invalid(np.asarray(found.capped)),
+        "residual": np.ma.masked_invalid(np.asarray(found.residual)),
     }
     designs = question.space.in_units(drawn.designs)
     own = design_columns(question.space)

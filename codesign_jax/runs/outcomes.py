@@ -45,7 +45,9 @@ def load(path: Path, key: str) -> tuple[Outcome | None, str]:
     try:
         arrays = archives.load(path)
         why = archives.refusal(arrays, key)
-        return None if why else Outcome(*(arrays[name] for name in Outcome._fields)), why
+        if why:
+            return None, why
+        return Outcome(**{name: arrays[name] for name in Outcome._fields if name in arrays}), ""
     except FileNotFoundError:
         return None, ""
     except OSError as error:

@@ -58,7 +58,12 @@ def empty_history(settings: Settings, num_parameters: int) -> History:
     return History(
         population=np.zeros((e, n, num_parameters), real),
         trials=Outcome(
-            cost=trials(real), status=trials(whole), lost_time=trials(real), bad_step=trials(whole)
+            cost=trials(real),
+            status=trials(whole),
+            lost_time=trials(real),
+            bad_step=trials(whole),
+            capped=trials(real),
+            residual=trials(real),
         ),
         cost=np.zeros((e, n), real),
         weight=np.zeros((e, n), real),
@@ -142,14 +147,20 @@ def from_arrays(arrays: dict) -> Record:
         key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
         memory = jax.tree.map(jnp.asarray, s.get("memory"))
         state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
-        test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
+        test = _outcomes(jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
         start = Start(**arrays["start"]) if "start" in arrays else None
-        return Record(state, History(**(h | {"trials": Outcome(**h["trials"])})), test, start)
+        return Record(state, History(**(h | {"trials": _outcomes(h["trials"])})), test, start)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RunError(
             f"its checkpoints hold other arrays than this version of codesign-jax has ({error}): "
             "use the version that made the run, which provenance.json names"
         ) from error
+
+
+def _outcomes(arrays: dict) -> Outcome:
+    """Outcomes; checkpoints of an older version do not tell how the solver ended."""
+    untold = np.full_like(arrays["cost"], np.nan)
+    return Outcome(**({"capped": untold, "residual": untold} | arrays))
 
 
 def refuse_other(
@@ -176,7 +187,7 @@ def refuse_other(
         "they are of another seed": not np.array_equal(jax.random.key_data(record.state.key), seed),
         f"they are not of {n} particles of {d} parameters": particles != (n, d)
         or history.population.shape != (room, n, d),
-        f"they are not of {t} trials": any(v.shape != (room, n, t) for v in history.trials),
+        f"they are not of {t} trials": any(np.shape(v) != (room, n, t) for v in history.trials),
         f"checkpoint {step} holds episode {record.done}": own != step,
         f"they have {record.done} episodes of {e}": not 0 <= record.done <= min(room, e),
     }

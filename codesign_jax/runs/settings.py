@@ -58,10 +58,10 @@ class Settings:
 
 
 # Particles, trials, episodes and further test trials.  The paper's (sections VI.2 and VI.4), which
-# the optimisers that are compared with the paper's share; and those of the default optimiser, by
+# the optimisers that are compared with the paper's share; and those of the screened searches, by
 # docs/notes/search.md.
 _SIZES = {"2d": (10, 6, 64, 36), "": (60, 6, 128, 72)}
-_DEFAULT_SIZES = {"2d": (12, 3, 24, 12), "": (24, 3, 29, 12)}
+_SCREENED_SIZES = {"2d": (13, 3, 23, 6), "": (25, 3, 30, 6)}
 
 _RANGES = {
     "particles": (1, MAX_PARTICLES),
@@ -89,12 +89,13 @@ def make_settings(
 ) -> Settings:
     """Fills sizes that are not given: those of 2D for "2d", of 23D otherwise.
 
-    They are the paper's, but for the default optimiser, whose particles meet each of the scene's
+    They are the paper's, but for a screened search, whose particles meet each of the scene's
     `objects` once in an episode.
     """
-    by_preset = _DEFAULT_SIZES if optimizer == optimize.DEFAULT else _SIZES
+    screens = optimizer in optimize.SCREENED
+    by_preset = _SCREENED_SIZES if screens else _SIZES
     sizes = by_preset.get(preset, by_preset[""])
-    if optimizer == optimize.DEFAULT:
+    if screens:
         sizes = (sizes[0], max(objects, sizes[1]), *sizes[2:])
     asked = (particles, trials, episodes, test_trials)
     chosen = (s if a is None else a for a, s in zip(asked, sizes, strict=True))

@@ -10,10 +10,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from codesign_jax import files, types
-from codesign_jax.codesign import SUCCESS_COST, FinalTest
+from codesign_jax.codesign import VERDICTS, FinalTest, verdicts
 from codesign_jax.runs.columns import MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
@@ -130,20 +131,14 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
     names, noise = [s.name for s in scene.objects.object], noise_values(trials)
 
     def row(t: int) -> Row:
-        one = Outcome(*(np.asarray(v)[t] for v in outcomes))
-        found = {"trial": t, "object": names[int(trials.shape[t])], "verdict": ended(one)}
-        return found | {name: _number(v[t]) for name, v in noise.items()} | _ending(one)
+        one = jax.tree.map(lambda v: np.asarray(v)[t], outcomes)
+        found = {"trial": t, "object": names[int(trials.shape[t])]}
+        drawn = {name: _number(v[t]) for name, v in noise.items()}
+        return found | drawn | {"verdict": VERDICTS[verdicts(one)]} | _ending(one)
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = (row(t) for t in range(len(outcomes.cost)))
     _replace(path, written([*MORE[REFERENCE].columns], rows))
-
-
-def ended(outcome: Outcome) -> str:
-    """How a trial ended, in a word: kept, lost, stuck or failed; its entries are numbers."""
-    if types.failed(int(outcome.status)):
-        return "stuck" if int(outcome.status) & Status.STUCK else "failed"
-    return "kept" if float(outcome.cost) < SUCCESS_COST else "lost"
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:
@@ -203,7 +198,12 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[Row]:
     for e in span:
         for i, t in np.ndindex(*trials.cost.shape[1:]):
             own = {"episode": e + 1, "particle": i, "trial": t, "object": names[t % len(names)]}
-            yield own | _ending(Outcome(*(v[e, i, t] for v in trials)))
+            yield own | _ending(jax.tree.map(lambda v, at=(e, i, t): v[at], trials))
+
+
+def _told(value: Any) -> str:
+    """A number; empty if it is not one, or none was told."""
+    return "" if value is None or np.isnan(value) else _number(value)
 
 
 def _ending(outcome: Outcome) -> Row:
@@ -214,6 +214,8 @@ def _ending(outcome: Outcome) -> Row:
         "lost_time_s": _number(outcome.lost_time),
         "status": status_names(outcome.status),
         "first_bad_step": bad_step if bad_step >= 0 else "",
+        "steps_at_limit": _told(outcome.capped),
+        "residual": _told(outcome.residual),
     }
 
 

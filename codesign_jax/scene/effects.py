@@ -33,6 +33,10 @@ _PRESCRIBED = (
 
 _SKIN = "its geoms are rigid parts of single bodies"
 
+_IMPEDANCE = "MuJoCo's impedance grows with depth in the elastic force as well"
+
+_SPRINGS = "the springs of its joints are constants of a rollout"
+
 EFFECTS: Mapping[str, Effect] = {
     "lateral_bending": Effect("fingers bend sideways"),
     "twist": Effect("fingers twist about their length"),
@@ -55,9 +59,17 @@ EFFECTS: Mapping[str, Effect] = {
         "of all contacts: none, coulomb, or full with torsion and rolling",
         {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},
     ),
+    "soft_touch": Effect(
+        "damping and friction of a contact grow with its depth, from none at first touch",
+        {"mujoco": {True: _IMPEDANCE}, "mjx": {True: _IMPEDANCE}},
+    ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),
     "neo_hookean": Effect("rubber at large strain: fingers soften as they bend"),
+    "lateral_threshold": Effect(
+        "pressure resists sideways bending up to a moment",
+        {"mujoco": {True: _SPRINGS}, "mjx": {True: _SPRINGS}},
+    ),
     "pressure_dynamics": Effect("chambers fill with a lag and under the supply's limits"),
     "gravity": Effect("everything has weight"),
 }

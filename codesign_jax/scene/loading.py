@@ -158,6 +158,11 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
             f"must be at least two time steps ({2 * h:g} s): "
             "a stiffer contact is unstable (MuJoCo's refsafe)"
         )
+    if scene.effects.lateral_threshold and not scene.effects.lateral_bending:
+        problems.append(
+            f"{where}.effects.lateral_threshold = true resists sideways bending, which "
+            "effects.lateral_bending = false leaves out"
+        )
     if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:
         problems.append(
             f"{where}.phases ends after {scene.end_time:g} s: the number of steps is structure, "

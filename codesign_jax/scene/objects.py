@@ -52,6 +52,20 @@ class Noise:
     hand_mass: float = quantity("", 0, 1, default=0.0)
 
 
+ROBUST = Noise(
+    position=0.01,
+    orientation=10.0,
+    mass=0.15,
+    size=0.1,
+    friction=0.2,
+    stiffness=0.15,
+    hand_mass=0.1,
+)
+"""Noise of `--robust` [ours]: placement and size twice the paper's, mass three times, and what the
+paper keeps: friction, of which two materials differ by more, stiffness as between two castings of
+one silicone, and the masses of fingers and palm."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Table:
     """The plane z = 0 and its friction with the object.

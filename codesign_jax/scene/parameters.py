@@ -20,6 +20,7 @@ import dataclasses
 import functools
 import re
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -169,6 +170,64 @@ class DesignSpace:
             raise schema.SceneError(found)
         unit_slips.hint_at_kilopascals(columns[[row == "pressure" for row in rows]])
 
+    def check(self, designs: np.typing.ArrayLike) -> None:
+        """Checks designs where they come in: they are numbers in SI units, and legal ones.
+
+        Functions that are traced do not; of traced designs only the shape is checked.
+
+        Args:
+          designs: Design vectors [SI], shape (..., parameter).
+
+        Raises:
+          SceneError: If a number is not finite, and see `refuse_unit_slips`. Of designs outside of
+            the bounds or above the pressure limit, which are simulated all the same, a warning is
+            given.
+        """
+        self.refuse_unit_slips(designs)
+        if isinstance(designs, jax.core.Tracer):
+            return
+        rows = np.asarray(designs, float).reshape(-1, self.num_parameters)
+        self._refuse_infinite(rows)
+        units = [UNITS[unit][0] for unit in self.units]
+        problems = self._outside(units, self.low, self.high, rows)
+        if above := self._above_the_limit(rows):
+            problems.append(
+                f"{above} of {len(rows)} designs with a pressure above the limit of the wall, to "
+                "which space.project lowers it"
+            )
+        if problems:
+            text = f"designs that are not legal, simulated all the same: {'; '.join(problems)}"
+            warnings.warn(text, stacklevel=3)
+
+    def _refuse_infinite(self, rows: np.ndarray) -> None:
+        """Refuses numbers that are none, designs of shape (design, parameter) in any units."""
+        bad = ~np.isfinite(rows)
+        names = zip(self.names, bad.any(0), rows.T, bad.T, strict=True)
+        found = [
+            f"{name} = {column[where][0]} is not a finite number"
+            for name, any_bad, column, where in names
+            if any_bad
+        ]
+        if found:
+            raise schema.SceneError(found)
+
+    def _outside(
+        self, units: Sequence[str], low: np.ndarray, high: np.ndarray, rows: np.ndarray
+    ) -> list[str]:
+        """Which parameters are outside of the bounds, all in these units, of rows as above."""
+        ends = zip(self.names, units, low, high, rows.T, strict=True)
+        return [problem for end in ends if (problem := unit_slips.outside(*end))]
+
+    def _above_the_limit(self, rows: np.ndarray) -> int:
+        """How many designs [SI], shape (design, parameter), have a pressure above its limit."""
+        source, start = np.asarray(self.source), _offsets(self.hand)
+        full = np.where(source >= 0, rows[:, np.maximum(source, 0)], np.asarray(self.base))
+        fingers = np.arange(len(self.hand.finger))
+        caps = self.hand.pressure_limit.per_wall * full[:, start["wall"] + fingers]
+        # A pressure at its limit is a legal one, also as a float32.
+        above = full[:, start["pressure"] + fingers] > caps * (1 + 1e-6)
+        return int(above.any(1).sum())
+
     def refuse_population(self, population: np.typing.ArrayLike) -> None:
         """Refuses what are not designs of this space, shape (particle, parameter).
 
@@ -217,16 +276,14 @@ class DesignSpace:
         simulated, though no optimiser proposes it.
 
         Raises:
-          SceneError: If the last axis is not that of the parameters.
+          SceneError: If the last axis is not that of the parameters, or a number is not finite.
         """
         self._refuse_shape(design, "..., ")
         given, scale = np.asarray(design, float), np.asarray(self.scale)
-        ends = zip(self.names, self.units, self.low / scale, self.high / scale, strict=True)
-        columns = given.reshape(-1, self.num_parameters).T
-        found = [
-            unit_slips.outside(*end, column) for end, column in zip(ends, columns, strict=True)
-        ]
-        if words := "; ".join(problem for problem in found if problem):
+        rows = given.reshape(-1, self.num_parameters)
+        self._refuse_infinite(rows)
+        problems = self._outside(self.units, self.low / scale, self.high / scale, rows)
+        if words := "; ".join(problems):
             text = f"design outside of the space's bounds, which is simulated all the same: {words}"
             warnings.warn(text, stacklevel=2)
         return given * scale

@@ -28,9 +28,11 @@ class Effects:
     finger_palm: bool = False
     surface: str = choice("spheres", "hull", default="spheres")
     friction: str = choice("none", "coulomb", "full", default="coulomb")
+    soft_touch: bool = False
     disturb: bool = True
     ungrasp: bool = True
     neo_hookean: bool = False
+    lateral_threshold: bool = False
     pressure_dynamics: bool = False
     gravity: bool = True
 
@@ -122,6 +124,8 @@ class Contact:
       finger_palm_friction: Coulomb coefficient of fingers on the palm, only with
         `effects.finger_palm`.
       finger_palm_stiffness: As `normal_stiffness`, of fingers on the palm.
+      touch_depth: Depth over which damping and friction of a contact grow to their full strength,
+        only with `effects.soft_touch`.
     """
 
     normal_stiffness: float = quantity("N/m", 10, 1e6)
@@ -135,6 +139,7 @@ class Contact:
     finger_finger_friction_ratio: float = quantity("", 0.01, 1000, default=1.0)
     finger_palm_friction: float = quantity("", 0, 5, default=0.8)
     finger_palm_stiffness: float = quantity("N/m", 10, 1e6, default=20e3)
+    touch_depth: float = quantity("m", 1e-6, 0.01, default=0.3e-3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,12 +208,15 @@ class Newton:
       evaluations: Largest number of line-search evaluations of an iteration; where no kernel runs
         a line search has at most six.
       decrement: Relative Newton decrement at which a world has converged, a share of the cost's
-        scale; a step that ends above it sets the bit SOLVER_CAP.
+        scale. A step that ends above it has stopped at the limit of iterations.
+      residual: Residual of such a step, the root of its decrement, above which the trial has the
+        warning SOLVER_CAP; see `Outcome`.
     """
 
     iterations: int = quantity("", 1, 1000, structure=True, default=24)
     evaluations: int = quantity("", 1, 1000, structure=True, default=14)
     decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-6)
+    residual: float = quantity("", 1e-8, 1e8, structure=True, default=0.01)
 
 
 @dataclasses.dataclass(frozen=True)

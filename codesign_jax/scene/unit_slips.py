@@ -55,7 +55,7 @@ def outside(name: str, unit: str, low: float, high: float, values: np.ndarray) -
     """
     slack = 1e-6 * max(abs(low), abs(high))  # bounds that went to SI and back, also as float32
     bad = values[~((values >= low - slack) & (values <= high + slack))]
-    return schema.range_problem(name, float(bad[0]), unit, low, high) if bad.size else None
+    return schema.range_problem(name, _plain(bad[0]), unit, low, high) if bad.size else None
 
 
 def slips(name: str, row: str, values: np.ndarray) -> list[str]:
@@ -65,6 +65,11 @@ def slips(name: str, row: str, values: np.ndarray) -> list[str]:
     outside = values[(values < kind.low - slack) | (values > kind.high + slack)]
     for value in outside.ravel()[:1]:
         if schema.unit_slip(float(value), kind.unit, kind.low, kind.high):
-            problem = schema.range_problem(name, float(value), kind.unit, kind.low, kind.high)
+            problem = schema.range_problem(name, _plain(value), kind.unit, kind.low, kind.high)
             return [f"{problem}; Python takes SI units and radians"]
     return []
+
+
+def _plain(value: float) -> float:
+    """A number as it was most likely written: a float32 as a float has nine more digits."""
+    return float(f"{value:.7g}")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured import StructuredEngine, assembly, coordinates
-from codesign_jax.engines.structured.lanes import Stages, dot
+from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.laws.contact import constraint_update
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.linear.tree import propagate, relative
@@ -95,9 +95,8 @@ def grip(scene: Scene, hand: WorldModel, state: State, ctrl: jax.Array) -> jax.A
       state: Their states before the step, with the accelerations of the step.
       ctrl: Controls of the step, shape (nu, world).
     """
-    run = Stages()
-    problem, velocity = assembly.problem(scene, run, hand, state, ctrl)
-    motion = propagate(run, problem.kin, state.acc)
+    problem, velocity = assembly.problem(scene, hand, state, ctrl)
+    motion = propagate(problem.kin, state.acc)
     found = jnp.zeros(ctrl.shape[1], ctrl.dtype)
     for name, contacts in problem.contacts.items():
         if name.endswith("_object"):

@@ -18,7 +18,6 @@ from scipy.stats import mannwhitneyu
 from codesign_jax import codesign, rollout
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.lanes import Stages
 from codesign_jax.engines.structured.laws import hull, shapes
 from codesign_jax.engines.structured.laws.kinematics import kinematics
 from codesign_jax.engines.structured.world_model import world_constants
@@ -44,7 +43,7 @@ def gaps(scene: Scene, fields: Any, qpos: jax.Array) -> jax.Array:
     """Signed distances of the hull's vertices from the object [m], (vertex, world)."""
     hand = world_constants(scene, fields)
     state = coordinates.reset(scene, fields._replace(start=qpos))
-    kin = kinematics(Stages(), hand, layout(scene).axes, state)
+    kin = kinematics(hand, layout(scene).axes, state)
     point = hull.vertices(scene, hand, kin).point
     local = shapes.in_object(kin.object[:, :, None, None], point)
     return shapes.signed_distance(scene, hand, local)[0].reshape(-1, qpos.shape[0])

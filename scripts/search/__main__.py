@@ -38,12 +38,14 @@ def main(arguments: list[str] | None = None) -> int:
         "--optimizers",
         nargs="+",
         default=[optimize.DEFAULT],
-        help="names, each with changes if wanted: screened-cma-es:sigma=0.25,particles=12,trials=6",
+        help="names, each with changes if wanted: screened-es:sigma=0.2,particles=13,trials=6",
     )
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--budget", type=int, default=2400, help="grasps of a seed, all counted")
     parser.add_argument("--tests", type=int, default=400, help="trials of a recommended design")
     parser.add_argument("--marks", type=int, default=9, help="times at which one is recommended")
+    parser.add_argument("--at", type=int, nargs="+", default=[], help="grasps instead of --marks")
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, help="time after which no step begins")
     parser.add_argument("--chunk", type=int, help="most grasps of a call")
     provenance.add_commit(parser)
@@ -58,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
         case = make_case(name, space, args.preset)
         stem = f"{args.preset}-{name.replace(':', '-').replace('=', '')}"
         how = {"seeds": args.seeds, "budget": args.budget, "tests": args.tests, "chunk": chunk}
-        how["marks"] = args.marks
+        how |= {"marks": args.marks, "at": args.at, "first_seed": args.first_seed}
         study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")
         grasps, start = 0, time.monotonic()
         while not study.finished:
@@ -72,6 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
                 f"{name}: episode {study.done}/{study.marks[-1]}, {rate:.0f} grasps/s", flush=True
             )
         row = study.row() | {"preset": args.preset, "scene": args.scene, "objects": args.objects}
+        row["first_seed"] = args.first_seed
         made = {"provenance": provenance.results(args.commit), "tests": args.tests}
         write_json(args.out / f"{stem}.json", row | made)
         shares = [sum(k >= 0.95 for k in kept) / len(kept) for kept in row["kept"]]

@@ -15,6 +15,27 @@ from scripts.shared import figures, tables
 PAGE, FIGURE = Path("docs/notes/search.md"), Path("docs/figures/search.png")
 
 
+def merged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of one search over other seeds as one row, in the order of their first seeds.
+
+    Raises:
+      ValueError: If they have a seed in common, or recommended at other times.
+    """
+    found: dict[tuple, dict[str, Any]] = {}
+    for row in sorted(rows, key=lambda row: row.get("first_seed", 0)):
+        name = tuple(row.get(n) for n in ("optimizer", "preset", "scene", "objects"))
+        first = row.get("first_seed", 0)
+        if name not in found:
+            found[name] = row | {"next_seed": first + len(row["kept"][-1])}
+            continue
+        whole = found[name]
+        if first < whole["next_seed"] or row["grasps"] != whole["grasps"]:
+            raise ValueError(f"two files of {name} overlap, or have other marks")
+        whole["kept"] = [a + b for a, b in zip(whole["kept"], row["kept"], strict=True)]
+        whole["next_seed"] = first + len(row["kept"][-1])
+    return [*found.values()]
+
+
 def reached(row: dict[str, Any], share: float) -> str:
     """Grasps after which this share of the seeds keeps `RELIABLE`, and stays there."""
     good = np.array([np.mean(np.array(kept) >= RELIABLE) for kept in row["kept"]])
@@ -78,7 +99,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--page", type=Path, default=PAGE)
     parser.add_argument("--figure", type=Path, default=FIGURE)
     args = parser.parse_args(arguments)
-    rows = [json.loads(path.read_text()) for path in sorted(args.folder.glob("*.json"))]
+    rows = merged([json.loads(path.read_text()) for path in sorted(args.folder.glob("*.json"))])
     if not rows:
         print(f"error: {args.folder} has no results of scripts.search", file=sys.stderr)
         return 2

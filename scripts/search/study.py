@@ -6,6 +6,7 @@ the search's; those by which the recommended design is judged do not.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,30 +21,33 @@ from codesign_jax.engines import Engine
 from codesign_jax.optimize import Optimizer, State
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import Outcome, failed
+from codesign_jax.types import Outcome, Trial, failed
 from scripts.shared.output import write_arrays
 
-CANDIDATES, ROUNDS = 24, 12
-"""Particles that are tested at a mark, and trials of each."""
+CANDIDATES, ROUNDS = 25, 12
+"""Most particles that are tested at a mark, and most trials of each, but for whole turns of the
+objects; an optimiser whose runs have a shorter final test has that."""
 STREAM_JUDGE = 0x6A756467
 """Stream of the trials that judge a recommended design ("judg")."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """An optimiser with its sizes, by a name such as `screened-cma-es:sigma=0.25,particles=12`.
+    """An optimiser with its sizes, by a name such as `screened-es:sigma=0.2,particles=12`.
 
     Attributes:
       name: The name.
       optimizer: The optimiser.
       particles: Its particles.
       trials: Trials of each in an episode.
+      tests: Trials of each that choose at a mark.
     """
 
     name: str
     optimizer: Optimizer
     particles: int
     trials: int
+    tests: int = ROUNDS
 
     @property
     def worlds(self) -> int:
@@ -66,8 +70,14 @@ def make_case(name: str, space: DesignSpace, preset: str) -> Case:
         preset, "concurrent", "morphology", "structured", 0, optimizer=kind, **sizes
     )
     made: Any = codesign.make_optimizer(kind, space)
-    own = {n: type(getattr(made, n))(float(v)) for n, v in given.items()}
-    return Case(name, dataclasses.replace(made, **own), usual.particles, usual.trials)
+    own = {n: _as(type(getattr(made, n)), v) for n, v in given.items()}
+    tests = min(ROUNDS, usual.test_trials)
+    return Case(name, dataclasses.replace(made, **own), usual.particles, usual.trials, tests)
+
+
+def _as(kind: type, text: str) -> Any:
+    """A field's value from its text; "4.0" is a whole number too."""
+    return text if kind is str else kind(float(text))
 
 
 class Study:
@@ -84,6 +94,9 @@ class Study:
         budget: int,
         tests: int,
         marks: int = 9,
+        at: Sequence[int] = (),
+        first_seed: int = 0,
+        shapes: np.ndarray | None = None,
         chunk: int,
         path: Path,
     ):
@@ -98,26 +111,39 @@ class Study:
           budget: Grasps of a seed after which the search ends.
           tests: Trials that judge a recommended design.
           marks: Number of times at which one is recommended.
+          at: Grasps of a seed after which one is recommended, instead of `marks`; each mark is the
+            last episode that they allow.
+          first_seed: The first seed.
+          shapes: Objects that the trials of each seed take turns with, shape (seed, object); None
+            for the scene's.
           chunk: Most grasps of a call.
           path: File of what is done.
         """
         self.case, self.scene, self.engine, self.space = case, scene, engine, space
         self.tests, self.chunk, self.path = tests, chunk, path
-        self.keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+        self.keys = jax.vmap(jax.random.key)(first_seed + jnp.arange(seeds))
         self.mask = jnp.ones(space.num_parameters, bool)
-        self.simulate = jax.jit(self._simulate, static_argnums=2)
+        every = np.tile(np.arange(len(scene.objects.object)), (seeds, 1))
+        self.shapes = every if shapes is None else np.asarray(shapes)
+        self.rounds = -(-case.tests // self.shapes.shape[1]) * self.shapes.shape[1]
+        self.simulate = jax.jit(jax.vmap(self._simulate))
         self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
         self.tell = jax.jit(
             jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
         )
-        episodes = max(1, int((budget - self.before - self.tested) / case.worlds))
+        episodes = self._episodes(budget)
         first = getattr(case.optimizer, "screening", 0) + getattr(case.optimizer, "retests", 0) + 1
         self.marks = sorted(
-            {*np.geomspace(min(first, episodes), episodes, marks).round().astype(int)}
+            {*map(self._episodes, at)}
+            or {*np.geomspace(min(first, episodes), episodes, marks).round().astype(int)}
         )
         self.kept: dict[int, np.ndarray] = {}
         self.designs: dict[int, np.ndarray] = {}
         self.state, self.last = self._restore() if path.exists() else (self._start(), None)
+
+    def _episodes(self, grasps: int) -> int:
+        """Episodes of a seed after which no more than so many grasps have been simulated."""
+        return max(1, int((grasps - self.before - self.tested) / self.case.worlds))
 
     @property
     def before(self) -> int:
@@ -127,7 +153,7 @@ class Study:
     @property
     def tested(self) -> int:
         """Grasps by which a mark chooses."""
-        return min(CANDIDATES, self.case.particles) * ROUNDS
+        return min(CANDIDATES, self.case.particles) * self.rounds
 
     @property
     def done(self) -> int:
@@ -194,14 +220,14 @@ class Study:
             chosen = jnp.take_along_axis(self.last[0], best, 1)
         chosen = chosen[:, :CANDIDATES]
         tested = self._costs(
-            self._all(chosen, self._noise(codesign.STREAM_TEST, self.done), ROUNDS)
+            self._all(chosen, self._noise(codesign.STREAM_TEST, self.done), self.rounds)
         )
         design = chosen[jnp.arange(len(chosen)), tested.argmin(1)][:, None]
         outcome = self._all(design, self._noise(STREAM_JUDGE, 0), self.tests)
         kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
         self.kept[self.done] = kept[:, 0].mean(-1)
         self.designs[self.done] = np.asarray(design[:, 0])
-        return tested.size * ROUNDS + kept.size
+        return tested.size * self.rounds + kept.size
 
     def _noise(self, stream: int, index: int) -> jax.Array:
         return jax.vmap(lambda key: codesign.stream_key(key, stream, index))(self.keys)
@@ -210,21 +236,43 @@ class Study:
         return jax.jit(lambda found: particle_cost(self.scene, found))(outcome)
 
     def _all(self, populations: jax.Array, keys: jax.Array, trials: int) -> Outcome:
-        """Outcomes of shape (seed, particle, trial), simulated in calls of equal size."""
-        count, size = len(keys), max(1, self.chunk // (populations.shape[1] * trials))
-        size, parts = min(size, count), []
+        """Outcomes of shape (seed, particle, trial) in the trials of these keys."""
+        return self.outcomes(populations, self.drawn(keys, trials, self.shapes, self.scene))
+
+    def outcomes(self, populations: jax.Array, trials: Trial) -> Outcome:
+        """Outcomes of shape (seed, particle, trial), simulated in calls of equal size.
+
+        Args:
+          populations: Particles of each seed, shape (seed, particle, parameter).
+          trials: Trials that these meet, leading axes (seed, trial).
+        """
+        count, worlds = len(populations), populations.shape[1] * trials.yaw.shape[1]
+        size, parts = min(max(1, self.chunk // worlds), count), []
         for start in range(0, count, size):
             rows = jnp.minimum(jnp.arange(start, start + size), count - 1)
-            parts.append(self.simulate(populations[rows], keys[rows], trials))
+            own = jax.tree.map(lambda v, rows=rows: v[rows], trials)
+            parts.append(self.simulate(populations[rows], own))
         return jax.tree.map(lambda *v: jnp.concatenate(v)[:count], *parts)
 
-    def _simulate(self, populations: jax.Array, keys: jax.Array, trials: int) -> Outcome:
-        def one(population: jax.Array, key: jax.Array) -> Outcome:
-            drawn = rollout.sample_trials(self.scene, key, trials)
-            hands = jax.vmap(self.space.params)(population)
-            return rollout.evaluate(self.scene, self.engine, hands, drawn)
+    def drawn(self, keys: jax.Array, trials: int, shapes: np.ndarray, scene: Scene) -> Trial:
+        """Trials of each key with a scene's noise, of objects that take turns.
 
-        return jax.vmap(one)(populations, keys)
+        Args:
+          keys: Typed keys, shape (seed,).
+          trials: Trials of each.
+          shapes: Objects of each, shape (seed, object).
+          scene: Scene with the noise.
+
+        Returns:
+          Trials with leading axes (seed, trial).
+        """
+        drawn = jax.vmap(lambda key: rollout.sample_trials(scene, key, trials))(keys)
+        turns = shapes[:, np.arange(trials) % shapes.shape[1]]
+        return drawn._replace(shape=jnp.asarray(turns, drawn.shape.dtype))
+
+    def _simulate(self, population: jax.Array, trials: Trial) -> Outcome:
+        hands = jax.vmap(self.space.params)(population)
+        return rollout.evaluate(self.scene, self.engine, hands, trials)
 
     def _leaves(self) -> list[jax.Array]:
         state = self.state._replace(key=jax.vmap(jax.random.key_data)(self.state.key))

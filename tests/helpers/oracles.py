@@ -14,7 +14,7 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import assembly, coordinates
-from codesign_jax.engines.structured.lanes import Stages, dot, sum_axis, sum_fingers, sum_items
+from codesign_jax.engines.structured.lanes import dot, once, sum_axis, sum_fingers
 from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.laws.kinematics import Acc
 from codesign_jax.engines.structured.linear.tree import (
@@ -119,12 +119,11 @@ def unbalanced(scene, fields, ctrl, found, stride):
 
     @jax.jit
     def force(many, qpos, qvel, acc, u):
-        run = Stages()
         state = coordinates.make(scene, qpos, qvel, acc)
-        given = assembly.problem(scene, run, world_constants(scene, many), state, u.T)
+        given = assembly.problem(scene, world_constants(scene, many), state, u.T)
 
         def power(virtual: Acc, acc: Acc):
-            return residual_power(run, *given, acc, virtual).sum()
+            return residual_power(*given, acc, virtual).sum()
 
         none = jax.tree.map(jnp.zeros_like, state.acc)
         # Power is linear in the virtual accelerations: its slope is the force itself.
@@ -138,24 +137,23 @@ def unbalanced(scene, fields, ctrl, found, stride):
     return np.array(worst[0]) / np.max(worst[1], axis=1, keepdims=True)
 
 
-def residual_power(
-    run: Stages, problem: Problem, velocity: Spatial, acc: Acc, virtual: Acc
-) -> jax.Array:
+def residual_power(problem: Problem, velocity: Spatial, acc: Acc, virtual: Acc) -> jax.Array:
     """Power lambda' F of the unbalanced forces at acc along virtual, shape (1, world)."""
     if problem.palm_acc is not None:  # data of the step, not a solution
         acc = acc._replace(wrist=problem.palm_acc)
-    motion = propagate(run, problem.kin, acc)
-    along = propagate(run, problem.kin, virtual)
-    inertial = inertial_forces(run, problem, acc, motion)
+    motion = propagate(problem.kin, acc)
+    along = propagate(problem.kin, virtual)
+    inertial = inertial_forces(problem, acc, motion)
     force = Forces(*(m - s for m, s in zip(inertial, problem.smooth, strict=True)))
-    power = inner(run, force, virtual, along)
+    power = inner(force, virtual, along)
     for name, c in problem.contacts.items():
 
         def pushed(c: Contacts, motion: Spatial, velocity: Spatial, along: Spatial, name=name):
             force = constraint_update(c, _jar(name, c, motion, velocity)).force
-            return sum_items(dot(force, c.relative(relative(name, along, c))))
+            each = dot(force, c.relative(relative(name, along, c)))
+            return each.reshape(-1, each.shape[-1]).sum(0, keepdims=True)
 
-        power = power - run(pushed, c, motion, velocity, along)
+        power = power - once(pushed, c, motion, velocity, along)
     return power
 
 
@@ -165,20 +163,20 @@ def _jar(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Arra
     return c.relative(relative(name, motion, c)) - c.reference(speed)
 
 
-def inertial_forces(run: Stages, problem: Problem, acc: Acc, motion: Spatial) -> Forces:
+def inertial_forces(problem: Problem, acc: Acc, motion: Spatial) -> Forces:
     """M a in factored form: spatial forces of the bodies and armature forces of the joints."""
     body, hand = problem.body, problem.hand
     moves = problem.palm_acc is None
     return Forces(
         body.palm.times(motion.palm),
-        run(lambda b, m: b.times(m), body.link, motion.link),
+        once(lambda b, m: b.times(m), body.link, motion.link),
         body.object.times(motion.object),
         hand.wrist_armature * acc.wrist if moves else jnp.zeros_like(acc.wrist),
         hand.armature * acc.finger,
     )
 
 
-def inner(run: Stages, force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
+def inner(force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
     """Product of forces and accelerations over all bodies and joints, shape (1, world)."""
 
     def product(force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
@@ -187,4 +185,4 @@ def inner(run: Stages, force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
         rest = dot(force.palm, motion.palm) + dot(force.object, motion.object)
         return sum_fingers(links + joints) + rest + dot(force.wrist, acc.wrist)
 
-    return run(product, force, acc, motion)
+    return once(product, force, acc, motion)

@@ -28,8 +28,11 @@ def floating(**effects):
     return dataclasses.replace(base, hand=free, gravity=0.0)
 
 
-def collision(base, engine, step, precision):
-    """A sphere of 0.5 m/s hits a finger of a hand at rest: model, history of 0.6 s, momentum."""
+def collision(base, engine, step, precision, *, bend=0.0):
+    """A sphere of 0.5 m/s hits a finger of a hand at rest: model, history of 0.6 s, momentum.
+
+    Fingers that are bent at the start spring open, and if they cross they push one another first.
+    """
     # Solved as far as the precision goes: what is left of a force is left of the momentum.
     tolerance = {"float32": 1e-12, "float64": 1e-24}[precision]
     b = bench(base, engine, step, precision, tolerance)
@@ -43,6 +46,7 @@ def collision(base, engine, step, precision):
     qpos[0, -7:-4] = data.xpos[model.layout(b.scene).bodies[0, 1]] + [0, 0.07, 0]
     qvel = np.zeros((1, compiled.nv))
     qvel[0, -5] = -0.5
+    qpos[0, model.layout(b.scene).dofs[..., 0]] = bend
     fields = fields._replace(start=qpos)
     history = b.run(fields, held(b, fields, 0.6) * 0, qpos, qvel)
     assert np.abs(history.object_velocity[0, -1, 1] + 0.5) > 0.01, "the sphere met nothing"
@@ -66,9 +70,9 @@ def momentum(engine, step, precision):
     return Found(worst / np.linalg.norm(first), MOMENTUM[precision])
 
 
-def impulses(base, engine, step, precision):
+def impulses(base, engine, step, precision, **start):
     """What each step's accelerations add to linear and angular momentum, relative, (2,)."""
-    compiled, history, first = collision(base, engine, step, precision)
+    compiled, history, first = collision(base, engine, step, precision, **start)
     data, h, worst = mujoco.MjData(compiled), compiled.opt.timestep, np.zeros(2)
     acc, vel, kind = np.zeros(6), np.zeros(6), mujoco.mjtObj.mjOBJ_BODY
     for k in range(history.qpos.shape[1] - 1):
@@ -116,6 +120,30 @@ def hull_angular_impulse(engine, step, precision):
     return Found(impulses(skin(), engine, step, precision)[1], MOMENTUM[precision])
 
 
+CROSSED = 0.9
+"""Angle of every joint [rad] at which the tips of the two fingers stand in one another."""
+
+
+@functools.cache
+def meeting(step, precision):
+    """Impulses of fingers that push one another; without that contact they go another way."""
+    apart = floating(surface="hull", finger_finger=False)
+    paths = [
+        collision(base, "structured", step, precision, bend=CROSSED)[1].qpos[0]
+        for base in (skin(), apart)
+    ]
+    assert np.abs(paths[0] - paths[1])[0, 6:-7].max() > 0.01, "the fingers do not touch"
+    return impulses(skin(), "structured", step, precision, bend=CROSSED)
+
+
+def meeting_impulse(engine, step, precision):
+    return Found(meeting(step, precision)[0], MOMENTUM[precision])
+
+
+def meeting_angular_impulse(engine, step, precision):
+    return Found(meeting(step, precision)[1], MOMENTUM[precision])
+
+
 FIRST_ORDER = (
     "semi-implicit Euler changes the fingers' inertia matrix after the step's impulse: linear "
     "momentum is kept to first order in h only, in MuJoCo C as well; contact forces are equal and "
@@ -139,3 +167,9 @@ free = (
     "angular impulse that a step adds, relative",
 )
 case(*free, steps=(1.0, 0.5))(hull_angular_impulse)
+
+crossed = "free hand with the hull whose fingers push one another"
+case(9, crossed, "impulse that a step adds, relative", steps=(1.0, 0.5))(meeting_impulse)
+case(9, crossed, "angular impulse that a step adds, relative", steps=(1.0, 0.5))(
+    meeting_angular_impulse
+)

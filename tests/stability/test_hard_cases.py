@@ -9,6 +9,8 @@ import pytest
 from tests.stability import (  # noqa: F401  (they register their cases)
     beam,
     capstan,
+    crossed,
+    curled,
     decision,
     energy,
     grasp,

@@ -215,7 +215,9 @@ class StructuredEngine(Equal):
         series = found["distance"], found["height"], found["speed"]
         shape = (*series[0].shape, 0)
         qpos = found["qpos"] if trajectory else jnp.zeros(shape, series[0].dtype)
-        return Trace(*series, qpos, self._status(found), coordinates.flat(end))
+        # The decrement is a share of forces times accelerations, its root one of forces.
+        force = jnp.sqrt(jnp.maximum(found["residual"], 0.0))
+        return Trace(*series, qpos, self._status(found), coordinates.flat(end), force)
 
     @staticmethod
     def _run(program: Program, *args, **record) -> tuple[dict[str, jax.Array], State]:

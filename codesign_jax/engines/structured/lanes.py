@@ -12,16 +12,13 @@ import jax
 import jax.numpy as jnp
 
 
-class Stages:
-    """Runs parts of a program so that XLA computes each result once.
+def once(function: Callable, *args: Any) -> Any:
+    """Returns function(*args), which XLA computes once; both are pytrees of arrays.
 
     XLA's fusion recomputes an intermediate in every kernel that uses it; in a chain of small matrix
     products that multiplies the work by ten and the compile time by a hundred.
     """
-
-    def __call__(self, function: Callable, *args: Any) -> Any:
-        """Returns function(*args), computed once; both are pytrees of arrays."""
-        return jax.lax.optimization_barrier(function(*args))
+    return jax.lax.optimization_barrier(function(*args))
 
 
 def scan_links(
@@ -129,13 +126,6 @@ def sum_axis(x: jax.Array, axis: int) -> jax.Array:
 def sum_fingers(x: jax.Array) -> jax.Array:
     """Sum over the finger axis, kept with length one."""
     return sum_axis(x, x.ndim - 2)[..., None, :]
-
-
-def sum_items(x: jax.Array) -> jax.Array:
-    """Sum over all axes but the world's, shape (1, world)."""
-    while x.ndim > 2:
-        x = sum_axis(x, 0)
-    return sum_fingers(x)
 
 
 def inverse_spd(m: jax.Array) -> jax.Array:

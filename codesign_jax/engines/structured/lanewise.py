@@ -130,7 +130,7 @@ class _Place(int):
 
 @functools.lru_cache(maxsize=1024)
 def _program(call: _Call) -> Callable[[list], Any]:
-    """What calls of one key compute, traced once; JAX finds its operations as one of its own.
+    """What calls of one key compute: one jitted function, so that JAX's cache of traces has it.
 
     Tracing is most of the time that a kernel takes to compile, and its functions come again: for
     each pair of bodies, and in the kernel of the next scene.

@@ -62,7 +62,7 @@ def rollout(
         return trace, (fields, ctrl, path, trace.speed)
 
     def backward(saved: tuple, cotangent: Trace):
-        return adjoint(*saved, cotangent._replace(status=None))
+        return adjoint(*saved, cotangent._replace(status=None, residual=None))
 
     run.defvjp(forward, backward)
     return run(fields, ctrl)
@@ -122,7 +122,7 @@ def _adjoint(
       ctrl: Its controls.
       path: Its steps.
       speed: Its largest velocities, as in `Trace`.
-      cotangent: Cotangent of its trace, without the status.
+      cotangent: Cotangent of its trace, without status and residual.
     """
     scene = engine.scene
     program = AdjointProgram.here(scene, engine.limits, ctrl.dtype, len(ctrl))

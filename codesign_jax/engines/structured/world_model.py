@@ -55,6 +55,8 @@ class WorldModel(NamedTuple):
       gravity: Magnitude of gravity [m/s^2], shape (1, world); None without the effect.
       section: Height, wall, segment length and width of the fingers, shape (4, finger, world); None
         without the effect `neo_hookean` and the surface "hull".
+      threshold: Numbers of `model.morphology.thresholds`, shape (3, finger, world); None without
+        the effect `lateral_threshold`.
     """
 
     mount: jax.Array
@@ -88,6 +90,7 @@ class WorldModel(NamedTuple):
     gravity: jax.Array | None = None
     section: jax.Array | None = None
     palm_disc: jax.Array | None = None
+    threshold: jax.Array | None = None
 
 
 def rotation_columns(quat: jax.Array) -> jax.Array:
@@ -193,6 +196,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         bounds=bounds(numbers),
         gravity=-fields.gravity[None, :, 2] if scene.effects.gravity else None,
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
+        threshold=None if fields.threshold is None else fields.threshold.transpose(2, 1, 0),
         palm_disc=last(fields.geom_size[:, lay.disc[0], :2])[:, None] if lay.disc.size else None,
     )
 

@@ -22,18 +22,26 @@ from codesign_jax.scene import Scene
 
 # Rows of a contact's jar and numbers of its line, by friction model.
 ROWS = {"none": (3, 2), "coulomb": (3, 5), "full": (6, 5)}
-# Numbers of a cone, by friction model.
-CONE = {
-    "none": ("normal", "spring", "damper"),
-    "coulomb": ("normal", "tangent", "friction", "ratio", "spring", "damper"),
-    "full": Cone._fields,
+# Fields of a cone that a friction model does not need.
+NEEDLESS = {
+    "none": ("tangent", "friction", "ratio", "spin", "roll"),
+    "coulomb": ("spin", "roll"),
+    "full": (),
 }
 
 
-def cone_of(friction: str, numbers: Any) -> Cone:
-    """The cone of a friction model from its numbers, in the order of `CONE`."""
+def cone_fields(scene: Scene) -> list[str]:
+    """Fields of the cones of a scene's contacts."""
+    absent = NEEDLESS[scene.effects.friction]
+    if not scene.effects.soft_touch:
+        absent += ("growth", "least")
+    return [name for name in Cone._fields if name not in absent]
+
+
+def cone_of(scene: Scene, numbers: Any) -> Cone:
+    """The cone of a scene's contacts from its numbers, in the order of `cone_fields`."""
     found: dict[str, Any] = dict.fromkeys(Cone._fields)
-    return Cone(**found | {name: numbers[i] for i, name in enumerate(CONE[friction])})
+    return Cone(**found | {name: numbers[i] for i, name in enumerate(cone_fields(scene))})
 
 
 def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
@@ -77,12 +85,12 @@ class ContactSet:
 
     def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """The set's part of the table of the worlds' constants."""
-        return {f"cone.{which_cone(self.name)}": (1, (len(CONE[self.scene.effects.friction]),))}
+        return {f"cone.{which_cone(self.name)}": (1, (len(cone_fields(self.scene)),))}
 
     def cone(self, read: Callable[[str], Lanes], pair: str = "") -> Cone:
         """Contact parameters of the set's pair of bodies or another, lanes of a world each."""
         numbers = read(f"cone.{which_cone(pair or self.name)}")
-        return cone_of(self.scene.effects.friction, numbers)
+        return cone_of(self.scene, numbers)
 
     @staticmethod
     def contacts(place: tuple, cone: Cone) -> Contacts:
@@ -265,8 +273,3 @@ def sphere_on_table(height, centre, radius):
     """Point, normal and gap of spheres (3, k, ...) against the table."""
     c = shapes.spheres_on_table(None, height, centre, radius)  # type: ignore[arg-type]
     return c.point, c.normal, c.distance[None]
-
-
-def direct(function: Callable, *args: Any) -> Any:
-    """Runs a stage: in a kernel nothing is computed twice."""
-    return function(*args)

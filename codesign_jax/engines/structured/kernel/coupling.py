@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import direct, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
@@ -34,7 +34,7 @@ TOLERANCE = 1e-2
 """Squared error of a step, relative to its squared size, both as measured by H.
 
 An exact solution gains little: Newton's method takes 3 % more iterations than with 1e-6, and
-conjugate gradients 40 % fewer (fingers that touch in 120 grasps of scene `paper`, commit 04d1fb0).
+conjugate gradients 40 % fewer (fingers that touch in 120 grasps of scene `paper`).
 """
 
 
@@ -228,13 +228,13 @@ class Coupling:
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
         def solve(done: Eliminated, axes, armature, r, ro):
             if done.hinges is None or done.slides is None:
-                obj = el.solve_object(direct, done.q, ro)
+                obj = el.solve_object(done.q, ro)
                 none = jnp.zeros_like(obj)
                 return Iterate(none, none, obj)
-            r, ro, hinges = el.eliminate_again(direct, axes, done.hinges, r, ro)
+            r, ro, hinges = el.eliminate_again(axes, done.hinges, r, ro)
             slide_axes = el.wrist_slides(armature)
-            _, ro, slides = el.eliminate_again(direct, slide_axes, done.slides, r, ro)
-            obj = el.solve_object(direct, done.q, ro)
+            _, ro, slides = el.eliminate_again(slide_axes, done.slides, r, ro)
+            obj = el.solve_object(done.q, ro)
             first, motion = el.substitute(slide_axes, slides, jnp.zeros_like(obj), obj)
             second, motion = el.substitute(axes, hinges, motion, obj)
             return Iterate(jnp.concatenate([first, second]), motion, obj)

@@ -1,13 +1,15 @@
 """Eliminates the fingers from their tips, then wrist and object: Newton's linear system."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, direct, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
-from codesign_jax.engines.structured.kernel.memory import choose, full, loop, upper
+from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
@@ -66,10 +68,16 @@ class Elimination:
                 tau = tau if turned is None else tau + contract(axes[:, :3], turned[None], 1)
             node = el.add_link(node, el.link_terms(link.matrix(), push, pushes))
             y = contract(axes, node.r[None], 1) + tau
-            node, kept = el.eliminate_and_keep(direct, node, axes, armature, tau, terms)
+            node, kept = el.eliminate(node, axes, armature, tau, terms)
             if terms is not None:
                 y = y + terms.y
             return node, kept, dot(y, kept.factors.z)
+
+        def free(node, *forces):
+            """`eliminate` where the subtree does not touch the object: c, q and r_object are 0."""
+            new, kept, more = eliminate(node._replace(c=None), *forces)
+            factors = kept.factors._replace(g=jnp.zeros_like(kept.factors.w))
+            return new._replace(c=node.c), kept._replace(factors=factors), more
 
         def step(i: Any, carry: tuple) -> tuple:
             node, work = carry
@@ -82,19 +90,26 @@ class Elimination:
             terms = add_terms([r.terms for r in rows]) if rows else None
             pairs = problem.pair_push(i) if problem.pairs else None
             forces = (motion, smooth, tau, axes, armature, acc, pushes, terms, pairs)
-            node, kept, more = lanewise(eliminate, node, problem.body_of(i), *forces)
-            for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
-                problem.write(name, value, i)
+            forces = (problem.body_of(i), *forces)
+
+            def eliminated(how: Callable) -> tuple[el.Quadratic, Lanes]:
+                new, kept, more = lanewise(how, node, *forces)
+                for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
+                    problem.write(name, value, i)
+                if problem.pairs:
+                    problem.write("inverse", kept.inverse, i)
+                return new._replace(p=upper(new.p), q=upper(new.q)), more
+
+            ways = (partial(eliminated, eliminate), partial(eliminated, free))
+            node, more = either(i <= held, *ways, self.block.size) if rows else ways[0]()
             if problem.pairs:
-                problem.write("inverse", kept.inverse, i)
                 work = lanewise(jnp.add, work, more)
-            node = self.add_rows(node._replace(p=upper(node.p), q=upper(node.q)), rows)
-            return node, work
+            return self.add_rows(node, rows), work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         tip = [self.row(c, self.links, None, alpha) for c in problem.skin]
         node = self.add_rows(el.Quadratic(*empty), tip)
-        start = node, zeros((), self.like)
+        start, held = (node, zeros((), self.like)), self.last_on_object()
         node, work = loop(self.links, step, start, self.block.size, reverse=True)
         if problem.pairs:
             node, work = node._replace(r=problem.add_first(node.r)), self.block.sum(work)
@@ -147,6 +162,16 @@ class Elimination:
             terms[2] = zeros(shapes[2], self.like)
         return Row(slots.set.on_object, used, el.JointTerms(*terms), matrix, force)
 
+    def last_on_object(self) -> jax.Array:
+        """Last row of the hull with contacts with the object, a scalar; -1 if there is none."""
+        held = [c for c in self.problem.skin if c.set.on_object]
+
+        def later(row: Any, last: jax.Array) -> jax.Array:
+            used = [c.used(row) > 0 for c in held]
+            return jnp.where(used[0], jnp.asarray(row, jnp.int32), last) if used else last
+
+        return jax.lax.fori_loop(0, self.links + 1, later, jnp.int32(-1))
+
     def add_rows(self, node: el.Quadratic, rows: list["Row"]) -> el.Quadratic:
         """Adds the rows' contacts to the links before them; p and q as triangles."""
         for row in rows:
@@ -188,7 +213,7 @@ class Elimination:
             matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
             node = el.add_palm(node, matrices, force, pushes)
             if rigid:
-                obj = el.solve_object(direct, node.q, node.r_object)
+                obj = el.solve_object(node.q, node.r_object)
                 none = jnp.zeros_like(obj)
                 step = Iterate(none, none, obj)
                 return step, Eliminated(None, None, node.q, dot(node.r_object, obj))
@@ -199,10 +224,10 @@ class Elimination:
                 axes, (armature[3:], armature[:3]), (force.wrist[3:], force.wrist[:3]), strict=True
             ):
                 y = contract(subspace, node.r[None], 1) + twist
-                node, new = el.eliminate_and_keep(direct, node, subspace, inertia, twist)
+                node, new = el.eliminate(node, subspace, inertia, twist)
                 kept.append(new)
                 work.append(dot(y, new.factors.z))
-            obj = el.solve_object(direct, node.q, node.r_object)
+            obj = el.solve_object(node.q, node.r_object)
             first, motion = el.substitute(axes[1], kept[1].factors, jnp.zeros_like(obj), obj)
             second, motion = el.substitute(axes[0], kept[0].factors, motion, obj)
             step = Iterate(jnp.concatenate([first, second]), motion, obj)

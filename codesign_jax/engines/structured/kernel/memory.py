@@ -148,6 +148,19 @@ def choose(which: jax.Array, compute: Callable, otherwise: Any, size: int) -> An
     return rebuild(jax.lax.cond(which, some, lambda: arrays))
 
 
+def either(which: jax.Array, one: Callable, other: Callable, size: int) -> Any:
+    """one() where a scalar is true, else other(): trees of lanes of the same structure."""
+    found: list[Callable] = []
+
+    def run(compute: Callable) -> list[jax.Array]:
+        arrays, rebuild = solid(compute(), size)
+        found.append(rebuild)
+        return arrays
+
+    arrays = jax.lax.cond(which, lambda: run(one), lambda: run(other))
+    return found[0](arrays)
+
+
 def solid(tree: Any, size: int) -> tuple[list[jax.Array], Callable]:
     """Arrays (size,) of a tree of lanes, numbers filled in, and what rebuilds the tree."""
     leaves, structure = jax.tree.flatten(tree, is_leaf=lambda x: isinstance(x, Lanes))

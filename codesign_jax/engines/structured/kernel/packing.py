@@ -37,6 +37,8 @@ class Packing(Tables):
             arrays |= self._palm_slots(hand)
         if hand.section is not None:
             arrays["section"] = hand.section[None]
+        if hand.threshold is not None:
+            arrays["threshold"] = hand.threshold[None]
         if self.scene.effects.surface == "hull":
             arrays |= skin.pack(self.scene, hand)
         if hand.mesh is not None:

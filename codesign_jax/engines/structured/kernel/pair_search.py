@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import skin
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.memory import loop
+from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
@@ -196,9 +196,13 @@ class Search:
         places = (("joint", behind), ("frame", row), ("frame", behind))
         return tuple(self.read(name, r, pairing) for name, r in places)  # type: ignore[return-value]
 
+    def _size(self) -> Lanes:
+        """Half the width, the height and a segment of the lanes' own fingers."""
+        return self.p.hand.read(self.step.hand, "section_box")
+
     def _rows(self, row: Any, pairing: Pairing, there: jax.Array, first: jax.Array) -> None:
         links = self.p.links
-        self_size = self.p.hand.read(self.step.hand, "section_box")
+        self_size = self._size()
         size = pairing.swap(self_size)
         side = first.astype(jnp.int32)
 
@@ -221,11 +225,12 @@ class Search:
                     )
 
                     def vertices() -> None:
-                        self._row_contact(
-                            row, pairing, there, side, (own, kind), (theirs, size, last), (j, i)
-                        )
+                        other = theirs, size, last
+                        found = row, pairing, there, side
+                        self._row_contact(*found, tried, (own, kind), other, (j, i))
 
-                    any_of(near & (apart.lane < 0), vertices)
+                    tried = near & (apart.lane < 0)
+                    any_of(tried, vertices)
 
                 any_of(near, boxes)
 
@@ -239,6 +244,7 @@ class Search:
         pairing: Pairing,
         there: jax.Array,
         side: jax.Array,
+        tried: jax.Array,
         own: tuple,
         other: tuple,
         rows: tuple,
@@ -250,19 +256,40 @@ class Search:
           pairing: The pairing.
           there: Lanes whose finger and partner exist.
           side: Lanes' side of the pairing, 0 or 1.
+          tried: Lanes whose two rows may have a point in common.
           own: Links of the lanes' own row, see `_links`, and its kind.
           other: Links of their partners' row, its size, and whether it is the last one.
           rows: Numbers of both rows.
         """
         count, (links, kind), (theirs, size, last) = skin.pair_points(self.p.scene), own, other
+        rings, own_size = self.p.scene.discretization.hull_rings, self._size()
+        each_ring, start = count // rings, zeros((sections.SUMS,), self.like)
 
-        def add(k: Any, sums: Lanes) -> Lanes:
-            vertex = self.p.hand.read(self.step.hand, "pair_vertex", kind * count + k)
-            end = lanes([last], (), wide=True)
-            ends = lanewise(sections.inside, vertex, links, theirs, size, end)
-            return lanewise(sections.add_vertex, sums, *ends)
+        def read(k: Any) -> Lanes:
+            return self.p.hand.read(self.step.hand, "pair_vertex", k)
 
-        sums = loop(count, add, zeros((sections.SUMS,), self.like), self.block.size)
+        def ring(r: Any, sums: Lanes) -> Lanes:
+            first = kind * count + r * each_ring
+            ring = lanewise(sections.ring_in_section, read(first), links, theirs)
+            away = lanewise(sections.ring_outside, ring, own_size, size).lane
+
+            def add(k: Any, sums: Lanes) -> Lanes:
+                vertex = read(first + k)
+                away = lanewise(sections.outside, vertex, ring, size).lane
+
+                def within() -> Lanes:
+                    end = lanes([last], (), wide=True)
+                    ends = lanewise(sections.inside, vertex, links, theirs, size, end)
+                    return lanewise(sections.add_vertex, sums, *ends)
+
+                return choose(anywhere(tried & ~away), within, sums, self.block.size)
+
+            def points() -> Lanes:
+                return loop(each_ring, add, sums, self.block.size)
+
+            return choose(anywhere(tried & ~away), points, sums, self.block.size)
+
+        sums = loop(rings, ring, start, self.block.size)
         one, two = lanewise(sections.pressure, sums)
         which = there & (one[2].lane < 0)
 

@@ -168,46 +168,38 @@ def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dic
 TABLE = "object_table"
 
 
-def of_link(axes, chain: Chain, numbers: dict, joint: dict, still: dict):
+def of_link(scene: Scene, chain: Chain, numbers: dict, joint: dict, still: dict):
     """What a link hands on, and its power.
 
     Args:
-      axes: Names of a joint's axes.
+      scene: The scene.
       chain: What it inherits.
-      numbers: Its constants, the finger's and the worlds', by name.
+      numbers: See `Step.link_constants`.
       joint: Angles and velocities of the joint before it, and the chamber's pressure, by name.
       still: Accelerations and virtual accelerations of the joint, and the cotangent of the centre
         of mass.
     """
-    constants = [numbers[n] for n in LINK]
-    at = joint["finger"], joint["finger_vel"], still["acc"]
-    forces = (
-        numbers["gain"], joint["pressure"], numbers.get("section"), numbers.get("gravity")
-    )  # fmt: skip
-    after, found = link_forces(axes, chain[:5], constants, at, forces)
+    after, found = link_forces(scene, chain[:5], numbers, joint | {"acc": still["acc"]})
     along = next_motion(chain.along, found["axes"], still["virtual"])
     body = make_body(numbers["mass"], found["body_centre"], found["tensor"])
-    inertial = numbers["armature"] * still["acc"] - found["tau"]
+    armature = found.get("armature_now", numbers["armature"])
+    inertial = armature * still["acc"] - found["tau"]
     power = dot(body.times(after[4]) - found["smooth"], along) + dot(inertial, still["virtual"])
     return Chain(*after, along), dot(still["centre_bar"], found["body_centre"]) - power
 
 
-LINK = ("offset", "mass", "centre", "inertia", "stiffness", "damping")
-"""Constants of a link in the order of `step.link_forces`."""
-
-
-def of_palm(timestep: float, state: dict, arm, constants: list, still: dict) -> tuple:
+def of_palm(timestep: float, state: dict, arm, constants: dict, still: dict) -> tuple:
     """Geometry and motions of palm and object, and the power of palm, wrist and object.
 
     Args:
       timestep: Time step [s].
       state: Positions and velocities of wrist and object, by name.
       arm: Commands of the arm frame.
-      constants: See `step.PALM_CONSTANTS`.
+      constants: See `Step.palm_constants`.
       still: Accelerations of wrist and object, and their virtual ones.
     """
     given = {name: still[name] for name in ("acc_wrist", "acc_object")}
-    found = palm_and_object(timestep, state | given, arm, *constants)
+    found = palm_and_object(timestep, state | given, arm, constants)
     palm, now, virtual = found["palm"], found["now"], still["virtual_wrist"]
     along = palm_motion(virtual, palm.axes)
     power = dot(palm.palm.times(now.palm_motion) - palm.smooth_palm, along)
@@ -245,7 +237,7 @@ def between_spheres(
     """
     balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
     one, other = sections.between(*balls)
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in (one, other)]
     return _between(ends, mine[0][2:], theirs[0][2:])
 
@@ -262,7 +254,7 @@ def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, w
       which: Number of the sphere on the link.
     """
     ball = sphere_ball(mine[0], mine[1], mine[2], which)
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     found = sections.ball_on_palm(ball, (*palm[:2], size))
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in found]
     return _between(ends, mine[0][2:], palm[2:])
@@ -297,7 +289,7 @@ def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
 
 def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
     """Power of a row on another finger's row; mine and theirs: sides before and behind."""
-    cone = cone_of(scene.effects.friction, numbers)
+    cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
     moves = [
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
@@ -325,7 +317,7 @@ def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:
 
 
 def _cone(scene: Scene, name: str, at: dict) -> contact.Cone:
-    return cone_of(scene.effects.friction, at[f"cone.{which_cone(name)}"])
+    return cone_of(scene, at[f"cone.{which_cone(name)}"])
 
 
 def _item(values: jax.Array, which: jax.Array) -> jax.Array:

@@ -78,8 +78,13 @@ class Problem:
         self.like = jnp.zeros((block.size,), palm.armature.dtype)
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
-        """Reads names from the table that has them."""
+        """Reads names from the table that has them.
+
+        Of the joints' armature that of this step, if it changes.
+        """
         m = self.m
+        if "armature_now" in m.scratch.groups:
+            names = tuple("armature_now" if n == "armature" else n for n in names)
         tables = ((m.hand, m.hand_ref), (m.state, m.state_ref), (m.scratch, m.scratch_ref))
         found = []
         for name in names:

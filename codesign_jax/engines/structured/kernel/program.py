@@ -236,11 +236,13 @@ class Program(Packing):
         first = speed.largest(step, moving).lane
         done, _, last_speed = jax.lax.while_loop(going, body, (jnp.int32(0), alive, first))
 
+        # As for decided worlds of a block that goes on: no residual, and the speed that they have.
+        ended = {"speed": last_speed, "residual": jnp.zeros_like(last_speed)}
+
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
             record(t)
-            for k in range(len(self.trace)):
-                last = trace[jnp.maximum(done - 1, 0), k, own]
-                trace[t, k, own] = last_speed if k == 2 else last
+            for k, name in enumerate(self.trace):
+                trace[t, k, own] = ended.get(name, trace[jnp.maximum(done - 1, 0), k, own])
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))

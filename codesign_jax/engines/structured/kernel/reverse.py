@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import advance, objects, powers, speed
+from codesign_jax.engines.structured.kernel import advance, powers, speed
 from codesign_jax.engines.structured.kernel.bars import Bars
 from codesign_jax.engines.structured.kernel.memory import Block
 from codesign_jax.engines.structured.kernel.pair_sweep import PairSweep
 from codesign_jax.engines.structured.kernel.powers import Chain
-from codesign_jax.engines.structured.kernel.problem import Iterate, Memory, Problem
+from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
 from codesign_jax.engines.structured.kernel.slots import any_of
-from codesign_jax.engines.structured.kernel.step import PALM_CONSTANTS, Step
+from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kernel.sweep import Sweep
 from codesign_jax.engines.structured.kernel.virtual import Virtual, palm_problem
 from codesign_jax.engines.structured.lanes import dot
@@ -70,16 +70,7 @@ class ReverseStep(Step):
         """
         p, block, bars = self.p, self.block, self.bars
         bars.begin()
-        state = {
-            n: p.world_state.read(self.world_state, n, 0, block.world) for n in p.world_state.groups
-        }
-        at = self._palm(state, arm)
-        thing = objects.read(p.scene, block, (p.world, self.world), (p.hand, self.hand), self.grid)
-        bound = {c.name: c.bind(p.scratch, self.scratch, self.constant) for c in p.sets}
-        m = Memory(
-            p.hand, self.hand, p.finger_state, self.finger_state, p.scratch, self.scratch, bound
-        )
-        now, centre = self._forward(state, at, pressure, m, thing)
+        state, at, thing, m, now, centre = self.assemble(arm, pressure)
         go = lanes([moved], (), wide=False)
         before, acc_bar = self._integration(state, at, now, go)
         forces = palm_problem(at["palm"], *acc_bar)
@@ -142,22 +133,18 @@ class ReverseStep(Step):
     ) -> Lanes:
         """Adds palm, wrist and object; stores their cotangents and returns those of the arm."""
         p, (now, virtual, wrist_bar) = self.p, accelerations
-        names = [n for n in PALM_CONSTANTS if n in p.world.groups]
-        constants = [self.constant(n) if n in names else None for n in PALM_CONSTANTS]
         still = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
         still |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_motion}
         own = {n: self.bars.of_step(n) for n in ("columns", "object_vel", "height")}
         base, own = self.block.sum((base, own))
         one = lanes([self.like + 1.0], (), wide=False)
-        given = {n: state[n] for n in MOVED}, arm, constants
+        given = {n: state[n] for n in MOVED}, arm, self.palm_constants()
         run = partial(powers.of_palm, p.scene.discretization.timestep)
         acc = wrist_bar if not p.scene.effects.wrist else lanewise(jnp.zeros_like, wrist_bar)
         height = plus(own["height"], lanes([shown.height], (), wide=False))
         bars = base, own["columns"], own["object_vel"], height, acc, one
         found, arm_bar, constant_bars = pull(run, given, (still,), bars)
-        self.bars.add_once(
-            {n: v for n, v in zip(PALM_CONSTANTS, constant_bars, strict=True) if v is not None}
-        )
+        self.bars.add_once(constant_bars)
         for name, value in plus(found, before).items():
             p.world_state.write(self.bars.world_state, name, value, 0, self.block.world)
         any_of(shown.speed != 0, lambda: speed.add(self, state, shown.speed))

@@ -99,20 +99,20 @@ def pair_vertices(scene: Scene, section: jax.Array) -> jax.Array:
         (cap, (cap + 1) / 2, shrunk, length, np.where(weight == 1, band[0], 0.0)),
         (reach, 0 * weight, scale[1:], 0 * weight, band[1:]),
     )
-    found = []
-    for number, kind in enumerate(kinds):
-        for at, follows, size, along, share in zip(*kind, strict=True):
-            steep = max(at, 0.0) ** 3 if number else 0.0
-            across, up = size * around[:, 0], size * around[:, 1]
-            one = jnp.ones_like(across)
-            normal = [one * steep / segment * 2.0]
-            normal += [(size * unit[:, i, None, None]) ** 3 / half[i] for i in (0, 1)]
-            long = jnp.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-            surface = size * arc * along * segment / 2.0 + one * share * area
-            place = [one * at * segment / 2.0, across, up + half[1]]
-            rest = [n / long for n in normal]
-            found.append(jnp.stack([*place, *rest, one * follows, surface / width**2], 1))
-    return jnp.concatenate(found)
+    # All rings at once, shape (ring of a kind, point, finger, world): ring by ring they would be
+    # hundreds of operations for XLA.
+    at, follows, size, along, share = np.concatenate(kinds, 1)[..., None, None, None]
+    steep = np.where(np.arange(len(at)) < rings, 0.0, np.maximum(at.ravel(), 0.0) ** 3)
+    across, up = (size * around[:, i] for i in (0, 1))
+    normal = [
+        steep.reshape(at.shape) / segment * 2.0,
+        *((size * unit[:, i, None, None]) ** 3 / half[i] for i in (0, 1)),
+    ]
+    long = jnp.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    surface = (size * arc * along * segment / 2.0 + share * area) / width**2
+    found = [at * segment / 2.0, across, up + half[1], *(n / long for n in normal)]
+    found = [jnp.broadcast_to(x, across.shape) for x in (*found, follows, surface)]
+    return jnp.stack(found, 2).reshape(-1, 8, *across.shape[2:])
 
 
 def pack(scene: Scene, hand: WorldModel) -> dict[str, jax.Array]:

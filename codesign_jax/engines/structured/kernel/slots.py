@@ -1,9 +1,8 @@
 """Contacts in slots: few of the many places that may touch do, and only those get a slot.
 
-Every lane fills the slots of a row from the first one on.  A pass through a row ends after the
-largest number of slots that any lane has filled, of the lanes that the pass is for: so its cost
-grows with the contacts that exist, and of worlds that still iterate, and not with those that are
-possible.
+Every lane fills the slots of a row from the first one on.  A loop over the slots of a row runs to
+the largest number that any active lane has filled.  Its cost therefore grows with the contacts that
+exist in worlds that still iterate, not with those that are possible.
 """
 
 import contextlib

@@ -31,6 +31,8 @@ from codesign_jax.engines.structured.laws.integration import rigid_arm
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
 from codesign_jax.engines.structured.world_model import apply_columns
+from codesign_jax.model.layout import joint_axes
+from codesign_jax.scene import Scene
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.program import Program
@@ -47,7 +49,11 @@ PALM_CONSTANTS = (
     "wrist_stiffness",
     "gravity",
 )
-"""Constants of the worlds that `palm_and_object` takes, in its order; some scenes lack the last."""
+"""Constants of the worlds that `palm_and_object` takes; some scenes lack the last ones."""
+LINK_CONSTANTS = ("offset", "mass", "centre", "inertia", "stiffness", "damping", "armature")
+"""Constants of each link that `link_forces` takes."""
+FINGER_CONSTANTS = ("gain", "section", "threshold")
+"""Constants of each finger that it takes; some scenes lack all but the first."""
 
 
 class Step:
@@ -77,9 +83,23 @@ class Step:
         """Constants of the worlds."""
         return [self.constant(n) for n in names]
 
-    def gravity(self) -> Lanes | None:
-        """Magnitude of gravity; None without the effect."""
-        return self.constant("gravity") if "gravity" in self.p.world.groups else None
+    def palm_constants(self) -> dict[str, Lanes]:
+        """Constants that `palm_and_object` takes, by name, of those that the scene has."""
+        return {n: self.constant(n) for n in PALM_CONSTANTS if n in self.p.world.groups}
+
+    def link_constants(self, i: Any) -> dict[str, Lanes]:
+        """Constants that `link_forces` takes, by name, of those that the scene has."""
+        read = partial(self.p.hand.read, self.hand)
+        found = {n: read(n, i) for n in LINK_CONSTANTS}
+        found |= {n: read(n) for n in FINGER_CONSTANTS if n in self.p.hand.groups}
+        if "gravity" in self.p.world.groups:
+            found["gravity"] = self.constant("gravity")
+        return found
+
+    def joint(self, i: Any) -> dict[str, Lanes]:
+        """Angles, velocities and accelerations of a joint, by name."""
+        read = partial(self.p.finger_state.read, self.finger_state)
+        return {n: read(n, i) for n in ("finger", "finger_vel", "acc")}
 
     def advance(self, arm: Lanes, pressure: Lanes, undecided: Callable, waiting: Any, speed: Any):
         """Advances the block.
@@ -95,27 +115,16 @@ class Step:
           Trace entries distance, height, residual, iterations and, with slots, overflow; speed
           after the step; worlds that have moved, and so go on.
         """
-        p, scene = self.p, self.p.scene
-        state = {
-            n: p.world_state.read(self.world_state, n, 0, self.block.world)
-            for n in p.world_state.groups
-        }
-        geometry = self._palm(state, arm)
-        hand, world = (p.hand, self.hand), (p.world, self.world)
-        thing = objects.read(scene, self.block, world, hand, self.grid)
-        bound = {c.name: c.bind(p.scratch, self.scratch, self.constant) for c in p.sets}
-        memory = Memory(
-            p.hand, self.hand, p.finger_state, self.finger_state, p.scratch, self.scratch, bound
-        )
-        now, centre = self._forward(state, geometry, pressure, memory, thing)
-        rigid = not scene.effects.wrist
+        p = self.p
+        state, geometry, _, memory, now, centre = self.assemble(arm, pressure)
+        rigid = not p.scene.effects.wrist
         problem = Problem(p.links, self.block, memory, geometry["palm"], rigid=rigid)
         now, quality = Newton(problem).solve(now, waiting, *p.limits)
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
         goes_on, slots = waiting & undecided(distance, height), []
         if p.slotted:
-            slots = [self._overflow(bound, waiting)]
+            slots = [self._overflow(memory.contacts, waiting)]
             goes_on &= slots[0] == 0
         new_speed, good = advance.advance(self, state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
@@ -123,22 +132,33 @@ class Step:
         residual = jnp.where(waiting, quality.residual.lane, 0.0)
         return (distance, height, residual, count, *slots), new_speed, good
 
+    def assemble(self, arm: Lanes, pressure: Lanes) -> tuple:
+        """Reads the state, and leaves bodies, forces and contacts in the scratch table.
+
+        Args:
+          arm: As in `advance`.
+          pressure: As in `advance`.
+
+        Returns:
+          The state of wrist and object by name, what `palm_and_object` finds, the objects, the
+          memory, the warm start, and the hand's centre from the object's.
+        """
+        p, hand, world = self.p, (self.p.hand, self.hand), (self.p.world, self.world)
+        read = partial(p.world_state.read, self.world_state, item=0, world=self.block.world)
+        state = {name: read(name) for name in p.world_state.groups}
+        run = partial(palm_and_object, p.scene.discretization.timestep)
+        at = lanewise(run, state, arm, self.palm_constants())
+        thing = objects.read(p.scene, self.block, world, hand, self.grid)
+        bound = {c.name: c.bind(p.scratch, self.scratch, self.constant) for c in p.sets}
+        state_table, scratch = (p.finger_state, self.finger_state), (p.scratch, self.scratch)
+        memory = Memory(*hand, *state_table, *scratch, bound)
+        return state, at, thing, memory, *self._forward(state, at, pressure, memory, thing)
+
     def _overflow(self, bound: dict[str, Any], waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
         lists = [c.overflow() for c in bound.values() if isinstance(c, BoundSlots)]
         most = self.block.fold(total(lists), jnp.maximum)
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
-
-    def _palm(self, state: dict, arm: Lanes) -> dict[str, Any]:
-        """Kinematics, inertia and smooth forces of palm, wrist and object."""
-        names = self.p.world.groups
-        constants = [self.constant(n) if n in names else None for n in PALM_CONSTANTS]
-        timestep = self.p.scene.discretization.timestep
-
-        def compute(state: dict, arm: jax.Array, *constants: Any) -> dict[str, Any]:
-            return palm_and_object(timestep, state, arm, *constants)
-
-        return lanewise(compute, state, arm, *constants)
 
     def keep(self, i: Any, chain: tuple) -> None:
         """Called with origin, frame, velocity, bias and motion of the link before each joint.
@@ -164,7 +184,7 @@ class Step:
             lambda x, f, s, share: share * (x + apply_columns(f, s)),
             at["place"], at["frame"], stub, share,
         )  # fmt: skip
-        wide, gravity = zeros((6,), like), self.gravity()
+        wide = zeros((6,), like)
         vel, bias, motion = (
             lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
         )
@@ -180,24 +200,9 @@ class Step:
             origin, frame, vel, bias, motion, middle = carry
             self.keep(i, carry[:5])
             before = Side(frame, motion, vel)
-            names = ("offset", "mass", "centre", "inertia", "stiffness", "damping")
-            constants = [p.hand.read(self.hand, n, i) for n in names]
-            gain = p.hand.read(self.hand, "gain")
-            soft = p.scene.effects.neo_hookean
-            section = p.hand.read(self.hand, "section") if soft else None
-            forces = gain, pressure, section, gravity
-            joint = [
-                p.finger_state.read(self.finger_state, n, i)
-                for n in ("finger", "finger_vel", "acc")
-            ]
-            out = lanewise(
-                partial(link_forces, self.p.lay.axes),
-                (origin, frame, vel, bias, motion),
-                constants,
-                joint,
-                forces,
-            )
-            carry, stored = out
+            joint = self.joint(i) | {"pressure": pressure}
+            run = partial(link_forces, p.scene)
+            carry, stored = lanewise(run, carry[:5], self.link_constants(i), joint)
             stored |= {"step_acc": zeros((p.axes,), like), "step_motion": wide}
             for name, value in stored.items():
                 m.scratch.write(self.scratch, name, value, i)
@@ -235,33 +240,27 @@ class Step:
         return lanewise(sphere_on_table, height, centre, radius)
 
 
-def palm_and_object(
-    timestep: float, state: dict, arm, mass, centre, tensor, damping, armature, obj, principal, k, g
-) -> dict[str, Any]:
+def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[str, Any]:
     """Geometry, motion, inertia and smooth forces of palm, wrist and object.
 
     Args:
       timestep: Time step [s].
       state: The state by name.
       arm: Commands of the arm frame, shape (6, ...).
-      mass: The first of `PALM_CONSTANTS`; the others follow in their order.
-      centre: See there, and so on.
-      tensor: Inertia tensor.
-      damping: Of the wrist.
-      armature: Of the wrist.
-      obj: Mass of the object.
-      principal: Its principal inertia.
-      k: Stiffness of the wrist; None for a rigid arm, whose accelerations follow from the commands.
-      g: Magnitude of gravity; None without the effect.
+      constants: Those of `PALM_CONSTANTS` that the scene has, by name. Without a stiffness of the
+        wrist its accelerations follow from the commands.
     """
+    k, g = constants.get("wrist_stiffness"), constants.get("gravity")
     s = State(**{k: state.get(k) for k in State._fields})
     place = kin._place(s)
     frame, axes, vel, bias = kin._wrist(place, s.wrist, s.wrist_vel)
     columns, object_vel = kin._object(s)
-    turned = inertia.turned_tensor(frame, tensor)
-    palm = Body(mass, place + apply_columns(frame, centre), turned)
-    thing = Centred(obj, inertia.principal_tensor(columns, principal))
-    spring = -damping * state["wrist_vel"]
+    centre = place + apply_columns(frame, constants["palm_centre"])
+    turned = inertia.turned_tensor(frame, constants["palm_inertia"])
+    palm = Body(constants["palm_mass"], centre, turned)
+    tensor = inertia.principal_tensor(columns, constants["object_inertia"])
+    thing = Centred(constants["object_mass"], tensor)
+    spring = -constants["wrist_damping"] * state["wrist_vel"]
     if k is not None:
         spring = k * (arm - state["wrist"]) + spring
     acc = state["acc_wrist"], state["acc_object"]
@@ -277,47 +276,53 @@ def palm_and_object(
         "columns": columns,
         "object_vel": object_vel,
         "now": now,
-        "palm": Palm(palm, thing, *smooth, spring, armature, axes),
+        "palm": Palm(palm, thing, *smooth, spring, constants["wrist_armature"], axes),
     }
 
 
-def link_forces(names: tuple[str, ...], parent: tuple, constants: Any, joint: Any, forces: Any):
+def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
     """A link's kinematics, inertia and forces.
 
     Args:
-      names: Names of a joint's axes.
+      scene: The scene.
       parent: Origin, frame, velocity, bias and motion of the link before it.
-      constants: Offset, mass, centre, inertia, stiffness and damping.
-      joint: Angles, velocities and accelerations of the joint before it.
-      forces: Gain and pressure of the chamber, the section or None, gravity or None.
+      constants: See `Step.link_constants`.
+      joint: Angles, velocities and accelerations of the joint before it, and the chamber's
+        pressure, by name.
 
     Returns:
       Origin, frame, velocity, bias and motion of the link, and what the solver needs, by name.
     """
-    gain, pressure, section, gravity = forces
     origin, frame, vel, bias, motion = parent
-    offset, mass, centre, principal, stiffness, damping = constants
-    q, rate, acc = joint
+    q, rate, pressure = joint["finger"], joint["finger_vel"], joint["pressure"]
+    hinges = [constants[n] for n in ("stiffness", "damping", "armature")]
     cos, sin = jnp.cos(q), jnp.sin(q)
-    origin, frame, axes = kin._turn_link(names, origin, frame, offset, cos, sin)
-    vel, bias = kin._link_velocity(vel, bias, axes, rate)
-    motion = next_motion(motion, axes, acc)
-    body = Body(
-        mass,
-        origin + apply_columns(frame, centre),
-        inertia.principal_tensor(frame, principal),
+    origin, frame, axes = kin._turn_link(
+        joint_axes(scene), origin, frame, constants["offset"], cos, sin
     )
-    tau = -stiffness * q - damping * rate
-    bend = tau[:1] + gain * pressure
-    if section is not None:
-        bend = bend + inertia.softening_moment(section, stiffness[:1], q[:1])
+    vel, bias = kin._link_velocity(vel, bias, axes, rate)
+    motion = next_motion(motion, axes, joint["acc"])
+    body = Body(
+        constants["mass"],
+        origin + apply_columns(frame, constants["centre"]),
+        inertia.principal_tensor(frame, constants["inertia"]),
+    )
+    own = inertia.springs(scene, tuple(hinges), constants.get("threshold"), pressure, q)
+    tau = -own.stiffness * q - own.damping * rate
+    bend = tau[:1] + constants["gain"] * pressure
+    if own.moment is not None:
+        bend = bend + own.moment
+    if "section" in constants:
+        bend = bend + inertia.softening_moment(constants["section"], hinges[0][:1], q[:1])
     tau = jnp.concatenate([bend, tau[1:]])
     stored = {
         "axes": axes,
         "body_centre": body.centre,
         "tensor": triangle(body.tensor),
         "motion": motion,
-        "smooth": body.smooth_force(vel, bias, gravity),
+        "smooth": body.smooth_force(vel, bias, constants.get("gravity")),
         "tau": tau,
     }
+    if own.moment is not None:
+        stored["armature_now"] = own.armature
     return (origin, frame, vel, bias, motion), stored

@@ -15,6 +15,7 @@ from codesign_jax.engines.structured.kernel.powers import Chain, Place, RowSide
 from codesign_jax.engines.structured.kernel.problem import Iterate, Memory
 from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
+from codesign_jax.engines.structured.kernel.step import LINK_CONSTANTS
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.engines.structured.laws.cones import which_cone
@@ -119,29 +120,17 @@ class Sweep:
         return _add(bars, **{n: read(f"pairbar.{n}", i) for n in Place._fields})
 
     def _link(self, i: Any, after: Chain, pressure: Lanes, centre_bar: Lanes) -> Chain:
-        p, hand = self.p, self.step.hand
-        names = [*powers.LINK, "armature"]
-        numbers = {n: p.hand.read(hand, n, i) for n in names} | {"gain": p.hand.read(hand, "gain")}
-        if p.scene.effects.neo_hookean:
-            numbers["section"] = p.hand.read(hand, "section")
-        if (gravity := self.step.gravity()) is not None:
-            numbers["gravity"] = gravity
-        angles, rates, acc = self._joint("finger", i), self._joint("finger_vel", i), None
-        acc = self._joint("acc", i)
-        joint = {"finger": angles, "finger_vel": rates, "pressure": pressure}
-        share = p.hand.read(hand, "share", i + 1)
-        still = {"acc": acc, "virtual": self.m.scratch.read(self.m.scratch_ref, "virtual", i)}
+        numbers, joint = self.step.link_constants(i), self.step.joint(i)
+        still = {"acc": joint.pop("acc")}
+        still["virtual"] = self.m.scratch.read(self.m.scratch_ref, "virtual", i)
+        share = self.p.hand.read(self.step.hand, "share", i + 1)
         still["centre_bar"] = lanewise(jnp.multiply, centre_bar, share)
-        run = partial(powers.of_link, p.lay.axes)
+        run, joint = partial(powers.of_link, self.p.scene), joint | {"pressure": pressure}
         before, own, moved = pull(run, (self.chain(i), numbers, joint), (still,), (after, self.one))
-        self.bars.add({n: own[n] for n in names}, i)
-        self.bars.add({n: v for n, v in own.items() if n not in names})
-        self.bars.add({"pressure": moved.pop("pressure")})
+        self.bars.add({n: own.pop(n) for n in LINK_CONSTANTS}, i)
+        self.bars.add(own | {"pressure": moved.pop("pressure")})
         self.bars.add_joint(moved, i)
         return before
-
-    def _joint(self, name: str, i: Any) -> Lanes:
-        return self.p.finger_state.read(self.step.finger_state, name, i)
 
     def _mount(self, base: Chain, centre_bar: Lanes) -> Chain:
         read = partial(self.p.hand.read, self.step.hand)

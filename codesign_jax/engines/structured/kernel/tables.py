@@ -84,6 +84,8 @@ class Tables:
             }
         if self.scene.effects.neo_hookean:
             more |= {"section": (1, (4,))}
+        if self.scene.effects.lateral_threshold:
+            more |= {"threshold": (1, (3,))}
         if self.scene.effects.surface == "hull":
             more |= skin.fields(self.scene)
         support, grid = objects.tables(self.scene, self.fingers)
@@ -152,6 +154,8 @@ class Tables:
             "new_finger": (n, (a,)),
             "new_finger_vel": (n, (a,)),
         }
+        if self.scene.effects.lateral_threshold:
+            fields |= {"armature_now": (n, (a,))}
         for contacts in self.sets:
             fields |= contacts.groups()
         if any(isinstance(s, PairSet) for s in self.sets):

@@ -52,13 +52,18 @@ def make_cone(
     c = scene.contact
     impratio = c.friction_ratio if impratio is None else impratio
     impedance = c.impedance if impedance is None else impedance
+    grows = {}
+    if scene.effects.soft_touch:
+        spring, _ = _reference(scene, impedance)
+        least = scene.discretization.timestep**2 * spring
+        grows = {"growth": 1.0 / c.touch_depth + 0.0 * least, "least": least}
     regularizer = (1.0 - impedance) / impedance * contact_invweight(scene) * bodies
     reference = _reference(scene, impedance)
     if scene.effects.friction == "none":
-        return Cone(1.0 / regularizer, None, None, None, *reference)
+        return Cone(1.0 / regularizer, None, None, None, *reference, **grows)
     ratio = friction / jnp.sqrt(impratio)
     tangent = impratio / regularizer
-    cone = Cone(1.0 / regularizer, tangent, friction, ratio, *reference)
+    cone = Cone(1.0 / regularizer, tangent, friction, ratio, *reference, **grows)
     if scene.effects.friction != "full":
         return cone
     least = jnp.maximum(friction, 1e-5)  # MuJoCo's mjMINMU

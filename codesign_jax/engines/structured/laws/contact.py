@@ -29,6 +29,9 @@ class Cone(NamedTuple):
       damper: Coefficient of the velocity in aref [1/s].
       spin: Torsional friction over Coulomb friction [m].
       roll: Rolling friction over Coulomb friction [m].
+      growth: Inverse of the depth over which a contact's damping and friction grow [1/m], see
+        `Contacts.grown`.
+      least: Share of D that a contact of no depth has, h^2 spring.
     """
 
     normal: jax.Array | float
@@ -39,6 +42,8 @@ class Cone(NamedTuple):
     damper: jax.Array | float
     spin: jax.Array | float | None = None
     roll: jax.Array | float | None = None
+    growth: jax.Array | float | None = None
+    least: jax.Array | float | None = None
 
 
 class Ends(NamedTuple):
@@ -110,9 +115,31 @@ class Contacts(NamedTuple):
         assert cone.spin is not None and cone.roll is not None
         return cone.roll * omega + (cone.spin - cone.roll) * dot(n, omega) * n
 
+    @property
+    def grown(self) -> Cone:
+        """The cone of a contact of this depth.
+
+        MuJoCo's normal force is -D (a + b v) - D k r with spring k, damper b and distance r: at
+        first touch its second part is zero and its first part at once what it is at any depth.
+        With the effect `soft_touch` D is D c of the ramp c = min(1, -r / depth), and k is k / c:
+        damping and friction grow with the depth, and the elastic force stays.  The ramp begins at
+        h^2 k: c = h^2 k + (1 - h^2 k) min(1, -r / depth).  At no depth the force is so that of a
+        linearly implicit spring, -D k (r + b h^2 v + h^2 a), stable at any step; it vanishes with
+        the step h.  A contact with c = 0 would be an explicit spring on a link of a few grams.
+        """
+        cone = self.cone
+        if cone.growth is None or cone.least is None:
+            return cone
+        share = jnp.minimum(jnp.maximum(-self.distance * cone.growth, 0.0), 1.0)
+        share = cone.least + (1.0 - cone.least) * share
+        tangent = None if cone.tangent is None else cone.tangent * share
+        spring = cone.spring / share
+        return cone._replace(normal=cone.normal * share, tangent=tangent, spring=spring)
+
     def reference(self, velocity: jax.Array) -> jax.Array:
         """Reference acceleration aref from the relative point velocity, shaped as that."""
-        return -self.cone.damper * velocity - self.cone.spring * self.distance * self.direction
+        cone = self.grown
+        return -cone.damper * velocity - cone.spring * self.distance * self.direction
 
 
 class Response(NamedTuple):
@@ -137,7 +164,7 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> Response:
     the middle zone 1/2 D_m (w_n - mu |w_t|)^2 with D_m = D_n / (1 + mu^2 / impratio), the top zone
     zero.
     """
-    cone, n = contacts.cone, contacts.direction
+    cone, n = contacts.grown, contacts.direction
     if cone.friction is None:
         return _update_frictionless(contacts, jar)
     normal = dot(n, jar)
@@ -173,14 +200,14 @@ def _update_frictionless(contacts: Contacts, jar: jax.Array) -> Response:
     """One row a contact: quadratic in the normal part where that is negative."""
     n = contacts.normal
     normal = dot(n, jar)
-    stiff = jnp.where(contacts.active & (normal < 0), contacts.cone.normal, 0.0)
+    stiff = jnp.where(contacts.active & (normal < 0), contacts.grown.normal, 0.0)
     pairs = [(i, j) for i in range(3) for j in range(i, 3)]
     hessian = jnp.stack([stiff * n[i] * n[j] for i, j in pairs])
     return Response(-stiff * normal * n, hessian, 0.5 * stiff * normal**2)
 
 
 def _zones(contacts: Contacts, normal: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:
-    cone = contacts.cone
+    cone = contacts.grown
     # With D_n / D_t = 1 / impratio; where friction is zero nothing sticks.
     bottom = contacts.active & (cone.friction * cone.normal * normal + cone.tangent * length <= 0)
     middle = contacts.active & ~bottom & (normal < cone.friction * length)
@@ -218,7 +245,7 @@ def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> Line:
 
 def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
     """First and second derivative of the cost along the line, shape (...)."""
-    cone = contacts.cone
+    cone = contacts.grown
     normal = ray.n0 + alpha * ray.n1
     if cone.friction is None:
         stiff = jnp.where(contacts.active & (normal < 0), cone.normal, 0.0)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.lanes import Stages, dot
+from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, Ends
 
 BLOCK = 8
@@ -37,27 +37,26 @@ def slots(spheres: int, fingers: int) -> int:
     return BLOCK * -(-count // BLOCK)
 
 
-def contacts(run: Stages, cone: Cone, centre: jax.Array, radius: jax.Array) -> Contacts:
+def contacts(cone: Cone, centre: jax.Array, radius: jax.Array) -> Contacts:
     """Contacts of the pairs of spheres that touch.
 
     Args:
-      run: Runs the stages.
       cone: Their parameters.
       centre: Sphere centres, shape (3, link, k, finger, world).
       radius: Radii [m], shape (link, k, finger, world).
     """
     links, k, fingers, worlds = radius.shape
     (first, second), count = _candidates(links, k, fingers), slots(links * k, fingers)
-    fits = run(_near, jax.lax.stop_gradient(centre), radius)
+    fits = once(_near, jax.lax.stop_gradient(centre), radius)
     touching = fits.sum(0, dtype=jnp.int32)[None]
-    chosen = run(lambda f: _choose(f, count), fits)
+    chosen = once(lambda f: _choose(f, count), fits)
     ends = jnp.stack([jnp.asarray(s, jnp.int32)[chosen] for s in (first, second)])
     used = jnp.arange(count)[:, None] < touching
 
     def place(centre: jax.Array, radius: jax.Array, ends: jax.Array, used: jax.Array):
         return _place(centre.reshape(3, -1, worlds), radius.reshape(-1, worlds), ends, used)
 
-    found = run(place, centre, radius, ends, used)
+    found = once(place, centre, radius, ends, used)
     point, normal, gap = (x[..., None, :] for x in found)
     link = (ends // (k * fingers)) * fingers + ends % fingers
     return Contacts(point, normal, gap, cone, ends=Ends(link[:, :, None], touching))

@@ -5,10 +5,10 @@ has the images x1 = T_i(v) and x0 = T_{i-1}(v) and lies at x = (1 - w) x0 + w x1
 rigid bodies are affine in the point, so that the blend of the two images' velocities is exactly
   dx = V_{i-1}(x) + w dtheta x (x1 - p),
 the parent's velocity at the vertex itself and a share of the joint's own rotation dtheta = S_i dq_i
-about the image on the link: no common point has to be assumed.  A contact adds its offset from the
-vertex to the contact point to both.  With the relative motion m = (angular, linear, joint's
-rotation) of nine components a contact is the matrix X'KX, X = [-[r], 1, -[lever]] with lever =
-w (x1 + offset - p); the sums over a joint's vertices enter the elimination of that joint.
+about the image on the link.  The two images need no contact point in common.  A contact adds its
+offset from the vertex to the contact point to both.  With the relative motion m = (angular, linear,
+joint's rotation) of nine components a contact is the matrix X'KX, X = [-[r], 1, -[lever]] with
+lever = w (x1 + offset - p); the sums over a joint's vertices enter the elimination of that joint.
 """
 
 from typing import NamedTuple

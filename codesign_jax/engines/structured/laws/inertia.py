@@ -5,10 +5,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import Stages, cross, dot, spatial, total
+from codesign_jax.engines.structured.lanes import cross, dot, once, spatial, total
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, State
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, turn_columns
-from codesign_jax.model.morphology import softening
+from codesign_jax.model.morphology import softening, threshold_moments
+from codesign_jax.scene import Scene
 
 
 class Body(NamedTuple):
@@ -150,7 +151,7 @@ def turned_tensor(frame: jax.Array, tensor: jax.Array) -> jax.Array:
     return turn_columns(frame, jnp.moveaxis(turn_columns(frame, tensor), 0, 1))
 
 
-def bodies(run: Stages, hand: WorldModel, kin: Kinematics) -> Bodies:
+def bodies(hand: WorldModel, kin: Kinematics) -> Bodies:
     """Inertia of all bodies at the present positions."""
 
     def link(origin: jax.Array, frame: jax.Array):
@@ -164,10 +165,10 @@ def bodies(run: Stages, hand: WorldModel, kin: Kinematics) -> Bodies:
             principal_tensor(obj, hand.object_inertia),
         )
 
-    centre, tensor, object_tensor = run(rest, kin.palm, kin.object)
+    centre, tensor, object_tensor = once(rest, kin.palm, kin.object)
     return Bodies(
         palm=Body(hand.palm_mass, centre, tensor),
-        link=Body(hand.mass, *run(link, kin.origin, kin.link)),
+        link=Body(hand.mass, *once(link, kin.origin, kin.link)),
         object=Centred(hand.object_mass, object_tensor),
     )
 
@@ -178,8 +179,66 @@ def softening_moment(section: jax.Array, stiffness: jax.Array, angle: jax.Array)
     return stiffness * angle * softening(angle / segment, height, wall, width=width)
 
 
+class Springs(NamedTuple):
+    """A joint's springs, and what the threshold of sideways bending adds; (axis, ...).
+
+    Attributes:
+      stiffness: Of the hinges.
+      damping: With the implicit term.
+      armature: With the implicit terms.
+      moment: Further moment on the bend hinge, shape (1, ...); None without the effect.
+    """
+
+    stiffness: jax.Array
+    damping: jax.Array
+    armature: jax.Array
+    moment: jax.Array | None
+
+
+def springs(
+    scene: Scene, constants: tuple, threshold: jax.Array | None, pressure: jax.Array, q: jax.Array
+) -> Springs:
+    """A joint's springs at its angles.
+
+    The threshold is a spring that is implicit in the lateral hinge as its own one, see
+    `model.layout.implicit_damping`.
+
+    Args:
+      scene: The scene.
+      constants: Stiffness, damping and armature of the hinges, shape (axis, ...).
+      threshold: See `WorldModel`, shape (3, ...); None without the effect.
+      pressure: Chamber pressure.
+      q: Angles, shape (axis, ...); the second one is the lateral one.
+    """
+    stiffness, damping, armature = constants
+    if threshold is None:
+        return Springs(stiffness, damping, armature, None)
+    h = scene.discretization.timestep
+    more, moment = threshold_moments(tuple(threshold), pressure, q[0], q[1])
+    stiffness = _with_lateral(stiffness, stiffness[1] + more)
+    if scene.discretization.spring_damping == "added":
+        lateral = damping[1] + h * more, armature[1] + h * h * more
+    else:
+        least = h * stiffness[1]
+        lateral = jnp.maximum(damping[1], least), jnp.maximum(armature[1], h * least)
+    damping, armature = map(_with_lateral, (damping, armature), lateral)
+    return Springs(stiffness, damping, armature, moment[None])
+
+
+def joint_springs(scene: Scene, hand: WorldModel, state: State, pressure: jax.Array) -> Springs:
+    """`springs` of all joints, arrays of shape (link, axis, finger, world)."""
+    each = hand.stiffness, hand.damping, hand.armature
+    if hand.threshold is None:
+        return springs(scene, each, None, pressure, state.finger)
+    run = jax.vmap(lambda c, q: springs(scene, c, hand.threshold, pressure, q))
+    return run(each, state.finger)
+
+
+def _with_lateral(axes: jax.Array, lateral: jax.Array) -> jax.Array:
+    return jnp.concatenate([axes[:1], lateral[None], axes[2:]])
+
+
 def smooth_forces(
-    run: Stages,
     hand: WorldModel,
     kin: Kinematics,
     body: Bodies,
@@ -190,7 +249,6 @@ def smooth_forces(
     """All forces that do not depend on the accelerations.
 
     Args:
-      run: Runs the stages.
       hand: The hand.
       kin: Kinematics of the state.
       body: Inertia of the state.
@@ -205,13 +263,16 @@ def smooth_forces(
     else:
         wrist = hand.wrist_stiffness * (arm - state.wrist)
         wrist = wrist - hand.wrist_damping * state.wrist_vel
-    finger = -hand.stiffness * state.finger - hand.damping * state.finger_vel
+    joint = joint_springs(scene, hand, state, pressure)
+    finger = -joint.stiffness * state.finger - joint.damping * state.finger_vel
     bend = finger[:, :1] + hand.gain * pressure
+    if joint.moment is not None:
+        bend = bend + joint.moment
     if scene.effects.neo_hookean:
         assert hand.section is not None
         bend = bend + softening_moment(hand.section, hand.stiffness[:, :1], state.finger[:, :1])
     finger = jnp.concatenate([bend, finger[:, 1:]], 1)
-    links = run(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
+    links = once(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
     return Smooth(
         palm=body.palm.smooth_force(kin.palm_vel, kin.palm_bias, g),
         link=links,

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import (
-    Stages,
     cross,
     motion_cross,
+    once,
     rotate,
     scan_links,
     spatial,
@@ -105,28 +105,26 @@ class Kinematics(NamedTuple):
     object_vel: jax.Array
 
 
-def kinematics(
-    run: Stages, hand: WorldModel, axis_names: tuple[str, ...], state: State
-) -> Kinematics:
+def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> Kinematics:
     """Computes the kinematics of all bodies."""
     place = _place(state)
-    palm, wrist_axes, palm_vel, palm_bias = run(_wrist, place, state.wrist, state.wrist_vel)
-    frame, origin = run(mounted, place, palm, hand.mount, hand.base)
+    palm, wrist_axes, palm_vel, palm_bias = once(_wrist, place, state.wrist, state.wrist_vel)
+    frame, origin = once(mounted, place, palm, hand.mount, hand.base)
     vel, bias = palm_vel, palm_bias
-    trig = run(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
+    trig = once(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
 
     def next_link(carry, link):
         (origin, frame, vel, bias), ((offset, cos, sin, rate), _) = carry, link
         turn = partial(_turn_link, axis_names)
-        origin, frame, subspace = run(turn, origin, frame, offset, cos, sin)
-        vel, bias = run(_link_velocity, vel, bias, subspace, rate)
+        origin, frame, subspace = once(turn, origin, frame, offset, cos, sin)
+        vel, bias = once(_link_velocity, vel, bias, subspace, rate)
         return (origin, frame, vel, bias), (origin, frame, vel, bias, subspace)
 
     over = (hand.offset, *trig, state.finger_vel)
     lanes = jnp.zeros_like(hand.offset[0])
     first = (origin, frame, vel + lanes, bias + lanes)
     _, (origins, frames, vels, biases, axes) = scan_links(next_link, first, over)
-    columns, object_vel = run(_object, state)
+    columns, object_vel = once(_object, state)
     return Kinematics(
         place=place,
         palm=palm,

@@ -121,6 +121,67 @@ def separated(own: tuple, own_size, theirs: tuple, size, last) -> jax.Array:
     return most
 
 
+def ring_in_section(vertex, own: tuple, theirs: tuple) -> jax.Array:
+    """Where a ring's points are in both frames of another finger's row: one affine map a frame.
+
+    Points of a ring differ in two of their coordinates only, so that a point across and up from the
+    joint has the coordinates map[:, 0] + across map[:, 1] + up map[:, 2].
+
+    Args:
+      vertex: Any point of the ring, see `inside`.
+      own: Joint of its row, and frames of the links before and behind it.
+      theirs: The same of the other row.
+
+    Returns:
+      The maps to the coordinates in the frame before and in that behind, shape (6, 3, ...).
+    """
+    (joint, before, after), (origin, *frames) = own, theirs
+    weight = vertex[6]
+    columns = [before[k] + weight * (after[k] - before[k]) for k in range(3)]
+    start = joint - origin + vertex[0] * columns[0]
+    rows = [[dot(f[k], v) for v in (start, *columns[1:])] for f in frames for k in range(3)]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+LEEWAY = 1e-5
+"""How far outside a point has to be to be left out by `outside` [m]: far above rounding errors."""
+
+
+def ring_outside(ring: jax.Array, own_size, size) -> jax.Array:
+    """Whether all points of a ring are outside another finger's row, surely; see `outside`."""
+    across, up = own_size[0], own_size[1]  # from the section's middle
+    middle = [r[0] + up * r[2] for r in ring]
+    reach = [across * jnp.abs(r[1]) + up * jnp.abs(r[2]) for r in ring]
+    low = [m - r for m, r in zip(middle, reach, strict=True)]
+    high = [m + r for m, r in zip(middle, reach, strict=True)]
+    return _parted(low, high, size)
+
+
+def outside(vertex, ring: jax.Array, size) -> jax.Array:
+    """Whether a point of a ring is outside another finger's row, surely.
+
+    Args:
+      vertex: The point.
+      ring: See `ring_in_section`.
+      size: See `inside`.
+    """
+    place = [r[0] + vertex[1] * r[1] + vertex[2] * r[2] for r in ring]
+    return _parted(place, place, size)
+
+
+def _parted(low: list, high: list, size) -> jax.Array:
+    """Whether a box in the frame before and one in the frame behind have no point in the row.
+
+    A point's place in the row's section lies between its places in the two frames.
+    """
+    width, up, half = size[0], size[1], size[2]
+    most = jnp.maximum(-half - high[0], low[3] - half)
+    for k, least, largest in ((1, -width, width), (2, 0.0 * up, 2.0 * up)):
+        most = jnp.maximum(most, jnp.minimum(low[k], low[3 + k]) - largest)
+        most = jnp.maximum(most, least - jnp.maximum(high[k], high[3 + k]))
+    return most > LEEWAY
+
+
 def inside(vertex, own: tuple, theirs: tuple, size, last) -> tuple[tuple, tuple]:
     """Point, normal, gap, lever and share of a point in another finger's row, on either side.
 

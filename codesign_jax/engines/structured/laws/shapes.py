@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.lanes import Stages, cross, dot
+from codesign_jax.engines.structured.lanes import cross, dot, once
 from codesign_jax.engines.structured.laws import meshes
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts
 from codesign_jax.engines.structured.laws.kinematics import Kinematics
@@ -22,7 +22,6 @@ def spheres_on_object(
     scene: Scene,
     hand: WorldModel,
     kin: Kinematics,
-    run: Stages,
     centre: jax.Array,
     radius: jax.Array | float,
 ) -> Contacts:
@@ -32,7 +31,6 @@ def spheres_on_object(
       scene: The scene.
       hand: The hand.
       kin: Kinematics.
-      run: Runs the stages.
       centre: Sphere centres from the object's, shape (3, ...).
       radius: Sphere radii, broadcasting to (...).
     """
@@ -43,8 +41,8 @@ def spheres_on_object(
     def place(columns: jax.Array, centre: jax.Array, distance: jax.Array, gradient: jax.Array):
         return on_surface(columns, centre, radius, distance, gradient)
 
-    distance, gradient = run(measure, kin.object, centre)
-    point, normal, gap = run(place, kin.object, centre, distance, gradient)
+    distance, gradient = once(measure, kin.object, centre)
+    point, normal, gap = once(place, kin.object, centre, distance, gradient)
     return Contacts(point, normal, gap, hand.cones.hand_object)
 
 
@@ -189,9 +187,7 @@ def _capsule(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _sphere(size, jnp.stack([p[0], p[1], p[2] - nearest]))
 
 
-def object_on_table(
-    run: Stages, scene: Scene, hand: WorldModel, kin: Kinematics, height: jax.Array
-) -> Contacts:
+def object_on_table(scene: Scene, hand: WorldModel, kin: Kinematics, height: jax.Array) -> Contacts:
     """Contacts of the object with the table, four slots as in MuJoCo's plane colliders.
 
     The points are the four lower corners of a box; the lower rim's lowest point, its upper
@@ -210,7 +206,7 @@ def object_on_table(
             arms = new if arms is None else jnp.where(mine, new, arms)
         return on_table(arms, height)
 
-    point, normal, gap = run(points, hand.object_size[:, 0], kin.object[:, :, 0], height)
+    point, normal, gap = once(points, hand.object_size[:, 0], kin.object[:, :, 0], height)
     return Contacts(point, normal, gap, hand.cones.object_table)
 
 

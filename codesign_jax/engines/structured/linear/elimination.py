@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import Stages, contract, inverse_spd, sum_fingers
+from codesign_jax.engines.structured.lanes import contract, inverse_spd, sum_fingers
 from codesign_jax.engines.structured.linear.tree import Forces, Matrices
 
 
@@ -82,17 +82,15 @@ class JointTerms(NamedTuple):
 
 
 def eliminate(
-    run: Stages,
     node: Quadratic,
     axes: jax.Array,
     armature: jax.Array,
     tau: jax.Array,
     terms: JointTerms | None = None,
-) -> tuple[Quadratic, Factors]:
+) -> tuple[Quadratic, Kept]:
     """Minimises over the accelerations of a joint.
 
     Args:
-      run: Runs the stages.
       node: The subtree's objective in its base link's acceleration.
       axes: Motion subspace S, shape (axis, 6, finger, world).
       armature: Diagonal joint inertia (armature with implicit terms), shape (axis, finger, world).
@@ -100,41 +98,28 @@ def eliminate(
       terms: More of the objective that the joint's accelerations are in.
 
     Returns:
-      The objective in the parent's acceleration and the factors for `substitute`.
+      The objective in the parent's acceleration, the factors for `substitute`, and what else
+      `eliminate_again` needs.
     """
-    node, kept = eliminate_and_keep(run, node, axes, armature, tau, terms)
-    return node, kept.factors
-
-
-def eliminate_and_keep(
-    run: Stages,
-    node: Quadratic,
-    axes: jax.Array,
-    armature: jax.Array,
-    tau: jax.Array,
-    terms: JointTerms | None = None,
-) -> tuple[Quadratic, Kept]:
-    """`eliminate`, with all that `eliminate_again` needs."""
-    u, h, y = run(_project, node.p, node.c, node.r, axes, tau)
+    u, h, y = _project(node.p, node.c, node.r, axes, tau)
     if terms is None:
-        inverse = run(_joint_inverse, axes, u, armature)
+        inverse = _joint_inverse(axes, u, armature)
     else:
-        inverse = run(_joint_inverse, axes, u, armature, terms.d)
+        inverse = _joint_inverse(axes, u, armature, terms.d)
         u, y = u + terms.u, y + terms.y
         h = None if h is None else h + terms.h
-    factors = Factors(*run(_factor, inverse, u, h, y))
-    return Quadratic(*run(_reduce, node, u, h, factors)), Kept(factors, inverse)
+    factors = Factors(*_factor(inverse, u, h, y))
+    return Quadratic(*_reduce(node, u, h, factors)), Kept(factors, inverse)
 
 
 def eliminate_again(
-    run: Stages, axes: jax.Array, kept: Kept, r: jax.Array, r_object: jax.Array
+    axes: jax.Array, kept: Kept, r: jax.Array, r_object: jax.Array
 ) -> tuple[jax.Array, jax.Array, Factors]:
     """`eliminate` of the same matrix with other forces and none on the joint.
 
     Since r - U z = r - (D^-1 U')'y it takes a sixth of the operations.
 
     Args:
-      run: Runs the stages.
       axes: Motion subspace S, shape (axis, 6, finger, world).
       kept: What the elimination left.
       r: Force on the subtree's base link, shape (6, finger, world).
@@ -143,15 +128,11 @@ def eliminate_again(
     Returns:
       The forces in the parent's acceleration, and the factors for `substitute`.
     """
-
-    def reduce(y: jax.Array, kept: Kept, r: jax.Array, ro: jax.Array):
-        w, g, _ = kept.factors
-        ro = ro if g is None else ro + contract(g, y[:, None], 0)
-        return r - contract(w, y[:, None], 0), ro, contract(kept.inverse, y[None], 1)
-
-    y = run(lambda s, r: contract(s, r[None], 1), axes, r)
-    r, r_object, z = run(reduce, y, kept, r, r_object)
-    return r, r_object, kept.factors._replace(z=z)
+    w, g, _ = kept.factors
+    y = contract(axes, r[None], 1)
+    r_object = r_object if g is None else r_object + contract(g, y[:, None], 0)
+    z = contract(kept.inverse, y[None], 1)
+    return r - contract(w, y[:, None], 0), r_object, kept.factors._replace(z=z)
 
 
 def _project(p: jax.Array, c: jax.Array | None, r: jax.Array, axes: jax.Array, tau: jax.Array):
@@ -213,21 +194,14 @@ def substitute(
     return a, parent + contract(axes, a[:, None], 0)
 
 
-def solve_object(run: Stages, q: jax.Array, r: jax.Array) -> jax.Array:
+def solve_object(q: jax.Array, r: jax.Array) -> jax.Array:
     """Solves Q v_o = r for the six object accelerations by 3 x 3 blocks, shape (6, 1, world)."""
-
-    def schur(q: jax.Array, r: jax.Array):
-        top = inverse_spd(q[:3, :3])
-        low = contract(q[3:, :3, None], top[None], 1)  # Q_ba Q_aa^-1
-        rest = q[3:, 3:] - contract(low[:, :, None], q[None, :3, 3:], 1)
-        return top, rest, r[3:] - contract(low, r[None, :3], 1)
-
-    def finish(q: jax.Array, r: jax.Array, top: jax.Array, rest: jax.Array, right: jax.Array):
-        second = contract(inverse_spd(rest), right[None], 1)
-        left = r[:3] - contract(q[:3, 3:], second[None], 1)
-        return jnp.concatenate([contract(top, left[None], 1), second])
-
-    return run(finish, q, r, *run(schur, q, r))
+    top = inverse_spd(q[:3, :3])
+    low = contract(q[3:, :3, None], top[None], 1)  # Q_ba Q_aa^-1
+    rest = q[3:, 3:] - contract(low[:, :, None], q[None, :3, 3:], 1)
+    second = contract(inverse_spd(rest), (r[3:] - contract(low, r[None, :3], 1))[None], 1)
+    left = r[:3] - contract(q[:3, 3:], second[None], 1)
+    return jnp.concatenate([contract(top, left[None], 1), second])
 
 
 class Own(NamedTuple):

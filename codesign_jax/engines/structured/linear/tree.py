@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import Stages, scan_links, spatial, total
+from codesign_jax.engines.structured.lanes import once, scan_links, spatial, total
 from codesign_jax.engines.structured.laws import finger_pairs, hull
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.laws.inertia import Bodies, Smooth
@@ -63,22 +63,17 @@ def next_motion(parent: jax.Array, axes: jax.Array, a: jax.Array) -> jax.Array:
     return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
 
 
-def propagate(run: Stages, kin: Kinematics, acc: Acc) -> Spatial:
+def propagate(kin: Kinematics, acc: Acc) -> Spatial:
     """Spatial accelerations J a of all bodies, without velocity terms."""
-    palm = run(palm_motion, acc.wrist, kin.wrist_axes)
+    palm = once(palm_motion, acc.wrist, kin.wrist_axes)
 
     def step(parent: jax.Array, link: tuple):
-        motion = run(next_motion, parent, *link[0])
+        motion = once(next_motion, parent, *link[0])
         return motion, motion
 
     first = palm + jnp.zeros_like(kin.vel[:, 0])
     _, links = scan_links(step, first, (kin.axes, acc.finger))
     return Spatial(palm, jnp.moveaxis(links, 0, 1), acc.object)
-
-
-def on_links(name: str) -> bool:
-    """Whether the items of a set of contacts are of links or joints, several of each."""
-    return name.startswith(("finger", "hull"))
 
 
 def relative(name: str, motion: Spatial, c: Contacts | None = None) -> jax.Array:

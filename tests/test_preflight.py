@@ -105,7 +105,7 @@ def test_fingers_are_as_deep_in_the_palm_as_engines_find(surface):
     np.testing.assert_allclose(clearance.in_palm(the_scene, designs), exact, atol=1e-12)
     exact, invalid = np.asarray(exact), np.asarray(invalid)
     np.testing.assert_array_equal(invalid != 0, exact > 0.002)
-    report = preflight.check(the_scene, designs, details=False)
+    report = preflight.check(the_scene, designs)
     refused = sum("inside the palm" in line for line in report.refusals)
     assert refused == (exact > 0.002).sum() > 0
 

@@ -29,7 +29,7 @@ __all__ = [
     "load_scene",
     "mesh_notes",
     "parse_design",
-    "preflight_notes",
+    "preflight_warnings",
     "solver_problems",
     "source_files",
     "use_compilation_cache",
@@ -252,26 +252,25 @@ def mesh_notes(scene: Scene) -> list[str]:
     return notes
 
 
-def preflight_notes(
-    scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray], *, details: bool = False
+def preflight_warnings(
+    scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]
 ) -> list[str]:
-    """Warnings about designs that are about to be simulated, and notes if details are asked for.
+    """Warnings about designs that are about to be simulated.
 
     Args:
       scene: The scene.
       space: The design space.
       designs: Designs [SI units], each of shape (parameter,), by what to call them.
-      details: Whether to say what the steps do to the fingers' springs.
 
     Raises:
       SceneError: If a design must not be simulated.
     """
     stacked = np.array([*designs.values()], np.float32)
     params = params_of(space, stacked)
-    report = preflight.check(scene, params, [*designs], details=details)
+    report = preflight.check(scene, params, [*designs])
     if report.refusals:
         raise SceneError(report.refusals)
-    return [f"warning: {text}" for text in report.warnings] + report.notes
+    return [f"warning: {text}" for text in report.warnings]
 
 
 def counted(number: int, noun: str) -> str:

@@ -36,7 +36,7 @@ def main(options: "Evaluate") -> int:
     _check(options, case.engine)
     engine = make_engine(case.engine, case.scene)
     designs = {"the design": case.design}
-    notes = common.preflight_notes(case.scene, case.space, designs, details=options.dry_run)
+    notes = common.preflight_warnings(case.scene, case.space, designs)
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
         which = "best final design" if options.particle is None else f"particle {options.particle}"

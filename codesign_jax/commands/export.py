@@ -42,7 +42,7 @@ def main(options: "Export") -> int:
     _check(options, case)
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
-    notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
+    notes = common.preflight_warnings(case.scene, case.space, {"the design": case.design})
     simulating = options.tolerance != "off" and not options.no_sheet
     engine = make_engine(case.engine, case.scene) if simulating else None
     console = Console(highlight=False, soft_wrap=True)

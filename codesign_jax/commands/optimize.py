@@ -49,7 +49,7 @@ def main(options: "Optimize") -> int:
         runs.check_folder(folder, scene, own, fresh=options.fresh, sources=sources)
     if asked.several(options):
         seeds.check_table(asked.table_folder(options))
-    notes = [*_preflight(scene, settings, options.dry_run), *common.mesh_notes(scene)]
+    notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
         _dry_run(plan, len(every), options)
@@ -173,7 +173,7 @@ def _jobs(options: "Optimize", scene: Scene, every: dict[Path, Settings]) -> int
     return int(any(result is None for result in results.values()))
 
 
-def _preflight(scene: Scene, settings: Settings, details: bool) -> list[str]:
+def _preflight(scene: Scene, settings: Settings) -> list[str]:
     """Checks the ends of the design space, as every particle lies between them.
 
     Only the ends themselves are refused or warned about: what a particle is later, its status says.
@@ -187,7 +187,7 @@ def _preflight(scene: Scene, settings: Settings, details: bool) -> list[str]:
     projected = np.asarray(jax.vmap(space.project)(stacked))
     names = [f"design of the space's {n}" for n in ends]
     designs = dict(zip(names, projected, strict=True))
-    return common.preflight_notes(scene, space, designs, details=details)
+    return common.preflight_warnings(scene, space, designs)
 
 
 def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:

@@ -49,7 +49,7 @@ def main(options: "Sample") -> int:
     dataset.refuse_other(options.out, question)
     design = question.space.default()
     designs = {"the default design": design}
-    notes = common.preflight_notes(scene, question.space, designs, details=options.dry_run)
+    notes = common.preflight_warnings(scene, question.space, designs)
     for note in [*notes, *common.mesh_notes(scene)]:
         console.print(note, markup=False)
     count = question.shards(options.designs)

@@ -1,18 +1,19 @@
-"""A process that has imported everything and used nothing of JAX, and forks those that faults end.
+"""The command in forks of a process that has imported everything and used nothing of JAX.
 
-A process of `codesign` imports for seconds, and none of its files is touched meanwhile. A fork of
-this process begins after that. It is made before JAX has a backend and before any thread of JAX's:
-to fork later is what JAX forbids.
+A process of `codesign` imports for seconds, and none of its files is touched meanwhile. A fork
+begins after that. multiprocessing's fork server has no backend and no thread of JAX's: to fork
+later is what JAX forbids.
 """
 
+import contextlib
 import ctypes
-import json
+import multiprocessing
 import os
 import signal
-import socket
 import sys
-import time
 import traceback
+from collections.abc import Iterable
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
 
@@ -45,50 +46,35 @@ def obey_permissions() -> None:
 
 
 class Forked:
-    """A process that the zygote forked."""
+    """The command in a process of its own."""
 
-    def __init__(self, zygote: "Zygote", pid: int, log: Path):
-        """Refers to a running process, whose output goes to `log`."""
-        self._zygote, self.pid, self._log = zygote, pid, log
-        self._code: int | None = None
+    def __init__(self, process: Any, log: Path):
+        """Takes a process of multiprocessing's that runs, whose output goes to `log`."""
+        self._process, self._log = process, log
 
     def send(self, number: int) -> None:
-        """Sends a signal; nothing happens if it has ended: its number is its own until `wait`."""
-        if self._code is None:
-            os.kill(self.pid, number)
+        """Sends a signal; nothing happens if it has ended."""
+        if self._process.exitcode is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._process.pid, number)
 
     def wait(self, limit: float) -> int | None:
         """Exit status, negative for a signal; None if it goes on after `limit` seconds."""
-        if self._code is None:
-            self._code = self._zygote.ask({"wait": self.pid, "limit": limit})
-        return self._code
+        self._process.join(limit)
+        return self._process.exitcode
 
     def text(self) -> str:
         """What it has written to stdout and stderr."""
         return self._log.read_text(encoding="utf-8", errors="replace")
 
 
-class Zygote:
-    """This process's fork, see the module; nothing of JAX may have been used before."""
+class Server:
+    """Starts commands in forks of a process that has imported modules."""
 
-    def __init__(self) -> None:
-        """Forks it."""
-        from jax._src import xla_bridge
-
-        assert not xla_bridge._backends, "JAX has a backend: too late to fork"
-        ours, theirs = socket.socketpair()
-        self._pid = os.fork()
-        if not self._pid:
-            ours.close()
-            _serve(theirs)
-        theirs.close()
-        self._lines = ours.makefile("rw", encoding="utf-8")
-
-    def ask(self, request: dict[str, Any]) -> Any:
-        """Sends a request and returns the answer."""
-        self._lines.write(json.dumps(request) + "\n")
-        self._lines.flush()
-        return json.loads(self._lines.readline())["answer"]
+    def __init__(self, modules: Iterable[str]):
+        """Takes the names of the modules; the first fork waits until they are imported."""
+        self._context: ForkServerContext = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload([*modules])
 
     def start(
         self,
@@ -96,7 +82,7 @@ class Zygote:
         log: Path,
         *,
         environment: dict[str, str],
-        arm: list[Any] | None = None,
+        arm: tuple[Path, Path, int, int] | None = None,
         real: bool = False,
     ) -> Forked:
         """Starts the command in a fork, in this process's working directory.
@@ -108,67 +94,40 @@ class Zygote:
           arm: Arguments of `Shim.arm`, with the library before them; None: no fault.
           real: Whether the fork becomes a new interpreter, as a user's, which imports by itself.
         """
-        request = {"start": arguments, "log": str(log), "environment": environment, "arm": arm}
-        request |= {"real": real, "folder": os.getcwd()}
-        return Forked(self, self.ask(request), log)
+        log.touch()
+        given = arguments, log, environment, arm, real
+        process = self._context.Process(target=_command, args=given, daemon=True)
+        process.start()
+        return Forked(process, log)
 
 
-def _serve(lines: socket.socket) -> None:
-    """Answers requests until the other end is closed, then ends what is left; never returns."""
-    end_with_parent()
-    running: dict[int, int | None] = {}
-    stream = lines.makefile("rw", encoding="utf-8")
-    for line in stream:
-        request = json.loads(line)
-        if "start" in request:
-            answer = os.fork()
-            if not answer:
-                _command(request)
-            running[answer] = None
-        else:
-            answer = _wait(request["wait"], request["limit"])
-            if answer is not None:
-                running.pop(request["wait"], None)
-        stream.write(json.dumps({"answer": answer}) + "\n")
-        stream.flush()
-    for pid in running:
-        os.kill(pid, signal.SIGKILL)
-    os._exit(0)
-
-
-def _wait(pid: int, limit: float) -> int | None:
-    until = time.monotonic() + limit
-    while True:
-        found, status = os.waitpid(pid, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status)
-        if time.monotonic() > until:
-            return None
-        time.sleep(0.005)
-
-
-def _command(request: dict[str, Any]) -> None:
+def _command(
+    arguments: list[str],
+    log: Path,
+    environment: dict[str, str],
+    arm: tuple[Path, Path, int, int] | None,
+    real: bool,
+) -> None:
     """Runs the command in a fork and ends it as the program does; never returns."""
     end_with_parent()
-    log = os.open(request["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
-    os.dup2(log, 1)
-    os.dup2(log, 2)
-    os.environ.update(request["environment"])
-    os.chdir(request["folder"])
-    if request["real"]:
-        os.execv(sys.executable, [sys.executable, "-m", "codesign_jax.cli", *request["start"]])
+    output = os.open(log, os.O_WRONLY | os.O_TRUNC)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    os.environ.update(environment)
+    if real:
+        os.execv(sys.executable, [sys.executable, "-m", "codesign_jax.cli", *arguments])
     code, begun = 1, False
     try:
-        if request["arm"] is not None:
+        if arm is not None:
             from scripts.faults.shim import Mode, Shim
 
-            library, folder, at, mode = request["arm"]
-            Shim(Path(library)).arm(Path(folder), at, Mode(mode))
+            library, folder, at, mode = arm
+            Shim(library).arm(folder, at, Mode(mode))
         from codesign_jax import cli
 
-        sys.argv = ["codesign", *request["start"]]
+        sys.argv = ["codesign", *arguments]
         begun = True
-        code = cli.main(request["start"])
+        code = cli.main(arguments)
     except SystemExit as stop:  # how the parser refuses
         code = stop.code if isinstance(stop.code, int) else 1
     except BaseException as error:  # as the interpreter would say it

@@ -401,9 +401,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     def refuse(problems: list[str]) -> None:
         if problems:
-            from codesign_jax.scene.schema import SceneError
+            from codesign_jax.scene.schema import InputError
 
-            raise SceneError(problems)
+            raise InputError(problems)
 
     code = status.of(run)
     if arguments is None and code == status.INTERRUPTED:

@@ -43,7 +43,7 @@ class Program:
         """Calls the program; `constants` are checked and replace the scene's.
 
         Raises:
-          SceneError: If the constants do not fit the scene, see `scene.constants.check`.
+          InputError: If the constants do not fit the scene, see `scene.constants.check`.
           RuntimeError: In a process that was forked from one that had simulated.
         """
         return _again_if_stuck(

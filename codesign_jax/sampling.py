@@ -63,7 +63,7 @@ def draw(
       Designs first to first + n - 1 with their trials.
 
     Raises:
-      SceneError: If `key` is not one typed key, or a number is no whole number or below 1.
+      InputError: If `key` is not one typed key, or a number is no whole number or below 1.
     """
     axes.refuse_draws(key, num_trials)
     noise = scene.constants()

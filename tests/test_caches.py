@@ -17,7 +17,7 @@ from codesign_jax.archives import Store
 from codesign_jax.compiler import cache
 from codesign_jax.runs import failures, rates
 from codesign_jax.scene.meshes import grid
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
 
@@ -280,7 +280,7 @@ def test_a_failed_world_with_any_damage_is_refused_or_whole(tmp_path):
         path.write_bytes(other)
         try:
             found = failures.load(path)
-        except SceneError as error:
+        except InputError as error:
             assert "is not a failed world of a run" in str(error)
             refused += 1
         else:
@@ -289,7 +289,7 @@ def test_a_failed_world_with_any_damage_is_refused_or_whole(tmp_path):
     for name in ("trial_friction", "place", "status"):
         assert name in one_failure()
         archives.save(path, {k: v for k, v in one_failure().items() if k != name})
-        with pytest.raises(SceneError, match="is not a failed world"):
+        with pytest.raises(InputError, match="is not a failed world"):
             failures.load(path)
 
 

@@ -106,7 +106,7 @@ def test_factors_scale_the_stiffness_of_joints():
 
 
 def test_a_hand_on_a_circle_is_refused():
-    with pytest.raises(schema.SceneError, match="give each finger a base"):
+    with pytest.raises(schema.InputError, match="give each finger a base"):
         sets.numbers(scene.load("paper_spheres"), sets.values(sets.space_filling(2, 0)))
 
 
@@ -515,5 +515,5 @@ def test_bad_input_is_told_in_words(scored, arguments, part, monkeypatch):
     folder, calibrate = scored
     arguments = [str(folder / a) if a.endswith(".npz") else a for a in arguments]
     monkeypatch.setattr(sys, "argv", ["calibrate.py", *arguments, "--out", str(folder)])
-    with pytest.raises(schema.SceneError, match=part):
+    with pytest.raises(schema.InputError, match=part):
         calibrate.main()

@@ -251,7 +251,7 @@ def test_every_effect_is_in_the_table():
 
 def test_unsupported_effect_names_itself_and_the_engine():
     scene = effects_scene({"wrist": False})
-    with pytest.raises(schema.SceneError, match="engine mjx: effects.wrist = false .*float64"):
+    with pytest.raises(schema.InputError, match="engine mjx: effects.wrist = false .*float64"):
         make_engine("mjx", scene)
     assert effects.state(scene.effects, "wrist", "mjx") == "unsupported (false)"
     assert effects.state(scene.effects, "wrist", "mujoco") == "off"
@@ -275,18 +275,18 @@ def check_combination(values, shape):
     """
     chosen = {f"effects__{k}": v for k, v in values.items()}
     if values["surface"] == "hull" and values["friction"] == "full":
-        with pytest.raises(schema.SceneError, match="effects.surface = 'hull' needs friction"):
+        with pytest.raises(schema.InputError, match="effects.surface = 'hull' needs friction"):
             grasps.pinch(shape, links=1, **chosen)
         return
     if values["lateral_threshold"] and not values["lateral_bending"]:
-        with pytest.raises(schema.SceneError, match="lateral_bending = false leaves out"):
+        with pytest.raises(schema.InputError, match="lateral_bending = false leaves out"):
             grasps.pinch(shape, links=1, **chosen)
         return
     scene = grasps.pinch(shape, links=1, **chosen)
     for name in effects.ENGINES:
         refused = effects.refusals(scene.effects, name)
         if refused:
-            with pytest.raises(schema.SceneError) as caught:
+            with pytest.raises(schema.InputError) as caught:
                 make_engine(name, scene)
             assert len(caught.value.problems) == len(refused)
             assert all(f"engine {name}: effects." in p for p in caught.value.problems)

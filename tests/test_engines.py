@@ -294,13 +294,13 @@ def test_batches_do_not_depend_on_order_or_size(hurried):
 
 
 def test_unknown_engine_names_the_nearest():
-    with pytest.raises(schema.SceneError, match="did you mean 'mujoco'"):
+    with pytest.raises(schema.InputError, match="did you mean 'mujoco'"):
         make_engine("mujocco", pinch())
 
 
 def test_mujocos_solver_table_is_refused_where_it_has_no_effect():
     """Unless a preset wrote it, or [newton] is set as well: then the scene serves all engines."""
-    with pytest.raises(schema.SceneError) as error:
+    with pytest.raises(schema.InputError) as error:
         make_engine("structured", pinch(solver__iterations=31, solver__tolerance=1e-9))
     iterations, tolerance = error.value.problems
     assert "solver.iterations = 31" in iterations and "set newton.iterations" in iterations

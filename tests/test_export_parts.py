@@ -138,7 +138,7 @@ def test_the_core_is_one_piece_with_openings_to_pour(written):
 
 
 def test_a_finger_without_a_chamber_is_refused():
-    with pytest.raises(schema.SceneError) as error:
+    with pytest.raises(schema.InputError) as error:
         process.sizes([0.01, 0.1], 0.02, [0.02, 0.02], [0.005, 0.005], Process())
     [problem] = error.value.problems
     assert "finger 0 of 10 mm" in problem and "--end-wall" in problem

@@ -6,7 +6,7 @@ from scipy import integrate, optimize
 
 from codesign_jax import cli, finger, scene
 from codesign_jax.scene import parameters
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from scripts import silicones
 from scripts.accuracy import beam
 from tests.helpers import beams
@@ -157,7 +157,7 @@ WRONG = {
 def test_a_wrong_file_is_refused(text, tmp_path):
     path = tmp_path / "finger.csv"
     path.write_text(text)
-    with pytest.raises(SceneError, match="finger.csv") as error:
+    with pytest.raises(InputError, match="finger.csv") as error:
         finger.read(path)
     assert WRONG[text] in str(error.value)
 

@@ -14,7 +14,7 @@ import trimesh
 
 from codesign_jax import engines, make_engine, rollout, scene
 from codesign_jax.engines.structured.laws import meshes as lanes
-from codesign_jax.scene import SceneError, constants, library, meshes, objects, reach
+from codesign_jax.scene import InputError, constants, library, meshes, objects, reach
 from codesign_jax.scene.meshes import reading, surface
 from codesign_jax.scene.parameters import design_space
 from scripts.faults import fuzz
@@ -25,7 +25,7 @@ PAPER = library.available("scenes")["paper_spheres"]
 
 
 def refusals(call, *arguments, **options):
-    with pytest.raises(SceneError) as caught:
+    with pytest.raises(InputError) as caught:
         call(*arguments, **options)
     return caught.value.problems
 
@@ -63,7 +63,7 @@ def test_names_that_no_file_or_table_could_hold(name):
 
 
 def test_an_error_never_speaks_to_the_terminal():
-    error = SceneError(["a \x1b[2J\x9b and \ud800\u2028"])
+    error = InputError(["a \x1b[2J\x9b and \ud800\u2028"])
     assert str(error) == r"a \x1b[2J\x9b and \ud800\u2028"
 
 
@@ -124,7 +124,7 @@ def test_sizes_of_mesh_files(tmp_path, monkeypatch):
     (problem,) = refusals(objects.load, object_file(tmp_path, entry + '"a"', entry + '"b"'))
     assert "the meshes have" in problem
     monkeypatch.setattr(meshes.grid, "MAX_WORK", 1e5)
-    with pytest.raises(SceneError, match="12 faces are too many for a grid of"):
+    with pytest.raises(InputError, match="12 faces are too many for a grid of"):
         _ = load_mesh(path).grid
 
 

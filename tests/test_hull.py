@@ -16,7 +16,7 @@ from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.laws.kinematics import kinematics
 from codesign_jax.engines.structured.linear.tree import Spatial, relative
 from codesign_jax.model import hull
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from tests.helpers import grasps
 
 LENGTH, HEIGHT = 0.11, 0.018
@@ -119,15 +119,15 @@ def test_velocities_are_derivatives_of_positions():
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
 def test_other_engines_refuse_the_hull(engine):
     with pytest.raises(
-        SceneError, match=f'engine {engine}: effects.surface = "hull".*use engine structured'
+        InputError, match=f'engine {engine}: effects.surface = "hull".*use engine structured'
     ):
         make_engine(engine, hull_scene())
 
 
 def test_bad_settings_are_refused():
-    with pytest.raises(SceneError, match="'hull' needs friction = 'coulomb' or 'none', not 'full'"):
+    with pytest.raises(InputError, match="'hull' needs friction = 'coulomb' or 'none', not 'full'"):
         grasps.pinch("box", effects__surface="hull", effects__friction="full")
-    with pytest.raises(SceneError, match="hull_points = 6 must be a multiple of 4"):
+    with pytest.raises(InputError, match="hull_points = 6 must be a multiple of 4"):
         hull_scene(points=6)
-    with pytest.raises(SceneError, match="did you mean 'hull'"):
+    with pytest.raises(InputError, match="did you mean 'hull'"):
         scene.load("paper_spheres", overrides={"effects": {"surface": "hul"}})

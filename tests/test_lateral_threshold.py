@@ -123,7 +123,7 @@ def test_nothing_bends_below_the_threshold_and_the_rest_bends_as_without():
 
 
 def test_it_needs_sideways_bending():
-    with pytest.raises(schema.SceneError, match="lateral_bending = false leaves out"):
+    with pytest.raises(schema.InputError, match="lateral_bending = false leaves out"):
         scene.load(
             "paper",
             overrides={"effects.lateral_threshold": True, "effects.lateral_bending": False},

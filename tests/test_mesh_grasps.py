@@ -111,7 +111,7 @@ def test_support_points_carry_the_lowest(household):
 def test_engines_that_cannot_say_so():
     the_scene = scene.load("paper_spheres", object_set="household")
     for name in ("mujoco", "mjx"):
-        with pytest.raises(schema.SceneError) as caught:
+        with pytest.raises(schema.InputError) as caught:
             make_engine(name, the_scene)
         assert len(caught.value.problems) == 8
         assert f"not supported by engine {name}: object 'mug' is a mesh" in str(caught.value)

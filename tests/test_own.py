@@ -220,5 +220,5 @@ def test_costs_see_as_much_of_a_grasp_as_they_say(here):
     the_scene = scene.load(TINY)
     assert own.make_cost("mine:turned", the_scene)[1] is False
     assert own.make_cost("mine:until_lost", the_scene)[1] is True
-    with pytest.raises(scene.SceneError, match="builtins has no file of Python code"):
+    with pytest.raises(scene.InputError, match="builtins has no file of Python code"):
         own.contents(["scene", "builtins:pow"])

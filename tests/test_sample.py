@@ -95,7 +95,7 @@ def test_objects_take_turns_with_one_trial_and_at_large_indices():
     first = 2**31 - 8
     drawn = sampling.draw(THREE, SPACE, KEY, first=first, n=6, num_trials=1)
     np.testing.assert_array_equal(drawn.trials.shape[:, 0], (first + np.arange(6)) % 3)
-    with pytest.raises(scene.SceneError, match="num_trials = 0 must be"):
+    with pytest.raises(scene.InputError, match="num_trials = 0 must be"):
         sampling.draw(THREE, SPACE, KEY, first=0, n=6, num_trials=0)
 
 

@@ -230,7 +230,7 @@ def test_landscape_varies_two_of_many_and_counts_what_it_should():
 def test_a_file_that_is_no_landscape_is_refused(tmp_path):
     for content in (b"", b"nothing"):
         (tmp_path / "x.npz").write_bytes(content)
-        with pytest.raises(scene.SceneError, match="is not a landscape of this version"):
+        with pytest.raises(scene.InputError, match="is not a landscape of this version"):
             landscape.load(tmp_path / "x.npz")
 
 

@@ -19,7 +19,7 @@ from codesign_jax.commands import jobs, slurm
 from codesign_jax.runs import checkpoint
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from tests.helpers.slurm_cluster import MISSING, PATH, cluster
 from tests.helpers.toy_engine import TINY
 
@@ -95,7 +95,7 @@ def test_parameters_are_what_submitit_and_slurm_want():
     assert found["slurm_srun_args"] == ["--cpus-per-task=8", "--mpi=none", "--quiet"]
     further = {"requeue": True, "reservation": "course", "spread-job": True}
     assert found["slurm_additional_parameters"] == further
-    with pytest.raises(SceneError, match="tasks_per_node: a run is one process"):
+    with pytest.raises(InputError, match="tasks_per_node: a run is one process"):
         slurm.parameters({"tasks_per_node": 2})
 
 
@@ -158,7 +158,7 @@ def test_results_that_lay_there_before_are_never_unpickled(tmp_path):
 
 def test_a_start_that_is_refused_leaves_no_folder(tmp_path):
     asked = SimpleNamespace(job_set=(("cluster=local", "memory=3"),), jobs=1)
-    with pytest.raises(SceneError, match="memory"), jobs.private_folder(tmp_path / "a/b") as own:
+    with pytest.raises(InputError, match="memory"), jobs.private_folder(tmp_path / "a/b") as own:
         jobs.executor(asked, own)
     assert not (tmp_path / "a").exists()
 
@@ -169,7 +169,7 @@ def test_a_dry_run_tells_where_jobs_start_and_what_is_not_used_there(monkeypatch
     words = "local; not used, as there is no SLURM here: slurm_partition"
     assert jobs.plan(partition) == words
     wrong = SimpleNamespace(jobs=2, job_set=(("gpu=8",),))
-    with pytest.raises(SceneError, match="--job-set: .*gpu"):
+    with pytest.raises(InputError, match="--job-set: .*gpu"):
         jobs.plan(wrong)
 
 

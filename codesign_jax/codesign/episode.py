@@ -15,7 +15,7 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
 from codesign_jax.programs import Program, shared
-from codesign_jax.scene import Constants, Scene, SceneError
+from codesign_jax.scene import Constants, InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
@@ -83,7 +83,7 @@ class Task:
         """Makes the engine.
 
         Raises:
-          SceneError: If the space is none, or there are no trials, or the engine is that of a scene
+          InputError: If the space is none, or there are no trials, or the engine is that of a scene
             of another structure, or worlds are to be recorded and to stop.
         """
         problems = []
@@ -93,7 +93,7 @@ class Task:
         if not isinstance(self.trials, int | np.integer) or self.trials < 1:
             problems.append(f"trials = {self.trials!r} must be a whole number, at least 1")
         if problems:
-            raise SceneError(problems)
+            raise InputError(problems)
         if self.engine is None:
             object.__setattr__(self, "engine", engines.make_engine(engines.DEFAULT, self.scene))
         axes.refuse_other(self.scene, self.engine)
@@ -118,7 +118,7 @@ class Task:
           constants: Numbers instead of the scene's, leaves of shape () or (trial,).
 
         Raises:
-          SceneError: If the population or the constants do not fit, and see `DesignSpace.check`,
+          InputError: If the population or the constants do not fit, and see `DesignSpace.check`,
             which warns of designs that are not legal.
         """
         self.space.refuse_population(population)
@@ -264,11 +264,11 @@ def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
     """Refuses a mask that is not one of the space's parameters.
 
     Raises:
-      SceneError: If its shape is another one.
+      InputError: If its shape is another one.
     """
     if np.shape(mask) != (space.num_parameters,):
         names = ", ".join(space.names)
-        raise SceneError(
+        raise InputError(
             [f"the mask has shape {np.shape(mask)}, not ({space.num_parameters},), that is {names}"]
         )
 

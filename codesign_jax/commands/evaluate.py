@@ -19,7 +19,7 @@ from codesign_jax.runs import choice, rates, tables
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Evaluate
@@ -29,7 +29,7 @@ def main(options: "Evaluate") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input.
+      InputError: If something is wrong with the input.
     """
     common.use_compilation_cache()
     case = _of_particle(find_case(options), options)
@@ -61,17 +61,17 @@ def _of_particle(case: Case, options: "Evaluate") -> Case:
     """The case of the final particle that was asked for, if one was.
 
     Raises:
-      SceneError: If there is no such particle.
+      InputError: If there is no such particle.
     """
     if options.particle is None:
         return case
     if options.run_folder is None:
-        raise SceneError(["--particle is one of a run: give its folder, or leave it out"])
+        raise InputError(["--particle is one of a run: give its folder, or leave it out"])
     record = choice.read_record(options.run_folder)
     particles = np.asarray(record.state.particles)
     problem = schema.range_problem("--particle", options.particle, "", 0, len(particles) - 1)
     if problem:
-        raise SceneError([problem])
+        raise InputError([problem])
     return case._replace(design=particles[options.particle])
 
 
@@ -94,7 +94,7 @@ def _check(options: "Evaluate", engine: str) -> None:
         problems.append(f"--out {options.out} must end in .csv")
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], engine)
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     for flag, path in (("--render", options.render), ("--out", options.out)):
         if path:
             common.check_place(flag, path)
@@ -156,7 +156,7 @@ def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Conso
         from codesign_jax.report import animation
     except ImportError as error:
         message = f"--render needs {error.name}: pip install '.[viz]' in the checkout"
-        raise SceneError([message]) from error
+        raise InputError([message]) from error
     count = min(options.trials, len(case.scene.objects.object))
     trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)
     params = case.space.params(jnp.asarray(case.design, jnp.float32))

@@ -19,7 +19,7 @@ from codesign_jax.report.landscape import Landscape
 from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.scene_files import contents, write_scene
 from codesign_jax.scene import schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, failed
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def main(options: "Options") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input; nothing is written then.
+      InputError: If something is wrong with the input; nothing is written then.
     """
     common.use_compilation_cache()
     case = find_case(options)
@@ -80,7 +80,7 @@ def _folder(options: "Options", case: Case) -> Path:
     """Where the files go: to the run, if it is the run's scene that is simulated.
 
     Raises:
-      SceneError: If the folder cannot be written.
+      InputError: If the folder cannot be written.
     """
     own = options.run_folder
     folder = Path("landscape")
@@ -98,7 +98,7 @@ def _refuse_other_scene(folder: Path, case: Case) -> None:
     """Refuses to replace scene files that are not those of the landscape.
 
     Raises:
-      SceneError: With their names.
+      InputError: With their names.
     """
     others = [
         str(folder / name)
@@ -106,7 +106,7 @@ def _refuse_other_scene(folder: Path, case: Case) -> None:
         if (folder / name).exists() and (folder / name).read_bytes() != content
     ]
     if others:
-        raise SceneError(
+        raise InputError(
             [f"--out: {', '.join(others)} would be replaced by the landscape's: choose another"]
         )
 
@@ -121,7 +121,7 @@ def _check(options: "Options", case: Case) -> None:
     problems = [problem for problem in found if problem]
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     common.check_engine(case.engine)
 
 
@@ -131,11 +131,11 @@ def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
     chosen = names or (known if len(known) == 2 else ())
     unknown = [name for name in chosen if name not in known]
     if unknown:
-        raise SceneError(
+        raise InputError(
             [f"--parameters {name!r} is not a parameter; {_meant(name, known)}" for name in unknown]
         )
     if len(set(chosen)) != 2 or len(chosen) != 2:
-        raise SceneError([f"--parameters must name two of {', '.join(known)}"])
+        raise InputError([f"--parameters must name two of {', '.join(known)}"])
     return known.index(chosen[0]), known.index(chosen[1])
 
 

@@ -23,7 +23,7 @@ from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Optimize
@@ -33,7 +33,7 @@ def main(options: "Optimize") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input; nothing was created then.
+      InputError: If something is wrong with the input; nothing was created then.
     """
     common.use_compilation_cache()
     if options.distributed is not None:
@@ -96,7 +96,7 @@ def _distributed(options: "Optimize") -> int:
     if options.dry_run:
         problems.append("--dry-run knows one host: leave out --distributed to have its estimate")
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     code, here = hosts.run(options)
     if here.index or code == 2 or code >= 128:
         return code
@@ -179,7 +179,7 @@ def _preflight(scene: Scene, settings: Settings) -> list[str]:
     Only the ends themselves are refused or warned about: what a particle is later, its status says.
 
     Raises:
-      SceneError: If an end must not be simulated.
+      InputError: If an end must not be simulated.
     """
     space = design_space(scene.hand, settings.preset)
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from codesign_jax.commands import common, failure, grasp
 from codesign_jax.runs.progress import Busy
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Replay
@@ -18,17 +18,17 @@ def main(options: "Replay") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input.
+      InputError: If something is wrong with the input.
     """
     common.use_compilation_cache()
     if options.path is not None:
         if options.run_folder is not None:
-            raise SceneError([f"{options.path} and --run {options.run_folder}: give one of them"])
+            raise InputError([f"{options.path} and --run {options.run_folder}: give one of them"])
         if not options.path.is_dir():
             return failure.main(options.path, options.engine)
         options.run_folder = options.path
     if options.out is not None and options.out.suffix != ".html":
-        raise SceneError([f"--out {options.out} must end in .html"])
+        raise InputError([f"--out {options.out} must end in .html"])
     path = options.out or _default(options.run_folder)
     common.check_place("--out", path)
     asked = grasp.find(options)

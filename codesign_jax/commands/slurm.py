@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from codesign_jax.runs import checkpoint
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 QUEUE_SECONDS = 10.0
 """Time between two calls of `squeue`, which the cluster's controller has to answer."""
@@ -50,11 +50,11 @@ def parameters(given: Mapping[str, Any]) -> dict[str, Any]:
         takes (`slurm_additional_parameters`) is such as "reservation=course,hint=compute_bound".
 
     Raises:
-      SceneError: If a run would be more than one process.
+      InputError: If a run would be more than one process.
     """
     many = [k for k in given if k.removeprefix("slurm_") in ("nodes", "tasks_per_node")]
     if any(given[name] != 1 for name in many):
-        raise SceneError([f"--job-set {many[0]}: a run is one process on one node"])
+        raise InputError([f"--job-set {many[0]}: a run is one process on one node"])
     found = dict(given)
     for name in {"slurm_setup", "slurm_teardown"} & {*given}:
         found[name] = [str(given[name])]
@@ -88,7 +88,7 @@ class Array:
         """Queues a call for each run folder.
 
         Raises:
-          SceneError: With SLURM's words, if it does not take them.
+          InputError: With SLURM's words, if it does not take them.
         """
         try:
             with self._made.batch():  # SLURM keeps an array within its number at a time
@@ -97,7 +97,7 @@ class Array:
             words = str(error).strip().splitlines()[-1:] or ["without a word"]
             problem = f"SLURM does not take the jobs: {words[0].removeprefix('sbatch: error: ')}"
             advice = "to use this machine instead: --job-set cluster=local"
-            raise SceneError([problem, advice]) from error
+            raise InputError([problem, advice]) from error
         array = next(iter(self._jobs.values())).job_id.split("_")[0]
         self._console.print(f"SLURM job {array}; to look at it: squeue --jobs {array}")
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from codesign_jax import archives, files
 from codesign_jax.runs import columns
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 FILE = "landscape.npz"
 TABLE = columns.LANDSCAPE
@@ -67,7 +67,7 @@ def load(path: Path) -> Landscape:
     """Reads the arrays of a landscape.
 
     Raises:
-      SceneError: If the file holds none.
+      InputError: If the file holds none.
     """
     try:
         stored = archives.load(path)
@@ -76,4 +76,4 @@ def load(path: Path) -> Landscape:
         problem = (
             f"{path} is not a landscape of this version ({error}); codesign landscape writes one"
         )
-        raise SceneError([problem]) from error
+        raise InputError([problem]) from error

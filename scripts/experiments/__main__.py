@@ -23,7 +23,7 @@ from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
 from codesign_jax.runs.parquet import library
 from codesign_jax.scene import Scene, keypaths, parameters
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from scripts.experiments import landscape, parquet, plan, results, strategies
 from scripts.shared import output, provenance
 
@@ -232,5 +232,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except SceneError as error:
+    except InputError as error:
         sys.exit(f"error: {error}")

@@ -202,7 +202,7 @@ def main() -> int:
             common.use_compilation_cache()
             run(args)
         text = report(args.data)
-    except (scene.SceneError, FileNotFoundError) as error:
+    except (scene.InputError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
     print(text)
     if args.page:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from codesign_jax import scene
 from codesign_jax.batch import LIMIT
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from scripts.shared import provenance
 from scripts.winners import files as winners_files
 from scripts.winners import variants as winners
@@ -55,7 +55,7 @@ def variants(args: argparse.Namespace) -> list[Variant]:
     """The variants asked for.
 
     Raises:
-      SceneError: If a name is unknown.
+      InputError: If a name is unknown.
     """
     known = {v.name: v for v in VARIANTS}
     for text in args.extra:
@@ -64,7 +64,7 @@ def variants(args: argparse.Namespace) -> list[Variant]:
     names = args.variants or list(known)
     unknown = [n for n in names if n not in known]
     if unknown:
-        raise SceneError([f"--variants {n!r} unknown; valid: {', '.join(known)}" for n in unknown])
+        raise InputError([f"--variants {n!r} unknown; valid: {', '.join(known)}" for n in unknown])
     return [known[n] for n in names]
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -135,6 +136,14 @@ def wrong(name, other):
 def test_every_part_of_the_package_has_its_layer():
     parts = {name.split(".")[1] for name in modules() if name.startswith("codesign_jax.")}
     assert parts == set(ORDER)
+
+
+def test_the_map_of_contributing_has_the_same_order():
+    """Its rows are the lines of `LAYERS`."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text.split("what its files have in common |\n|---|---|\n")[1].split("\n\n")[0]
+    named = [re.findall(r"`([a-z_]+)/?`", row.split("|")[1]) for row in table.splitlines()]
+    assert [set(row) for row in named] == [set(line.split()) for line in LAYERS.strip().split("\n")]
 
 
 def test_imports_point_one_way():

@@ -230,7 +230,17 @@ once = {"steps": (1.0,), "precisions": ("float64",)}  # a force at rest does not
 fingers = "two crossed hull fingers"
 by = "error of the force against the quadrature of the overlap, relative"
 case(34, f"{fingers}, flat on flat", f"{by}; default mesh", precisions=("float64",))(on_flat)
-case(34, f"{fingers}, flat on flat", f"{by}; worst of 5, 10 and 20 links", **once)(by_links)
+coarse = (
+    "with five links rings of vertices stand 11 mm apart, twice as far as by default: the error "
+    "falls with the square of that"
+)
+case(
+    34,
+    f"{fingers}, flat on flat",
+    f"{by}; worst of 5, 10 and 20 links",
+    failures={(1.0, "float64"): coarse},
+    **once,
+)(by_links)
 for kind, turn in ROLLED.items():
     title, own = f"{fingers}, {kind}", kind.split()[0]
     case(34, title, f"{by}; 256 points a link", name=f"mesh_{own}", **once)(

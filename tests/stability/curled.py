@@ -88,5 +88,16 @@ def without(engine, step, precision):
 
 one = {"unit": "m", "precisions": ("float32",)}
 curl = (35, "fingers of the default scene curl onto the palm")
-case(*curl, "deepest point of a finger in the palm", steps=(1.0, 0.5, 0.25), **one)(curls)
+STRIKES = (
+    "thin fingers that roll up within half a second strike the palm; at rest they are at most "
+    "3 mm deep"
+)
+failing = {(step, "float32"): STRIKES for step in (1.0, 0.5, 0.25)}
+case(
+    *curl,
+    "deepest point of a finger in the palm",
+    steps=(1.0, 0.5, 0.25),
+    failures=failing,
+    **one,
+)(curls)
 case(*curl, "the same without that contact", lower=True, steps=(1.0,), **one)(without)

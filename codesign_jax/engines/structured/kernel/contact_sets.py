@@ -192,6 +192,36 @@ class BoundContacts:
         matrix, wrench = lanewise(response, place, self.cone, jar)
         return [upper(matrix), wrench]
 
+    def wrench(self, item: Any, alpha: Lanes) -> Lanes:
+        """Wrench (6,) of the item's contacts where the last step has moved jar, which is kept."""
+        return self.if_touching(item, lambda: [self._wrench(item, alpha)], [(6,)])[0]
+
+    def _wrench(self, item: Any, alpha: Lanes) -> Lanes:
+        contacts = self.set.contacts
+
+        def response(place, cone, alpha, jar, step):
+            c = contacts(place, cone)
+            force = contact.constraint_update(c, jar + alpha * step).force
+            return sum_axis(contact.contact_wrench(c, force), 1)
+
+        jar, step = self.read("jar", item), self.read("step", item)
+        return lanewise(response, self.place(item), self.cone, alpha, jar, step)
+
+    def changes(self, item: Any, alpha: Lanes) -> Lanes:
+        """How many of the item's contacts the last step takes to another zone of the cone."""
+        return self.if_touching(item, lambda: [self._changes(item, alpha)], [()])[0]
+
+    def _changes(self, item: Any, alpha: Lanes) -> Lanes:
+        of_line = self.set.of_line
+
+        def count(gap, cone, ray, alpha):
+            c = of_line(gap, cone)
+            line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
+            return sum_axis(jnp.where(contact.same_zone(c, line, alpha), 0.0, 1.0), 0)
+
+        gap = tuple(self.read(field, item) for field in self.set.of_lines)
+        return lanewise(count, gap, self.cone, self.read("ray", item), alpha)
+
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
         """Stores the contacts' cost along a relative motion (6, ...); returns its slope at 0."""
         return self.if_touching(item, lambda: [self._prepare_linesearch(item, step)], [()])[0]

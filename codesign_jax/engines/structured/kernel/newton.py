@@ -1,18 +1,25 @@
 """Newton's method of `solver`, inside a kernel: links in loops, numbers in registers."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import solver
-from codesign_jax.engines.structured.kernel.coupling import Coupling
+from codesign_jax.engines.structured.kernel.chord import LARGEST, Chord
+from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.linesearch import LINE_TOLERANCE, LineSearch
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop, solid
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
 from codesign_jax.engines.structured.kernel.slots import only
-from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.engines.structured.kernel.team_solver import (
+    TeamCoupling,
+    TeamElimination,
+    TeamLineSearch,
+)
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
 
 class Quality(NamedTuple):
@@ -28,7 +35,11 @@ class Newton:
     def __init__(self, problem: Problem):
         """Takes the step's problem."""
         self.problem, self.block = problem, problem.block
-        self.elimination, self.search = Elimination(problem), LineSearch(problem)
+        one = problem.block.team == 1
+        self.elimination = (Elimination if one else TeamElimination)(problem)
+        self.search = (LineSearch if one else TeamLineSearch)(problem)
+        self.coupling = Coupling if one else TeamCoupling
+        self.chord = Chord(problem) if problem.slotted and one else None
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -54,13 +65,18 @@ class Newton:
             busy = waiting & (before.lane > tolerance)
             # A world that has converged keeps its iterate, so its contacts need not be looked at.
             with only(problem.slotted, busy):
-                step = self.direction(now, last, ~busy)
+                step, done = self.direction(now, last, ~busy)
                 slope, curvature, first = self.search.prepare(now, step)
                 residual, scale = lanewise(_residual, slope, first, problem.palm, now.object_motion)
                 floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, solver.FAR)
                 alpha = self.search.find(slope, curvature, first, floor, evaluations)
             alpha, residual = lanewise(hold, before, alpha, residual)
             now = lanewise(solver.tree_add_scaled, alpha, now, step)
+            if self.chord:
+                likely = busy & (residual.lane > tolerance) & (residual.lane <= LARGEST)
+                found = now, alpha, residual
+                confirm = partial(self.confirm, *found, done, scale, likely, tolerance)
+                now, alpha, residual = choose(anywhere(likely), confirm, found, self.block.size)
             return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
@@ -74,7 +90,60 @@ class Newton:
         loop(problem.links, lambda i, _: (problem.move("acc", i, last), [])[1], [], self.block.size)
         return now, Quality(residual, count)
 
-    def direction(self, now: Iterate, last: Lanes, idle: jax.Array) -> Iterate:
+    def confirm(
+        self,
+        now: Iterate,
+        alpha: Lanes,
+        residual: Lanes,
+        done: Eliminated,
+        scale: Lanes,
+        likely: jax.Array,
+        tolerance: float,
+    ) -> tuple[Iterate, Lanes, Lanes]:
+        """Ends the iteration of worlds whose next decrement would be below the tolerance.
+
+        Args:
+          now: The iterate behind the step.
+          alpha: Length of the step.
+          residual: Relative decrement before it.
+          done: What `direction` left of the palm's elimination.
+          scale: Scale of the decrement.
+          likely: Lanes of worlds whose decrement is to be looked at.
+          tolerance: Relative Newton decrement.
+
+        Returns:
+          Iterate, length and decrement, see `Chord`; the length belongs to "step_acc" of the links.
+        """
+        chord, pairs, size = self.chord, self.problem.pairs, self.block.size
+        assert chord is not None
+
+        def look(likely: jax.Array) -> tuple[Iterate, Lanes, Lanes]:
+            more, work = chord.step(now, done, alpha)
+            new = lanewise(jnp.divide, work, scale)
+            found = likely & (new.lane >= 0) & (new.lane <= tolerance)
+            taken = found if pairs is None else found & ~pairs.touching_worlds()
+
+            def take() -> tuple[Iterate, Lanes]:
+                chord.take(more, alpha, taken)
+                mask = lanes([taken], (), wide=False)
+                there = lanewise(
+                    lambda t, a, b: jax.tree.map(partial(jnp.where, t), a, b),
+                    mask,
+                    lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), now, more),
+                    now,
+                )
+                return there, lanewise(lambda t, a: jnp.where(t, 1.0, a), mask, alpha)
+
+            there, length = choose(anywhere(taken), take, (now, alpha), size)
+            small = lanes([found], (), wide=False)
+            return there, length, lanewise(jnp.where, small, new, residual)
+
+        with only(self.problem.slotted, likely):
+            steady = likely & chord.steady(alpha)
+            as_was = now, alpha, residual
+            return choose(anywhere(steady), lambda: look(steady), as_was, size)
+
+    def direction(self, now: Iterate, last: Lanes, idle: jax.Array) -> tuple[Iterate, Eliminated]:
         """Newton's step: the fingers' factors, and the step of wrist and object.
 
         Args:
@@ -86,13 +155,13 @@ class Newton:
         node, work = self.elimination.backward(last)
         step, done = self.elimination.at_palm(now, node, self.elimination.slot_pushes(last))
         if pairs is None:
-            return step
+            return step, done
         done = done._replace(work=lanewise(jnp.add, done.work, work))
 
         def correct() -> Iterate:
-            return Coupling(self.problem, pairs, done).correct(step, idle)
+            return self.coupling(self.problem, pairs, done).correct(step, idle)
 
-        return choose(pairs.touching_now(), correct, step, self.block.size)
+        return choose(pairs.touching_now(), correct, step, self.block.size), done
 
 
 def _residual(slope, first, palm: Palm, motion):

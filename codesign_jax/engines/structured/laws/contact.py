@@ -243,6 +243,18 @@ def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> Line:
     return Line(n0, n1, dot(u, u), dot(u, v), dot(v, v))
 
 
+def same_zone(contacts: Contacts, ray: Line, alpha: jax.Array) -> jax.Array:
+    """Whether the contacts are in one zone of the cone, see `constraint_update`, at 0 and alpha."""
+    normals = ray.n0, ray.n0 + alpha * ray.n1
+    if contacts.cone.friction is None:
+        one, two = (normal < 0 for normal in normals)
+        return ~contacts.active | (one == two)
+    squares = ray.uu, ray.uu + alpha * (2 * ray.uv + alpha * ray.vv)
+    lengths = [jnp.sqrt(jnp.maximum(s, 0.0) + 1e-30) for s in squares]
+    one, two = (_zones(contacts, n, size) for n, size in zip(normals, lengths, strict=True))
+    return (one[0] == two[0]) & (one[1] == two[1])
+
+
 def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
     """First and second derivative of the cost along the line, shape (...)."""
     cone = contacts.grown

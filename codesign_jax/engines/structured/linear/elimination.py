@@ -113,9 +113,13 @@ def eliminate(
 
 
 def eliminate_again(
-    axes: jax.Array, kept: Kept, r: jax.Array, r_object: jax.Array
+    axes: jax.Array,
+    kept: Kept,
+    r: jax.Array,
+    r_object: jax.Array,
+    tau: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array, Factors]:
-    """`eliminate` of the same matrix with other forces and none on the joint.
+    """`eliminate` of the same matrix with other forces.
 
     Since r - U z = r - (D^-1 U')'y it takes a sixth of the operations.
 
@@ -124,12 +128,14 @@ def eliminate_again(
       kept: What the elimination left.
       r: Force on the subtree's base link, shape (6, finger, world).
       r_object: Force on the object, same shape.
+      tau: Force on the joint, shape (axis, finger, world); None for none.
 
     Returns:
       The forces in the parent's acceleration, and the factors for `substitute`.
     """
     w, g, _ = kept.factors
     y = contract(axes, r[None], 1)
+    y = y if tau is None else y + tau
     r_object = r_object if g is None else r_object + contract(g, y[:, None], 0)
     z = contract(kept.inverse, y[None], 1)
     return r - contract(w, y[:, None], 0), r_object, kept.factors._replace(z=z)

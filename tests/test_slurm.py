@@ -100,11 +100,11 @@ def test_parameters_are_what_submitit_and_slurm_want():
 
 
 def test_what_the_queue_says_is_counted_and_reasons_that_matter_are_named():
-    queue = [slurm.State("RUNNING"), slurm.State("PENDING", "Priority")]
+    queue = [slurm.JobState("RUNNING"), slurm.JobState("PENDING", "Priority")]
     assert slurm.summary(queue) == "1 pending, 1 running"
-    queue += [slurm.State("PENDING", "PartitionTimeLimit"), slurm.State("CANCELLED")]
+    queue += [slurm.JobState("PENDING", "PartitionTimeLimit"), slurm.JobState("CANCELLED")]
     assert slurm.summary(queue) == "2 pending, 1 running (PartitionTimeLimit)"
-    assert slurm.summary([slurm.State("COMPLETED")]) == ""
+    assert slurm.summary([slurm.JobState("COMPLETED")]) == ""
 
 
 def test_why_a_job_failed_is_said_in_words(tmp_path):

@@ -12,7 +12,7 @@ from rich.console import Console
 from codesign_jax import codesign, engines, rollout, runs, types
 from codesign_jax.commands import common, estimate
 from codesign_jax.commands.case import Case, find_case
-from codesign_jax.commands.estimate import Part
+from codesign_jax.commands.estimate import TimedPart
 from codesign_jax.engines import make_engine
 from codesign_jax.report import verdicts
 from codesign_jax.runs import choice, rates, tables
@@ -101,8 +101,8 @@ def _check(options: "Evaluate", engine: str) -> None:
 
 
 def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
-    def part(name: str, grasps: int) -> Part:
-        return Part(name, rates.batch_work(case.scene, case.engine, grasps, devices=1), grasps)
+    def part(name: str, grasps: int) -> TimedPart:
+        return TimedPart(name, rates.batch_work(case.scene, case.engine, grasps, devices=1), grasps)
 
     console.print(f"grasps: {options.trials}")
     parts = [part("", options.trials)]

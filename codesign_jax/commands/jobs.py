@@ -209,7 +209,7 @@ def run(
             markup=False,
         )
         if made.cluster == "slurm":
-            place = slurm.Array(made, console)
+            place = slurm.JobArray(made, console)
         else:
             place = Processes(made, options.jobs or 1)
         place.start(calls)

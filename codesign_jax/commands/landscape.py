@@ -29,7 +29,7 @@ PART = "landscape.part"
 """What is done of a landscape, until it is finished."""
 
 
-class Grid(NamedTuple):
+class Plane(NamedTuple):
     """Designs over a grid of two parameters.
 
     Attributes:
@@ -147,7 +147,7 @@ def _meant(name: str, known: tuple[str, ...]) -> str:
     return schema.nearest(name, known)
 
 
-def grid(case: Case, columns: tuple[int, int], points: int) -> Grid:
+def grid(case: Case, columns: tuple[int, int], points: int) -> Plane:
     """A regular grid over the ranges of two parameters, ends included.
 
     Pressures are lowered under the limit that the walls set, as of every particle.
@@ -163,7 +163,7 @@ def grid(case: Case, columns: tuple[int, int], points: int) -> Grid:
     designs = np.tile(np.asarray(case.design, np.float32), (first.size, 1))
     designs[:, columns[0]], designs[:, columns[1]] = first.ravel(), second.ravel()
     projected = jax.jit(jax.vmap(space.project))(designs)
-    return Grid(columns, (axes[0], axes[1]), np.asarray(projected))
+    return Plane(columns, (axes[0], axes[1]), np.asarray(projected))
 
 
 def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Console) -> None:
@@ -171,7 +171,7 @@ def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Conso
     size = calls.equal(len(designs), calls.most_designs(trials))
     grasps = len(designs) * trials.count
     console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
-    console.print(estimate.text([estimate.Part("", calls.work(trials, size), grasps)]))
+    console.print(estimate.text([estimate.TimedPart("", calls.work(trials, size), grasps)]))
 
 
 def _trials(case: Case, options: "Options") -> Trials:
@@ -202,7 +202,7 @@ def simulated_designs(
     return found
 
 
-def summarize(case: Case, made: Grid, found: Outcome, seed: int) -> Landscape:
+def summarize(case: Case, made: Plane, found: Outcome, seed: int) -> Landscape:
     """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
     space, shape = case.space, tuple(len(axis) for axis in made.axes)
     counted = ~failed(found.status)

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, files, runs
 from codesign_jax.commands import asked, common, estimate, hosts, jobs, reference, seeds, status
-from codesign_jax.commands.estimate import Part
+from codesign_jax.commands.estimate import TimedPart
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, rates
@@ -215,7 +215,7 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     together = 1 if options.jobs else count
     work = rates.work(scene, settings, runs=together, devices=options.devices)
-    parts = [Part("", work, count * (settings.grasps + seed))]
+    parts = [TimedPart("", work, count * (settings.grasps + seed))]
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
         parts.append(reference.part(scene, settings, trials, count))

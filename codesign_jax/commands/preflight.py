@@ -18,7 +18,7 @@ SINK = 1e-3
 """Depth at rest [m] above which a contact is called soft: the paper's objects are 60 mm wide."""
 
 
-class Report(NamedTuple):
+class Findings(NamedTuple):
     """What was found; each entry names the design, the value, its limit and the reason.
 
     Attributes:
@@ -30,7 +30,7 @@ class Report(NamedTuple):
     warnings: list[str]
 
 
-def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Report:
+def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Findings:
     """Checks designs against the scene's limits; costs milliseconds and simulates nothing.
 
     Args:
@@ -41,7 +41,7 @@ def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Repo
     designs = Params(*(np.asarray(v, float) for v in designs))
     count = designs.length.shape[0]
     names = names or [f"design {i}" for i in range(count)]
-    report = Report([], _scene_warnings(scene))
+    report = Findings([], _scene_warnings(scene))
     sound = []
     for i, name in enumerate(names):
         one = Params(*(v[i] for v in designs))

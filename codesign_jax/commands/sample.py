@@ -142,7 +142,7 @@ def _dry_run(options: "Sample", question: Question, console: Console) -> None:
     work = rates.batch_work(
         question.scene, options.engine, question.chunk * options.trials, devices=1
     )
-    console.print(estimate.text([estimate.Part("", work, _grasps(options))]), markup=False)
+    console.print(estimate.text([estimate.TimedPart("", work, _grasps(options))]), markup=False)
     size = dataset.most_bytes(question, options.designs)
     console.print(f"size: at most about {size / 1e6:.1f} MB")
 

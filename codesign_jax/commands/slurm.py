@@ -34,7 +34,7 @@ NORMAL = {"None", "Priority", "Resources", "JobArrayTaskLimit", "BeginTime"}
 """Reasons for which jobs wait in any queue."""
 
 
-class State(NamedTuple):
+class JobState(NamedTuple):
     """State of a job in SLURM's words, and why it waits or ended."""
 
     name: str
@@ -71,7 +71,7 @@ def parameters(given: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-class Array:
+class JobArray:
     """Jobs of one array."""
 
     def __init__(self, made: Any, console: Console):
@@ -81,7 +81,7 @@ class Array:
         self._made, self._console = made, console
         self._jobs: dict[Path, Any] = {}
         self._asked, self._said = float("-inf"), ""
-        self._states: dict[str, State] = {}
+        self._states: dict[str, JobState] = {}
         self._ended: dict[Path, float] = {}
 
     def start(self, calls: Mapping[Path, tuple[Any, ...]]) -> None:
@@ -145,12 +145,12 @@ class Array:
         since = self._ended.get(folder)
         if since is None or time.monotonic() - since < RESULT_SECONDS:
             return ""
-        state = self._states.get(job_id, State("unknown: it has left the queue"))
+        state = self._states.get(job_id, JobState("unknown: it has left the queue"))
         # A job that was cancelled as it waited still has the reason for that.
         return state.name if state.reason in NORMAL else f"{state.name} ({state.reason})"
 
 
-def states(job_ids: Iterable[str]) -> dict[str, State] | None:
+def states(job_ids: Iterable[str]) -> dict[str, JobState] | None:
     """States of jobs by their id; those that SLURM has forgotten are missing.
 
     Args:
@@ -171,11 +171,11 @@ def states(job_ids: Iterable[str]) -> dict[str, State] | None:
     if asked.returncode:
         return {} if "Invalid job id" in asked.stderr else None
     lines = (line.strip().split("|") for line in asked.stdout.splitlines())
-    found = {parts[0]: State(*parts[1:]) for parts in lines if len(parts) == 3}
+    found = {parts[0]: JobState(*parts[1:]) for parts in lines if len(parts) == 3}
     return {job_id: found[job_id] for job_id in ids if job_id in found}
 
 
-def summary(found: Iterable[State]) -> str:
+def summary(found: Iterable[JobState]) -> str:
     """How many jobs run and wait, and why, if it is not for their turn."""
     counts: dict[str, int] = {}
     reasons = set()

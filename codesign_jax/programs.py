@@ -117,7 +117,7 @@ def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
 
     Args:
       build: Function (scene, engine, space, *arguments) that returns a function to jit, which reads
-        numbers from its constants alone; the last argument is a cost of one's own or None.
+        numbers from its constants alone; a last argument that is a `Recording` may have a cost.
     """
 
     def jitted(*arguments: Any) -> Callable:
@@ -129,7 +129,7 @@ def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
 
     @functools.wraps(build)
     def find(scene: Scene, engine: Engine, space: DesignSpace, *arguments: Any) -> Callable:
-        if arguments[-1] is not None:
+        if isinstance(arguments[-1], rollout.Recording) and arguments[-1].cost is not None:
             # A cost of one's own may read names and whatever else is no number of the scene.
             return jitted(scene, engine, space, *arguments)
         if not isinstance(engine, Hashable) or sources.digest() is None:

@@ -15,7 +15,7 @@ codesign_jax.scene.schema.InputError: params have no axis (world,); ... makes a 
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,20 @@ scene's `cost.maximum`, and `cost.particle_cost` leaves it out or scores it with
 cost reads of the trace needs `stop_when_lost=False`, or `stop_when_lost=True` if it is meant to see
 a grasp up to the loss of the object only, and its qpos needs `record_qpos=True`; see `cost.shown`.
 """
+
+
+class Recording(NamedTuple):
+    """What of a rollout is recorded, when its worlds stop, and what it costs; see `simulate`."""
+
+    record_qpos: bool = False
+    stop_when_lost: bool | None = None
+    cost: CostFunction | None = None
+
+    @property
+    def to_end(self) -> bool:
+        """See `goes_on`."""
+        return goes_on(self.record_qpos, self.stop_when_lost)
+
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
 _LATER, _HAND_MASS = 1, 2

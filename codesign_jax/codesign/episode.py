@@ -102,8 +102,8 @@ class Task:
     @property
     def how(self) -> tuple[Any, ...]:
         """What its programs are built from, see `programs.shared`."""
-        shown = self.record_qpos, self.stop_when_lost
-        return self.scene, self.engine, self.space, self.trials, *shown, self.cost
+        recording = rollout.Recording(self.record_qpos, self.stop_when_lost, self.cost)
+        return self.scene, self.engine, self.space, self.trials, recording
 
     def evaluate(
         self, population: jax.Array, key: jax.Array, constants: Constants | None = None
@@ -214,11 +214,9 @@ def _evaluation(
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-    cost: rollout.CostFunction | None,
+    recording: rollout.Recording,
 ) -> Callable[..., Outcome]:
-    how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
+    how = recording._asdict()
 
     def simulate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
         trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
@@ -234,11 +232,9 @@ def _episode(
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-    cost: rollout.CostFunction | None,
+    recording: rollout.Recording,
 ) -> EpisodeFunction:
-    how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
+    how = recording._asdict()
 
     def episode(
         state: State,

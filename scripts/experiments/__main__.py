@@ -30,9 +30,7 @@ from scripts.shared import output, provenance
 
 def parse() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("experiment", choices=[*plan.PAPER, "types", "figures"])
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
     parser.add_argument(
@@ -55,7 +53,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--devices", type=int, help="by default all that are visible")
     parser.add_argument("--every", type=int, default=4, help="episodes between checkpoints")
     parser.add_argument("--fresh", action="store_true", help="delete what is there of it")
-    provenance.add_commit(parser)
     parser.add_argument(
         "--trials",
         type=Path,

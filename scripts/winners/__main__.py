@@ -31,9 +31,7 @@ MESH_TRIALS = 8
 
 def parse() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/winners.npz"))
     parser.add_argument("--size", choices=list(SIZES), default="paper")
     parser.add_argument("--experiments", type=lambda s: s.split(","), default=["23d", "2d"])
@@ -42,7 +40,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
     parser.add_argument("--budget", type=float, default=1e9, help="seconds to begin calls in")
-    provenance.add_commit(parser)
     parser.add_argument("--merge", type=Path, nargs="+", metavar="FILE", help="joined into --out")
     parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
     parser.add_argument("--report", action="store_true", help="draw what --data holds and stop")

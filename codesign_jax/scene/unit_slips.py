@@ -3,6 +3,7 @@
 import warnings
 
 import jax
+import jax.core
 import numpy as np
 
 from codesign_jax.scene import schema

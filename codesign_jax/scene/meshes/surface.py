@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 _CHUNK = 1 << 14  # points at once: the pairs' arrays stay in the cache
 MOST_PIECES = 1_000_000  # 200 MB and some seconds
@@ -35,7 +35,7 @@ class Surface(NamedTuple):
     normal: np.ndarray
     edge_normal: np.ndarray
     corner_normal: np.ndarray
-    tree: cKDTree
+    tree: KDTree
     piece: np.ndarray
     reach: float
 
@@ -77,7 +77,7 @@ def prepare(vertices: np.ndarray, faces: np.ndarray) -> Surface:
     inward = np.cross(normal[:, None], edge)
     return Surface(
         corner, edge, inward, normal, at_edge[which].reshape(-1, 3, 3), at_vertex[faces],
-        cKDTree(centroid), np.asarray(piece), float(reach),
+        KDTree(centroid), np.asarray(piece), float(reach),
     )  # fmt: skip
 
 

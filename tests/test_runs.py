@@ -131,8 +131,8 @@ def test_sizes_default_to_the_papers():
     )
     assert two.grasps == 64 * 60 + 360
     # The default optimiser's: each of its trials is one with another object.
-    assert sizes("23d", optimize.DEFAULT) == (24, 3, 29, 12)
-    assert sizes("full", optimize.DEFAULT, objects=8) == (24, 8, 29, 12)
+    assert sizes("23d", optimize.DEFAULT) == (25, 3, 30, 6)
+    assert sizes("full", optimize.DEFAULT, objects=8) == (25, 8, 30, 6)
 
 
 def test_settings_report_every_problem():

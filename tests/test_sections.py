@@ -115,3 +115,56 @@ def test_the_force_grows_up_to_half_a_section(roll):
         fine = [force(n, 0.11, 0.0, np.pi / 2, 1e-3, (0.02, 0.03)) for n in (6, 12)]
         coarse = force(2, 0.11, 0.0, np.pi / 2, 1e-3, (0.02, 0.03))
         assert abs(fine[0] - fine[1]) < 0.2 * abs(coarse - fine[1])
+
+
+def random_rows(rng, count):
+    """Two rows of bent fingers near one another each: joint, frame before and frame behind it."""
+
+    def frames(n):
+        q = rng.normal(size=(n, 4))
+        w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+        first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+        second = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
+        third = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+        return np.array([first, second, third])
+
+    def bent(frame):
+        angle = rng.uniform(-0.6, 0.6, count)
+        turned = frame.copy()
+        turned[0] = np.cos(angle) * frame[0] + np.sin(angle) * frame[2]
+        turned[2] = np.cos(angle) * frame[2] - np.sin(angle) * frame[0]
+        return turned
+
+    rows = []
+    for _ in range(2):
+        before = frames(count)
+        rows.append((rng.normal(size=(3, count)) * 0.008, before, bent(before)))
+    return rows
+
+
+@pytest.mark.parametrize("fault", [0.0, 3e-3])
+def test_no_point_inside_a_row_is_left_out(fault):
+    """Points that `inside` finds are never `outside`, nor are their rings; a planted shift shows.
+
+    Random rows of bent fingers, 4,096 pairs with all points of a row; in float32, as in a kernel.
+    """
+    count, length = 4096, 0.14
+    rng = np.random.default_rng(5)
+    own, theirs = (tuple(map(jnp.float32, row)) for row in random_rows(rng, count))
+    last = jnp.float32(rng.random(count) < 0.3)
+    size = jnp.float32(np.repeat([[*HALF, length / LINKS / 2]], count, 0).T)
+    points = jnp.float32(added(2)[1](length))[rng.integers(0, skin.KINDS, count)]
+    points = jnp.moveaxis(points, 0, -1).reshape(2, -1, 8, count)  # ring, point, number, pair
+
+    def ring(points):
+        map_ = sections.ring_in_section(points[0], own, theirs).at[:, 0].add(fault)
+        left = jax.vmap(lambda v: sections.outside(v, map_, size))(points)
+        found = jax.vmap(lambda v: sections.inside(v, own, theirs, size, last)[0][2] < 0)(points)
+        return sections.ring_outside(map_, size, size)[None], left, found[:, 0, 0]
+
+    look = jax.jit(jax.vmap(ring))
+    rings, left, found = (np.asarray(x) for x in look(points))
+    assert 0.02 < found.mean() < 0.5 and left.mean() > 0.4, (found.mean(), left.mean())
+    missed = (found & left).sum() + (found & rings).sum()
+    assert bool(missed) == bool(fault), missed
+    assert (left | ~rings).all() or fault  # a ring is left out only if each of its points is

@@ -210,7 +210,7 @@ class Trace(NamedTuple):
           A trace whose arrays have lost their axis time; `last` and `residual` are None.
 
         Raises:
-          SceneError: If the grasp has no such phase.
+          InputError: If the grasp has no such phase.
           ValueError: If the trace is not one of a whole grasp of the scene.
 
         >>> import jax.numpy as jnp

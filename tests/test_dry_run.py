@@ -4,11 +4,11 @@ import dataclasses
 import re
 
 import pytest
-from toy import TINY
 
 from codesign_jax import cli, objects, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import rates
+from tests.helpers.toy_engine import TINY
 
 SUBJECT = ("--scene", str(TINY), "--engine", "mujoco", "--dry-run")
 

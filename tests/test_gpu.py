@@ -15,7 +15,7 @@ import pytest
 from codesign_jax.compiler import launch
 from codesign_jax.engines.base import staged
 from codesign_jax.engines.structured import StructuredEngine
-from tests import gpu_cases, small
+from tests.helpers import gpu_cases, grasps
 
 pytestmark = pytest.mark.gpu
 
@@ -29,11 +29,9 @@ def on_cpu(tmp_path):
     started = []
 
     def start(case):
-        path, here = tmp_path / "result.npz", Path(__file__)
-        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-        environment["PYTHONPATH"] = f"{here.parents[1]}:{environment.get('PYTHONPATH', '')}"
-        command = [sys.executable, str(here.with_name("gpu_cases.py")), case, str(path)]
-        process = subprocess.Popen(command, env=environment)
+        path, environment = tmp_path / "result.npz", {**os.environ, "JAX_PLATFORMS": "cpu"}
+        command = [sys.executable, "-m", "tests.helpers.gpu_cases", case, str(path)]
+        process = subprocess.Popen(command, env=environment, cwd=Path(__file__).parents[1])
         started.append(process)
 
         def read():
@@ -133,7 +131,7 @@ def test_staged_blocks_are_narrow_for_few_worlds(name):
 
 def test_the_default_is_float32_and_the_kernel():
     """What a user gets on a GPU without asking."""
-    scene = small.pinch("cylinder", links=2)
+    scene = grasps.pinch("cylinder", links=2)
     fields, ctrl = gpu_cases.inputs(scene, 3)
     engine = StructuredEngine(scene)
     assert engine.rollout(fields, ctrl[:, :20]).distance.dtype == np.float32

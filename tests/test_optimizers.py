@@ -9,7 +9,6 @@ import numpy as np
 import optax
 import pytest
 from scipy import stats
-from toy import tiny
 
 from codesign_jax import codesign, optimize
 from codesign_jax.optimize import (
@@ -29,6 +28,7 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import make_settings
+from tests.helpers.toy_engine import tiny
 
 # As many parameters as in the paper, of different ranges.  Each optimiser has two programs for all
 # tests: its `ask` and `tell` at this size.

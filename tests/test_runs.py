@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from toy import tiny
 
 from codesign_jax import codesign, files, optimize, scene
 from codesign_jax.runs import columns, rates, tables
@@ -29,6 +28,7 @@ from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import library, parameters
 from codesign_jax.types import Status
+from tests.helpers.toy_engine import tiny
 
 ROOT = Path(__file__).parent.parent
 

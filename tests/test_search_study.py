@@ -5,13 +5,13 @@ import json
 import jax
 import numpy as np
 import pytest
-from toy import TINY, ToyEngine, tiny
 
 from codesign_jax import codesign, rollout, scene
 from codesign_jax.cost import particle_cost
 from codesign_jax.types import failed
 from scripts.search import report, study, unseen
 from scripts.search.study import Study, make_case
+from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
 SIZES = "particles=4,trials=2"
 

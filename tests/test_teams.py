@@ -10,7 +10,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program, teams
 from codesign_jax.engines.structured.world_model import world_constants
 from scripts.shared import work
-from tests import gpu_cases
+from tests.helpers import gpu_cases
 
 LIMITS = Limits(60, 30, 1e-18)
 

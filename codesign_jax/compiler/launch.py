@@ -53,13 +53,16 @@ SHARED_BYTES = 27_648
 """Shared memory of a block of which eight, all that registers allow, share 228 kB (sm_90)."""
 
 
+@functools.cache
 def available(platform: str) -> str | None:
     """Why kernels cannot run on a platform, or None if they can.
 
     Args:
       platform: As `jax.default_backend` names it; "gpu" is only NVIDIA's.
     """
-    return _available(platform)
+    if platform not in ("cpu", "gpu"):
+        return f"kernels are compiled for CPUs and NVIDIA GPUs, not for {platform!r}"
+    return _llvmlite() or ffi.unsupported() or (_gpu() if platform == "gpu" else None)
 
 
 WARPS_EACH = 4
@@ -87,13 +90,13 @@ def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
         return host.vector_bytes() // np.dtype(dtype).itemsize
     lanes = 32
     if total is not None:
-        while lanes > FEWEST_LANES and 2 * total <= lanes * WARPS_EACH * _multiprocessors():
+        while lanes > FEWEST_LANES and 2 * total <= lanes * WARPS_EACH * multiprocessors():
             lanes //= 2
     return lanes
 
 
 @functools.cache
-def _multiprocessors() -> int:
+def multiprocessors() -> int:
     """Multiprocessors of this computer's first GPU; those of an A100 if it cannot be asked."""
     try:
         return int(getattr(jax.local_devices(backend="gpu")[0], "core_count", 108))
@@ -212,13 +215,6 @@ def _varying(inputs: tuple) -> dict[str, Any]:
         "sharding": jax.sharding.NamedSharding(mesh, whole),
         "manual_axis_type": jax.sharding.ManualAxisType(varying=every),
     }
-
-
-@functools.cache
-def _available(platform: str) -> str | None:
-    if platform not in ("cpu", "gpu"):
-        return f"kernels are compiled for CPUs and NVIDIA GPUs, not for {platform!r}"
-    return _llvmlite() or ffi.unsupported() or (_gpu() if platform == "gpu" else None)
 
 
 def _llvmlite() -> str | None:

@@ -41,9 +41,9 @@ from codesign_jax.optimize.resampling import MAX_PARTICLES
 STREAM_SCREEN = 0x72616E64
 """Stream of the random designs ("rand")."""
 STREAM_MOVE = 0x636D6173
-"""Stream of the strategy's draws in ``ask`` ("cmas")."""
+"""Stream of the strategy's draws in `ask` ("cmas")."""
 STREAM_TELL = 0x636D6174
-"""Stream of its draws in ``tell`` ("cmat")."""
+"""Stream of its draws in `tell` ("cmat")."""
 LEAST = 3
 """Fewest particles: the average, and two for the strategy to rank."""
 STRATEGIES = {"open-es": OPEN_SIGMA, "cma-es": 0.2}
@@ -64,17 +64,17 @@ class Screened:
     opens other parameters, strategy and average start anew at particle 0.
 
     Attributes:
-        keeps_best: True: the final test counts new trials only; see ``Optimizer.keeps_best``.
-        screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
-        space: Bounds and constraint of the parameters.
-        strategy: One of ``STRATEGIES``. With "open-es", whose draws come in pairs, the last one of
-            an even number of particles is the strategy's mean.
-        screening: Episodes of random designs.
-        retests: Episodes that simulate the best of them again.
-        sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
-            that of ``STRATEGIES``.
-        recency: After ``t`` episodes of the strategy its mean has weight ``recency / (t + recency
-            - 1)`` in the average: 1 is the plain average, more forgets the first means sooner.
+      keeps_best: True: the final test counts new trials only; see `Optimizer.keeps_best`.
+      screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
+      space: Bounds and constraint of the parameters.
+      strategy: One of `STRATEGIES`. With "open-es", whose draws come in pairs, the last one of
+        an even number of particles is the strategy's mean.
+      screening: Episodes of random designs.
+      retests: Episodes that simulate the best of them again.
+      sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
+        that of `STRATEGIES`.
+      recency: After `t` episodes of the strategy its mean has weight `recency / (t + recency
+        - 1)` in the average: 1 is the plain average, more forgets the first means sooner.
     """
 
     keeps_best = True
@@ -91,7 +91,7 @@ class Screened:
         """Check the static fields.
 
         Raises:
-            ValueError: If one of them is out of its range.
+          ValueError: If one of them is out of its range.
         """
         if self.strategy not in STRATEGIES:
             raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
@@ -99,13 +99,13 @@ class Screened:
             raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma >= 0: {self}")
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
-        """The state before episode 0; see ``Optimizer.init``.
+        """The state before episode 0; see `Optimizer.init`.
 
         The seed particle gives the parameters that a schedule closes from the start.
 
         Raises:
-            TypeError: If ``key`` is not a typed key.
-            ValueError: If the shape of the seed particle or the number of particles is wrong.
+          TypeError: If `key` is not a typed key.
+          ValueError: If the shape of the seed particle or the number of particles is wrong.
         """
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST:
@@ -119,7 +119,7 @@ class Screened:
         return state._replace(memory=memory | self._start(state))
 
     def ask(self, state: State, mask: ArrayLike) -> jax.Array:
-        """Particles to evaluate; see ``Optimizer.ask``.
+        """Particles to evaluate; see `Optimizer.ask`.
 
         The constraint of the space may change a closed parameter, as with the particle filter.
         """
@@ -134,10 +134,10 @@ class Screened:
     def tell(
         self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
     ) -> tuple[State, Info]:
-        """The next state and the episode's report; see ``Optimizer.tell``.
+        """The next state and the episode's report; see `Optimizer.tell`.
 
         Raises:
-            ValueError: If shapes do not match.
+          ValueError: If shapes do not match.
         """
         assert state.memory is not None
         cost = check_told(state, population, cost)

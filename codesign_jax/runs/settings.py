@@ -141,7 +141,7 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     if hand is not None:
         try:
             space = design_space(hand, settings.preset)
-        except schema.SceneError as error:
+        except schema.InputError as error:
             found += [f"--{problem}" for problem in error.problems]
     low, high = _RANGES["episodes"]
     if low <= settings.episodes <= high:  # it is as long as the run

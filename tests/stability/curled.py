@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from codesign_jax import model, scene
-from tests import small
+from tests.helpers import grasps
 from tests.stability.bench import bench
 from tests.stability.oracle import Reader
 from tests.stability.table import Found, case
@@ -31,7 +31,7 @@ def deepest(step, precision, *, palm=True):
     b = bench(default(palm=palm), "structured", step, precision)
     hands = []
     for length, pressure in HANDS:
-        params, trial = small.hand_world(b.scene, length=length, wall=WALL, height=0.015)
+        params, trial = grasps.hand_world(b.scene, length=length, wall=WALL, height=0.015)
         hands.append((params, pressure))
     fields = b.fields([h for h, _ in hands], [trial] * len(hands))
     fingers = b.scene.num_fingers

@@ -52,7 +52,7 @@ def evaluated(engine, step, precision, links=10, num_trials=TRIALS):
 
 
 def ranks(one, two):
-    return stats.spearmanr(one[1], two[1]).statistic
+    return stats.spearmanr(one[1], two[1])[0]
 
 
 def rates(one, two):

@@ -78,7 +78,7 @@ class StructuredEngine(Equal):
         Raises:
           ValueError: If a segment has no step, or there is none to truncate.
           KernelUnavailable: If kernels cannot run on this device.
-          SceneError: If a mesh's distance cannot be put on a grid, or was read for a hand with
+          InputError: If a mesh's distance cannot be put on a grid, or was read for a hand with
             smaller contact spheres.
         """
         effects.refuse(scene.effects, self.name)

@@ -81,10 +81,8 @@ class Problem:
         self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
         self.pairs: BoundPairs | None = m.contacts.get("finger_finger")  # type: ignore[assignment]
         self.fingers = [m.contacts[n] for n in ("finger_object", "finger_table") if n in m.contacts]
-        self.skin: list[BoundSlots] = [
-            c  # type: ignore[misc]
-            for n, c in m.contacts.items()
-            if n.startswith("hull_")
+        self.skin: list[BoundSlots] = [  # type: ignore[assignment]  # hull sets are slots
+            c for n, c in m.contacts.items() if n.startswith("hull_")
         ]
         self.slots = [c for n, c in m.contacts.items() if not n.startswith(("finger", "hull_"))]
         self.slotted = [*self.skin, *([self.pairs] if self.pairs else [])]

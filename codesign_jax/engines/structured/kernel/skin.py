@@ -169,7 +169,7 @@ class Skin:
         ball = self.step.p.hand.read(self.step.hand, "ball", kind)
         centre, reach = lanewise(hull.ball_around, joint, before.frame, after.frame, ball)
         for slots in self.sets:
-            slots.clear(row)
+            slots.clear(row)  # pyright: ignore[reportAttributeAccessIssue]  # hull sets are slots
             _, _, gap = self.step.geometry(slots.set.name, centre, reach, self.at, self.thing)
 
             def vertices(slots: BoundSlots = slots) -> None:

@@ -151,7 +151,7 @@ class Team:
 
         value = lanes(y, (len(y),), wide=True)
         r, ro, z = lanewise(reduce, kept, self.one(r), self.one(ro), value)
-        return r.lane, ro.lane, z
+        return r.lane, ro.lane, z  # pyright: ignore[reportAttributeAccessIssue]  # lanewise gives Lanes
 
     def link(self, i: Any) -> el.Kept:
         """What a link's elimination has left, by columns."""

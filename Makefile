@@ -12,11 +12,12 @@ CHECKED := codesign_jax scripts tests notebooks
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs test test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo docs test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
+	@echo "make quick       a minute of them, for another Python: PYTHON=python3.13 VENV=.venv-python3.13"
 	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
 	@echo "make test-ptx    kernels for GPUs, assembled without one"
 	@echo "make test-browser  the report in a headless Chromium"
@@ -34,6 +35,11 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
+
+# The quick core: a minute for another Python, make quick PYTHON=python3.13 VENV=.venv-python3.13
+CORE := layers scene parameters schedule optimizers compiler planted_faults codesign run_folder
+quick: $(STAMP)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(CORE:%=tests/test_%.py)
 
 # What needs a browser: the report and its 3D replay in a headless Chromium.
 test-browser: $(STAMP)

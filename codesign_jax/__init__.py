@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from codesign_jax.caches import use_compilation_cache
     from codesign_jax.codesign import Task
     from codesign_jax.engines import make_engine
-    from codesign_jax.scene import SceneError, constants, hand, objects, parameters
+    from codesign_jax.scene import InputError, constants, hand, objects, parameters
     from codesign_jax.types import Params, Status, Trace, Trial
 
 _HOME = {
@@ -37,7 +37,7 @@ _HOME = {
     "hand": "codesign_jax.scene",
     "objects": "codesign_jax.scene",
     "parameters": "codesign_jax.scene",
-    "SceneError": "codesign_jax.scene",
+    "InputError": "codesign_jax.scene",
     "make_engine": "codesign_jax.engines",
     "Task": "codesign_jax.codesign",
     "Params": "codesign_jax.types",
@@ -50,7 +50,7 @@ _HOME = {
 
 __all__ = [
     "Params",
-    "SceneError",
+    "InputError",
     "Status",
     "Task",
     "Trace",

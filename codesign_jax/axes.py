@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import Constants, Scene
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trial
 
 _TRIAL = Trial((), (2,), (), (2,), (), (), (), (), ())
@@ -25,7 +25,7 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
       axes: Names of the axes; where they are the same the arrays have to be as long.
 
     Raises:
-      SceneError: With every array of another shape.
+      InputError: With every array of another shape.
     """
     fingers = (scene.num_fingers,)
     one = Params(fingers, fingers, fingers, (), (6,), fingers)
@@ -36,7 +36,7 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
         if counts[0] != counts[1]:
             problems = [f"params have {counts[0]} {axes[0]}s and trials {counts[1]}"]
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
 
 
 def refuse_other(scene: Any, engine: Any) -> None:
@@ -47,17 +47,17 @@ def refuse_other(scene: Any, engine: Any) -> None:
       engine: What should be an engine. Those of one's own without an attribute `scene` take all.
 
     Raises:
-      SceneError: If `scene` is none, or its structure is not that of the engine's scene: the engine
+      InputError: If `scene` is none, or its structure is not that of the engine's scene: the engine
         would simulate its own.
     """
     if not isinstance(scene, Scene):
-        raise SceneError([f"scene is a {type(scene).__name__}, not a Scene; scene.load reads one"])
+        raise InputError([f"scene is a {type(scene).__name__}, not a Scene; scene.load reads one"])
     own = getattr(engine, "scene", None)
     if own is None or own.structure == scene.structure:
         return
     keys = _differences(dataclasses.asdict(own.structure), dataclasses.asdict(scene.structure), "")
     some = ", ".join(keys[:3]) + (", ..." if len(keys) > 3 else "")
-    raise SceneError(
+    raise InputError(
         [
             f"engine {engine.name} was made for a scene of another structure (other: {some}); "
             f"make_engine({engine.name!r}, scene) makes one for this scene"
@@ -82,12 +82,12 @@ def refuse_constants(constants: Constants, count: int, axis: str) -> None:
       axis: Its name.
 
     Raises:
-      SceneError: With the first leaf of another length.
+      InputError: With the first leaf of another length.
     """
     for path, value in jax.tree_util.tree_leaves_with_path(constants):
         if np.ndim(value) == 1 and np.shape(value)[0] != count:
             key = jax.tree_util.keystr(path)
-            raise SceneError(
+            raise InputError(
                 [f"constants{key} has {np.shape(value)[0]} values, one a {axis}: there are {count}"]
             )
 
@@ -100,14 +100,14 @@ def refuse_draws(key: Any, count: int) -> None:
       count: What should be a number of trials.
 
     Raises:
-      SceneError: If `key` is anything but one typed key, or `count` is no whole number or below 1.
+      InputError: If `key` is anything but one typed key, or `count` is no whole number or below 1.
     """
     if not isinstance(count, int | np.integer) or count < 1:
-        raise SceneError([f"num_trials = {count} must be a whole number, at least 1"])
+        raise InputError([f"num_trials = {count} must be a whole number, at least 1"])
     shape, kind = jnp.shape(key), jnp.result_type(key)
     if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
         words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
-        raise SceneError([words])
+        raise InputError([words])
 
 
 def _problems(what: str, batch: Any, one: Any, axis: str) -> list[str]:

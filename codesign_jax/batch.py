@@ -172,8 +172,8 @@ class Batch:
         if self._parts is None:
             task, joined = self._task, min(runs, self._group(request))
             worlds = -(-joined * self._worlds(request) // len(self.devices))
-            scene, engine, *rest = task.how
-            how = scene, engine, rest[0], block_lanes(engine, worlds), *rest[1:]
+            scene, engine, space, trials, recording = task.how
+            how = scene, engine, space, block_lanes(engine, worlds), trials, recording
             draw, before, after = (
                 Program(scene, make(*how), self._optimizer) for make in (_draw, _before, _after)
             )
@@ -211,16 +211,16 @@ class Batch:
         """The blocks of all runs, dealt to the devices."""
         parts = _deal(tuple(p.blocks for p in packed), len(self.devices))
         return [
-            self._call(blocks, packed[0].common, device)
+            self.call(blocks, packed[0].common, device)
             for blocks, device in zip(parts, self.devices, strict=False)
         ]
 
     def _one_by_one(self, packed: Sequence[_Packed]) -> list[tuple]:
         """Every run by itself, in turn on each device."""
         turns = zip(packed, itertools.cycle(self.devices), strict=False)
-        return [self._call(p.blocks, p.common, device) for p, device in turns]
+        return [self.call(p.blocks, p.common, device) for p, device in turns]
 
-    def _call(self, blocks: tuple, common: tuple, device: Device) -> tuple:
+    def call(self, blocks: tuple, common: tuple, device: Device) -> tuple:
         """Begins to simulate on a device; returns at once."""
         blocks, common = jax.device_put((blocks, common), device)
         return self._launcher(blocks, common, device)(blocks, common)
@@ -252,9 +252,7 @@ def _draw(
     space: DesignSpace,
     lanes: int | None,
     num_trials: int,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-    cost: rollout.CostFunction | None,
+    recording: rollout.Recording,
 ) -> Callable:
     """Draws an episode's trials."""
 
@@ -271,9 +269,7 @@ def _before(
     space: DesignSpace,
     lanes: int | None,
     num_trials: int,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-    cost: rollout.CostFunction | None,
+    recording: rollout.Recording,
 ) -> Callable:
     """Moves a run's particles and prepares their worlds."""
 
@@ -283,7 +279,9 @@ def _before(
         worlds = rollout.crossed(jax.vmap(space.params)(population), noise)
         fields, ctrl, initial = rollout.prepare(scene, *worlds, constants)
         blocks = staged(engine, lanes).pack(fields, ctrl)
-        return _Packed(population, worlds[1], initial, *blocks, None if cost is None else ctrl)
+        return _Packed(
+            population, worlds[1], initial, *blocks, None if recording.cost is None else ctrl
+        )
 
     return before
 
@@ -295,12 +293,9 @@ def _launch(
     space: DesignSpace,
     lanes: int | None,
     num_trials: int,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-    cost: rollout.CostFunction | None,
+    recording: rollout.Recording,
 ) -> Callable:
-    whole = rollout.goes_on(record_qpos, stop_when_lost)
-    return staged(engine, lanes, trajectory=whole).launch
+    return staged(engine, lanes, trajectory=recording.to_end).launch
 
 
 @shared
@@ -310,9 +305,7 @@ def _after(
     space: DesignSpace,
     lanes: int | None,
     num_trials: int,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-    cost: rollout.CostFunction | None,
+    recording: rollout.Recording,
 ) -> Callable:
     """Judges a run's worlds and tells its optimiser."""
 
@@ -324,11 +317,10 @@ def _after(
     ) -> tuple[State, EpisodeInfo]:
         (state, packed), (mask, out) = asked, found
         shape = packed.population.shape[0], num_trials
-        whole = rollout.goes_on(record_qpos, stop_when_lost)
-        trace = staged(engine, lanes, trajectory=whole).unpack(out, shape[0] * shape[1])
+        stages = staged(engine, lanes, trajectory=recording.to_end)
+        trace = stages.unpack(out, shape[0] * shape[1])
         judged = trace, packed.ctrl, packed.initial, packed.trials, constants
-        how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
-        outcome = rollout.judge(scene, *judged, **how)
+        outcome = rollout.judge(scene, *judged, **recording._asdict())
         trials, last = rollout.grid((outcome, trace.last), shape)
         costs = particle_cost(scene.with_constants(constants), trials)
         new, selection = optimizer.tell(state, packed.population, costs, mask)

@@ -1,6 +1,7 @@
 """The `codesign` command: its flags.  Nothing heavy is imported before they are parsed."""
 
 import dataclasses
+import importlib
 import importlib.metadata
 import sys
 from pathlib import Path
@@ -22,8 +23,17 @@ from codesign_jax.commands.flags import (
 )
 
 
+class Command:
+    """A command: its flags are fields, its work is `main` of the module of its name."""
+
+    def run(self) -> int:
+        """Runs the command and returns the exit status."""
+        name = type(self).__name__.lower()
+        return importlib.import_module(f"codesign_jax.commands.{name}").main(self)
+
+
 @dataclasses.dataclass
-class Optimize:
+class Optimize(Command):
     """Co-design morphology and control of a hand.
 
     The same command again resumes the run in its folder, and more --episodes extend it.  Sizes that
@@ -66,9 +76,9 @@ class Optimize:
     """Trials of a particle in an episode, best a multiple of the objects; default: one with each
     object; the paper's are 6."""
     episodes: Count = None
-    """Episodes; default: 23 in 2d, 30 otherwise; the paper's are 64 and 128."""
+    """Episodes; default: 21 in 2d, 28 otherwise; the paper's are 64 and 128."""
     test_trials: Count = None
-    """Further trials that test each final particle, in whole rounds of --trials; default: 6; the
+    """Further trials that test each final particle, in whole rounds of --trials; default: 12; the
     paper's are 36 in 2d, 72 otherwise; 0: none."""
     reference_trials: Count = None
     """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine
@@ -100,15 +110,9 @@ class Optimize:
     dry_run: Flag = False
     """Print the resolved scene, the number of grasps and an estimate; write nothing."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import optimize
-
-        return optimize.main(self)
-
 
 @dataclasses.dataclass
-class Evaluate(RunOrDesign):
+class Evaluate(Command, RunOrDesign):
     """Evaluate one design: costs of each object, how sure they are, an animation if asked for."""
 
     trials: int = 6
@@ -124,15 +128,9 @@ class Evaluate(RunOrDesign):
     dry_run: Flag = False
     """Print the number of grasps and an estimate of the time; simulate nothing."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import evaluate
-
-        return evaluate.main(self)
-
 
 @dataclasses.dataclass(kw_only=True)
-class Export(RunOrDesign):
+class Export(Command, RunOrDesign):
     """Export a design: MuJoCo models with a player, commands, parts to cast, a build sheet.
 
     The folder is there once all of it is done. docs/export.md has every file.
@@ -169,15 +167,9 @@ class Export(RunOrDesign):
     overwrite: Flag = False
     """Write into a folder that has files already."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import export
-
-        return export.main(self)
-
 
 @dataclasses.dataclass
-class Landscape(RunOrDesign):
+class Landscape(Command, RunOrDesign):
     """Draw the mean cost over a grid of two parameters: a figure, a table and arrays.
 
     With --run the files go to the run folder, and its report shows them.
@@ -199,15 +191,9 @@ class Landscape(RunOrDesign):
     dry_run: Flag = False
     """Print the number of grasps and an estimate of the time; simulate and write nothing."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import landscape
-
-        return landscape.main(self)
-
 
 @dataclasses.dataclass
-class Render(Shown, RunOrDesign):
+class Render(Command, Shown, RunOrDesign):
     """Draw one grasp, of a design or of a run: an animation (.gif) or a film strip (.png)."""
 
     out: Path = Path("grasp.gif")
@@ -219,15 +205,9 @@ class Render(Shown, RunOrDesign):
     size: int = 320
     """Width and height of a picture in pixels."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import render
-
-        return render.main(self)
-
 
 @dataclasses.dataclass
-class Report:
+class Report(Command):
     """Write the report of a run: one HTML file, with the best grasp in 3D, that works offline.
 
     It has the chosen design and its success, the evolution of cost and parameters, the landscape
@@ -243,15 +223,9 @@ class Report:
     no_replay: Flag = False
     """Leave the grasp in 3D out: nothing is simulated."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import report
-
-        return report.main(self)
-
 
 @dataclasses.dataclass(kw_only=True)
-class Sample:
+class Sample(Command):
     """Simulate random designs, one row a grasp of a Parquet file: a data set.
 
     Designs are uniform between their bounds, with pressures lowered under the limit of their
@@ -292,15 +266,9 @@ class Sample:
     dry_run: Flag = False
     """Print the number of grasps and an estimate of time and size; simulate and write nothing."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import sample
-
-        return sample.main(self)
-
 
 @dataclasses.dataclass
-class Scenes:
+class Scenes(Command):
     """List scenes and their effects: on, off, or unsupported by an engine."""
 
     name: Annotated[
@@ -310,15 +278,9 @@ class Scenes:
     engine: Text = None
     """Show this engine only."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import scenes
-
-        return scenes.main(self)
-
 
 @dataclasses.dataclass
-class Replay(Shown):
+class Replay(Command, Shown):
     """Show one grasp in 3D in a browser, or say how a failed world of a run failed.
 
     A page of its own that works offline: the best grasp of a run, any row of its trials.csv, or a
@@ -335,15 +297,9 @@ class Replay(Shown):
     open: Flag = False
     """Open it in the browser."""
 
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import replay
-
-        return replay.main(self)
-
 
 @dataclasses.dataclass
-class Finger(flags.Subject):
+class Finger(Command, flags.Subject):
     """Predict one finger's bending and forces over pressure, and compare it with measurements.
 
     A file of measurements is a CSV whose head names columns and their units: pressure_kPa, and one
@@ -361,12 +317,6 @@ class Finger(flags.Subject):
     """Fit the shear modulus, and where forces were measured the moment per pressure, too."""
     out: File = None
     """Write what is printed, measured and predicted, as a table (.csv)."""
-
-    def run(self) -> int:
-        """Runs the command and returns the exit status."""
-        from codesign_jax.commands import finger
-
-        return finger.main(self)
 
 
 COMMANDS = (
@@ -401,9 +351,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     def refuse(problems: list[str]) -> None:
         if problems:
-            from codesign_jax.scene.schema import SceneError
+            from codesign_jax.scene.schema import InputError
 
-            raise SceneError(problems)
+            raise InputError(problems)
 
     code = status.of(run)
     if arguments is None and code == status.INTERRUPTED:

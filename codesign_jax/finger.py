@@ -24,7 +24,7 @@ from scipy import optimize
 
 from codesign_jax.model import morphology
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import SceneError, nearest
+from codesign_jax.scene.schema import InputError, nearest
 from codesign_jax.types import Params
 
 UNITS = {
@@ -309,17 +309,17 @@ def read(path: Path) -> dict[str, np.ndarray]:
       Columns of `COLUMNS` that the file has [SI units], shape (row,); NaN for an empty cell.
 
     Raises:
-      SceneError: With everything that is wrong with the file.
+      InputError: With everything that is wrong with the file.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = [(n, line) for n, line in enumerate(file, 1) if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "no UTF-8 text"
-        raise SceneError([f"{path}: {why}"]) from error
+        raise InputError([f"{path}: {why}"]) from error
     lines = [(n, line) for n, line in lines if not line.lstrip().startswith("#")]
     if not lines:
-        raise SceneError(
+        raise InputError(
             [f"{path} is empty; its head names columns, such as pressure_kPa,angle_deg"]
         )
     head, *rows = csv.reader([line for _, line in lines])
@@ -345,7 +345,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
         )
         problems = _missing(table)
     if problems:
-        raise SceneError([f"{path}: {p}" for p in problems])
+        raise InputError([f"{path}: {p}" for p in problems])
     return table
 
 

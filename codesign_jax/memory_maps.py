@@ -12,7 +12,7 @@ from pathlib import Path
 _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _FULL, _TOO_FULL = 0.3, 0.9  # shares of what is allowed: from here programs go; nothing is compiled
 
-_forget: list[Callable[[], object]] = []
+forgetters: list[Callable[[], object]] = []
 
 
 def count() -> int:
@@ -34,7 +34,7 @@ def most() -> int:
 
 def holds_programs(forget: Callable[[], object]) -> None:
     """Notes a function that drops programs which could be compiled again."""
-    _forget.append(forget)
+    forgetters.append(forget)
 
 
 def relieve() -> None:
@@ -46,7 +46,7 @@ def relieve() -> None:
         return
     import jax
 
-    for forget in _forget:
+    for forget in forgetters:
         forget()
     jax.clear_caches()
     gc.collect()

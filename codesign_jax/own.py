@@ -20,7 +20,7 @@ import numpy as np
 from codesign_jax import rollout
 from codesign_jax.optimize import Optimizer, Space, State
 from codesign_jax.rollout import CostFunction
-from codesign_jax.scene import Scene, SceneError
+from codesign_jax.scene import InputError, Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome, Params, Trace
 
@@ -48,7 +48,7 @@ def contents(names: Iterable[str]) -> dict[str, bytes]:
     where that is another; what these import is not among them.
 
     Raises:
-      SceneError: If a module cannot be imported, or has no file of Python code.
+      InputError: If a module cannot be imported, or has no file of Python code.
     """
     found = {}
     for name in filter(is_own, names):
@@ -70,13 +70,13 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
       `stop_when_lost`, False if it has none.
 
     Raises:
-      SceneError: If it is no function of scene, trace and controls that returns one number.
+      InputError: If it is no function of scene, trace and controls that returns one number.
     """
     flag, cost = f"--cost {name}", _load(name, "--cost")
     _refuse_signature(flag, cost, ("scene", "trace", "ctrl"))
     stops = getattr(cost, "stop_when_lost", False)
     if not isinstance(stops, bool):
-        raise SceneError([f"{flag}: its attribute stop_when_lost must be True or False"])
+        raise InputError([f"{flag}: its attribute stop_when_lost must be True or False"])
 
     constants = scene.constants()
 
@@ -104,16 +104,16 @@ def make_optimizer(name: str, space: Space, num_particles: int | None = None) ->
       num_particles: Particles of a run, with which its functions are tried on a cost of zero.
 
     Raises:
-      SceneError: If it is none as `optimize.Optimizer` describes them.
+      InputError: If it is none as `optimize.Optimizer` describes them.
     """
     flag, make = f"--optimizer {name}", _load(name, "--optimizer")
     _refuse_signature(flag, make, ("space",))
     made = _tried(flag, make, lambda: make(space))
     missing = [n for n in ("space", "keeps_best", "init", "ask", "tell") if not hasattr(made, n)]
     if missing:
-        raise SceneError([f"{flag}: it lacks {', '.join(missing)} of optimize.Optimizer"])
+        raise InputError([f"{flag}: it lacks {', '.join(missing)} of optimize.Optimizer"])
     if any(leaf is made for leaf in jax.tree.leaves(made)):
-        raise SceneError(
+        raise InputError(
             [
                 f"{flag}: it is no pytree: make it a dataclass and register that with "
                 "jax.tree_util.register_dataclass"
@@ -130,7 +130,7 @@ def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
     seed, mask = jnp.asarray((low + high) / 2, float), np.ones(low.shape, bool)
     state = _tried(flag, make, lambda: made.init(jax.random.key(0), seed, n))
     if not isinstance(state, State) or np.shape(state.particles) != (n, low.size):
-        raise SceneError(
+        raise InputError(
             [f"{flag}: init must return an optimize.State with particles ({n}, {low.size})"]
         )
 
@@ -140,9 +140,9 @@ def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
 
     population, told = _tried(flag, make, lambda: jax.eval_shape(episode, state))
     if population.shape != (n, low.size):
-        raise SceneError([f"{flag}: ask returns {population.shape}, not ({n}, {low.size})"])
+        raise InputError([f"{flag}: ask returns {population.shape}, not ({n}, {low.size})"])
     if not (isinstance(told, tuple) and len(told) == 2 and _same(state, told[0])):
-        raise SceneError(
+        raise InputError(
             [
                 f"{flag}: tell must return a state, with the arrays of init's in shape and type, "
                 "and an optimize.Info (`optimize.protocol.summarize` makes one)"
@@ -169,11 +169,11 @@ def _load(name: str, flag: str = "") -> Any:
     """The object of a name.
 
     Raises:
-      SceneError: If there is none, or its module cannot be imported.
+      InputError: If there is none, or its module cannot be imported.
     """
     begin = f"{flag} {name}".strip()
     if words := problem(name):
-        raise SceneError([f"{flag}: {words}".removeprefix(": ")])
+        raise InputError([f"{flag}: {words}".removeprefix(": ")])
     module, _, attribute = name.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)
@@ -182,17 +182,17 @@ def _load(name: str, flag: str = "") -> Any:
         imported = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise SceneError([f"{begin}: {_where(error, None)}"]) from error
-        raise SceneError(
+            raise InputError([f"{begin}: {_where(error, None)}"]) from error
+        raise InputError(
             [f"{begin}: there is no module {module!r} in {here} or among the installed packages"]
         ) from error
     except (Exception, SystemExit) as error:
-        raise SceneError([f"{begin}: importing it fails: {_where(error, None)}"]) from error
+        raise InputError([f"{begin}: importing it fails: {_where(error, None)}"]) from error
     finally:
         sys.path.remove(here)
     if not hasattr(imported, attribute):
         place = getattr(imported, "__file__", None) or module
-        raise SceneError([f"{begin}: {place} has no {attribute!r}"])
+        raise InputError([f"{begin}: {place} has no {attribute!r}"])
     return getattr(imported, attribute)
 
 
@@ -200,12 +200,12 @@ def _source(name: str, module: str) -> Path:
     """File of Python code that a module was read from.
 
     Raises:
-      SceneError: If there is none, such as of a module in C.
+      InputError: If there is none, such as of a module in C.
     """
     try:
         return Path(inspect.getsourcefile(sys.modules[module]) or "").resolve(strict=True)
     except (TypeError, OSError) as error:
-        raise SceneError(
+        raise InputError(
             [f"{name}: module {module} has no file of Python code, which a run keeps a copy of"]
         ) from error
 
@@ -214,29 +214,29 @@ def _refuse_signature(flag: str, function: Any, arguments: tuple[str, ...]) -> N
     """Refuses what cannot be called with so many arguments.
 
     Raises:
-      SceneError: With the arguments that it gets.
+      InputError: With the arguments that it gets.
     """
     wanted = f"a function of ({', '.join(arguments)})"
     if not callable(function):
-        raise SceneError([f"{flag}: it is {type(function).__name__}, not {wanted}"])
+        raise InputError([f"{flag}: it is {type(function).__name__}, not {wanted}"])
     try:
         inspect.signature(function).bind(*arguments)
     except ValueError:  # it does not tell
         pass
     except TypeError as error:
-        raise SceneError([f"{flag}: it must be {wanted}: {error}"]) from error
+        raise InputError([f"{flag}: it must be {wanted}: {error}"]) from error
 
 
 def _tried(flag: str, code: Any, call: Callable[[], Any]) -> Any:
     """Returns what the user's code returns.
 
     Raises:
-      SceneError: With the error that it raises, and its line.
+      InputError: With the error that it raises, and its line.
     """
     try:
         return call()
     except Exception as error:
-        raise SceneError([f"{flag}: {_where(error, code)}"]) from error
+        raise InputError([f"{flag}: {_where(error, code)}"]) from error
 
 
 def _where(error: BaseException, code: Any) -> str:

@@ -43,7 +43,7 @@ class Program:
         """Calls the program; `constants` are checked and replace the scene's.
 
         Raises:
-          SceneError: If the constants do not fit the scene, see `scene.constants.check`.
+          InputError: If the constants do not fit the scene, see `scene.constants.check`.
           RuntimeError: In a process that was forked from one that had simulated.
         """
         return _again_if_stuck(
@@ -64,16 +64,16 @@ class Program:
         return jax.tree.map(lambda v: jnp.asarray(v, float), numbers)
 
 
-_process = {"begun": False, "forked": False}
+process = {"begun": False, "forked": False}
 """Whether programs have run in this process, and whether it was forked from one in which they had.
 
 A child of `os.fork` has none of XLA's threads, for which its programs would wait for ever.
 """
 
 
-def _forked() -> None:
+def note_fork() -> None:
     """This process is a child."""
-    _process["forked"] = _process["begun"]
+    process["forked"] = process["begun"]
 
 
 def _begin() -> None:
@@ -82,16 +82,16 @@ def _begin() -> None:
     Raises:
       RuntimeError: If the process was forked from one in which programs had run.
     """
-    if _process["forked"]:
+    if process["forked"]:
         raise RuntimeError(
             "this process was forked from one that had simulated, and would wait for ever for "
             "XLA's threads, which it has not: begin processes by multiprocessing's `spawn`"
         )
-    _process["begun"] = True
+    process["begun"] = True
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forked)
+    os.register_at_fork(after_in_child=note_fork)
 
 
 def _again_if_stuck(call: Callable[[], Any]) -> Any:
@@ -117,7 +117,7 @@ def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
 
     Args:
       build: Function (scene, engine, space, *arguments) that returns a function to jit, which reads
-        numbers from its constants alone; the last argument is a cost of one's own or None.
+        numbers from its constants alone; a last argument that is a `Recording` may have a cost.
     """
 
     def jitted(*arguments: Any) -> Callable:
@@ -129,7 +129,7 @@ def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
 
     @functools.wraps(build)
     def find(scene: Scene, engine: Engine, space: DesignSpace, *arguments: Any) -> Callable:
-        if arguments[-1] is not None:
+        if isinstance(arguments[-1], rollout.Recording) and arguments[-1].cost is not None:
             # A cost of one's own may read names and whatever else is no number of the scene.
             return jitted(scene, engine, space, *arguments)
         if not isinstance(engine, Hashable) or sources.digest() is None:

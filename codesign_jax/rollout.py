@@ -10,14 +10,15 @@
 >>> hand, engine = space.params(space.default()), make_engine("structured", grasping)
 >>> rollout.simulate(grasping, engine, hand, trials)
 Traceback (most recent call last):
-codesign_jax.scene.schema.SceneError: params have no axis (world,); ... makes a batch
+codesign_jax.scene.schema.InputError: params have no axis (world,); ... makes a batch
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -41,6 +42,20 @@ cost reads of the trace needs `stop_when_lost=False`, or `stop_when_lost=True` i
 a grasp up to the loss of the object only, and its qpos needs `record_qpos=True`; see `cost.shown`.
 """
 
+
+class Recording(NamedTuple):
+    """What of a rollout is recorded, when its worlds stop, and what it costs; see `simulate`."""
+
+    record_qpos: bool = False
+    stop_when_lost: bool | None = None
+    cost: CostFunction | None = None
+
+    @property
+    def to_end(self) -> bool:
+        """See `goes_on`."""
+        return goes_on(self.record_qpos, self.stop_when_lost)
+
+
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
 _LATER, _HAND_MASS = 1, 2
 
@@ -62,7 +77,7 @@ def sample_trials(
       Trials with leading axis (trial,).
 
     Raises:
-      SceneError: If `key` is not one typed key, `num_trials` is no whole number or below 1, or the
+      InputError: If `key` is not one typed key, `num_trials` is no whole number or below 1, or the
         constants do not fit the scene or the trials.
     """
     axes.refuse_draws(key, num_trials)
@@ -102,7 +117,7 @@ def numbers(scene: Scene, constants: Constants | None) -> Constants:
     """The constants if there are any, checked, or else the scene's.
 
     Raises:
-      SceneError: If they do not fit the scene, see `scene.constants.check`.
+      InputError: If they do not fit the scene, see `scene.constants.check`.
     """
     if constants is None:
         return scene.constants()
@@ -114,12 +129,12 @@ def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
     """Returns a trial without noise for an object of the set, by index or name.
 
     Raises:
-      SceneError: If the set has no such object.
+      InputError: If the set has no such object.
     """
     names = [s.name for s in scene.objects.object]
     if shape not in names and shape not in range(len(names)):
         hint = schema.nearest(str(shape), names)
-        raise schema.SceneError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
+        raise schema.InputError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
     index = names.index(shape) if isinstance(shape, str) else shape
     zero, one = jnp.zeros(()), jnp.ones(())
     return Trial(jnp.int32(index), jnp.zeros(2), zero, jnp.zeros(2), one, one, one, one, one)
@@ -154,7 +169,7 @@ def simulate(
       Outcome and trace with leading axis (world,).
 
     Raises:
-      SceneError: If the engine was made for a scene of another structure, if an array lacks an
+      InputError: If the engine was made for a scene of another structure, if an array lacks an
         axis, if the constants do not fit the scene or lie outside their ranges, or if a parameter
         is out of its range by a factor between units, such as millimetres given for metres, or a
         finger is so high that its contacts begin farther from a mesh than distances reach; of
@@ -171,11 +186,11 @@ def goes_on(record_qpos: bool, stop_when_lost: bool | None) -> bool:
     """Whether worlds are simulated to the end though they are lost.
 
     Raises:
-      SceneError: If they are to stop, and to be recorded: an engine records whole grasps.
+      InputError: If they are to stop, and to be recorded: an engine records whole grasps.
     """
     if record_qpos and stop_when_lost:
         problem = "record_qpos=True records whole grasps: leave out stop_when_lost=True"
-        raise schema.SceneError([problem])
+        raise schema.InputError([problem])
     return record_qpos or stop_when_lost is False
 
 
@@ -218,10 +233,10 @@ def grasp(
       Trace of shape (steps,).
 
     Raises:
-      SceneError: As `simulate`, or if there are no such steps.
+      InputError: As `simulate`, or if there are no such steps.
     """
     if steps is not None and not 0 < steps <= scene.num_steps:
-        raise schema.SceneError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
+        raise schema.InputError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
     params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
     constants = _checked(scene, engine, params, trial, constants)
     fields, ctrl, _ = prepare(scene, params, trial, constants)
@@ -235,7 +250,7 @@ def _checked(
     """The numbers of a batch of worlds that is as `simulate` asks for.
 
     Raises:
-      SceneError: See `simulate`.
+      InputError: See `simulate`.
     """
     axes.refuse_other(scene, engine)
     constants = numbers(scene, constants)
@@ -360,7 +375,7 @@ def evaluate(
       Outcomes, every array of shape (particle, trial).
 
     Raises:
-      SceneError: See `simulate`.
+      InputError: See `simulate`.
     """
     return evaluate_to_end(
         scene,

@@ -63,7 +63,7 @@ def draw(
       Designs first to first + n - 1 with their trials.
 
     Raises:
-      SceneError: If `key` is not one typed key, or a number is no whole number or below 1.
+      InputError: If `key` is not one typed key, or a number is no whole number or below 1.
     """
     axes.refuse_draws(key, num_trials)
     noise = scene.constants()
@@ -106,18 +106,19 @@ def make_simulate(
       engine: Engine that simulates.
       space: Space of the designs.
     """
-    return Program(scene, _simulation(scene, engine, space, None))
+    return Program(scene, _simulation(scene, engine, space, rollout.Recording()))
 
 
 @shared
 def _simulation(
-    scene: Scene, engine: Engine, space: DesignSpace, cost: None
+    scene: Scene, engine: Engine, space: DesignSpace, recording: rollout.Recording
 ) -> Callable[[jax.Array, Trial, Constants], Outcome]:
     def simulate(designs: jax.Array, trials: Trial, constants: Constants) -> Outcome:
         shape = trials.yaw.shape
         hands = jax.vmap(space.params)(jnp.repeat(designs, shape[1], axis=0))
         flat = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), trials)
-        found, _ = rollout.simulate(scene, engine, hands, flat, constants=constants)
+        how = recording._asdict()
+        found, _ = rollout.simulate(scene, engine, hands, flat, constants=constants, **how)
         return rollout.grid(found, shape)
 
     return simulate

@@ -41,7 +41,7 @@ def _state() -> _State:
     return found
 
 
-_imported = _state()
+at_import = _state()
 _defined: dict[str, dict[str, object]] = {}
 
 
@@ -55,10 +55,10 @@ def digest() -> str | None:
 
 def of_files() -> str | None:
     """As `digest`, for what is not traced: names that were replaced do not matter."""
-    if not _imported or _now() != _imported:
+    if not at_import or _now() != at_import:
         return None
     found = _read()
-    return found if _now() == _imported else None  # edited while it was read
+    return found if _now() == at_import else None  # edited while it was read
 
 
 def note() -> None:
@@ -114,7 +114,7 @@ def _now() -> _State:
 @functools.cache
 def _read() -> str:
     found = hashlib.sha256()
-    for name in sorted(_imported):
+    for name in sorted(at_import):
         code = (ROOT / name).read_bytes()
         found.update(f"{name} {len(code)}\n".encode() + code)
     return found.hexdigest()

@@ -171,8 +171,8 @@ class Trace(NamedTuple):
         not tell.
       last: Generalized positions and velocities at the end, those in which a decided world stays,
         shape (nq + nv,), or None.
-      residual: Residual of the step taken from each state, see `Outcome`, shape (time,), or None
-        if the engine does not tell.
+      residual: Residual of the step taken from each state, see `Outcome`, 0 of one that converged,
+        shape (time,), or None if the engine does not tell.
 
     An object that leaves the hand after six seconds, as its cost sees it:
 
@@ -210,7 +210,7 @@ class Trace(NamedTuple):
           A trace whose arrays have lost their axis time; `last` and `residual` are None.
 
         Raises:
-          SceneError: If the grasp has no such phase.
+          InputError: If the grasp has no such phase.
           ValueError: If the trace is not one of a whole grasp of the scene.
 
         >>> import jax.numpy as jnp

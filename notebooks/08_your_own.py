@@ -29,7 +29,7 @@ import numpy as np
 import trimesh
 
 from codesign_jax import (
-    SceneError,
+    InputError,
     codesign,
     make_engine,
     parameters,
@@ -117,7 +117,7 @@ wrong = (folder / "mine.toml").read_text().replace("mass = 0.08", "mass = 80", 1
 (folder / "wrong.toml").write_text(wrong.replace("friction = 0.5", "fricton = 0.5"))
 try:
     scene.load(name, object_set=folder / "wrong.toml")
-except SceneError as error:
+except InputError as error:
     print(error)
 
 # %% [markdown]

@@ -45,6 +45,7 @@ STATEMENTS = (
     "{c_ratio_here:.0f} times as many steps in contact",
     "{flips_concurrent:.1f} % of fresh grasps",
     "{flips_switch:.1f} % with one switch and {flips_single:.1f} % in a single domain",
+    "{few_faster:.1f} and {many_faster:.1f} times as fast with {few:,.0f} and {many:,.0f} grasps",
     "{fast_rate:.1f} times the rate of `standard`",
     "{compared:,.0f} of {same:,.0f} verdicts",
     "{c_differs:.1f} % of {c_trials:.0f} verdicts differ, and C differs from itself in "
@@ -146,11 +147,22 @@ def _engines(data: Path) -> Iterator[tuple[str, float]]:
     yield "c_chaos", 100 * float((kept[False] != kept[True]).mean())
 
 
+def _kernel(data: Path) -> Iterator[tuple[str, float]]:
+    """How much faster whole grasps of the default scene are with today's kernel, on a GPU."""
+    records = _json(data / "before_after_h100.json")["records"]
+    whole = [r for r in records if r["case"] == "hull and fingers, whole grasps"]
+    for name, worlds in (("few", 60), ("many", 1728)):
+        seconds = {r["state"]: r["median_s"] for r in whole if r["worlds"] == worlds}
+        yield name, worlds
+        yield f"{name}_faster", seconds["before"] / seconds["after"]
+
+
 def figures(data: Path) -> dict[str, float]:
     """The numbers that README states, from docs/data alone."""
     install = _json(data / "install.json")
     found = {"install_seconds": install["seconds"], "install_gb": install["disk_gb"]}
-    return found | dict(_experiments(data)) | dict(_fresh(data)) | dict(_engines(data))
+    parts = (_experiments, _fresh, _engines, _kernel)
+    return found | {name: value for part in parts for name, value in part(data)}
 
 
 def table(data: Path) -> str:

@@ -172,15 +172,12 @@ def run_tests(recorder: Recorder, processes: int) -> int:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--json", type=Path, default=Path("runs/gpu_suite.json"))
     parser.add_argument("--case", choices=RATES, help="measure one case when a line is entered")
     parser.add_argument("--rates", nargs="*", choices=RATES, default=[*RATES], metavar="CASE")
     parser.add_argument("--worlds", type=int, help="worlds of every rate, to try the suite itself")
     parser.add_argument("--processes", type=int, default=12, help="tests that run at once")
-    provenance.add_commit(parser)
     parser.add_argument(
         "--parts", nargs="+", choices=("rates", "tests"), default=["rates", "tests"]
     )

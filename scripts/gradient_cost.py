@@ -6,7 +6,6 @@ With `CODESIGN_CACHE=off` in the environment it shows what a first call costs, o
 a call that finds kernels and programs on disk.
 """
 
-import argparse
 import json
 from pathlib import Path
 
@@ -17,13 +16,10 @@ from scripts.shared import gradients, output, provenance
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--scenes", nargs="+", default=["paper_spheres", "paper"])
     parser.add_argument("--worlds", nargs="+", type=int, default=[60])
     parser.add_argument("--json", type=Path)
-    provenance.add_commit(parser)
     arguments = parser.parse_args()
     use_compilation_cache()
     cases = []

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from trimesh.exchange.stl import export_stl
 
 FOLDER = Path(__file__).parent.parent / "objects"
 HEAD = """\
@@ -188,7 +189,7 @@ def main() -> None:
     (folder / "household").mkdir(parents=True, exist_ok=True)
     for name, make in SHAPES.items():
         mesh, path = finish(make()), folder / "household" / f"{name}.stl"
-        path.write_bytes(trimesh.exchange.stl.export_stl(mesh))
+        path.write_bytes(export_stl(mesh))
         size = " x ".join(f"{v:.0f}" for v in mesh.extents)
         print(f"{name}: {size} mm, {mesh.volume / 1e3:.0f} cm^3, {len(mesh.faces)} faces")
     entries = (ENTRY.format(name=name) for name in SHAPES)

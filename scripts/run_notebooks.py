@@ -8,11 +8,12 @@ from pathlib import Path
 
 import jupytext
 import nbclient
+from nbclient.exceptions import CellExecutionError
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
-from tests import quick_compile  # noqa: E402
+from tests.helpers import compile_flags  # noqa: E402
 
 
 def run(path: Path) -> str | None:
@@ -27,7 +28,7 @@ def run(path: Path) -> str | None:
     )
     try:
         client.execute()
-    except nbclient.exceptions.CellExecutionError as error:
+    except CellExecutionError as error:
         return f"{path.name}: {error}"
     print(f"{path.name}: {time.perf_counter() - start:.0f} s", flush=True)
     return None
@@ -36,7 +37,7 @@ def run(path: Path) -> str | None:
 def main() -> int:
     """Runs the notebooks, two at a time as they mostly compile, and returns the exit status."""
     if os.environ.get("CODESIGN_FAST"):
-        quick_compile.use()
+        compile_flags.use()
     with ProcessPoolExecutor(2) as pool:
         errors = [e for e in pool.map(run, sorted((ROOT / "notebooks").glob("*.py"))) if e]
     print(*errors, sep="\n", end="", file=sys.stderr)

@@ -7,7 +7,7 @@ import tempfile
 
 import pytest
 
-from tests import quick_compile
+from tests.helpers import compile_flags
 
 # Selections that compile as for users: margins go into the documentation, rates are measured, and
 # slow tests run longer than they compile; some hard cases hold by what optimised code rounds.
@@ -25,7 +25,7 @@ def pytest_configure(config):
     if hasattr(config, "workerinput"):
         return
     if config.option.markexpr not in AS_FOR_USERS:
-        quick_compile.use()
+        compile_flags.use()
     folder = tempfile.mkdtemp(prefix="codesign-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     os.environ["CODESIGN_TESTS_FOLDER"] = folder  # see tiny_run.py
@@ -56,7 +56,6 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish():
     """What was imported stays: no search for garbage looks at it again."""
     gc.freeze()
-    quick_compile.share_contexts()
 
 
 def pytest_sessionfinish():

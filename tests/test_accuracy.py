@@ -19,7 +19,7 @@ from scripts.accuracy import beam, decision, impulse, oracle, steps, study, tip,
 from scripts.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
 from scripts.accuracy.store import Case, Store, merge
 from scripts.accuracy.timing import name
-from tests.small import pinch, still
+from tests.helpers.grasps import pinch, still
 
 ROOT = Path(__file__).parents[1]
 
@@ -51,13 +51,13 @@ def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
 
 def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
     wrong = {"discretization": {"timestep": 18.0}}
-    with pytest.raises(schema.SceneError) as error:
+    with pytest.raises(schema.InputError) as error:
         scene.load("paper_spheres", accuracy="fats", overrides=wrong)
     assert "did you mean 'fast'" in str(error.value)
     assert "0.018" in str(error.value)
     mistaken = tmp_path / "mine.toml"
     mistaken.write_text('description = "x"\n[discretization]\nlink = 3\n[solver]\n')
-    with pytest.raises(schema.SceneError, match="links"):
+    with pytest.raises(schema.InputError, match="links"):
         scene.load("paper_spheres", accuracy=mistaken)
 
 
@@ -87,7 +87,7 @@ def test_settings_change_what_they_say_and_no_two_have_the_same_name():
 
 def test_a_long_step_needs_a_longer_contact_time_constant():
     """The scene refuses 20 ms as it is; with a longer constant the stiffness stays the same."""
-    with pytest.raises(schema.SceneError, match="time_constant"):
+    with pytest.raises(schema.InputError, match="time_constant"):
         Setting(timestep=20.0, keep_contact=True).scene()
     stiffness = []
     for setting in (STANDARD, Setting(timestep=20.0)):

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import TINY, tiny
 
 from codesign_jax import codesign, make_engine, rollout, scene
-from codesign_jax.scene import SceneError
+from codesign_jax.scene import InputError
+from tests.helpers.toy_engine import TINY, tiny
 
 SCENE, SPACE, ENGINE = tiny()
 HAND = jax.tree.map(np.asarray, SPACE.params(SPACE.default()))
@@ -140,15 +140,15 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_wrong_is_said(case):
     call, words = CASES[case]
-    with pytest.raises((SceneError, ValueError), match=words) as caught:
+    with pytest.raises((InputError, ValueError), match=words) as caught:
         call()
-    assert isinstance(caught.value, SceneError) or case == "millimetres at the start"
+    assert isinstance(caught.value, InputError) or case == "millimetres at the start"
 
 
 def test_it_is_said_while_tracing():
-    with pytest.raises(SceneError, match="params have no axis"):
+    with pytest.raises(InputError, match="params have no axis"):
         jax.jit(lambda p, t: simulate(p, t))(HAND, batch(TRIAL, 3))
-    with pytest.raises(SceneError, match="designs have shape"):
+    with pytest.raises(InputError, match="designs have shape"):
         jax.jit(SPACE.expand)(np.ones(3))
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from toy import TINY, tiny
 
 from codesign_jax import cli, codesign, runs
 from codesign_jax.batch import LIMIT, Batch, Request, take
@@ -16,6 +15,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
+from tests.helpers.toy_engine import TINY, tiny
 
 RUN = [
     *("optimize", "--scene", str(TINY), "--particles", "10", "--trials", "2", "--episodes", "2"),
@@ -30,13 +30,13 @@ jax.config.update("jax_num_cpu_devices", 2)
 from codesign_jax import batch, cli
 from codesign_jax.engines.structured import StructuredEngine
 
-seen, call, lanes = [], batch.Batch._call, StructuredEngine.block_lanes
+seen, call, lanes = [], batch.Batch.call, StructuredEngine.block_lanes
 
 def spy(self, blocks, common, device):
     seen.append((device.id, jax.tree.leaves(blocks)[0].shape[0]))
     return call(self, blocks, common, device)
 
-batch.Batch._call = spy
+batch.Batch.call = spy
 # As on a GPU, where a smaller batch has narrower blocks.
 StructuredEngine.block_lanes = lambda self, worlds: lanes(self, worlds) // (1 if worlds > 20 else 2)
 run, folder = sys.argv[2:], sys.argv[1]
@@ -78,13 +78,13 @@ def test_shares_of_joined_runs_are_those_of_one_run(tmp_path, monkeypatch):
 
     Then two runs in calls of one run each: --chunk has room for 39 grasps, and a run has 20.
     """
-    shares, call = [], Batch._call
+    shares, call = [], Batch.call
 
     def spy(self, blocks, *rest):
         shares.append(jax.tree.leaves(blocks)[0].shape[0])
         return call(self, blocks, *rest)
 
-    monkeypatch.setattr(Batch, "_call", spy)
+    monkeypatch.setattr(Batch, "call", spy)
     with monkeypatch.context() as patch:
         patch.setattr("codesign_jax.batch.take", lambda count: 2 * take(1))
         assert cli.main([*RUN, "--seeds", "0-2", "--out", str(tmp_path / "many")]) == 0
@@ -117,7 +117,7 @@ def test_devices_that_there_are_not_and_calls_without_grasps(tmp_path, capsys):
 def gpu(monkeypatch):
     """As on a GPU of 132 multiprocessors; programs are laid out and nothing is compiled."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(launch, "_multiprocessors", lambda: 132)
+    monkeypatch.setattr(launch, "multiprocessors", lambda: 132)
 
 
 def packed_lanes(particles, runs, devices=1, limit=LIMIT):

@@ -6,24 +6,14 @@ import pytest
 import trimesh
 
 from codesign_jax import model
-from codesign_jax.report import animation, bodies
-from codesign_jax.types import Outcome
-from tests import small
-
-
-def bent_grasp(the_scene):
-    """Three frames of a hand with random joint angles, as a replay."""
-    params, trial = small.hand_world(the_scene, length=0.11, height=0.018)
-    data = mujoco.MjData(model.compile_model(the_scene, params, trial))
-    turn = np.random.default_rng(0).uniform(-0.4, 0.4, (3, data.qpos.size - 7))
-    qpos = np.tile(data.qpos, (3, 1))
-    qpos[:, :-7] += turn
-    return animation.Replay(params, trial, Outcome(*np.zeros(4)), qpos)
+from codesign_jax.report import bodies
+from tests.helpers import grasps
+from tests.helpers.replays import bent_grasp
 
 
 def test_fingers_move_as_in_mujoco():
     """Skins of MuJoCo's own linear blend skinning, and the palm where its disc is."""
-    the_scene = small.pinch("box", links=4, effects__surface="hull")
+    the_scene = grasps.pinch("box", links=4, effects__surface="hull")
     grasp = bent_grasp(the_scene)
     shown, motion = bodies.parts(the_scene, grasp), bodies.motion(the_scene, grasp, rate=1000.0)
     assert motion.rate == pytest.approx(1 / the_scene.discretization.timestep)
@@ -42,10 +32,10 @@ def test_fingers_move_as_in_mujoco():
         np.testing.assert_allclose(palm.mean(0), centre, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", small.SHAPES)
+@pytest.mark.parametrize("name", grasps.SHAPES)
 def test_objects_have_their_size(name):
     """Volume of the drawn mesh against the solid's; round ones are polyhedra inside it."""
-    the_scene = small.pinch(name)
+    the_scene = grasps.pinch(name)
     a, b, c = the_scene.objects.object[0].half_sizes
     ball = 4 / 3 * np.pi * a**3
     solid = {

@@ -1,47 +1,17 @@
 """The report and its 3D replay in a headless Chromium: `make test-browser`."""
 
-import shutil
-
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_run import small_run  # noqa: F401
 
 from codesign_jax.report import bodies, viewer
-from tests import small
-from tests.test_bodies import bent_grasp
+from tests.helpers import grasps
+from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
+from tests.helpers.replays import bent_grasp
+from tests.helpers.tiny_run import small_run  # noqa: F401
 
 pytest.importorskip("plotly", reason="the extra 'report' is not installed")
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture(scope="module")
-def launch():
-    """Starts a headless Chromium of the system, or one that playwright installed."""
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    names = ("chromium", "chromium-browser", "google-chrome", "chromium-headless-shell")
-    program = next(filter(None, map(shutil.which, names)), None)
-    off = ("background-networking", "component-update", "sync", "gpu")
-    flags = ["--headless", "--no-sandbox", *(f"--disable-{what}" for what in off)]
-    with api.sync_playwright() as play:
-
-        def start(*more):
-            try:
-                return play.chromium.launch(executable_path=program, args=[*flags, *more])
-            except api.Error as error:
-                if program is None:
-                    pytest.skip("no Chromium: apt-get install chromium, or playwright install it")
-                raise error
-
-        yield start
-
-
-@pytest.fixture(scope="module")
-def browser(launch):
-    """A browser with WebGL by software."""
-    started = launch("--enable-unsafe-swiftshader")
-    yield started
-    started.close()
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +142,7 @@ def test_a_browser_without_webgl_shows_a_film_strip(run, flat_browser, tmp_path)
 
 def test_browser_skins_as_python_does(browser, tmp_path):
     """Vertices on the page at its frames against those of `bodies`, and between them continuous."""
-    the_scene = small.pinch("box", links=4, effects__surface="hull")
+    the_scene = grasps.pinch("box", links=4, effects__surface="hull")
     grasp = bent_grasp(the_scene)
     path = viewer.write(the_scene, grasp, tmp_path / "r.html", title="<b>", text=["a & b"])
     page = browser.new_page()

@@ -17,7 +17,7 @@ from codesign_jax.archives import Store
 from codesign_jax.compiler import cache
 from codesign_jax.runs import failures, rates
 from codesign_jax.scene.meshes import grid
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
 
@@ -67,7 +67,7 @@ def use_all(monkeypatch):
     caches.use_compilation_cache()
     jax.jit(lambda v: v * 3.25)(jnp.ones(7))
     cache.kept("kernel", lambda: b"code")
-    monkeypatch.setattr(grid, "_WORTH_KEEPING", 0.0)
+    monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
     grid.cached("cube", *cube(), 1e-3)
     work = rates.Work("structured", "cpu x2", "hull", 1, 1, 1)
     rates.record(work, 1.0, 1.0)
@@ -105,7 +105,7 @@ def test_the_oldest_go_first(tmp_path):
 
 
 def test_a_grid_and_a_kernel_in_the_place_of_another_are_not_taken(place, monkeypatch):
-    monkeypatch.setattr(grid, "_WORTH_KEEPING", 0.0)
+    monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
     vertices, faces = cube()
     first = grid.cached("a", vertices, faces, 1e-3)
     grid.cached("b", 0.5 * vertices, faces, 1e-3)
@@ -280,7 +280,7 @@ def test_a_failed_world_with_any_damage_is_refused_or_whole(tmp_path):
         path.write_bytes(other)
         try:
             found = failures.load(path)
-        except SceneError as error:
+        except InputError as error:
             assert "is not a failed world of a run" in str(error)
             refused += 1
         else:
@@ -289,7 +289,7 @@ def test_a_failed_world_with_any_damage_is_refused_or_whole(tmp_path):
     for name in ("trial_friction", "place", "status"):
         assert name in one_failure()
         archives.save(path, {k: v for k, v in one_failure().items() if k != name})
-        with pytest.raises(SceneError, match="is not a failed world"):
+        with pytest.raises(InputError, match="is not a failed world"):
             failures.load(path)
 
 

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.interpolate
-from toy import ToyEngine, tiny
 
 from codesign_jax import codesign, rollout, scene
 from codesign_jax.archives import Store
@@ -23,6 +22,7 @@ from scripts.calibration import __main__ as calibrate
 from scripts.calibration import files, report, score, sets, summary, surrogate
 from scripts.calibration.wave import Size, Wave, keep, trial_costs
 from scripts.experiments.landscape import STREAM_GRID
+from tests.helpers.toy_engine import ToyEngine, tiny
 
 AXIS = np.arange(12.0)
 
@@ -90,9 +90,8 @@ def test_numbers_of_a_set_are_those_of_the_files():
 
 
 def test_factors_scale_the_stiffness_of_joints():
-    from small import hand_world
-
     from codesign_jax.model import morphology
+    from tests.helpers.grasps import hand_world
 
     plain = scene.load("paper_spheres").hand
     material = dataclasses.replace(plain.material, lateral_factor=0.29, torsion_factor=3.0)
@@ -107,7 +106,7 @@ def test_factors_scale_the_stiffness_of_joints():
 
 
 def test_a_hand_on_a_circle_is_refused():
-    with pytest.raises(schema.SceneError, match="give each finger a base"):
+    with pytest.raises(schema.InputError, match="give each finger a base"):
         sets.numbers(scene.load("paper_spheres"), sets.values(sets.space_filling(2, 0)))
 
 
@@ -516,5 +515,5 @@ def test_bad_input_is_told_in_words(scored, arguments, part, monkeypatch):
     folder, calibrate = scored
     arguments = [str(folder / a) if a.endswith(".npz") else a for a in arguments]
     monkeypatch.setattr(sys, "argv", ["calibrate.py", *arguments, "--out", str(folder)])
-    with pytest.raises(schema.SceneError, match=part):
+    with pytest.raises(schema.InputError, match=part):
         calibrate.main()

@@ -13,13 +13,13 @@ import typing
 from pathlib import Path
 
 import pytest
-from command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
-from toy import TINY
 
 from codesign_jax import cli, codesign
 from codesign_jax.commands import mistyped, preflight, status
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.scene import effects
+from tests.helpers.command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
+from tests.helpers.toy_engine import TINY
 
 MISTYPED = {
     "optimise --preset 2d": "'optimise' is not a command; did you mean optimize?",

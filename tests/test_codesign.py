@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import ToyEngine, tiny
 
 from codesign_jax import codesign
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import State, schedule
 from codesign_jax.optimize.schedule import NAMES
 from codesign_jax.types import Outcome
+from tests.helpers.toy_engine import ToyEngine, tiny
 
 PARTICLES, TRIALS = 8, 3
 

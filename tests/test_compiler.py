@@ -3,14 +3,16 @@
 The CPU runs in CI; the same tests run on an NVIDIA GPU with the marker `gpu`.
 """
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.experimental import pallas as pl
 
-from codesign_jax.compiler import prefetch, thread, vector
-from codesign_jax.compiler.launch import Kernel, launch
+from codesign_jax.compiler import nvptx, prefetch, thread, vector
+from codesign_jax.compiler.launch import Kernel, describe, kernel_jaxpr, launch
 from codesign_jax.compiler.layout import Array, Layout
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
@@ -193,6 +195,42 @@ def test_angles_and_control(backend, dtype):
         compare(turns, (x, y), backend, dtype)
 
 
+def sum_of_pairs(x, y):
+    """Products of all lanes, summed as a block sums over its fingers."""
+    product, distance = x * y, 1
+    while distance < x.size:
+        product = product + jax.lax.rev(product.reshape(-1, 2, distance), (1,)).reshape(x.shape)
+        distance *= 2
+    return product
+
+
+def difference_of_pairs(x, y):
+    """What a lane's product has more than its partner's, where y is positive."""
+    product = x * y
+    theirs = jax.lax.rev(product.reshape(2, -1), (0,)).reshape(x.shape)
+    return product - jnp.where(y > 0, theirs, 0.0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_lanes_sum_after_an_exchange_has_the_same_bits_on_all(backend):
+    """No lane fuses its own product with another one's rounded product.
+
+    Fused the lanes' results differ in the last bit, and with it what all of them decide or store.
+    """
+    rng = np.random.default_rng(3)
+    x, y = rng.standard_normal((2, BLOCKS, lanes_of(backend))).astype(np.float32)
+    got = run([sum_of_pairs, difference_of_pairs], (x, np.abs(y)), np.float32, backend)
+    assert np.ptp(got[:, 0], axis=1).max() == 0
+    low, high = np.split(np.asarray(got[:, 1]), 2, axis=1)
+    np.testing.assert_array_equal(low, -high)
+    # LLVM fuses where it likes what it may: the text must not allow it.
+    for function, sign in ((sum_of_pairs, "fadd"), (difference_of_pairs, "fsub")):
+        for text in write(function, np.float32, np.float32):
+            assert sign in text and f"{sign} contract" not in text
+        ptx = nvptx.assembly(text)
+        assert f"{sign[1:]}.rn.f32" in ptx and "fma" not in ptx
+
+
 @pytest.mark.parametrize("dtype", [np.int32, np.int64])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_operations_on_integers(backend, dtype):
@@ -220,6 +258,7 @@ def test_operations_on_integers(backend, dtype):
         "shift right": lambda x, y: jax.lax.shift_right_logical(x, y),
         "shift right by 3": lambda x, y: jax.lax.shift_right_logical(x, jnp.full_like(x, 3)),
         "not": lambda x, y: ~x,
+        "bits": lambda x, y: jax.lax.population_count(x),
         "lt": lambda x, y: x < y,
         "ge": lambda x, y: x >= y,
         "ne": lambda x, y: x != y,
@@ -286,7 +325,6 @@ def test_what_has_no_instruction_is_named(function, kind, message):
 
 def test_text_is_valid_for_both_targets():
     """LLVM accepts it and makes PTX of it, with the instructions of a warp."""
-    from codesign_jax.compiler import nvptx
 
     def function(x, y):
         total = jax.lax.fori_loop(0, 3, lambda k, c: c + k * jnp.maximum(x, y), jnp.sin(x) / y)
@@ -326,6 +364,71 @@ def test_lanes_meet_where_they_read_what_others_wrote():
         True,
         False,
     ]
+
+
+def exchange(lanes, backend):
+    """A kernel of two tables that lanes share columns of, the second one on a GPU's chip.
+
+    Each of four lanes stores a product and reads all four, twice from the same places.
+    """
+    columns = lanes // 4
+
+    def kernel(x, out, table, onchip):
+        lane = jax.lax.broadcasted_iota(jnp.int32, (lanes,), 0)
+        own, mate = jax.lax.rem(lane, columns), jax.lax.div(lane, columns)
+
+        def body(k, total):
+            for ref in (table, onchip):
+                ref[mate, own] = x[0, :] * (mate + k).astype(jnp.float32)
+                total = total + ref[0, own] + ref[1, own] * 2 + ref[2, own] * 4 + ref[3, own] * 8
+            return total
+
+        out[0, :] = jax.lax.fori_loop(0, 3, body, jnp.zeros(lanes))
+
+    def spec(rows, width):
+        return pl.BlockSpec((None, rows, width), lambda i: (i, 0, 0))
+
+    sizes = ((1, lanes), (4, columns), (4, columns))
+    outputs = [jax.ShapeDtypeStruct((BLOCKS, *size), jnp.float32) for size in sizes]
+    call = pl.pallas_call(
+        kernel,
+        grid=(BLOCKS,),
+        in_specs=[spec(1, lanes)],
+        out_specs=[spec(*size) for size in sizes],
+        out_shape=outputs,
+    )
+    return call, outputs, Kernel("exchange", backend, lanes, (), (1,), (2,), (1, 2))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_lanes_exchange_through_memory(backend):
+    """Of lanes that share a column each reads what the others have stored, in every round."""
+    lanes = lanes_of(backend)
+    call, outputs, kind = exchange(lanes, backend)
+    x = np.random.default_rng(4).integers(0, 99, (BLOCKS, 1, lanes)).astype(np.float32)
+    got = jax.jit(lambda x: launch(call, (x,), outputs, kind)[0])(x)
+    each = x.reshape(BLOCKS, 4, -1)
+    rounds = [each * (np.arange(4) + k)[:, None] for k in range(3)]
+    want = sum(2 * np.einsum("bmc,m->bc", r, [1, 2, 4, 8]) for r in rounds)
+    np.testing.assert_array_equal(got, np.tile(want[:, None], (1, 1, 4)))
+
+
+def test_a_gpu_exchanges_on_its_chip_between_barriers():
+    """Lanes meet between storing and reading, and between reading and storing again."""
+    call, outputs, kind = exchange(32, "gpu")
+    x = jax.ShapeDtypeStruct((BLOCKS, 1, 32), jnp.float32)
+    layout = describe((x,), outputs, kind)
+    assert [a.role for a in layout.arrays] == ["input", "output", "output", "onchip"]
+    text = thread.write(kernel_jaxpr(call, [x]), layout, "test")
+    steps = re.findall(r"call void @llvm.nvvm.(bar)|(store|load) float.*%v\d+, align", text)
+    steps = [meets or access for meets, access in steps]
+    once = ["bar", "store", "bar", *["load"] * 4]
+    assert steps == ["load", *once, "load", *once, "store"]
+    ptx = nvptx.assembly(text)
+    assert ".shared .align 16 .b8 s3[128]" in ptx and "st.shared" in ptx and "ld.shared" in ptx
+    _, large, _ = exchange(32, "gpu")
+    large[2] = jax.ShapeDtypeStruct((BLOCKS, 1000, 8), jnp.float32)
+    assert describe((x,), large, kind).arrays[3].role == "output"
 
 
 def loop_text(reverse, rows=128, count=60):

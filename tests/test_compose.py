@@ -18,7 +18,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.optimize import schedule
 from codesign_jax.scene import parameters
 from codesign_jax.types import WARNINGS, Status
-from tests import small, toy
+from tests.helpers import grasps, toy_engine
 
 ROOT = Path(__file__).parents[1]
 
@@ -39,8 +39,8 @@ SHORT = {
 @pytest.fixture(scope="module")
 def batch():
     """A short grasp, fields and controls of four random worlds."""
-    scene = small.pinch("sphere", **SHORT)
-    return scene, *small.batch_inputs(scene, *small.random_worlds(scene, 3, 4))
+    scene = grasps.pinch("sphere", **SHORT)
+    return scene, *grasps.batch_inputs(scene, *grasps.random_worlds(scene, 3, 4))
 
 
 def test_vmap_is_a_larger_batch(batch):
@@ -84,10 +84,10 @@ def decided():
     The hand of world 0 stays above the object, which is lost as the window opens, and rises on;
     world 1 starts below the table; a pressure of world 2 is not a number from step 10 on.
     """
-    scene = small.pinch("sphere", **SHORT, effects__finger_object=False, effects__twist=False)
+    scene = grasps.pinch("sphere", **SHORT, effects__finger_object=False, effects__twist=False)
     with jax.enable_x64(True):
-        params, trials = small.random_worlds(scene, 3, 3)
-        fields, ctrl = small.batch_inputs(scene, params, trials)
+        params, trials = grasps.random_worlds(scene, 3, 3)
+        fields, ctrl = grasps.batch_inputs(scene, params, trials)
         ctrl = ctrl.at[0, :, 2].set(jnp.linspace(0.3, 0.4, ctrl.shape[1]))
         ctrl = ctrl.at[2, 10:, 6].set(jnp.nan)
         # A micrometre above the table: exactly on it, rounding decides whether an object touches.
@@ -99,7 +99,7 @@ def decided():
         with jax.enable_x64(True):
             run = partial(engines(scene)[name].rollout, trajectory=trajectory)
             trace = jax.jit(run, compiler_options=QUICK)(fields, ctrl)
-            return jax.tree.map(np.asarray, (trace, small.outcomes(scene, trace)))
+            return jax.tree.map(np.asarray, (trace, grasps.outcomes(scene, trace)))
 
     return scene, simulated
 
@@ -166,7 +166,7 @@ def test_a_rollout_begins_where_another_ended(batch, name):
 @pytest.mark.slow  # quick: by the toy engine (test_codesign)
 def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes():
     """By the kernel: each seed of a batch with its own schedule, as a loop over single episodes."""
-    scene = small.pinch("sphere", **SHORT)
+    scene = grasps.pinch("sphere", **SHORT)
     space = parameters.design_space(scene.hand, "2d")
     optimizer, engine = codesign.make_filter(space), StructuredEngine(scene)
     run = partial(codesign.Task(scene, space, 2, engine).run, optimizer)
@@ -192,18 +192,18 @@ def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes():
 @pytest.mark.slow
 def test_a_run_vmaps_over_constants():
     """Each world's physics as in a run of its own with those numbers."""
-    scene = small.pinch("sphere", **SHORT)
+    scene = grasps.pinch("sphere", **SHORT)
     space = parameters.design_space(scene.hand, "2d")
     optimizer = codesign.make_filter(space)
     run = partial(codesign.Task(scene, space, 2).run, optimizer)
     start = optimizer.init(jax.random.key(0), np.array((0.1, 0.05)), 3)
     masks = np.ones((2, 2), bool)
-    numbers = [scene.constants(), small.random_constants(scene, 1)]
+    numbers = [scene.constants(), grasps.random_constants(scene, 1)]
     numbers[1] = numbers[1]._replace(phases=numbers[0].phases)  # the number of steps is structure
     both = jax.tree.map(lambda *v: jnp.asarray(v, jnp.float32), *numbers)
     ends, infos = jax.jit(jax.vmap(run, (None, None, 0)))(start, masks, both)
     for k in range(2):
-        end, info = run(start, masks, small.nth(both, k))
+        end, info = run(start, masks, grasps.nth(both, k))
         # Two programs round fields differently, which may move a loss by a step of 10 ms.
         np.testing.assert_allclose(infos.trials.cost[k], info.trials.cost, atol=0.05)
         np.testing.assert_allclose(ends.particles[k], end.particles, rtol=1e-5)
@@ -221,14 +221,14 @@ def final_height(scene, trace, ctrl):
 
 def test_a_cost_of_ones_own_sees_the_end_of_the_trace():
     """MuJoCo's own simulation gives the object's final height, far behind its loss."""
-    scene = small.pinch("sphere", **SHORT)
-    hand, trial = small.hand_world(scene, pressure=0.0)
+    scene = grasps.pinch("sphere", **SHORT)
+    hand, trial = grasps.hand_world(scene, pressure=0.0)
     hand, trial = (jax.tree.map(lambda v: jnp.asarray(v)[None], x) for x in (hand, trial))
     engine = MujocoEngine(scene, num_threads=1)
     result = jax.jit(
         lambda p, t: rollout.evaluate(scene, engine, p, t, record_qpos=True, cost=final_height)
     )(hand, trial)
-    fields, commands = small.world_inputs(scene, *(small.nth(x, 0) for x in (hand, trial)))
+    fields, commands = grasps.world_inputs(scene, *(grasps.nth(x, 0) for x in (hand, trial)))
     data = mujoco.MjData(compiled := world_model(scene, fields))
     data.qpos[:] = fields.start
     for u in np.asarray(commands)[:-1]:
@@ -240,7 +240,7 @@ def test_a_cost_of_ones_own_sees_the_end_of_the_trace():
 
 def test_failed_trials_do_not_ask_ones_own_cost():
     """They show the scene's maximum; a cost that is no number for each world is refused."""
-    scene, space, engine = toy.tiny()
+    scene, space, engine = toy_engine.tiny()
     engine.failing = [1]
     params = jax.tree.map(lambda v: jnp.stack([v] * 3), space.params(jnp.array([0.05, 0.0])))
     trial = jax.tree.map(lambda v: v[None], rollout.nominal_trial(scene))
@@ -260,7 +260,7 @@ def test_failed_trials_do_not_ask_ones_own_cost():
 
 def test_a_cost_does_not_read_what_was_not_simulated():
     """Of a lost grasp the rest is missing without a trajectory: asked for, or an error in words."""
-    scene, space, engine = toy.tiny()
+    scene, space, engine = toy_engine.tiny()
     params = jax.tree.map(lambda v: v[None], space.params(jnp.array([0.05, 0.0])))
     trial = jax.tree.map(lambda v: v[None], rollout.nominal_trial(scene))
 
@@ -372,10 +372,10 @@ def slopes_of_a_share(value, x, broken):
 )
 def test_gradients_by_the_kernel_equal_central_differences(slopes):
     """In float64, of a world that is lost and of one that fails, whose pressures lag."""
-    scene = small.pinch("sphere", **FREE, effects__pressure_dynamics=True)
+    scene = grasps.pinch("sphere", **FREE, effects__pressure_dynamics=True)
     engine = StructuredEngine(scene, iterations=60, tolerance=1e-22)
     with jax.enable_x64(True):
-        value = partial(bent, scene, engine, small.hand_world(scene, pressure=50e3))
+        value = partial(bent, scene, engine, grasps.hand_world(scene, pressure=50e3))
         x, broken = jnp.array([[1.0, 1.0, 1.0], [0.9, 1.1, 1.2]]), jnp.array([False, True])
         slope = jax.jit(partial(slopes, value), compiler_options=QUICK)(x, broken)
         step = 1e-5 * jnp.eye(3)
@@ -391,9 +391,9 @@ def test_gradients_by_the_kernel_equal_central_differences(slopes):
 @pytest.mark.slow
 def test_gradients_through_the_air_supply():
     """By lag and rate of the supply, and by the pressure that it is to reach."""
-    scene = small.pinch("sphere", **FREE, effects__pressure_dynamics=True)
+    scene = grasps.pinch("sphere", **FREE, effects__pressure_dynamics=True)
     engine = StructuredEngine(scene, iterations=60, tolerance=1e-22)
-    hand, trial = small.hand_world(scene, pressure=50e3)
+    hand, trial = grasps.hand_world(scene, pressure=50e3)
 
     def value(x):
         numbers = scene.constants()
@@ -423,9 +423,10 @@ import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_num_cpu_devices", 2)
 from jax.sharding import Mesh, PartitionSpec
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small, test_compose
-scene = small.pinch("sphere", **test_compose.FREE)
-engine, world = StructuredEngine(scene), small.hand_world(scene, pressure=50e3)
+from tests import test_compose
+from tests.helpers import grasps
+scene = grasps.pinch("sphere", **test_compose.FREE)
+engine, world = StructuredEngine(scene), grasps.hand_world(scene, pressure=50e3)
 broken = jnp.array([False, True, False, False])
 x = jnp.asarray(np.random.default_rng(0).uniform(0.9, 1.1, (4, 3)), jnp.float32)
 def value(x, broken):
@@ -449,8 +450,8 @@ assert len(found.sharding.device_set) == 2
 
 def test_what_has_no_derivative_says_so():
     """Forward mode and second derivatives, before anything is compiled."""
-    scene = small.pinch("sphere", **FREE)
-    engine, world, x = StructuredEngine(scene), small.hand_world(scene), jnp.ones(3)
+    scene = grasps.pinch("sphere", **FREE)
+    engine, world, x = StructuredEngine(scene), grasps.hand_world(scene), jnp.ones(3)
 
     def value(x):
         return bent(scene, engine, world, x[None], jnp.zeros(1, bool))[0]

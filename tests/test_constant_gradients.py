@@ -10,8 +10,7 @@ import pytest
 
 from codesign_jax import rollout
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small
-from tests.test_gradients import short_grasp
+from tests.helpers import grasps
 
 # Forward it is one kernel; each of the two derivatives compiles in two minutes of a core's time.
 pytestmark = pytest.mark.slow
@@ -44,10 +43,10 @@ MOVING = {
 
 def grasp(dtype, **settings):
     """The scene's numbers, and the function from numbers of worlds, (world,), to their losses."""
-    scene = short_grasp()
+    scene = grasps.short_grasp()
     engine = StructuredEngine(scene, **settings)
     hand, trial = jax.tree.map(
-        lambda v: jnp.asarray(v, dtype if v.dtype.kind == "f" else None), small.hand_world(scene)
+        lambda v: jnp.asarray(v, dtype if v.dtype.kind == "f" else None), grasps.hand_world(scene)
     )
     trial = trial._replace(yaw=trial.yaw + 0.1, position=trial.position + 0.003)
 

@@ -13,7 +13,7 @@ from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import schema
-from tests.small import hand_world, nth, pinch, random_constants, random_worlds, repeat
+from tests.helpers.grasps import hand_world, nth, pinch, random_constants, random_worlds, repeat
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
@@ -336,7 +336,7 @@ def test_bad_numbers_are_named_before_anything_runs(message):
     constants = the_scene.constants()
     for key, value in BAD[message].items():
         constants = with_leaf(constants, key, lambda _, value=value: value)
-    with pytest.raises(schema.SceneError) as error:
+    with pytest.raises(schema.InputError) as error:
         rollout.simulate(the_scene, None, None, None, constants=constants)  # type: ignore[arg-type]
     assert message in str(error.value)
 
@@ -344,8 +344,8 @@ def test_bad_numbers_are_named_before_anything_runs(message):
 def test_constants_of_another_scene_are_refused():
     """Other fingers, other shapes: the keys that are missing and those that are too many."""
     the_scene, paper = short(), scene.load("paper_spheres")
-    with pytest.raises(schema.SceneError) as error:
+    with pytest.raises(schema.InputError) as error:
         rollout.sample_trials(the_scene, jax.random.key(0), 1, constants=paper.constants())
     assert "constants.hand.finger[2].azimuth is no number of this scene" in str(error.value)
-    with pytest.raises(schema.SceneError, match=r"constants.hand.finger\[2\].azimuth is missing"):
+    with pytest.raises(schema.InputError, match=r"constants.hand.finger\[2\].azimuth is missing"):
         rollout.sample_trials(paper, jax.random.key(0), 1, constants=the_scene.constants())

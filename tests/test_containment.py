@@ -16,7 +16,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.export import grasps
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status, Trace, failed
-from tests.small import (
+from tests.helpers.grasps import (
     batch_inputs,
     hand_world,
     nth,
@@ -290,7 +290,7 @@ def test_an_invalid_start_is_in_the_outcome(starting):
 @pytest.fixture(scope="module")
 def failing_run(tmp_path_factory):
     """A tiny optimisation in MuJoCo C in which some trials are too fast."""
-    from toy import TINY
+    from tests.helpers.toy_engine import TINY
 
     save = runs.loop.Loop.save
 
@@ -332,7 +332,7 @@ def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
 
 def test_the_end_of_a_stuck_world_has_its_hull_and_its_controls_in_mujoco():
     """The hull is in MuJoCo C as points, and no step of a world that is STUCK was bad."""
-    from toy import TINY
+    from tests.helpers.toy_engine import TINY
 
     hull = scene.load(TINY, overrides={"effects.surface": "hull"})
     space = parameters.design_space(hull.hand, "2d")
@@ -365,7 +365,7 @@ def test_what_is_no_failed_world_is_refused(failing_run, tmp_path, capsys):
 
 
 def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
-    from toy import TINY
+    from tests.helpers.toy_engine import TINY
 
     folder = tmp_path / "run"
     sizes = ["--particles", "3", "--trials", "2", "--episodes", "2", "--test-trials", "0"]

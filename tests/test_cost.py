@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from codesign_jax import cost, rollout, scene
 from codesign_jax.types import Outcome, Status, Trace
-from tests import small
+from tests.helpers import grasps
 
 SCENE = scene.load("paper_spheres")
 STEPS, LOST = SCENE.num_steps, SCENE.cost.lost_distance
@@ -135,7 +135,7 @@ def test_earlier_losses_cost_more(first, second):
 def test_worlds_are_independent_under_vmap():
     traces = [trace(400), trace(), trace(speed={300: np.nan}), trace(700)]
     batch = jax.tree.map(lambda *v: jnp.stack(v), *traces)
-    together = small.outcomes(SCENE, batch)
+    together = grasps.outcomes(SCENE, batch)
     for i, t in enumerate(traces):
         for a, b in zip(evaluate(t), together, strict=True):
             np.testing.assert_array_equal(a, b[i])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from codesign_jax.engines.structured.laws import shapes
-from tests import small
+from tests.helpers import grasps
 
 SIZES = {
     "box": (0.030, 0.022, 0.041),
@@ -63,7 +63,7 @@ def engine_contacts(kind, position, quat, centre):
     for i in range(POSES):
         mujoco.mju_quat2Mat(columns[i], quat[i])
     with jax.enable_x64(True):
-        alone = small.pinch(kind)
+        alone = grasps.pinch(kind)
         size = np.broadcast_to(np.array(SIZES[kind])[:, None, None], (3, 1, POSES))
         hand = SimpleNamespace(
             object_size=jnp.asarray(size),
@@ -79,7 +79,7 @@ def engine_contacts(kind, position, quat, centre):
         )
 
 
-@pytest.mark.parametrize("kind", small.SHAPES)
+@pytest.mark.parametrize("kind", grasps.SHAPES)
 def test_distances_equal_mujoco(kind):
     """Distance and normal of spheres outside the object."""
     position, quat, centre = poses(kind, 7)
@@ -101,7 +101,7 @@ def test_distances_equal_mujoco(kind):
     np.testing.assert_allclose(np.linalg.norm(back, axis=1), np.abs(RADIUS + gap / 2), atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", small.SHAPES)
+@pytest.mark.parametrize("kind", grasps.SHAPES)
 def test_penetrations_equal_mujoco(kind):
     """The depth of a sphere that overlaps the object."""
     position, quat, centre = poses(kind, 8)

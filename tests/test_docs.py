@@ -13,12 +13,12 @@ from typing import get_args
 import numpy as np
 import pytest
 import submitit
-import tiny_run
 import yaml
-from toy import TINY
 
 from codesign_jax import cli
 from codesign_jax.commands import evaluate, export, finger, landscape, render, replay, report
+from tests.helpers import tiny_run
+from tests.helpers.toy_engine import TINY
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "scripts/README.md")]
@@ -82,23 +82,23 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
         arguments.append("--dry-run")
     elif arguments[0] == "evaluate":
         kept = SimpleNamespace(status=np.zeros(1, int))  # of which the exit code is made
-        for name in ("_evaluate", "_render"):
+        for name in ("simulate", "draw"):
             monkeypatch.setattr(evaluate, name, lambda *rest: reached.append(rest) or kept)
     elif arguments[0] == "export":
-        monkeypatch.setattr(export, "_write", lambda *rest: reached.append(rest))
+        monkeypatch.setattr(export, "write_files", lambda *rest: reached.append(rest))
     elif arguments[0] == "finger":
-        monkeypatch.setattr(finger, "_compare", lambda *rest: reached.append(rest))
+        monkeypatch.setattr(finger, "compare", lambda *rest: reached.append(rest))
     elif arguments[0] == "report":
-        monkeypatch.setattr(report, "_best_grasp", lambda *rest: reached.append(rest))
+        monkeypatch.setattr(report, "best_grasp", lambda *rest: reached.append(rest))
     elif arguments[0] == "landscape":
-        for name in ("_simulate", "summarize", "_report", "_write"):
+        for name in ("simulated_designs", "summarize", "print_summary", "write_files"):
             monkeypatch.setattr(landscape, name, lambda *rest: reached.append(rest))
     elif arguments[0] == "render":
-        monkeypatch.setattr(render, "_draw", lambda *rest: reached.append(rest))
+        monkeypatch.setattr(render, "draw", lambda *rest: reached.append(rest))
     elif arguments[0] == "replay" and "failures" in example:
         monkeypatch.setattr(replay.failure, "main", lambda *rest: reached.append(rest) or 0)
     elif arguments[0] == "replay":
-        monkeypatch.setattr(replay, "_write", lambda *rest: reached.append(rest))
+        monkeypatch.setattr(replay, "write_page", lambda *rest: reached.append(rest))
     assert cli.main(arguments) == 0
     assert bool(reached) == (arguments[0] != "scenes" and "--dry-run" not in arguments)
 

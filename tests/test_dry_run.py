@@ -4,11 +4,11 @@ import dataclasses
 import re
 
 import pytest
-from toy import TINY
 
 from codesign_jax import cli, objects, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs import rates
+from tests.helpers.toy_engine import TINY
 
 SUBJECT = ("--scene", str(TINY), "--engine", "mujoco", "--dry-run")
 
@@ -35,7 +35,7 @@ def dry_run(capsys, command, *arguments):
 
 def test_optimize_says_that_the_test_has_whole_rounds(workplace, capsys):
     sizes = ["--trials", 4, "--test-trials"]
-    words = "final test: 96 of these grasps, 8 trials of each particle"
+    words = "final test: 104 of these grasps, 8 trials of each particle"
     assert f"{words}, in whole rounds of 4\n" in dry_run(capsys, "optimize", *sizes, 6)
     assert f"{words}\n" in dry_run(capsys, "optimize", *sizes, 8)
 

@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 
 from codesign_jax import control, model
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.mujoco import MujocoEngine, world_model
+from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine, coordinates
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import effects, schema
 from codesign_jax.types import WARNINGS
-from tests import small, steps
+from tests.helpers import grasps, oracles
+from tests.helpers.effect_settings import inflated, setting
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
@@ -43,19 +44,6 @@ SETTINGS = {
 TOGETHER = ("new models", "little")
 
 
-@jax.enable_x64(True)
-def setting(effects, shape="box", **changes):
-    """Scene, MuJoCo C's model, fields and controls of a pinch grasp, in float64."""
-    scene = small.pinch(shape, **{f"effects__{k}": v for k, v in effects.items()})
-    world, trial = small.hand_world(scene, **changes)
-    trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
-    fields, ctrl = small.world_inputs(scene, world, trial)
-    ctrl = np.asarray(ctrl)
-    oracle = world_model(scene, fields)
-    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
-    return scene, oracle, fields, ctrl
-
-
 @pytest.mark.parametrize(
     "name", [n if n in TOGETHER else pytest.param(n, marks=slow) for n in SETTINGS]
 )
@@ -65,8 +53,8 @@ def test_steps_equal_mujocos(name):
         scene, _, fields, ctrl = setting(SETTINGS[name])
         engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
         fields, ctrl = jax.tree.map(lambda x: jnp.asarray(x)[None], fields), ctrl[None, :420]
-        found = steps.path(engine, fields, ctrl)
-    errors, far, touching = steps.against_mujoco(scene, fields, ctrl, found)
+        found = oracles.path(engine, fields, ctrl)
+    errors, far, touching = oracles.against_mujoco(scene, fields, ctrl, found)
     # As in test_structured; MuJoCo's rigid arm gives way by the hand's forces over 1e9 kg, which
     # stiff fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
     assert errors.max() < (1e-8 if scene.effects.wrist else 1e-7) and far.max() < 1e-12
@@ -89,7 +77,7 @@ def test_mjx_steps_equal_mujocos():
         data.qpos[:] = fields.start
         for k in range(420):
             data.ctrl[:] = ctrl[k]
-            steps.soften(scene, fields, data)
+            oracles.soften(scene, fields, data)
             if k % 70 == 20:
                 ours = ours.replace(qpos=data.qpos.copy(), qvel=data.qvel.copy())
                 found = step(fields, ours, ctrl[k])
@@ -135,16 +123,6 @@ def test_neo_hookean_is_inert_at_small_strain():
     np.testing.assert_allclose(angles[1], angles[0], rtol=1e-5)
 
 
-def inflated(scene, fields, ctrl, pressure, steps=400):
-    """Bend angles (finger, link) of fingers at rest under a pressure, by the engine `mujoco`."""
-    with jax.enable_x64(True):
-        held = np.broadcast_to(ctrl[:1], (1, steps, ctrl.shape[1])).copy()
-        held[..., 6:] = pressure
-        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-        trace = make_engine("mujoco", scene).rollout(batch, jnp.asarray(held), trajectory=True)
-    return np.asarray(trace.qpos)[0, -1][model.layout(scene).dofs[..., 0]]
-
-
 # --- off is absent -------------------------------------------------------------------------------
 
 # Constants that only these effects read.
@@ -180,7 +158,7 @@ def changed(value, path, field, new):
 
 def program(scene):
     """Text of everything a grasp computes: the kernel's arguments, and the kernel of a step."""
-    world, trial = (jax.tree.map(jnp.asarray, small.stack(v)) for v in small.hand_world(scene))
+    world, trial = (jax.tree.map(jnp.asarray, grasps.stack(v)) for v in grasps.hand_world(scene))
     kernel = Program(scene, Limits(8, 8, 1e-6), width=8)
 
     def run(p, t):
@@ -193,7 +171,7 @@ def program(scene):
 
 def step_jaxpr(scene):
     """The jaxpr of the kernel of one step."""
-    shapes = [small.stack(v) for v in small.hand_world(scene)]
+    shapes = [grasps.stack(v) for v in grasps.hand_world(scene)]
     fields = jax.eval_shape(jax.vmap(lambda p, t: model.model_fields(scene, p, t)), *shapes)
     hand = jax.eval_shape(lambda f: world_constants(scene, f), fields)
     state = jax.eval_shape(lambda f: coordinates.reset(scene, f), fields)
@@ -202,7 +180,7 @@ def step_jaxpr(scene):
 
 
 def effects_scene(values, **settings):
-    return small.pinch(links=2, **{f"effects__{k}": v for k, v in values.items()}, **settings)
+    return grasps.pinch(links=2, **{f"effects__{k}": v for k, v in values.items()}, **settings)
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +243,7 @@ def test_kernel_without_palm_on_table():
 
 
 def test_every_effect_is_in_the_table():
-    names = [f.name for f in dataclasses.fields(small.pinch().effects)]
+    names = [f.name for f in dataclasses.fields(grasps.pinch().effects)]
     assert list(effects.EFFECTS) == names
     for effect in effects.EFFECTS.values():
         assert set(effect.refused) <= set(effects.ENGINES)
@@ -273,7 +251,7 @@ def test_every_effect_is_in_the_table():
 
 def test_unsupported_effect_names_itself_and_the_engine():
     scene = effects_scene({"wrist": False})
-    with pytest.raises(schema.SceneError, match="engine mjx: effects.wrist = false .*float64"):
+    with pytest.raises(schema.InputError, match="engine mjx: effects.wrist = false .*float64"):
         make_engine("mjx", scene)
     assert effects.state(scene.effects, "wrist", "mjx") == "unsupported (false)"
     assert effects.state(scene.effects, "wrist", "mujoco") == "off"
@@ -285,7 +263,7 @@ def values_of(field):
 
 
 COMBINATIONS = st.fixed_dictionaries(
-    {f.name: values_of(f) for f in dataclasses.fields(small.pinch().effects)}
+    {f.name: values_of(f) for f in dataclasses.fields(grasps.pinch().effects)}
 )
 
 
@@ -297,26 +275,26 @@ def check_combination(values, shape):
     """
     chosen = {f"effects__{k}": v for k, v in values.items()}
     if values["surface"] == "hull" and values["friction"] == "full":
-        with pytest.raises(schema.SceneError, match="effects.surface = 'hull' needs friction"):
-            small.pinch(shape, links=1, **chosen)
+        with pytest.raises(schema.InputError, match="effects.surface = 'hull' needs friction"):
+            grasps.pinch(shape, links=1, **chosen)
         return
     if values["lateral_threshold"] and not values["lateral_bending"]:
-        with pytest.raises(schema.SceneError, match="lateral_bending = false leaves out"):
-            small.pinch(shape, links=1, **chosen)
+        with pytest.raises(schema.InputError, match="lateral_bending = false leaves out"):
+            grasps.pinch(shape, links=1, **chosen)
         return
-    scene = small.pinch(shape, links=1, **chosen)
+    scene = grasps.pinch(shape, links=1, **chosen)
     for name in effects.ENGINES:
         refused = effects.refusals(scene.effects, name)
         if refused:
-            with pytest.raises(schema.SceneError) as caught:
+            with pytest.raises(schema.InputError) as caught:
                 make_engine(name, scene)
             assert len(caught.value.problems) == len(refused)
             assert all(f"engine {name}: effects." in p for p in caught.value.problems)
             continue
         engine = make_engine(name, scene)
         if name == "mujoco":
-            world, trial = (small.stack(v) for v in small.hand_world(scene))
-            fields, ctrl = small.batch_inputs(scene, world, trial)
+            world, trial = (grasps.stack(v) for v in grasps.hand_world(scene))
+            fields, ctrl = grasps.batch_inputs(scene, world, trial)
             trace = engine.rollout(fields, ctrl[:, :2])
             assert np.isfinite(trace.speed).all() and np.isfinite(trace.distance).all()
         elif name == "structured":
@@ -327,14 +305,14 @@ OPTIONS = {"deadline": None, "derandomize": True, "phases": [Phase.generate]}
 
 
 @settings(max_examples=3, **OPTIONS)
-@given(values=COMBINATIONS, shape=st.sampled_from(small.SHAPES))
+@given(values=COMBINATIONS, shape=st.sampled_from(grasps.SHAPES))
 def test_a_combination_builds_or_is_refused(values, shape):
     check_combination(values, shape)
 
 
 @slow
 @settings(max_examples=60, **OPTIONS)
-@given(values=COMBINATIONS, shape=st.sampled_from(small.SHAPES))
+@given(values=COMBINATIONS, shape=st.sampled_from(grasps.SHAPES))
 def test_any_combination_builds_or_is_refused(values, shape):
     check_combination(values, shape)
 
@@ -349,11 +327,11 @@ def test_mujoco_s_rigid_arm_moves_fingers_whatever_the_object_does():
     paths = []
     for rests in (True, False):
         effects = {f"effects__{name}": False for name in (*off, "disturb", "ungrasp")}
-        scene = small.pinch(
+        scene = grasps.pinch(
             "sphere", links=2, effects__object_table=rests, limits__penetration=0.1, **effects
         )
-        params, trials = small.random_worlds(scene, 0, 1)
-        fields, ctrl = small.batch_inputs(scene, params, trials)
+        params, trials = grasps.random_worlds(scene, 0, 1)
+        fields, ctrl = grasps.batch_inputs(scene, params, trials)
         pressed = ctrl[:, 210:222].at[:, :, 2].set(fields.start[0, 2])  # Pa, the arm at rest
         trace = jax.jit(MujocoEngine(scene).rollout, static_argnames="trajectory")(
             fields, pressed, trajectory=True

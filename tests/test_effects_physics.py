@@ -10,22 +10,9 @@ from scipy import integrate, optimize
 from codesign_jax import control
 from codesign_jax.engines.structured.laws import cones, contact
 from codesign_jax.model import morphology
-from tests import small
-from tests.test_effects import inflated, setting
-
-WIDTH, G = 0.020, 70e3
-
-
-def moment(kappa, height, wall):
-    """The neo-Hookean moment by quadrature over the section [N m]."""
-
-    def density(y):
-        stretch = 1 + kappa * y
-        hollow = wall < y < height - wall
-        return G * (stretch - stretch**-3) * y * (2 * wall if hollow else WIDTH)
-
-    edges = [0, wall, height - wall, height]
-    return sum(integrate.quad(density, a, b)[0] for a, b in zip(edges, edges[1:], strict=False))
+from tests.helpers import grasps
+from tests.helpers.closed_forms import WIDTH, G, moment
+from tests.helpers.effect_settings import inflated, setting
 
 
 @pytest.mark.parametrize("height,wall", [(0.020, 0.005), (0.015, 0.007), (0.025, 0.002)])
@@ -77,7 +64,7 @@ def test_angle_of_the_worked_example():
 
 
 def supply(**values):
-    return small.pinch(
+    return grasps.pinch(
         effects__pressure_dynamics=True, **{f"pneumatics__{k}": v for k, v in values.items()}
     )
 
@@ -98,7 +85,7 @@ def test_supply_against_an_integrator():
     """Lag, rate and maximum at once, along a grasp, against scipy's adaptive integrator."""
     scene = supply(lag=0.15, rate=120e3, maximum=90e3)
     h, count = 1e-3, 9000
-    scene = small.pinch(
+    scene = grasps.pinch(
         effects__pressure_dynamics=True,
         pneumatics__lag=0.15,
         pneumatics__rate=120e3,
@@ -174,7 +161,7 @@ def test_a_spinning_ball_slows_by_torsion(model_of_friction, expected):
 @jax.enable_x64(True)
 def some_contacts(friction, rng, count):
     """Contacts with random places and normals, world by world, and a pinch scene's cone."""
-    scene = small.pinch(effects__friction=friction)
+    scene = grasps.pinch(effects__friction=friction)
     normal = rng.normal(size=(3, 1, count))
     return contact.Contacts(
         point=jnp.asarray(0.05 * rng.normal(size=(3, 1, count))),
@@ -241,7 +228,7 @@ def test_a_coefficient_of_zero_is_no_friction():
     """Pressed, sliding and apart: the force of the frictionless model, which never pulls."""
     rng, count = np.random.default_rng(5), 50
     rough = some_contacts("coulomb", rng, count)
-    smooth = cones.make_cone(small.pinch(effects__friction="coulomb"), 0.0, bodies=2)
+    smooth = cones.make_cone(grasps.pinch(effects__friction="coulomb"), 0.0, bodies=2)
     bare = some_contacts("none", rng, count).cone
     a = jnp.asarray(30 * rng.normal(size=(3, 1, count)))
     force, expected = (pushes(rough._replace(cone=cone), a)[2] for cone in (smooth, bare))

@@ -1,5 +1,7 @@
 """Stock MJX against MuJoCo C: single steps in float64, whole short grasps, and failing worlds."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -12,8 +14,8 @@ from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Status
-from tests import small
-from tests.small import batch_inputs, nth, pinch, stack, still, world_inputs
+from tests.helpers import grasps
+from tests.helpers.grasps import batch_inputs, nth, pinch, stack, still, world_inputs
 
 # Designs (length, arm_z) [m] at which two fingers of three links lift the object at 190 kPa.
 HOLDING = {"box": (0.09, 0.05), "cylinder": (0.10, 0.08), "sphere": (0.11, 0.025)}
@@ -225,7 +227,7 @@ EXPECTED = {
 def test_failing_worlds_are_flagged_alike(hurried, engine, request):
     the_scene, *_ = hurried
     trace = request.getfixturevalue(f"{engine}_traces")[1]
-    result = small.outcomes(the_scene, trace)
+    result = grasps.outcomes(the_scene, trace)
     for index, (status, step) in EXPECTED.items():
         assert result.status[index] == status and result.bad_step[index] == step
     # A finger under 1e12 Pa is fast in the first step, or beyond float32's numbers.
@@ -261,13 +263,13 @@ def test_decided_worlds_are_not_simulated_further(hurried, monkeypatch):
     """MuJoCo leaves worlds that are lost or failed; their traces repeat the last entry."""
     the_scene, (fields, ctrl), _ = hurried
     engine = MujocoEngine(the_scene)
-    asked, advance = [], MujocoEngine._advance
+    asked, advance = [], MujocoEngine.advance
 
     def spy(self, batch, ids, *rest):
         asked.append(ids.tolist())
         return advance(self, batch, ids, *rest)
 
-    monkeypatch.setattr(MujocoEngine, "_advance", spy)
+    monkeypatch.setattr(MujocoEngine, "advance", spy)
     # World 0 keeps the object at the start; world 1 holds its hand up in the air: lost at once.
     away = ctrl.at[1, :, 2].set(0.3)
     trace = jax.tree.map(np.asarray, engine.rollout(nth(fields, slice(0, 2)), away[:2]))
@@ -275,7 +277,7 @@ def test_decided_worlds_are_not_simulated_further(hurried, monkeypatch):
     last = (window // 25 + 1) * 25  # the end of the chunk in which the window opens
     assert asked[window // 25] == [0, 1] and asked[window // 25 + 1] == [0]
     np.testing.assert_array_equal(trace.distance[1, last:], trace.distance[1, last - 1])
-    result = small.outcome(the_scene, nth(trace, 1))
+    result = grasps.outcome(the_scene, nth(trace, 1))
     np.testing.assert_allclose(result.cost, the_scene.cost.maximum, rtol=1e-6)
 
 
@@ -286,21 +288,29 @@ def test_batches_do_not_depend_on_order_or_size(hurried):
     whole = engine.rollout(fields, ctrl)
     order = np.array([5, 0])
     part = engine.rollout(nth(fields, order), nth(ctrl, order))
-    for a, b in zip(whole, part, strict=True):
-        np.testing.assert_array_equal(np.asarray(a)[order], b)
     again = engine.rollout(fields, ctrl)
-    for a, b in zip(whole, again, strict=True):
-        np.testing.assert_array_equal(a, b)
+    for a, b, c in zip(*map(jax.tree.leaves, (whole, part, again)), strict=True):
+        np.testing.assert_array_equal(np.asarray(a)[order], b)
+        np.testing.assert_array_equal(a, c)
 
 
 def test_unknown_engine_names_the_nearest():
-    with pytest.raises(schema.SceneError, match="did you mean 'mujoco'"):
+    with pytest.raises(schema.InputError, match="did you mean 'mujoco'"):
         make_engine("mujocco", pinch())
+
+
+def test_stock_mjx_is_an_extra(monkeypatch):
+    """Without its package the engine says how to get it, and the others do without."""
+    monkeypatch.setitem(sys.modules, "codesign_jax.engines.mjx", None)
+    the_scene = pinch("sphere", links=2)
+    with pytest.raises(schema.InputError, match="needs mujoco-mjx: pip install"):
+        make_engine("mjx", the_scene)
+    assert make_engine("structured", the_scene).name == "structured"
 
 
 def test_mujocos_solver_table_is_refused_where_it_has_no_effect():
     """Unless a preset wrote it, or [newton] is set as well: then the scene serves all engines."""
-    with pytest.raises(schema.SceneError) as error:
+    with pytest.raises(schema.InputError) as error:
         make_engine("structured", pinch(solver__iterations=31, solver__tolerance=1e-9))
     iterations, tolerance = error.value.problems
     assert "solver.iterations = 31" in iterations and "set newton.iterations" in iterations

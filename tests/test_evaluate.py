@@ -5,15 +5,15 @@ import csv
 import jax
 import numpy as np
 import pytest
-from command_runs import command, finished_run, own_workplace  # noqa: F401
 from scipy import stats
-from toy import TINY
 
 from codesign_jax import codesign, cost, rollout, runs, scene
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import columns
 from codesign_jax.types import Outcome, Status
+from tests.helpers.command_runs import command, finished_run, own_workplace  # noqa: F401
+from tests.helpers.toy_engine import TINY
 
 
 def test_evaluate_prints_costs_of_each_object(capsys):

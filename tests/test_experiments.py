@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 import scipy.stats
 from rich.console import Console
-from toy import TINY, ToyEngine, tiny
 
 from codesign_jax import codesign, runs
 from codesign_jax import scene as scenes
 from codesign_jax.batch import Batch
 from codesign_jax.optimize import schedule
 from codesign_jax.report.statistics import wilson
-from codesign_jax.scene import SceneError
+from codesign_jax.scene import InputError
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
 from scripts.experiments import figures, landscape, plan, report, results, strategies, study
 from scripts.experiments.plan import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
+from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
 SEED = 5
@@ -222,7 +222,7 @@ def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
     again, found = points(tmp_path / "x.part")
     assert found == 60, "two calls of six points"
     assert all(np.array_equal(again[name], value) for name, value in whole.items())
-    with pytest.raises(SceneError, match="x.part is of another design or other settings"):
+    with pytest.raises(InputError, match="x.part is of another design or other settings"):
         points(tmp_path / "x.part", seed=1)
     scene, space, _ = tiny()
     kept = results.of_landscape(scene, space, whole)

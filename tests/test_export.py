@@ -10,7 +10,6 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from toy import TINY
 
 from codesign_jax import cli, rollout, scene
 from codesign_jax.cost import outcome
@@ -21,7 +20,8 @@ from codesign_jax.export.play import play
 from codesign_jax.model import build_spec, hull
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status, Trial, failed
-from tests.small import batch_inputs, hand_world, nth, pinch, random_designs, stack
+from tests.helpers.grasps import batch_inputs, hand_world, nth, pinch, random_designs, stack
+from tests.helpers.toy_engine import TINY
 
 # A grasp in 2.2 s, with all joints and contacts.
 HURRIED = {

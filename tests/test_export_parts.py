@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.polynomial import Polynomial
-from toy import TINY
 
 from codesign_jax import cli
 from codesign_jax.export import casting, meshes, process
 from codesign_jax.export.process import Process, Size
 from codesign_jax.scene import schema
+from tests.helpers.toy_engine import TINY
 
 USUAL, FLAT, SHORT = Size(95, 20, 20, 5, 5), Size(170, 20, 15, 7, 7), Size(12, 20, 25, 2, 2)
 # STL holds float32: seven digits of lengths of up to 200 mm.
@@ -138,7 +138,7 @@ def test_the_core_is_one_piece_with_openings_to_pour(written):
 
 
 def test_a_finger_without_a_chamber_is_refused():
-    with pytest.raises(schema.SceneError) as error:
+    with pytest.raises(schema.InputError) as error:
         process.sizes([0.01, 0.1], 0.02, [0.02, 0.02], [0.005, 0.005], Process())
     [problem] = error.value.problems
     assert "finger 0 of 10 mm" in problem and "--end-wall" in problem

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from toy import TINY, ToyEngine, tiny
 
 from codesign_jax import cli, codesign, files, scene
 from codesign_jax.commands import calls, export
@@ -15,6 +14,7 @@ from codesign_jax.export.process import Process
 from codesign_jax.optimize import answer
 from codesign_jax.scene import parameters
 from codesign_jax.types import Outcome, Status
+from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
 STEPS = 5
 FACTOR = tolerance.NEAREST ** (-1 / (STEPS - 1))  # between a step and the next

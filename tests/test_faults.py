@@ -11,10 +11,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import tiny_run
 
 from scripts.faults import cases, damage, finished, page, shim
 from scripts.faults.store import Part, Result, Store, gather
+from tests.helpers import tiny_run
 
 needs_compiler = pytest.mark.skipif(shim.compiler() is None, reason="no C compiler")
 
@@ -166,7 +166,7 @@ def test_the_number_makes_the_case():
 
     bench = SimpleNamespace(folder=None)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scripts.faults.kills._operations", lambda bench: 800)
+        patch.setattr("scripts.faults.kills.count_operations", lambda bench: 800)
         found = [_place(bench, n, 100) for n in range(300)]
     assert len(set(found[:100])) == 100 and set(found) <= {*range(1, 801)}
     assert len(set(found)) > 250

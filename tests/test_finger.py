@@ -6,9 +6,10 @@ from scipy import integrate, optimize
 
 from codesign_jax import cli, finger, scene
 from codesign_jax.scene import parameters
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from scripts import silicones
 from scripts.accuracy import beam
+from tests.helpers import beams
 
 
 def made(links=10, **effects):
@@ -67,9 +68,7 @@ def test_neo_hookean_bending_is_the_law_s_quadrature():
 @pytest.mark.parametrize("pressure, load", [(40e3, 0.0), (40e3, 0.3)])
 def test_the_simulation_comes_to_the_same_rest(pressure, load):
     """The engine's finger, waited for; it rests to 1e-8, and its dead load is explicit."""
-    from tests import test_beam_oracles as oracles
-
-    simulated = oracles.Finger(10, timestep=0.002)
+    simulated = beams.Finger(10, timestep=0.002)
     position, frame = simulated.settle(force=(0, 0, load), pressure=pressure)
     whole = simulated.beam.bending / (simulated.length / 10)
     mine = finger.Finger(
@@ -158,7 +157,7 @@ WRONG = {
 def test_a_wrong_file_is_refused(text, tmp_path):
     path = tmp_path / "finger.csv"
     path.write_text(text)
-    with pytest.raises(SceneError, match="finger.csv") as error:
+    with pytest.raises(InputError, match="finger.csv") as error:
         finger.read(path)
     assert WRONG[text] in str(error.value)
 

@@ -10,44 +10,14 @@ from codesign_jax import model, scene
 from codesign_jax.engines.mjx import MjxEngine
 from codesign_jax.engines.structured.kernel.pairs import pair_slots
 from codesign_jax.engines.structured.laws import finger_pairs
-from tests import small
-
-SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 2}
+from tests.helpers import grasps
+from tests.helpers.curled_hands import SETTINGS, curled, kinds
 
 
 @jax.jit
 def contacts(centre, radius):
     """The engine's contacts between spheres of fingers, without a friction cone."""
     return finger_pairs.contacts(None, centre, radius)
-
-
-def curled(the_scene, seed, bend, height):
-    """Model, data and lanes of a hand with random joint angles about a bend, object between."""
-    hand, trial = small.hand_world(the_scene, length=0.1)
-    fields, _ = small.world_inputs(the_scene, hand, trial)
-    oracle = model.compile_model(the_scene, hand, trial)
-    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
-    data, random = mujoco.MjData(oracle), np.random.default_rng(seed)
-    lay, qpos = model.layout(the_scene), np.array(fields.start)
-    qpos[2] = height
-    angles = 0.1 * random.normal(size=lay.dofs.shape)
-    angles[..., 0] += bend
-    qpos[6 : 6 + lay.dofs.size] = angles.ravel()
-    data.qpos[:], data.qvel[:] = qpos, 0.3 * random.normal(size=oracle.nv)
-    data.ctrl[:6] = qpos[:6]
-    data.ctrl[6:] = 60e3
-    return oracle, data, jax.tree.map(lambda x: x[None], fields)
-
-
-def kinds(oracle, data):
-    """Numbers of contacts between two fingers and of a finger with the object."""
-    names = [
-        [mujoco.mj_id2name(oracle, mujoco.mjtObj.mjOBJ_GEOM, int(g)) for g in pair]
-        for pair in data.contact.geom
-    ]
-    fingers = [sum(n.startswith("finger") for n in pair) for pair in names]
-    held = sum("finger" in a + b and "object" in a + b for a, b in names)
-    return fingers.count(2), held
 
 
 def test_candidates_are_all_pairs_of_different_fingers():
@@ -108,7 +78,7 @@ def test_the_derivative_has_a_slot_for_whatever_touches_in_the_kernel():
 def test_mjx_equals_mujoco():
     """The same pairs in stock MJX; its Newton stops at the scene's tolerance of 1e-8."""
     with jax.enable_x64(True):
-        the_scene = small.pinch("sphere", **SETTINGS)
+        the_scene = grasps.pinch("sphere", **SETTINGS)
         oracle, data, fields = curled(the_scene, 0, bend=0.8, height=0.07)
         mujoco.mj_forward(oracle, data)
         engine = MjxEngine(the_scene)

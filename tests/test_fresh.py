@@ -5,11 +5,11 @@ import sys
 
 import numpy as np
 import pytest
-from toy import TINY
 
 from codesign_jax import scene
 from scripts.experiments import fresh, results
 from scripts.experiments.plan import Strategies
+from tests.helpers.toy_engine import TINY
 
 PLAN = Strategies("2d", "2d", ("single", "concurrent"), 2, 3, 2, 3, 3)
 

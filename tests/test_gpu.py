@@ -15,7 +15,7 @@ import pytest
 from codesign_jax.compiler import launch
 from codesign_jax.engines.base import staged
 from codesign_jax.engines.structured import StructuredEngine
-from tests import gpu_cases, small
+from tests.helpers import gpu_cases, grasps
 
 pytestmark = pytest.mark.gpu
 
@@ -29,11 +29,9 @@ def on_cpu(tmp_path):
     started = []
 
     def start(case):
-        path, here = tmp_path / "result.npz", Path(__file__)
-        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-        environment["PYTHONPATH"] = f"{here.parents[1]}:{environment.get('PYTHONPATH', '')}"
-        command = [sys.executable, str(here.with_name("gpu_cases.py")), case, str(path)]
-        process = subprocess.Popen(command, env=environment)
+        path, environment = tmp_path / "result.npz", {**os.environ, "JAX_PLATFORMS": "cpu"}
+        command = [sys.executable, "-m", "tests.helpers.gpu_cases", case, str(path)]
+        process = subprocess.Popen(command, env=environment, cwd=Path(__file__).parents[1])
         started.append(process)
 
         def read():
@@ -109,9 +107,13 @@ def test_neighbours_in_a_block_change_no_bit(name):
         np.testing.assert_array_equal(getattr(mixed, key), want, err_msg=key)
 
 
-def test_staged_blocks_are_narrow_for_few_worlds():
-    """What `codesign optimize` simulates by: widths follow the joined batch, bits do not."""
-    scene = gpu_cases.short_scene("hull and fingers")
+@pytest.mark.parametrize("name", ["hull", "hull and fingers"])
+def test_staged_blocks_are_narrow_for_few_worlds(name):
+    """What `codesign optimize` simulates by: widths follow the joined batch, bits do not.
+
+    Teams of lanes have blocks of one world, whose two fingers are the columns of its tables.
+    """
+    scene = gpu_cases.short_scene(name)
     fields, ctrl = gpu_cases.inputs(scene, 40)
     engine, ctrl = StructuredEngine(scene), ctrl[:, :200]
     widths = [engine.block_lanes(worlds) for worlds in (40, 16_384)]
@@ -120,7 +122,7 @@ def test_staged_blocks_are_narrow_for_few_worlds():
     def run(lanes):
         parts = staged(engine, lanes)
         blocks, common = jax.jit(parts.pack)(fields, ctrl)
-        assert blocks[0].shape[-1] == lanes
+        assert blocks[0].shape[-1] == (lanes if name == "hull" else 2)
         out = jax.jit(parts.launch)(blocks, common)
         return jax.jit(lambda out: parts.unpack(out, len(ctrl)))(out)
 
@@ -129,7 +131,7 @@ def test_staged_blocks_are_narrow_for_few_worlds():
 
 def test_the_default_is_float32_and_the_kernel():
     """What a user gets on a GPU without asking."""
-    scene = small.pinch("cylinder", links=2)
+    scene = grasps.pinch("cylinder", links=2)
     fields, ctrl = gpu_cases.inputs(scene, 3)
     engine = StructuredEngine(scene)
     assert engine.rollout(fields, ctrl[:, :20]).distance.dtype == np.float32

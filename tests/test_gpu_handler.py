@@ -9,7 +9,7 @@ import pytest
 
 from codesign_jax.compiler import ffi, gpu, launch
 from codesign_jax.compiler.layout import OUTPUT, Array, Layout
-from tests import frames, kernels
+from tests.helpers import call_frames, kernels
 
 KERNEL, CONTEXT, PRIMARY = 0xCAFE, 0xC0, 0xC1
 NAMES = {1: b"CUDA_ERROR_INVALID_VALUE", 218: b"CUDA_ERROR_INVALID_PTX"}
@@ -96,21 +96,21 @@ def prepared():
 def test_launch(prepared):
     """Grid, block, stream and the address of every array's first block, in the stream's context."""
     handler, use, _ = prepared
-    driver, xla = use(FakeDriver()), frames.Xla()
+    driver, xla = use(FakeDriver()), call_frames.Xla()
     for blocks in (1, 7):
-        inputs, outputs = frames.arrays(LAYOUT, blocks)
+        inputs, outputs = call_frames.arrays(LAYOUT, blocks)
         assert xla.call(handler, inputs, outputs) is None
         addresses = [a.ctypes.data for a in (*inputs, *outputs)]
         names, arguments = zip(*driver.calls, strict=True)
         assert names == ("cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuLaunchKernel") + (
             "cuCtxPopCurrent_v2",
         )
-        assert arguments[0][0] == frames.STREAM and arguments[1] == (CONTEXT,)
+        assert arguments[0][0] == call_frames.STREAM and arguments[1] == (CONTEXT,)
         assert arguments[2] == (
-            *(KERNEL, blocks, 1, 1, 32, 1, 1, 0, frames.STREAM, addresses, None),
+            *(KERNEL, blocks, 1, 1, 32, 1, 1, 0, call_frames.STREAM, addresses, None),
         )
         driver.calls.clear()
-    inputs, outputs = frames.arrays(LAYOUT, 0)
+    inputs, outputs = call_frames.arrays(LAYOUT, 0)
     assert xla.call(handler, inputs, outputs) is None and not driver.calls
 
 
@@ -127,8 +127,8 @@ def test_launch(prepared):
 def test_errors_of_the_driver(prepared, function, result, message):
     """They name the call and the result; the context is restored after a launch that failed."""
     handler, use, _ = prepared
-    driver, xla = use(FakeDriver(**{function: result})), frames.Xla()
-    assert xla.call(handler, *frames.arrays(LAYOUT, 2)) == (ffi.INTERNAL, message)
+    driver, xla = use(FakeDriver(**{function: result})), call_frames.Xla()
+    assert xla.call(handler, *call_frames.arrays(LAYOUT, 2)) == (ffi.INTERNAL, message)
     names = [name for name, _ in driver.calls]
     assert ("cuLaunchKernel" in names) == ("cuCtxPopCurrent_v2" in names)
     assert "cuLaunchKernel" not in names or function in ("cuLaunchKernel", "cuCtxPopCurrent_v2")
@@ -137,15 +137,15 @@ def test_errors_of_the_driver(prepared, function, result, message):
 def test_errors_of_xla(prepared):
     """No stream: XLA's own error is handed back.  Arrays of another kind are not launched on."""
     handler, use, _ = prepared
-    driver, xla = use(FakeDriver()), frames.Xla(stream_error=1)
+    driver, xla = use(FakeDriver()), call_frames.Xla(stream_error=1)
     xla.errors.append((9, "no stream"))
-    inputs, outputs = frames.arrays(LAYOUT, 2)
+    inputs, outputs = call_frames.arrays(LAYOUT, 2)
     assert xla.call(handler, inputs, outputs) == (9, "no stream")
     for wrong in ([inputs[0], inputs[0]], [inputs[0][:, :1], inputs[1]], inputs[:1]):
-        code, message = frames.Xla().call(handler, wrong, outputs)
+        code, message = call_frames.Xla().call(handler, wrong, outputs)
         assert code == ffi.INVALID_ARGUMENT and message.startswith("kernel fake needs ")
     with_one_more = [outputs[0], np.concatenate([outputs[1]] * 2)]
-    code, message = frames.Xla().call(handler, inputs, with_one_more)
+    code, message = call_frames.Xla().call(handler, inputs, with_one_more)
     assert message == "kernel fake needs array 3 to be output float32[blocks, 3, 32]"
     assert not driver.calls
 

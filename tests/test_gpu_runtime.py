@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codesign_jax.compiler import gpu, launch, thread
-from tests import kernels
+from tests.helpers import kernels
 
 pytestmark = pytest.mark.gpu
 

@@ -11,7 +11,7 @@ import pytest
 
 from codesign_jax import control, model
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small
+from tests.helpers import grasps
 
 # One program, but its derivative compiles in two minutes of a core's time.
 pytestmark = pytest.mark.slow
@@ -46,21 +46,6 @@ class Thrown(StructuredEngine):
     def reset(self, fields):
         state = super().reset(fields)
         return state._replace(linear_vel=state.linear_vel.at[0, 0].set(self.velocity))
-
-
-def short_grasp():
-    """Half a second: the hand comes down beside the box, closes and begins to lift."""
-    return small.pinch(
-        "box",
-        phases__approach=0.2,
-        phases__inflate=0.35,
-        phases__lift=0.5,
-        effects__disturb=False,
-        effects__ungrasp=False,
-        effects__palm_object=False,
-        effects__palm_table=False,
-        arm__start_height=0.15,
-    )
 
 
 def world(scene, design, value):
@@ -99,7 +84,7 @@ def simulate(scene, design, values):
 @pytest.fixture(scope="module")
 def checked():
     """By case: gradients, central differences, final position of the object."""
-    scene, rows, where = short_grasp(), [], {}
+    scene, rows, where = grasps.short_grasp(), [], {}
     for case, (changes, names, _) in CASES.items():
         base = np.array([{**START, **changes}.get(n, 0.0) for n in NAMES])
         where[case] = len(rows)
@@ -107,7 +92,7 @@ def checked():
         for name in names:
             for step in (STEP, -STEP):
                 rows.append(base + step * (np.array(NAMES) == name))
-    design = small.hand_world(scene)
+    design = grasps.hand_world(scene)
     with jax.enable_x64(True):
 
         def loss(values):

@@ -12,10 +12,8 @@ from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status
-from tests.small import stack
+from tests.helpers.grasps import GOOD, stack
 
-# Found by a random search over symmetric designs, straight above the object; in the files' units.
-GOOD = {"length": 86, "height": 24.5, "wall": 5, "spread": 55, "arm_z": 58, "pressure": 130}
 SHAPES = range(3)
 
 

@@ -11,21 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from command_runs import command, own_workplace  # noqa: F401  (a fixture)
-from solids import box, object_file
 
 from codesign_jax import engines, make_engine, rollout, scene
 from codesign_jax.engines.structured.laws import meshes as lanes
-from codesign_jax.scene import SceneError, constants, library, meshes, objects, reach
+from codesign_jax.scene import InputError, constants, library, meshes, objects, reach
 from codesign_jax.scene.meshes import reading, surface
 from codesign_jax.scene.parameters import design_space
 from scripts.faults import fuzz
+from tests.helpers.command_runs import command, own_workplace  # noqa: F401  (a fixture)
+from tests.helpers.solids import box, object_file
 
 PAPER = library.available("scenes")["paper_spheres"]
 
 
 def refusals(call, *arguments, **options):
-    with pytest.raises(SceneError) as caught:
+    with pytest.raises(InputError) as caught:
         call(*arguments, **options)
     return caught.value.problems
 
@@ -63,7 +63,7 @@ def test_names_that_no_file_or_table_could_hold(name):
 
 
 def test_an_error_never_speaks_to_the_terminal():
-    error = SceneError(["a \x1b[2J\x9b and \ud800\u2028"])
+    error = InputError(["a \x1b[2J\x9b and \ud800\u2028"])
     assert str(error) == r"a \x1b[2J\x9b and \ud800\u2028"
 
 
@@ -124,7 +124,7 @@ def test_sizes_of_mesh_files(tmp_path, monkeypatch):
     (problem,) = refusals(objects.load, object_file(tmp_path, entry + '"a"', entry + '"b"'))
     assert "the meshes have" in problem
     monkeypatch.setattr(meshes.grid, "MAX_WORK", 1e5)
-    with pytest.raises(SceneError, match="12 faces are too many for a grid of"):
+    with pytest.raises(InputError, match="12 faces are too many for a grid of"):
         _ = load_mesh(path).grid
 
 
@@ -180,7 +180,7 @@ def test_thin_faces_are_not_cut_into_millions(monkeypatch):
     rod = trimesh.creation.cylinder(0.002, 0.2, sections=8)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
     usual = surface.prepare(rod.vertices, rod.faces)
-    monkeypatch.setattr(surface, "_MOST_PIECES", 500)
+    monkeypatch.setattr(surface, "MOST_PIECES", 500)
     few = surface.prepare(rod.vertices, rod.faces)
     assert len(few.piece) <= 500 < len(usual.piece)
     expected = surface.signed_distance(usual, points)

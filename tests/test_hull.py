@@ -16,16 +16,15 @@ from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.laws.kinematics import kinematics
 from codesign_jax.engines.structured.linear.tree import Spatial, relative
 from codesign_jax.model import hull
-from codesign_jax.scene.schema import SceneError
-from tests import small
-from tests.test_structured import lanes_state
+from codesign_jax.scene.schema import InputError
+from tests.helpers import grasps
 
 LENGTH, HEIGHT = 0.11, 0.018
 
 
 def hull_scene(links=4, rings=2, points=8):
     density = {"discretization__hull_rings": rings, "discretization__hull_points": points}
-    return small.pinch("box", links=links, effects__surface="hull", **density)
+    return grasps.pinch("box", links=links, effects__surface="hull", **density)
 
 
 @pytest.mark.parametrize(("links", "rings", "points"), [(1, 1, 4), (4, 2, 8), (3, 5, 20)])
@@ -51,7 +50,7 @@ def test_mesh_is_the_closed_block_of_the_finger(links, rings, points):
 
 def bent(the_scene, seed=0):
     """Model and data of a hand with random joint angles of up to 0.4 rad."""
-    params, trial = small.hand_world(the_scene, length=LENGTH, height=HEIGHT)
+    params, trial = grasps.hand_world(the_scene, length=LENGTH, height=HEIGHT)
     compiled = model.compile_model(the_scene, params, trial, visual=True)
     data = mujoco.MjData(compiled)
     turn = np.random.default_rng(seed).uniform(-0.4, 0.4, data.qpos.shape)
@@ -85,17 +84,17 @@ def test_velocities_are_derivatives_of_positions():
     with jax.enable_x64(True):
         the_scene = hull_scene()
         _, data = bent(the_scene)
-        hand, trial = small.hand_world(the_scene, length=LENGTH, height=HEIGHT)
-        fields, _ = small.world_inputs(the_scene, hand, trial)
-        fields = small.repeat(fields, 1)
-        engine, lanes = StructuredEngine(the_scene), small.lanes(the_scene, fields)
+        hand, trial = grasps.hand_world(the_scene, length=LENGTH, height=HEIGHT)
+        fields, _ = grasps.world_inputs(the_scene, hand, trial)
+        fields = grasps.repeat(fields, 1)
+        engine, lanes = StructuredEngine(the_scene), grasps.lanes(the_scene, fields)
         rate = np.random.default_rng(1).normal(size=data.qvel.shape)
         rate[-6:] = 0.0  # the object's are no differences of its coordinates
 
         @jax.jit
         def at(h):
             qpos = data.qpos + h * np.append(rate, 0.0)
-            state = lanes_state(engine, the_scene, fields, qpos, rate)
+            state = grasps.lanes_state(engine, the_scene, fields, qpos, rate)
             kin = kinematics(lanes, model.layout(the_scene).axes, state)
             return kin, skin.vertices(the_scene, lanes, kin), state.position[:, 0, 0]
 
@@ -120,15 +119,15 @@ def test_velocities_are_derivatives_of_positions():
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
 def test_other_engines_refuse_the_hull(engine):
     with pytest.raises(
-        SceneError, match=f'engine {engine}: effects.surface = "hull".*use engine structured'
+        InputError, match=f'engine {engine}: effects.surface = "hull".*use engine structured'
     ):
         make_engine(engine, hull_scene())
 
 
 def test_bad_settings_are_refused():
-    with pytest.raises(SceneError, match="'hull' needs friction = 'coulomb' or 'none', not 'full'"):
-        small.pinch("box", effects__surface="hull", effects__friction="full")
-    with pytest.raises(SceneError, match="hull_points = 6 must be a multiple of 4"):
+    with pytest.raises(InputError, match="'hull' needs friction = 'coulomb' or 'none', not 'full'"):
+        grasps.pinch("box", effects__surface="hull", effects__friction="full")
+    with pytest.raises(InputError, match="hull_points = 6 must be a multiple of 4"):
         hull_scene(points=6)
-    with pytest.raises(SceneError, match="did you mean 'hull'"):
+    with pytest.raises(InputError, match="did you mean 'hull'"):
         scene.load("paper_spheres", overrides={"effects": {"surface": "hul"}})

@@ -14,7 +14,7 @@ from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Status
-from tests import small, steps
+from tests.helpers import grasps, oracles
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
@@ -25,9 +25,9 @@ def grasp():
 
     After 230 steps of a grasp the commands stay as they are.
     """
-    scene = small.pinch("cylinder", links=2)
-    params, trials = small.random_worlds(scene, 3, 3)
-    fields, ctrl = small.batch_inputs(scene, params, trials)
+    scene = grasps.pinch("cylinder", links=2)
+    params, trials = grasps.random_worlds(scene, 3, 3)
+    fields, ctrl = grasps.batch_inputs(scene, params, trials)
     ctrl = np.asarray(ctrl[:, :230])
     return scene, fields, jnp.asarray(np.concatenate([ctrl, ctrl[:, -1:].repeat(700, 1)], 1))
 
@@ -70,19 +70,19 @@ def test_kernel_becomes_ptx(effects, monkeypatch):
 
     monkeypatch.setattr(gpu, "register", register)
     monkeypatch.setattr(launch, "available", lambda platform: None)
-    scene = small.pinch("cylinder", links=2, **{f"effects__{k}": v for k, v in effects.items()})
+    scene = grasps.pinch("cylinder", links=2, **{f"effects__{k}": v for k, v in effects.items()})
     width = 16 if effects else 32  # half a warp takes part, or all of it
     program = Program(scene, Limits(8, 8, 1e-6), width=width)
     engine = StructuredEngine(scene)
 
     def run(params, trials):
-        f, c = small.batch_inputs(scene, params, trials)
+        f, c = grasps.batch_inputs(scene, params, trials)
         return program.simulate(
             world_constants(scene, f), engine.reset(f), c[:, :20], trajectory=bool(effects)
         )
 
     with jax.enable_x64(bool(effects)):
-        worlds = small.random_worlds(scene, 3, 3)
+        worlds = grasps.random_worlds(scene, 3, 3)
         text = jax.jit(run).trace(*worlds).lower(lowering_platforms=("cuda",)).as_text()
     (code,) = texts
     used, other = ("f64", "f32") if effects else ("f32", "f64")
@@ -95,12 +95,12 @@ def test_every_step_of_a_batch_equals_mujocos(grasp):
     """Five random hands in blocks of a few worlds each, solved to rounding in float64."""
     scene, *_ = grasp
     with jax.enable_x64(True):
-        params, trials = small.random_worlds(scene, 3, 5)
-        fields, ctrl = small.batch_inputs(scene, params, trials)
+        params, trials = grasps.random_worlds(scene, 3, 5)
+        fields, ctrl = grasps.batch_inputs(scene, params, trials)
         ctrl = ctrl[:, :300]
         engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
-        found = steps.path(engine, fields, ctrl)
-    errors, far, touching = steps.against_mujoco(scene, fields, np.asarray(ctrl), found)
+        found = oracles.path(engine, fields, ctrl)
+    errors, far, touching = oracles.against_mujoco(scene, fields, np.asarray(ctrl), found)
     # As in test_structured: a difference of velocities, and MuJoCo's own rounding.
     assert errors.max() < 1e-8 and far.max() < 1e-12
     assert touching.max() > 4  # more than the object on the table
@@ -137,12 +137,12 @@ def test_float32_is_close_to_mujoco_in_contact(grasp, stepped):
     The palm at 50 to 70 mm presses the straight fingers onto the table.
     """
     scene, fields, ctrl = grasp
-    own = small.nth(fields, 0)
+    own = grasps.nth(fields, 0)
     qpos = np.repeat(own.start[None].astype(np.float32), COUNT, 0)
     qpos[:, 2] = np.linspace(0.05, 0.07, COUNT)
     u = np.repeat(np.asarray(ctrl[:1, 150]), COUNT, 0)
     still = np.zeros((COUNT, qpos.shape[1] - 1), np.float32)
-    after, residual = stepped(small.repeat(own, COUNT), qpos, still, u)
+    after, residual = stepped(grasps.repeat(own, COUNT), qpos, still, u)
     assert float(residual.max()) < 1e-6
     compiled, h = exact(scene, own), scene.discretization.timestep
     data, touching = mujoco.MjData(compiled), []
@@ -165,7 +165,7 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     """
     scene, fields, ctrl = grasp
     count, random = COUNT, np.random.default_rng(0)
-    own = small.nth(fields, 0)
+    own = grasps.nth(fields, 0)
     ratio = np.float32(30)  # as in the scene `paper`
     contact = own.constants.contact._replace(friction_ratio=ratio)
     own = own._replace(impratio=ratio, constants=own.constants._replace(contact=contact))
@@ -175,7 +175,7 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     qvel[:, -6:] = random.normal(size=(count, 6)) * [0.1, 0.1, 0.05, 2, 2, 2]
     u[:, :6] = qpos[:, :6]
     qpos, qvel, u = (v.astype(np.float32) for v in (qpos, qvel, u))
-    after = np.asarray(stepped(small.repeat(own, count), qpos, qvel, u)[0])
+    after = np.asarray(stepped(grasps.repeat(own, count), qpos, qvel, u)[0])
     acc = (after.astype(float) - qvel) / scene.discretization.timestep
     compiled = exact(scene, own)
     data, errors = mujoco.MjData(compiled), []
@@ -230,7 +230,7 @@ def test_neighbours_of_a_failing_world_are_bitwise_unaffected(grasp):
     for index in (0, 2):
         for a, b in zip(*map(jax.tree.leaves, (good, bad)), strict=True):
             np.testing.assert_array_equal(a[index], b[index])
-    result = small.outcomes(scene, bad)
+    result = grasps.outcomes(scene, bad)
     assert int(result.status[1]) & (Status.SPEED | Status.NONFINITE)
     assert 20 < int(result.bad_step[1]) < 25
     assert np.isfinite(bad.last[1]).all()
@@ -259,7 +259,7 @@ def test_a_device_without_kernels_is_told_of_other_engines(grasp, monkeypatch):
     monkeypatch.setattr(launch, "describe", refuse)
     with pytest.raises(launch.KernelUnavailable, match="XLA refused; engine mjx runs on every"):
         jax.eval_shape(engine.rollout, fields, ctrl)
-    monkeypatch.setattr(launch, "_available", lambda platform: "no compiler")
+    monkeypatch.setattr(launch, "available", lambda platform: "no compiler")
     with pytest.raises(launch.KernelUnavailable, match="no compiler; engine mjx runs on every"):
         make_engine("structured", scene)
     # What other engines need of this one's physics needs no kernel.

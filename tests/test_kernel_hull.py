@@ -16,8 +16,7 @@ from codesign_jax.engines.structured.kernel import Limits, Program, tables
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import layout
 from codesign_jax.types import Status
-from tests import small
-from tests import test_hull_contact as oracle
+from tests.helpers import dense_steps, grasps
 
 # The quick tests have one state against the same dense solve, and states with too few slots, among
 # worlds with planted faults (test_planted_contacts), and rigid rings against MuJoCo C.
@@ -36,7 +35,7 @@ class Runs(NamedTuple):
 
     def along(self, count, start=None, ctrl=None):
         """The trace and qpos of worlds that repeat the fields."""
-        fields = small.repeat(self.fields, count)
+        fields = grasps.repeat(self.fields, count)
         start = self.engine.reset(fields) if start is None else start(fields)
         ctrl = np.repeat(self.ctrl[None], count, 0) if ctrl is None else ctrl
         return jax.tree.map(np.asarray, self.run(fields, start, jnp.asarray(ctrl)))
@@ -68,8 +67,8 @@ def velocity(first, second, h):
 def test_accelerations_equal_a_dense_solve(shape):
     """States of a grasp, one world each: one step of each against dense Jacobians and SciPy."""
     with jax.enable_x64(True):
-        scene = oracle.hull_scene(shape, hull_rings=2, hull_points=8)
-        hand, _, fields, model, ctrl = oracle.world(scene)
+        scene = dense_steps.hull_scene(shape, hull_rings=2, hull_points=8)
+        hand, _, fields, model, ctrl = dense_steps.world(scene)
         runs, h = compiled(scene, fields, ctrl), scene.discretization.timestep
         when, data, most = np.arange(20, STEPS, 35), mujoco.MjData(model), 0
         trace = runs.along(len(when))
@@ -83,7 +82,7 @@ def test_accelerations_equal_a_dense_solve(shape):
         for w, k in enumerate(when):
             data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[w], qvel[w], ctrl[w, 0]
             mujoco.mj_forward(model, data)
-            dense = oracle.Dense(scene, model, data, hand)
+            dense = dense_steps.Dense(scene, model, data, hand)
             expected = dense.solve()
             acc = (velocity(qpos[w], new[w, 1], h) - qvel[w]) / h
             error = np.linalg.norm(acc - expected) / max(np.linalg.norm(expected), 100.0)
@@ -136,20 +135,20 @@ def wound(scene, model, qpos, turn=0.05):
 def test_a_belt_around_a_cylinder_equals_a_dense_solve():
     """A finger wound about a cylinder by most of a turn, rubbing on it: one step."""
     with jax.enable_x64(True):
-        scene = oracle.hull_scene("cylinder", links=7, hull_rings=2, hull_points=8)
-        hand, trial = small.hand_world(scene, length=0.15)
-        fields, ctrl = small.world_inputs(scene, hand, trial)
+        scene = dense_steps.hull_scene("cylinder", links=7, hull_rings=2, hull_points=8)
+        hand, trial = grasps.hand_world(scene, length=0.15)
+        fields, ctrl = grasps.world_inputs(scene, hand, trial)
         model = world_model(scene, fields)
         qpos, qvel = wound(scene, model, np.array(fields.start))
         engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
         start = engine.place(engine.reset(batch), qpos[None], qvel[None])
-        lanes = small.lanes(scene, batch)
+        lanes = grasps.lanes(scene, batch)
         new, info = jax.jit(engine.step)(lanes, start, jnp.asarray(ctrl[0])[:, None])
         data, h = mujoco.MjData(model), scene.discretization.timestep
         data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl[0]
         mujoco.mj_forward(model, data)
-        dense = oracle.Dense(scene, model, data, hand)
+        dense = dense_steps.Dense(scene, model, data, hand)
         expected = dense.solve()
         acc = (np.asarray(engine.qvel(new))[0] - qvel) / h
     # The object's columns of a contact's first row are the normal, here across the axis y.
@@ -163,9 +162,9 @@ def test_a_belt_around_a_cylinder_equals_a_dense_solve():
 
 def test_too_few_slots_are_an_overflow(monkeypatch):
     """With one slot a row a grasp needs more as it touches, and its status tells from then on."""
-    scene = oracle.hull_scene("box", links=2, hull_rings=1, hull_points=4)
+    scene = dense_steps.hull_scene("box", links=2, hull_rings=1, hull_points=4)
     with jax.enable_x64(True):
-        _, _, fields, _, ctrl = oracle.world(scene)
+        _, _, fields, _, ctrl = dense_steps.world(scene)
     fields = jax.tree.map(lambda x: np.asarray(x, np.float32)[None], fields)
     monkeypatch.setattr(tables, "hull_slots", lambda _: 1)
     # A tolerance of its own: a kernel is known by its scene and limits.

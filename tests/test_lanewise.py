@@ -10,7 +10,7 @@ import pytest
 from codesign_jax.engines.structured import identity, lanewise
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
 from codesign_jax.engines.structured.linear import elimination
-from tests import small
+from tests.helpers import grasps
 
 FINGERS, WORLDS = 4, 8
 
@@ -108,7 +108,7 @@ def test_a_closure_over_an_array_is_traced_each_time():
 
 def test_identities():
     """Equal for equal values of one type; what has none says so."""
-    scene = small.pinch("box")
+    scene = grasps.pinch("box")
     equal = [
         (lambda: scaled(1.5)),
         (lambda: functools.partial(scaled, 2, out=(1, None, "x"))),

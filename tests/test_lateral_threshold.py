@@ -13,10 +13,9 @@ from scipy import integrate, optimize
 from codesign_jax import model, scene
 from codesign_jax.model import morphology
 from codesign_jax.scene import schema
-from tests import small
-from tests import test_kernel_pairs as oracle
-from tests.planted import Fault, planted, simulate
-from tests.test_finger_pairs import curled
+from tests.helpers import grasps
+from tests.helpers.curled_hands import batched, curled
+from tests.helpers.planted_faults import Fault, planted, simulate
 
 BOUND = 1e-8
 """As in test_kernel_pairs.py."""
@@ -25,7 +24,7 @@ SETTINGS = {"effects__lateral_threshold": True}
 
 def hand_and_numbers(the_scene):
     """Parameters of the hand, and the numbers of its first finger's joints."""
-    params, _ = small.hand_world(the_scene, length=0.1)
+    params, _ = grasps.hand_world(the_scene, length=0.1)
     beams = morphology.finger_beams(the_scene.hand, params)
     links = the_scene.discretization.links
     return params, beams, morphology.thresholds(the_scene.hand, params, beams, links)[0]
@@ -124,7 +123,7 @@ def test_nothing_bends_below_the_threshold_and_the_rest_bends_as_without():
 
 
 def test_it_needs_sideways_bending():
-    with pytest.raises(schema.SceneError, match="lateral_bending = false leaves out"):
+    with pytest.raises(schema.InputError, match="lateral_bending = false leaves out"):
         scene.load(
             "paper",
             overrides={"effects.lateral_threshold": True, "effects.lateral_bending": False},
@@ -182,12 +181,12 @@ def stiffen(the_scene, model_, data, fields):
 def simulated(damping):
     """Relative errors of a step's accelerations, of each fault's world and of a sound one."""
     with jax.enable_x64(True):
-        the_scene = small.pinch(
+        the_scene = grasps.pinch(
             "sphere", links=2, discretization__spring_damping=damping, **SETTINGS
         )
         model_, data, fields = curled(the_scene, 3, 0.4, 0.09)
         faults = FAULTS if damping == "added" else {}
-        fields_, qpos, qvel, ctrl = oracle.batched([(model_, data, fields)] * (len(faults) + 1))
+        fields_, qpos, qvel, ctrl = batched([(model_, data, fields)] * (len(faults) + 1))
         with planted(faults):
             run = jax.jit(partial(simulate, the_scene))
             ctrl = jnp.asarray(np.repeat(ctrl[:, None], 2, 1))

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -137,6 +138,14 @@ def test_every_part_of_the_package_has_its_layer():
     assert parts == set(ORDER)
 
 
+def test_the_map_of_contributing_has_the_same_order():
+    """Its rows are the lines of `LAYERS`."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text.split("what its files have in common |\n|---|---|\n")[1].split("\n\n")[0]
+    named = [re.findall(r"`([a-z_]+)/?`", row.split("|")[1]) for row in table.splitlines()]
+    assert [set(row) for row in named] == [set(line.split()) for line in LAYERS.strip().split("\n")]
+
+
 def test_imports_point_one_way():
     problems = [
         f"{name} imports {other}: {problem}"
@@ -247,3 +256,34 @@ def test_what_imports_are_seen_in_a_file():
     names = {"a", "a.b", "a.d"}
     assert list(imports(ast.parse(text), names)) == ["a.b", "a.b", "a", "a.d"]
     assert list(imports(ast.parse(text), names, inside=False)) == ["a.b", "a.b", "a"]
+
+
+def imported(tree):
+    """Dotted names of all that a file imports, also inside of functions."""
+    for node in statements(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def unshared(tree):
+    """Imports that would make a second module of a helper, or that take something of a test."""
+    own = {path.stem for path in (ROOT / "tests").rglob("*.py")}
+    for name in imported(tree):
+        first, *rest = name.split(".")
+        if first in own or (first == "tests" and rest[0].startswith("test_")):
+            yield name
+
+
+def test_tests_share_by_helpers_alone():
+    """A test module imports no other one, and a helper by its one name, `tests.helpers.NAME`."""
+    text = "from toy import TINY\nfrom tests.test_cost import a\nfrom tests import test_cost\n"
+    text += "from tests.helpers import grasps\n"
+    assert list(unshared(ast.parse(text.replace("toy", "toy_engine")))) == [
+        "toy_engine.TINY",
+        "tests.test_cost.a",
+        "tests.test_cost",
+    ]
+    found = {p.name: [*unshared(parse(p))] for p in sorted((ROOT / "tests").rglob("*.py"))}
+    assert not {name: names for name, names in found.items() if names}

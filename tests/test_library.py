@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet
 import pytest
-from toy import TINY
 
 import codesign_jax
 from codesign_jax import Task, engines, parameters, rollout, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.types import Trace
+from tests.helpers.toy_engine import TINY
 
 ROOT = Path(__file__).parents[1]
 
@@ -93,7 +93,7 @@ def test_steps_of_a_grasp_are_checked(short):
     space = parameters.design_space(the_scene.hand, "2d")
     world = space.params(space.default()), rollout.nominal_trial(the_scene)
     for steps in (0, the_scene.num_steps + 1):
-        with pytest.raises(scene.SceneError, match=f"steps = {steps}: the grasp has 1 to"):
+        with pytest.raises(scene.InputError, match=f"steps = {steps}: the grasp has 1 to"):
             rollout.grasp(the_scene, ArmEngine(), *world, steps=steps)
 
 

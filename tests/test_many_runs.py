@@ -15,7 +15,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command_runs import (
+from rich.console import Console
+
+from codesign_jax import codesign, runs, scene
+from codesign_jax.batch import Batch
+from codesign_jax.commands import jobs, seeds
+from codesign_jax.commands.seeds import Compared
+from codesign_jax.report.verdicts import Judged
+from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.types import Outcome, Status
+from tests.helpers.command_runs import (
     RUN,
     assert_same_run,
     command,
@@ -25,16 +34,7 @@ from command_runs import (
     stored,
     without,
 )
-from rich.console import Console
-from toy import TINY
-
-from codesign_jax import codesign, runs, scene
-from codesign_jax.batch import Batch
-from codesign_jax.commands import jobs, seeds
-from codesign_jax.commands.seeds import Compared
-from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs.checkpoint import Checkpoints
-from codesign_jax.types import Outcome, Status
+from tests.helpers.toy_engine import TINY
 
 BASE = [a for a in RUN if a not in ("--seed", "3")]
 

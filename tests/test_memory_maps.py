@@ -9,7 +9,7 @@ import pytest
 from codesign_jax import codesign, memory_maps, programs
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.scene import parameters
-from tests import kernels, small
+from tests.helpers import grasps, kernels
 
 
 def full(monkeypatch, share):
@@ -24,7 +24,7 @@ def test_the_system_tells_how_many_maps_there_are():
 def test_programs_go_when_many_maps_are_taken(monkeypatch):
     """All that nobody holds; a program that is held works on."""
     cleared, built, scene = [], [], types.SimpleNamespace(structure="s")
-    monkeypatch.setattr(memory_maps, "_forget", [])
+    monkeypatch.setattr(memory_maps, "forgetters", [])
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
     find = programs.shared(lambda *how: built.append(how) or (lambda v: v + 1))
 
@@ -53,7 +53,7 @@ def test_a_kernel_is_refused_before_the_limit(monkeypatch):
 
 def test_what_ctrl_c_left_in_jax_is_forgotten(monkeypatch):
     """The next call works; another recursion is an error as ever."""
-    cleared, scene = [], small.pinch("sphere", 2)
+    cleared, scene = [], grasps.pinch("sphere", 2)
     words = ["Recursively calling <weakref> multiply"]
 
     def stuck(*_):
@@ -73,10 +73,10 @@ def test_what_ctrl_c_left_in_jax_is_forgotten(monkeypatch):
 
 def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     """Only of a process that had simulated; its own first call is then an error at once."""
-    program = programs.Program(small.pinch("sphere", 2), lambda *_: 3)
+    program = programs.Program(grasps.pinch("sphere", 2), lambda *_: 3)
     for begun in (False, True):
-        monkeypatch.setattr(programs, "_process", {"begun": begun, "forked": False})
-        programs._forked()
+        monkeypatch.setattr(programs, "process", {"begun": begun, "forked": False})
+        programs.note_fork()
         if begun:
             with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
                 program(0, 0)
@@ -92,7 +92,7 @@ def test_many_structures_stay_below_a_limit(monkeypatch):
     changes |= {"phases__approach": 0.05, "phases__inflate": 0.1, "phases__lift": 0.15}
     found = []
     for links in range(2, 11):
-        scene = small.pinch("sphere", links, **changes)
+        scene = grasps.pinch("sphere", links, **changes)
         space = parameters.design_space(scene.hand)
         evaluate = codesign.Task(scene, space, 2).evaluate
         population = np.repeat(np.asarray(space.default(), np.float32)[None], 2, 0)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from solids import box, object_file
 
 from codesign_jax import control, model, scene
 from codesign_jax.engines import make_engine
@@ -27,8 +26,9 @@ from codesign_jax.runs import scene_files
 from codesign_jax.scene import objects, parameters, schema
 from codesign_jax.scene.meshes import surface
 from codesign_jax.types import Trace
-from tests import steps
-from tests.small import DATA, hand_world, nth, stack, still
+from tests.helpers import oracles
+from tests.helpers.grasps import DATA, hand_world, nth, stack, still
+from tests.helpers.solids import box, object_file
 
 ROOT = Path(__file__).parent.parent
 HOUSEHOLD = {
@@ -111,7 +111,7 @@ def test_support_points_carry_the_lowest(household):
 def test_engines_that_cannot_say_so():
     the_scene = scene.load("paper_spheres", object_set="household")
     for name in ("mujoco", "mjx"):
-        with pytest.raises(schema.SceneError) as caught:
+        with pytest.raises(schema.InputError) as caught:
             make_engine(name, the_scene)
         assert len(caught.value.problems) == 8
         assert f"not supported by engine {name}: object 'mug' is a mesh" in str(caught.value)
@@ -175,7 +175,7 @@ class Grasps(NamedTuple):
       names: Name of the object of each world.
       kernel: Trace of the kernel.
       reverse: Trace of the kernel for the same worlds in reverse.
-      unbalanced: Forces that the kernel leaves unbalanced, see `steps.unbalanced`.
+      unbalanced: Forces that the kernel leaves unbalanced, see `oracles.unbalanced`.
       compiled: How many programs the kernel's two traces took.
     """
 
@@ -206,7 +206,7 @@ def runner(the_scene):
         program = Program.here(the_scene, engine.limits, ctrl.dtype, len(ctrl))
         hand, start = world_constants(the_scene, fields), engine.reset(fields)
         found, _ = program.simulate(hand, start, ctrl, trajectory=True, states=True)
-        path = steps.Path(*(found[name] for name in ("qpos", "qvel", "acc", "distance")))
+        path = oracles.Path(*(found[name] for name in ("qpos", "qvel", "acc", "distance")))
         trace = Trace(*(found[name] for name in ("distance", "height", "speed", "qpos")))
         return trace, path, fields, ctrl
 
@@ -220,8 +220,8 @@ def unbalanced(the_scene, result, stride):
     it touches.
     """
     _, path, fields, ctrl = result
-    found = steps.Path(*(v[:, 1:] for v in path))
-    return steps.unbalanced(the_scene, fields, ctrl[:, 1:], found, stride)
+    found = oracles.Path(*(v[:, 1:] for v in path))
+    return oracles.unbalanced(the_scene, fields, ctrl[:, 1:], found, stride)
 
 
 @pytest.fixture(scope="module")

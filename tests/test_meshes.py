@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from solids import box, bracket, object_file
 
 from codesign_jax import scene
 from codesign_jax.commands import common
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.scene import meshes, objects, schema
 from codesign_jax.scene.meshes import grid, mass, repair, surface
+from tests.helpers.solids import box, bracket, object_file
 
 
 def solid(tmp_path, mesh, *, unit="m", repaired=False, voxel_error=5e-4):
@@ -25,7 +25,7 @@ def solid(tmp_path, mesh, *, unit="m", repaired=False, voxel_error=5e-4):
 
 
 def problems(tmp_path, mesh, **options):
-    with pytest.raises(schema.SceneError) as caught:
+    with pytest.raises(schema.InputError) as caught:
         solid(tmp_path, mesh, **options)
     return caught.value.problems
 
@@ -190,7 +190,7 @@ def test_all_problems_at_once(tmp_path):
         'name = "d"; type = "mesh"; size = [0.1]; friction = 0.8',
         'name = "e"; type = "box"; size = [0.03]; file = "open.off"; friction = 0.8',
     )
-    with pytest.raises(schema.SceneError) as caught:
+    with pytest.raises(schema.InputError) as caught:
         objects.load(path)
     said = caught.value.problems
     for expected in (
@@ -214,13 +214,13 @@ def test_a_surface_that_cuts_through_itself(tmp_path):
     other = box()
     other.apply_translation([0.02, 0.01, 0])
     found = solid(tmp_path, trimesh.util.concatenate([box(), other]), voxel_error=1e-3)
-    with pytest.raises(schema.SceneError, match="cuts through itself"):
+    with pytest.raises(schema.InputError, match="cuts through itself"):
         _ = found.grid
 
 
 def test_too_fine_a_grid(tmp_path, monkeypatch):
     monkeypatch.setattr(grid, "MAX_NODES", 1000)
-    with pytest.raises(schema.SceneError, match="more than 1,000"):
+    with pytest.raises(schema.InputError, match="more than 1,000"):
         _ = solid(tmp_path, box(), voxel_error=1e-3).grid
 
 
@@ -230,7 +230,7 @@ def test_density_becomes_a_mass(tmp_path):
     shape = objects.load(object_file(tmp_path, entry + "density = 1000")).object[0]
     assert shape.mass == pytest.approx(0.12) and shape.density is None
     box(4, 5, 6).export(tmp_path / "box.stl")
-    with pytest.raises(schema.SceneError, match=r"a: mass = 0.00012\d* is outside"):
+    with pytest.raises(schema.InputError, match=r"a: mass = 0.00012\d* is outside"):
         objects.load(object_file(tmp_path, entry + "density = 1000"))
 
 

@@ -11,7 +11,7 @@ import pytest
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import spec
-from tests.small import (
+from tests.helpers.grasps import (
     hand_world,
     nth,
     pinch,

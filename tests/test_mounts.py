@@ -11,7 +11,7 @@ from codesign_jax import model, scene
 from codesign_jax.commands import clearance, preflight
 from codesign_jax.scene import constants, hand, schema
 from codesign_jax.types import Params
-from tests.small import DATA, hand_world
+from tests.helpers.grasps import DATA, hand_world
 
 SPREADS = np.deg2rad([0.0, 30.0, 60.0, 90.0, 110.0])
 CORNERS = list(itertools.product((0.010, 0.180), (0.015, 0.025)))  # lengths and heights of Table I
@@ -115,7 +115,7 @@ def test_base_points_are_constants():
     # Rounding of float32 of numbers of some 0.01 m.
     np.testing.assert_allclose(places(other) - places(start), [[0.01, 0, 0]] * 4, atol=1e-8)
     far = tuple(f._replace(base=(0.3, 0.0)) for f in start.hand.finger)
-    with pytest.raises(schema.SceneError, match=r"finger\[0\].base\[0\] = 0.3 is outside"):
+    with pytest.raises(schema.InputError, match=r"finger\[0\].base\[0\] = 0.3 is outside"):
         constants.check(the_scene, start._replace(hand=start.hand._replace(finger=far)))
 
 
@@ -152,6 +152,6 @@ def test_the_lowest_point_of_base_points_is_that_of_the_circle_through_them():
 def test_mounts_that_say_nothing_or_too_much_are_refused(tmp_path, old, new, part):
     text = (DATA / "pinch.toml").read_text()
     (tmp_path / "bad.toml").write_text(text.replace(old, new, 1))
-    with pytest.raises(schema.SceneError) as error:
+    with pytest.raises(schema.InputError) as error:
         hand.load(tmp_path / "bad.toml")
     assert len(error.value.problems) == 1 and part in error.value.problems[0]

@@ -9,7 +9,6 @@ import numpy as np
 import optax
 import pytest
 from scipy import stats
-from toy import tiny
 
 from codesign_jax import codesign, optimize
 from codesign_jax.optimize import (
@@ -29,6 +28,7 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import make_settings
+from tests.helpers.toy_engine import tiny
 
 # As many parameters as in the paper, of different ranges.  Each optimiser has two programs for all
 # tests: its `ask` and `tell` at this size.
@@ -183,16 +183,19 @@ def test_screened_searches_average_the_means_of_evosax(name):
 
 
 def test_the_particles_of_the_default_are_what_was_simulated_as_particle_0():
-    """The averages newest first, before the best random design: those that the run can show."""
+    """The newest average and the one after a third of them: designs that the run can show."""
     made = Screened(SPACE)
-    state, populations, infos = run(made, start(made), OPEN[:7])
-    np.testing.assert_array_equal(state.particles[:2], populations[[6, 5], 0])
+    state, populations, infos = run(made, start(made), OPEN[:14])
+    np.testing.assert_array_equal(state.particles[1], populations[5 + 9 // 3 - 1, 0])
+    np.testing.assert_array_equal(state.particles[0], populations[-1, 0])
+    newest = np.tile(populations[-1, 0], (PARTICLES - 2, 1))
+    np.testing.assert_array_equal(state.particles[2:], newest)
+    np.testing.assert_array_equal(infos[-1].ancestors, [0, -1, *[0] * (PARTICLES - 2)])
+    assert not (state.particles[0] == state.particles[1]).all()
+    with_random, *_ = run(made, start(made), OPEN[:5])
     random = populations[:3].reshape(-1, WIDTH)
     order = np.argsort([info.cost for info in infos[:3]], axis=None)
-    np.testing.assert_array_equal(state.particles[2], random[order[0]])
-    newest = np.tile(populations[6, 0], (PARTICLES - 3, 1))
-    np.testing.assert_array_equal(state.particles[3:], newest)
-    np.testing.assert_array_equal(infos[-1].ancestors, [0, -1, -1, *[0] * (PARTICLES - 3)])
+    np.testing.assert_array_equal(with_random.particles, random[order[:PARTICLES]])
 
 
 def test_an_optimiser_of_the_package_needs_no_evosax(monkeypatch):

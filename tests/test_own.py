@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from command_runs import assert_same_run, snapshot
-from toy import TINY
 
 from codesign_jax import cli, codesign, own, parameters, runs, scene
+from tests.helpers.command_runs import assert_same_run, snapshot
+from tests.helpers.toy_engine import TINY
 
 MINE = '''
 import dataclasses
@@ -220,5 +220,5 @@ def test_costs_see_as_much_of_a_grasp_as_they_say(here):
     the_scene = scene.load(TINY)
     assert own.make_cost("mine:turned", the_scene)[1] is False
     assert own.make_cost("mine:until_lost", the_scene)[1] is True
-    with pytest.raises(scene.SceneError, match="builtins has no file of Python code"):
+    with pytest.raises(scene.InputError, match="builtins has no file of Python code"):
         own.contents(["scene", "builtins:pow"])

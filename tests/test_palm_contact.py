@@ -11,10 +11,9 @@ import pytest
 
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
-from tests import small
-from tests import test_kernel_pairs as oracle
-from tests.planted import Fault, cone_of, planted, simulate
-from tests.test_finger_pairs import curled
+from tests.helpers import curled_hands, dense_steps, grasps
+from tests.helpers.curled_hands import curled
+from tests.helpers.planted_faults import Fault, cone_of, planted, simulate
 
 BOUND = 1e-8
 """As in test_kernel_pairs.py."""
@@ -63,7 +62,7 @@ FAULTS = {
 def scene_of(surface):
     density = {"discretization__hull_rings": 2, "discretization__hull_points": 4}
     density = density if surface == "hull" else {"discretization__spheres_per_link": 2}
-    return small.pinch("sphere", links=2, effects__surface=surface, **SETTINGS, **density)
+    return grasps.pinch("sphere", links=2, effects__surface=surface, **SETTINGS, **density)
 
 
 def accelerations(scene, model, data):
@@ -71,8 +70,8 @@ def accelerations(scene, model, data):
     mujoco.mj_forward(model, data)
     if scene.effects.surface == "hull":
         with jax.enable_x64(True):
-            hand, _ = small.hand_world(scene, length=0.1)
-        dense = oracle.Dense(scene, model, data, hand)
+            hand, _ = grasps.hand_world(scene, length=0.1)
+        dense = dense_steps.DensePairs(scene, model, data, hand)
         assert dense.on_palm > 2 and dense.pairs > 3 and dense.num_hull > 20
         return dense.solve()
     assert on_palm(model, data) > 0
@@ -91,7 +90,7 @@ def simulated(surface):
         scene, faults = scene_of(surface), FAULTS[surface]
         state = curled(scene, *STATE)
         each = [state] * (len(faults) + 1)
-        fields, qpos, qvel, ctrl = oracle.batched(each)
+        fields, qpos, qvel, ctrl = curled_hands.batched(each)
         with planted(faults):
             run = jax.jit(partial(simulate, scene, iterations=30))
             ctrl = jnp.asarray(np.repeat(ctrl[:, None], 2, 1))
@@ -120,11 +119,11 @@ def test_spheres_equal_mujoco_on_curled_hands(friction, between):
     """Up to eight spheres on the palm, with and without contact between fingers."""
     settings = SETTINGS | {"effects__finger_finger": between, "effects__friction": friction}
     with jax.enable_x64(True):
-        scene = small.pinch("sphere", discretization__spheres_per_link=2, **settings)
+        scene = grasps.pinch("sphere", discretization__spheres_per_link=2, **settings)
         bends = (1.3, 1.5, 1.6, 1.2, 1.8, 0.3)
         worlds = [curled(scene, s, bend, height=0.12) for s, bend in enumerate(bends)]
-        inputs = oracle.batched(worlds)
-        qvel, _ = oracle.one_step(scene)(*inputs)
+        inputs = curled_hands.batched(worlds)
+        qvel, _ = curled_hands.one_step(scene)(*inputs)
         acc = (np.asarray(qvel) - inputs[2]) / scene.discretization.timestep
         for mine, (model, data, _), bend in zip(acc, worlds, bends, strict=True):
             mujoco.mj_forward(model, data)

@@ -64,11 +64,11 @@ def test_other_units_than_si_are_refused_in_words(name, value, expected):
     design = FULL.default()
     design[FULL.names.index(name)] = value
     for call in (FULL.params, FULL.project, FULL.refuse_unit_slips):
-        with pytest.raises(schema.SceneError) as caught:
+        with pytest.raises(schema.InputError) as caught:
             call(jnp.asarray(design))
         assert expected in str(caught.value) and "Python takes SI units" in str(caught.value)
     full = parameters.unflatten(HAND, design)
-    with pytest.raises(schema.SceneError, match=r"did you mean"):
+    with pytest.raises(schema.InputError, match=r"did you mean"):
         unit_slips.refuse(full)
 
 
@@ -78,7 +78,7 @@ def test_designs_of_another_length_are_refused_by_the_conversion_of_units():
     for convert in (space.from_units, space.in_units):
         assert convert([[95.0, 30.0]] * 3).shape == (3, 2)
         for design in (95.0, [95.0], [95.0, 30.0, 1.0], np.ones((2, 3))):
-            with pytest.raises(schema.SceneError, match=r"designs have shape .*: length, arm_z"):
+            with pytest.raises(schema.InputError, match=r"designs have shape .*: length, arm_z"):
                 convert(design)
 
 
@@ -99,7 +99,7 @@ def test_designs_outside_of_the_bounds_are_converted_with_a_warning():
 def test_a_design_that_is_no_number_is_refused(bad):
     space = parameters.design_space(HAND, "2d")
     for check in (space.from_units, space.check):
-        with pytest.raises(schema.SceneError, match=f"arm_z = {bad} is not a finite number"):
+        with pytest.raises(schema.InputError, match=f"arm_z = {bad} is not a finite number"):
             check([[0.1, 0.03], [0.1, bad]])
 
 
@@ -198,7 +198,7 @@ def test_default_lies_inside_the_bounds():
 
 
 def test_unknown_preset_names_the_nearest():
-    with pytest.raises(schema.SceneError, match="did you mean '2d'"):
+    with pytest.raises(schema.InputError, match="did you mean '2d'"):
         parameters.design_space(HAND, "2D")
 
 
@@ -318,7 +318,7 @@ def test_any_part_of_the_designs_is_drawn_alone_and_traced():
     ],
 )
 def test_what_no_designs_are_drawn_from_is_refused(key, n, expected):
-    with pytest.raises(schema.SceneError, match=re.escape(expected)):
+    with pytest.raises(schema.InputError, match=re.escape(expected)):
         FULL.sample(key, n)
 
 

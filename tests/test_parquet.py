@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 import pytest
-from toy import tiny
 
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Status, failed
 from scripts.experiments import parquet
 from scripts.experiments.plan import Strategies
+from tests.helpers.toy_engine import tiny
 
 ROOT = Path(__file__).parents[1]
 PLAN = Strategies("2d", "2d", ("single", "switch-1", "concurrent"), 2, 4, 3, 3, 6)
@@ -112,7 +112,7 @@ def test_a_landscape_s_rows_name_their_point(tmp_path):
 
 def test_without_pyarrow_nothing_is_simulated(finished, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(SceneError, match=r"pip install '\.\[parquet\]' in the checkout"):
+    with pytest.raises(InputError, match=r"pip install '\.\[parquet\]' in the checkout"):
         parquet.write_strategies(tmp_path / "x.parquet", PLAN, tiny()[1], finished, NOTES)
     arguments = ["experiments", "2d", "--size", "tiny", "--engine", "mujoco"]
     arguments += ["--out", str(tmp_path / "out"), "--parquet", str(tmp_path / "x.parquet")]

@@ -21,10 +21,9 @@ from codesign_jax.engines.structured.kernel.counts import Counts
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
-from tests import small
-from tests import test_kernel_pairs as oracle
-from tests.planted import Fault, chosen, cone_of, planted, simulate
-from tests.test_finger_pairs import curled, kinds
+from tests.helpers import curled_hands, dense_steps, grasps
+from tests.helpers.curled_hands import curled, kinds
+from tests.helpers.planted_faults import Fault, chosen, cone_of, planted, simulate
 
 BOUND = 1e-8
 """As in test_kernel_pairs.py."""
@@ -275,7 +274,7 @@ def scene_of(surface):
     settings |= {"contact__finger_finger_friction": 0.6}  # not the object's
     if surface == "hull":
         settings |= {"discretization__hull_rings": 2, "discretization__hull_points": 4}
-    return small.pinch("sphere", links=2, **settings)
+    return grasps.pinch("sphere", links=2, **settings)
 
 
 @functools.cache
@@ -291,7 +290,7 @@ def simulated(surface):
         states = {name: curled(scene, *state) for name, state in chosen.items()}
         kinds = [f.check if f.check in states else "main" for f in faults.values()]
         each = [states[kind] for kind in [*kinds, *states]]
-        fields, qpos, qvel, ctrl = oracle.batched(each)
+        fields, qpos, qvel, ctrl = curled_hands.batched(each)
         with planted(faults):
             run = jax.jit(partial(simulate, scene, iterations=ITERATIONS))
             ctrl = jnp.asarray(np.repeat(ctrl[:, None], 3, 1))
@@ -310,8 +309,8 @@ def solved(scene, model, data, qpos, qvel):
         assert min(kinds(model, data)) > 0
         return data.qacc.copy()
     with jax.enable_x64(True):
-        hand, _ = small.hand_world(scene, length=0.1)
-    dense = oracle.Dense(scene, model, data, hand)
+        hand, _ = grasps.hand_world(scene, length=0.1)
+    dense = dense_steps.DensePairs(scene, model, data, hand)
     assert dense.num_hull > 20 and dense.pairs > 4 and dense.merged > 4
     return dense.solve()
 

@@ -1,9 +1,9 @@
 """Faults planted in the kernel's own physics: the comparison with MuJoCo C notices each of them.
 
 One kernel simulates all faults, each in a world of its own beside a world that is sound, see
-`tests.planted`.  `test_kernel.py` and `test_structured.py` make the same comparison of sound
-kernels, with the same bounds; `test_planted_contacts.py` has the hull's stages and contacts between
-fingers.
+`helpers/planted_faults.py`.  `test_kernel.py` and `test_structured.py` make the same comparison of
+sound kernels, with the same bounds; `test_planted_contacts.py` has the hull's stages and contacts
+between fingers.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ import pytest
 
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
-from tests import small, steps
-from tests.planted import Fault, planted, simulate
+from tests.helpers import grasps, oracles
+from tests.helpers.planted_faults import Fault, planted, simulate
 
 STEPS = 8
 
@@ -162,10 +162,10 @@ BOUNDS = {"acceleration": 1e-8, "position": 1e-12, "distance": 1e-12}
 def wrong():
     """Path of every fault's world, and of a sound one at the end, with what MuJoCo C needs."""
     with jax.enable_x64(True), planted(FAULTS):
-        scene = small.pinch("box", links=2, effects__palm_object=False, effects__palm_table=False)
+        scene = grasps.pinch("box", links=2, effects__palm_object=False, effects__palm_table=False)
         fields, state, ctrl = touching(scene)
         found = jax.jit(partial(simulate, scene))(fields, state, ctrl, np.arange(len(ctrl)))
-    path = steps.Path(*(np.asarray(found[n]) for n in steps.Path._fields))
+    path = oracles.Path(*(np.asarray(found[n]) for n in oracles.Path._fields))
     return scene, fields, np.asarray(ctrl), path
 
 
@@ -175,9 +175,9 @@ def touching(scene):
     Both fingers press on the box and on the table and slide at decimetres a second.
     """
     count, random = len(FAULTS) + 1, np.random.default_rng(4)
-    hand, trial = small.hand_world(scene, length=0.1)
+    hand, trial = grasps.hand_world(scene, length=0.1)
     trial = trial._replace(mass=np.array(10.0))  # so that the fingers do not fling it away
-    fields, ctrl = small.world_inputs(scene, hand, trial)
+    fields, ctrl = grasps.world_inputs(scene, hand, trial)
     qpos = np.array(fields.start)
     qpos[2], qpos[3:6] = 0.1, 0.1 * random.normal(size=3)
     bend = np.zeros(model.layout(scene).dofs.shape)
@@ -187,7 +187,7 @@ def touching(scene):
     qvel[-4] = -0.2  # onto the table
     ctrl = np.repeat(np.asarray(ctrl[:1]), STEPS, 0)
     ctrl[:, :6], ctrl[:, 6:] = qpos[:6] + 0.01, 90e3
-    many = small.repeat((fields, ctrl), count)
+    many = grasps.repeat((fields, ctrl), count)
     return many[0], (np.repeat(qpos[None], count, 0), np.repeat(qvel[None], count, 0)), many[1]
 
 
@@ -195,10 +195,10 @@ def errors(wrong, world):
     """Errors of a world's steps by what is compared with MuJoCo C."""
     scene, fields, ctrl, path = wrong
     one = slice(world, world + 1)
-    own = steps.Path(*(v[one] for v in path))
+    own = oracles.Path(*(v[one] for v in path))
     batch = jax.tree.map(lambda v: v[one], fields)
-    acceleration, far, touching = steps.against_mujoco(scene, batch, ctrl[one], own)
-    compiled, moved = world_model(scene, small.nth(fields, world)), []
+    acceleration, far, touching = oracles.against_mujoco(scene, batch, ctrl[one], own)
+    compiled, moved = world_model(scene, grasps.nth(fields, world)), []
     for qpos, qvel, after in zip(own.qpos[0], own.qvel[0, 1:], own.qpos[0, 1:], strict=False):
         expected = qpos.copy()
         mujoco.mj_integratePos(compiled, expected, qvel, scene.discretization.timestep)

@@ -12,7 +12,7 @@ from codesign_jax import model, scene, start
 from codesign_jax.commands import clearance, preflight
 from codesign_jax.scene import parameters
 from codesign_jax.types import Params
-from tests.small import hand_world, pinch, random_worlds, still
+from tests.helpers.grasps import hand_world, pinch, random_worlds, still
 
 
 def low_start():
@@ -53,7 +53,7 @@ def test_lowest_point_bounds_mujocos_geoms():
 def test_starts_inside_table_or_object_are_refused_and_those_called_clear_are_clear():
     scene = low_start()
     designs = hands(scene, 64)
-    exact = np.asarray(clearance._depths(*clearance._arguments(scene, single(designs))))[0]
+    exact = np.asarray(clearance.depths(*clearance._arguments(scene, single(designs))))[0]
     low = [clearance.lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
     clear = np.array(low) >= 0.06  # the box's height
     assert clear.any() and (exact[clear] <= 0).all()
@@ -105,7 +105,7 @@ def test_fingers_are_as_deep_in_the_palm_as_engines_find(surface):
     np.testing.assert_allclose(clearance.in_palm(the_scene, designs), exact, atol=1e-12)
     exact, invalid = np.asarray(exact), np.asarray(invalid)
     np.testing.assert_array_equal(invalid != 0, exact > 0.002)
-    report = preflight.check(the_scene, designs, details=False)
+    report = preflight.check(the_scene, designs)
     refused = sum("inside the palm" in line for line in report.refusals)
     assert refused == (exact > 0.002).sum() > 0
 
@@ -114,7 +114,7 @@ def test_an_ordinary_start_needs_no_program(monkeypatch):
     def never(*arguments):
         raise AssertionError("a program was compiled")
 
-    monkeypatch.setattr(clearance, "_depths", never)
+    monkeypatch.setattr(clearance, "depths", never)
     for preset in ("2d", "full"):
         scene = pinch()
         space = parameters.design_space(scene.hand, preset)

@@ -10,7 +10,7 @@ from codesign_jax import model
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.report import sketch
 from codesign_jax.scene import primitives
-from tests import small
+from tests.helpers import grasps
 
 # No two sizes of a shape are equal, so that none can stand for another.
 SIZES = {
@@ -34,7 +34,7 @@ def on_table(kind):
 
 
 def test_every_primitive_is_tried():
-    assert set(SIZES) == set(KINDS) == set(small.SHAPES)
+    assert set(SIZES) == set(KINDS) == set(grasps.SHAPES)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -82,8 +82,8 @@ def test_outline_and_triangles_lie_on_the_surface(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_sketch_draws_the_shape_of_the_trial(kind):
-    the_scene = small.pinch(kind, links=1)
-    compiled = model.compile_model(the_scene, *small.hand_world(the_scene))
+    the_scene = grasps.pinch(kind, links=1)
+    compiled = model.compile_model(the_scene, *grasps.hand_world(the_scene))
     got = sketch._outline(the_scene, compiled, 0)
     want = primitives.PRIMITIVES[kind].outline(the_scene.objects.object[0].half_sizes)
     assert len(got) == len(want)

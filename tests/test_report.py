@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from toy import TINY
 
 from codesign_jax import cli, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, figures
 from codesign_jax.scene import parameters
+from tests.helpers.toy_engine import TINY
 
 TIMES = np.array([0.0, 0.5, 1.2])
 
@@ -28,7 +28,7 @@ def grasp():
 
 @pytest.fixture
 def no_opengl(monkeypatch):
-    monkeypatch.setattr(animation, "_opengl", lambda: None)
+    monkeypatch.setattr(animation, "opengl_backend", lambda: None)
 
 
 def test_replay_keeps_the_trajectory(grasp):
@@ -71,7 +71,7 @@ def test_strip_has_a_row_a_grasp_and_a_column_a_phase(grasp, no_opengl, tmp_path
 
 def test_renderer_draws_hand_and_object(grasp):
     the_scene, replay = grasp
-    if animation._opengl() is None:
+    if animation.opengl_backend() is None:
         pytest.skip("no OpenGL on this machine")
     frames = animation.frames(the_scene, replay, TIMES, size=(160, 120))
     assert frames.shape == (3, 120, 160, 3)
@@ -82,7 +82,7 @@ def test_renderer_draws_hand_and_object(grasp):
 
 def test_broken_opengl_falls_back(grasp, monkeypatch, tmp_path):
     the_scene, replay = grasp
-    animation._opengl.cache_clear()
+    animation.opengl_backend.cache_clear()
     monkeypatch.setenv("MUJOCO_GL", "no-such-way")
     try:
         said = []
@@ -91,7 +91,7 @@ def test_broken_opengl_falls_back(grasp, monkeypatch, tmp_path):
         )
         assert len(said) == 1
     finally:
-        animation._opengl.cache_clear()
+        animation.opengl_backend.cache_clear()
 
 
 def test_cost_evolution_marks_particles_mean_and_threshold(tmp_path):

@@ -10,14 +10,14 @@ import sys
 import numpy as np
 import pytest
 from scipy import stats
-from tiny_run import small_run  # noqa: F401
 
 from codesign_jax import cli, runs
 from codesign_jax.commands import reference
 from codesign_jax.report import landscape
 from codesign_jax.runs import choice, outcomes
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Status, failed
+from tests.helpers.tiny_run import small_run  # noqa: F401
 
 pytest.importorskip("plotly", reason="the extra 'report' is not installed")
 
@@ -80,7 +80,7 @@ def test_grasp_is_the_one_of_the_table(run):
     best, chosen = choice.find_grasp(the_scene, record), choice.choose(the_scene, record)
     np.testing.assert_array_equal(best.design, chosen.design)
     assert float(best.outcome.cost) == record.history.trials.cost[-1, chosen.row].min()
-    with pytest.raises(SceneError) as error:
+    with pytest.raises(InputError) as error:
         choice.find_grasp(the_scene, record, episode=4, trial=3)
     assert len(error.value.problems) == 2 and "--episode = 4 is outside [1, 3]" in str(error.value)
 

@@ -12,7 +12,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from command_runs import (  # noqa: F401
+
+from codesign_jax import runs, sources
+from codesign_jax.commands import reference
+from codesign_jax.runs import choice, columns, manifest
+from codesign_jax.runs.checkpoint import Checkpoints
+from tests.helpers.command_runs import (  # noqa: F401
     EPISODES,
     RESULTS,
     RUN,
@@ -26,12 +31,7 @@ from command_runs import (  # noqa: F401
     wait_for,
     without,
 )
-from toy import TINY
-
-from codesign_jax import runs, sources
-from codesign_jax.commands import reference
-from codesign_jax.runs import choice, columns, manifest
-from codesign_jax.runs.checkpoint import Checkpoints
+from tests.helpers.toy_engine import TINY
 
 
 def test_run_folder_is_complete(finished):
@@ -245,7 +245,7 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         raise AssertionError("simulated again")
 
     with monkeypatch.context() as patch:  # kept in the run folder
-        patch.setattr(reference, "_simulate", never)
+        patch.setattr(reference, "simulate", never)
         assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
         assert line in capsys.readouterr().out.splitlines()
         with pytest.raises(AssertionError, match="simulated again"):

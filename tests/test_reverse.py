@@ -31,11 +31,11 @@ from codesign_jax.engines.structured.kernel.bars import Bars
 from codesign_jax.engines.structured.kernel.program import Limits, Program
 from codesign_jax.engines.structured.kernel.virtual import Virtual
 from codesign_jax.engines.structured.lanewise import lanewise
-from tests import small
-from tests.planted import chosen, name_of
-from tests.reverse import Case, curled, weights_of
+from tests.helpers import grasps
+from tests.helpers.differences import Case, curled, weights_of
+from tests.helpers.planted_faults import chosen, name_of
 
-DATA, STEP = small.DATA, 1e-6
+DATA, STEP = grasps.DATA, 1e-6
 BOUND = 1e-8
 """Of the largest derivative of any group.  Differences lose rounding of 1e-15 over the step, and
 the step times the kink where a vertex of the hull enters a section within it: the quick tests'
@@ -253,7 +253,7 @@ def checked():
     """One kernel with all faults, whose other worlds are sound."""
     with jax.enable_x64(True):
         case = Case(
-            the_scene := small.pinch("box", links=2, **EVERYTHING),
+            the_scene := grasps.pinch("box", links=2, **EVERYTHING),
             curled(the_scene, 3, bend=1.4, height=0.055, seed=3),
         )
         first, second = (weights_of(case.start, seed) for seed in (0, 1))
@@ -373,7 +373,7 @@ def test_derivatives_of_scenes(name, tmp_path):
             the_scene = loaded("tripod3", DATA / "sphere.toml", settings)
         else:
             shape = "capsule" if name == "capsule" else "sphere"
-            the_scene = small.pinch(shape, links=2, **settings)
+            the_scene = grasps.pinch(shape, links=2, **settings)
         case = Case(the_scene, curled(the_scene, 8))
         # With the capsule the differences by the wrist's start err by 2e-6 at a step of 1e-6, by a
         # hundredth at a tenth of it, and by 7e-10 at 2e-8; below that rounding grows.
@@ -466,8 +466,8 @@ def rollout_slopes(engine, fields, ctrl):
 @pytest.mark.slow  # four kernels; quick: the parts of a segment are those of the whole path
 def test_segments_have_the_bits_of_the_whole_path():
     """Of worlds that fall and touch, one of which fails; truncated ones have others."""
-    the_scene = small.pinch("sphere", links=2, **SHORT)
-    fields, ctrl = small.batch_inputs(the_scene, *small.random_worlds(the_scene, 3, 3))
+    the_scene = grasps.pinch("sphere", links=2, **SHORT)
+    fields, ctrl = grasps.batch_inputs(the_scene, *grasps.random_worlds(the_scene, 3, 3))
     fields, ctrl = jax.tree.map(np.array, (fields, ctrl[:, 300:325]))
     fields.start[:, 2] = 0.09
     ctrl[:, :, 2], ctrl[2, 17:, 6] = 0.09, np.nan
@@ -484,8 +484,8 @@ def test_segments_have_the_bits_of_the_whole_path():
 @pytest.mark.slow
 def test_segments_need_a_fifth_of_the_memory():
     """Temporary memory of the compiled gradient, which has all that is stored of the steps."""
-    the_scene = small.pinch("sphere", links=2, **SHORT)
-    fields, ctrl = small.batch_inputs(the_scene, *small.random_worlds(the_scene, 3, 64))
+    the_scene = grasps.pinch("sphere", links=2, **SHORT)
+    fields, ctrl = grasps.batch_inputs(the_scene, *grasps.random_worlds(the_scene, 3, 64))
     sizes = {}
     for segment in (None, 30):
         engine = StructuredEngine(the_scene, segment=segment)
@@ -497,7 +497,7 @@ def test_segments_need_a_fifth_of_the_memory():
 
 
 def test_segments_are_asked_for_in_words():
-    the_scene = small.pinch("sphere", links=2)
+    the_scene = grasps.pinch("sphere", links=2)
     with pytest.raises(ValueError, match="at least"):
         StructuredEngine(the_scene, segment=0)
     with pytest.raises(ValueError, match="needs segment"):
@@ -510,7 +510,7 @@ def test_segments_are_asked_for_in_words():
 def test_gradients_of_random_worlds_are_finite():
     """2,000 worlds of the default scene in float32, a second each: through inflation and lift."""
     the_scene, count = scene.load("paper"), 2000
-    fields, ctrl = small.batch_inputs(the_scene, *small.random_worlds(the_scene, 0, count))
+    fields, ctrl = grasps.batch_inputs(the_scene, *grasps.random_worlds(the_scene, 0, count))
     engine = StructuredEngine(the_scene)
     found = jax.jit(jax.grad(lambda c: engine.rollout(fields, c).distance.sum()))(ctrl[:, :420])
     assert np.isfinite(found).all() and (np.abs(found).max((1, 2)) > 0).mean() > 0.99

@@ -9,7 +9,7 @@ import pytest
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
-from tests.small import hand_world, nth, pinch, random_designs, stack
+from tests.helpers.grasps import hand_world, nth, pinch, random_designs, stack
 
 PAPER = scene.load("paper_spheres")
 KEY = jax.random.key(5)

@@ -5,14 +5,14 @@ import os
 import shutil
 
 import pytest
-from command_runs import command, own_workplace, snapshot, without  # noqa: F401
-from tiny_run import RUN, copied
-from toy import TINY, tiny
 
 from codesign_jax import runs, scene
 from codesign_jax.runs import belongings, manifest, scene_files
 from codesign_jax.runs.directory import open_run
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
+from tests.helpers.command_runs import command, own_workplace, snapshot, without  # noqa: F401
+from tests.helpers.tiny_run import RUN, copied
+from tests.helpers.toy_engine import TINY, tiny
 
 SETTINGS = runs.make_settings("2d", "concurrent", "control", "mujoco", 0, particles=4, episodes=2)
 
@@ -107,7 +107,7 @@ def test_a_start_that_was_cut_short_begins_anew(moment, tmp_path, monkeypatch):
     if 0 < moment < 5:  # and a file that somebody put there stays
         (folder / "meshes").mkdir()
         (folder / "meshes" / "object_0.stl").write_text("solid")
-        with pytest.raises(SceneError, match="meshes/object_0.stl and no provenance"):
+        with pytest.raises(InputError, match="meshes/object_0.stl and no provenance"):
             start(folder)
         shutil.rmtree(folder / "meshes")
         assert sorted(os.listdir(folder)) == left
@@ -125,7 +125,7 @@ def test_a_file_changed_after_a_start_was_cut_short_is_kept(tmp_path, monkeypatc
             start(folder)
     (folder / "hand.toml").write_text("# my own\n")
     before = snapshot(folder)
-    with pytest.raises(SceneError, match="holds hand.toml and no provenance.json"):
+    with pytest.raises(InputError, match="holds hand.toml and no provenance.json"):
         start(folder)
     assert snapshot(folder) == before
 
@@ -136,7 +136,7 @@ def test_a_marker_names_no_other_files(marker, tmp_path):
     for path in (tmp_path / "x", tmp_path / "run" / "scene.toml"):
         path.write_text("mine")
     (tmp_path / "run" / ".start.json").write_text(marker)
-    with pytest.raises(SceneError, match="holds scene.toml and no provenance"):
+    with pytest.raises(InputError, match="holds scene.toml and no provenance"):
         start(tmp_path / "run")
     assert (tmp_path / "x").exists() and (tmp_path / "run" / "scene.toml").exists()
 
@@ -156,7 +156,7 @@ def test_fresh_deletes_no_file_that_is_not_the_runs(kind, run, tmp_path):
     else:
         (run / "failures").symlink_to(other if kind == "link" else tmp_path / "nowhere")
     before = snapshot(run)
-    with pytest.raises(SceneError) as refused:
+    with pytest.raises(InputError) as refused:
         start(run, fresh=True)
     words = {"file": "figures/my own.png in", "folder": "tests.csv in", "lock": r"files (.lock)"}
     assert words.get(kind, "no symbolic links (failures in") in str(refused.value)

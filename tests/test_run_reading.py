@@ -4,18 +4,19 @@ import errno
 import json
 import os
 import shutil
+from unittest import mock
 
 import numpy as np
 import pytest
-from command_runs import command, own_workplace, snapshot, stored  # noqa: F401
-from tiny_run import RUN, copied
 
 from codesign_jax import runs
 from codesign_jax.batch import Batch
 from codesign_jax.commands import status
 from codesign_jax.runs import checkpoint, choice, directory, manifest, tables
 from codesign_jax.runs.checkpoint import Checkpoints
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
+from tests.helpers.command_runs import command, own_workplace, snapshot, stored  # noqa: F401
+from tests.helpers.tiny_run import RUN, copied
 
 NEWEST = 4  # the final test, after three episodes
 
@@ -119,10 +120,10 @@ def test_every_command_says_which_checkpoint_it_takes(run, tmp_path, capsys):
 def test_a_run_without_a_whole_checkpoint_is_refused(run):
     for path in (run / "checkpoints").glob("*.sha256"):
         path.unlink()
-    with pytest.raises(SceneError, match=r"no checkpoint that is whole \(4: 4.sha256 is missing"):
+    with pytest.raises(InputError, match=r"no checkpoint that is whole \(4: 4.sha256 is missing"):
         choice.read_record(run)
     shutil.rmtree(run / "checkpoints")
-    with pytest.raises(SceneError, match="lost its checkpoints, while its tables have 3 episodes"):
+    with pytest.raises(InputError, match="lost its checkpoints, while its tables have 3 episodes"):
         choice.read_record(run)
 
 
@@ -144,7 +145,7 @@ def test_a_step_under_another_name_is_refused(careful, run, capsys):
             folder = run / "checkpoints"
             (folder / name.format(NEWEST - 1)).rename(folder / name.format(7))
     words = f"checkpoints/7 is step {NEWEST - 1} under another name, and nothing was changed"
-    with pytest.raises(SceneError, match=words):
+    with pytest.raises(InputError, match=words):
         runs.load_record(run)
     before = snapshot(run / "checkpoints")
     assert command(*RUN, "--out", run) == 1
@@ -165,7 +166,7 @@ def relabelled(run, identity):
 def test_checkpoints_of_another_run_are_refused(identity, run, capsys):
     relabelled(run, identity)
     before = snapshot(run / "checkpoints")
-    with pytest.raises(SceneError, match="is of another run, and nothing was changed"):
+    with pytest.raises(InputError, match="is of another run, and nothing was changed"):
         runs.load_record(run)
     assert command(*RUN, "--out", run) == 1
     assert "is of another run" in capsys.readouterr().err
@@ -189,23 +190,23 @@ def test_a_run_from_before_versions_is_read_and_goes_on(run, whole, capsys):
     assert "all 3 episodes are done" in capsys.readouterr().out
     content["settings"]["seed"] = 4  # whose checkpoints they are, its key tells
     manifest.write(run, content)
-    with pytest.raises(SceneError, match="not this run's: they are of another seed"):
+    with pytest.raises(InputError, match="not this run's: they are of another seed"):
         runs.load_record(run)
     content["settings"] |= {"seed": 3, "particles": 5}
     manifest.write(run, content)
-    with pytest.raises(SceneError, match="they are not of 5 particles"):
+    with pytest.raises(InputError, match="they are not of 5 particles"):
         runs.load_record(run)
     content["settings"]["particles"] = 4
     manifest.write(run, content)
     renumbered(run, NEWEST, 7)
-    with pytest.raises(SceneError, match="checkpoint 7 holds episode 3"):
+    with pytest.raises(InputError, match="checkpoint 7 holds episode 3"):
         runs.load_record(run)
 
 
 def test_a_run_of_a_newer_version_is_refused(run):
     content = manifest.read_provenance(run)
     manifest.write(run, content | {"schema": manifest.SCHEMA + 1})
-    with pytest.raises(SceneError, match="made by a newer version of codesign-jax"):
+    with pytest.raises(InputError, match="made by a newer version of codesign-jax"):
         runs.read_run(run)
 
 
@@ -219,7 +220,7 @@ def test_arrays_of_another_version_are_refused_in_words(change, run):
         else:
             arrays["history"]["trials"]["kept"] = np.zeros(3)
         store.save(NEWEST + 1, arrays)
-    with pytest.raises(SceneError, match="other arrays than this version"):
+    with pytest.raises(InputError, match="other arrays than this version"):
         runs.load_record(run)
 
 
@@ -231,12 +232,12 @@ def test_a_step_that_cannot_be_read_now_is_kept(number, run, monkeypatch, capsys
     def refused(path):
         raise OSError(number, os.strerror(number), str(path))
 
-    monkeypatch.setattr(checkpoint, "_file_digest", refused)
+    monkeypatch.setattr(checkpoint, "file_digest", refused)
     assert command(*RUN, "--out", run) == 1
     error = capsys.readouterr().err
     assert f"checkpoint {NEWEST} in " in error and os.strerror(number) in error
     assert "nothing was changed" in error and "go on from the one before" in error
-    with pytest.raises(SceneError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         runs.load_record(run)
     assert snapshot(run / "checkpoints") == before
 
@@ -267,7 +268,7 @@ def test_changed_scene_files_are_refused_by_all_that_read_the_run(run, capsys):
         assert "objects.toml was changed since the run was made" in error, arguments
         assert "--set KEY=VALUE" in error
     path.unlink()
-    with pytest.raises(SceneError, match="objects.toml is missing"):
+    with pytest.raises(InputError, match="objects.toml is missing"):
         runs.read_run(run)
     path.write_text(text)
     runs.read_run(run)
@@ -310,10 +311,10 @@ def test_a_hostile_provenance_is_refused_in_words(case, run):
         content = json.dumps(content)
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(
-        SceneError, match=r"provenance\.json is damaged: .* Put it back from a copy"
+        InputError, match=r"provenance\.json is damaged: .* Put it back from a copy"
     ):
         runs.read_run(run)
-    with pytest.raises(SceneError, match="is damaged"):
+    with pytest.raises(InputError, match="is damaged"):
         runs.setting_of([run], "episodes")
 
 
@@ -387,10 +388,8 @@ def test_a_run_that_cannot_be_saved_says_why(run, tmp_path, monkeypatch, capsys)
 
     def full(store, step, arrays):
         text = "RESOURCE_EXHAUSTED: Failed writing: x" + "/x" * 300 + ": No space left on device"
-        monkeypatch.setattr(
-            store._manager, "save", lambda *a, **k: (_ for _ in ()).throw(ValueError(text))
-        )
-        save(store, step, arrays)
+        with mock.patch("orbax.checkpoint.CheckpointManager.save", side_effect=ValueError(text)):
+            save(store, step, arrays)
 
     def full_log(folder, message):
         if message.startswith("failed"):

@@ -20,7 +20,7 @@ import pytest
 from codesign_jax import caches
 from codesign_jax.compiler import cache, cpu, ffi, gpu, host, launch, vector
 from codesign_jax.compiler.layout import OUTPUT, SCRATCH, Array, Layout
-from tests import frames, kernels
+from tests.helpers import call_frames, kernels
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
@@ -64,10 +64,10 @@ def test_any_number_of_threads_gives_the_same_bits(handler, pool, threads, block
     Tasks that run late look at the call's record after the handler has returned.
     """
     x, table = kernels.numbers(blocks)
-    xla, out = frames.Xla(threads, pool), np.full((blocks, 1, 8), np.nan, np.float32)
+    xla, out = call_frames.Xla(threads, pool), np.full((blocks, 1, 8), np.nan, np.float32)
     assert xla.call(handler, [x, table], [out]) is None
     alone = np.empty_like(out)
-    assert frames.Xla(1).call(handler, [x, table], [alone]) is None
+    assert call_frames.Xla(1).call(handler, [x, table], [alone]) is None
     np.testing.assert_array_equal(out, alone)
     # Ten rounds of a map that doubles differences; a few roundings of 6e-8 in each.
     np.testing.assert_allclose(out, kernels.expected(x, table), atol=2**10 * 4 * 6e-8)
@@ -144,7 +144,7 @@ jax.config.update("jax_compilation_cache_dir", sys.argv[1])
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec as P
 from codesign_jax.compiler import vector
-from tests import kernels
+from tests.helpers import kernels
 vector.write = None  # the machine code is there
 x, table = kernels.numbers(12)
 alone = jax.jit(kernels.run)(x, table)
@@ -239,7 +239,7 @@ def test_smaller_structures_are_refused(handler, structure, monkeypatch):
     kind = {"args": ffi.Arguments, "buffer": ffi.Buffer}[structure]
     size = ffi.size
     monkeypatch.setattr(ffi, "size", lambda s: size(s) - 8 * (s is kind))
-    xla = frames.Xla()
+    xla = call_frames.Xla()
     code, message = xla.call(handler, [x, table], [out])
     assert code == ffi.INVALID_ARGUMENT and "plain needs" in message and not out.any()
 
@@ -251,7 +251,7 @@ def test_missing_memory_is_an_error(threads):
     block = "define internal void @block(ptr %a, ptr %b, ptr %c, ptr %d) {\nret void\n}\n"
     loaded = host.Loaded(host.compile(block + cpu.handler_code("large", large)))
     (x, table), out = kernels.numbers(8), np.zeros((8, 1, 8), np.float32)
-    xla = frames.Xla(threads, "threads")
+    xla = call_frames.Xla(threads, "threads")
     code, message = xla.call(loaded.function("large"), [x, table], [out])
     xla.run_late()
     assert code == ffi.RESOURCE_EXHAUSTED and "scratch" in message
@@ -455,7 +455,7 @@ def old_driver(monkeypatch):
 )
 def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
     """Each reason is named, and launching says the same."""
-    launch._available.cache_clear()
+    launch.available.cache_clear()
     gpu.driver.cache_clear()
     cause(monkeypatch)
     try:
@@ -465,7 +465,7 @@ def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
             kernels.run(*kernels.numbers(2), backend=platform)
     finally:
         monkeypatch.undo()
-        launch._available.cache_clear()
+        launch.available.cache_clear()
         gpu.driver.cache_clear()
         ffi.installed_version.cache_clear()
     assert launch.available("cpu") is None

@@ -12,7 +12,7 @@ from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import hand, keypaths, library, objects, parameters, schema
-from tests.small import DATA, batch_inputs, nth, repeat, stack, still
+from tests.helpers.grasps import DATA, batch_inputs, nth, repeat, stack, still
 
 HANDS, OBJECTS = sorted(library.available("hands")), sorted(library.available("objects"))
 
@@ -22,7 +22,7 @@ def text_of(kind, name):
 
 
 def problems_of(loader, path):
-    with pytest.raises(schema.SceneError) as caught:
+    with pytest.raises(schema.InputError) as caught:
         loader(path)
     assert str(caught.value).splitlines() == caught.value.problems
     return caught.value.problems
@@ -98,9 +98,9 @@ def test_a_key_path_changes_its_value_and_the_resolved_scene_has_it(pair, tmp_pa
 def test_a_trial_of_an_unknown_object_names_the_nearest():
     the_scene = scene.load("paper")
     assert int(rollout.nominal_trial(the_scene, "cylinder").shape) == 1
-    with pytest.raises(schema.SceneError, match="'cubiod' unknown in paper; did you mean 'cuboid'"):
+    with pytest.raises(schema.InputError, match="'cubiod' unknown in paper; did you mean 'cuboid'"):
         rollout.nominal_trial(the_scene, "cubiod")
-    with pytest.raises(schema.SceneError, match="object 3 unknown"):
+    with pytest.raises(schema.InputError, match="object 3 unknown"):
         rollout.nominal_trial(the_scene, 3)
 
 
@@ -254,7 +254,7 @@ def test_all_problems_of_all_files_at_once(tmp_path):
     object_path = edited(
         tmp_path, "objects", "paper", ("mass = 0.05", "mass = -1"), ('type = "box"', 'type = "bx"')
     )
-    with pytest.raises(schema.SceneError) as caught:
+    with pytest.raises(schema.InputError) as caught:
         scene.load(
             "paper",
             hand_name=hand_path,

@@ -12,8 +12,6 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_run import small_run  # noqa: F401
-from toy import TINY
 
 from codesign_jax import cli, codesign, runs, scene, sources
 from codesign_jax.commands import calls, failure, replay, status
@@ -24,6 +22,8 @@ from codesign_jax.report import animation, landscape
 from codesign_jax.runs import choice
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome, Status, failed
+from tests.helpers.tiny_run import small_run  # noqa: F401
+from tests.helpers.toy_engine import TINY
 
 DESIGN = ["--scene", str(TINY), "--engine", "mujoco", "--design", "length=100", "arm_z=0"]
 
@@ -32,7 +32,7 @@ DESIGN = ["--scene", str(TINY), "--engine", "mujoco", "--design", "length=100", 
 def workplace(tmp_path, monkeypatch):
     """An empty working directory, a cache of its own, and no OpenGL, which is slow."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(animation, "_opengl", lambda: None)
+    monkeypatch.setattr(animation, "opengl_backend", lambda: None)
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     return tmp_path / "work"
@@ -94,7 +94,7 @@ def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys)
 def test_failed_worlds_are_listed_where_no_grasp_was_asked_for(run, tmp_path, monkeypatch):
     listed = []
     monkeypatch.setattr(failure, "show_list", listed.append)
-    monkeypatch.setattr(replay, "_write", lambda *arguments: None)
+    monkeypatch.setattr(replay, "write_page", lambda *arguments: None)
     own = ["replay", str(run), "--out", str(tmp_path / "r.html")]
     for more in (["--trial", "0"], ["--episode", "1"], ["--object", "sphere"]):
         assert cli.main([*own, *more]) == 0 and not listed
@@ -230,7 +230,7 @@ def test_landscape_varies_two_of_many_and_counts_what_it_should():
 def test_a_file_that_is_no_landscape_is_refused(tmp_path):
     for content in (b"", b"nothing"):
         (tmp_path / "x.npz").write_bytes(content)
-        with pytest.raises(scene.SceneError, match="is not a landscape of this version"):
+        with pytest.raises(scene.InputError, match="is not a landscape of this version"):
             landscape.load(tmp_path / "x.npz")
 
 
@@ -242,7 +242,7 @@ def test_a_landscape_of_another_scene_stays_out_of_the_run(run, workplace, monke
         zero = np.zeros((len(designs), 1))
         return Outcome(zero, zero.astype(int), zero, zero.astype(int))
 
-    monkeypatch.setattr(command, "_simulate", simulate)
+    monkeypatch.setattr(command, "simulated_designs", simulate)
     before = (run / landscape.FILE).exists()
     sizes = ["--points", "2", "--trials", "1"]
     assert cli.main(["landscape", "--run", str(run), *sizes, "--set", "gravity=3.7"]) == 0
@@ -255,7 +255,7 @@ def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
     def stop(*rest):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "_simulate", stop)
+    monkeypatch.setattr(command, "simulated_designs", stop)
     assert cli.main(["landscape", *DESIGN, "--points", "2"]) == 130
     assert not list(workplace.iterdir()) and "stopped" in capsys.readouterr().out
 

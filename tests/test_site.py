@@ -9,11 +9,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from test_browser import browser, launch  # noqa: F401
 
 from codesign_jax import model
 from scripts import reference_page, site_pages
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
 
 ROOT = Path(__file__).parent.parent
 BUILT_IN = {
@@ -78,7 +78,7 @@ def test_a_key_without_a_meaning_is_an_error():
 
 
 def test_the_layout_of_qpos_is_that_of_mujocos_model():
-    scene = small.pinch()
+    scene = grasps.pinch()
     compiled = model.compile_template(scene)
     sizes = {"F": scene.num_fingers, "N": scene.discretization.links}
     sizes["A"] = (compiled.nv - 12) // (sizes["F"] * sizes["N"])
@@ -146,7 +146,7 @@ def site(tmp_path_factory):
 
 
 @pytest.mark.browser
-def test_the_site_is_read_and_searched_without_a_network(site, browser):  # noqa: F811
+def test_the_site_is_read_and_searched_without_a_network(site, browser):
     page, complaints = browser.new_page(viewport={"width": 1300, "height": 900}), []
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("request", lambda r: None if r.url.startswith("file:") else complaints.append(r.url))

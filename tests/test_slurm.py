@@ -13,15 +13,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from slurm_cluster import MISSING, PATH, cluster
-from toy import TINY
 
 from codesign_jax import cli, runs
 from codesign_jax.commands import jobs, slurm
 from codesign_jax.runs import checkpoint
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
+from tests.helpers.slurm_cluster import MISSING, PATH, cluster
+from tests.helpers.toy_engine import TINY
 
 RUN = [
     *("optimize", "--scene", str(TINY), "--engine", "mujoco", "--particles", "4", "--trials", "2"),
@@ -95,16 +95,16 @@ def test_parameters_are_what_submitit_and_slurm_want():
     assert found["slurm_srun_args"] == ["--cpus-per-task=8", "--mpi=none", "--quiet"]
     further = {"requeue": True, "reservation": "course", "spread-job": True}
     assert found["slurm_additional_parameters"] == further
-    with pytest.raises(SceneError, match="tasks_per_node: a run is one process"):
+    with pytest.raises(InputError, match="tasks_per_node: a run is one process"):
         slurm.parameters({"tasks_per_node": 2})
 
 
 def test_what_the_queue_says_is_counted_and_reasons_that_matter_are_named():
-    queue = [slurm.State("RUNNING"), slurm.State("PENDING", "Priority")]
+    queue = [slurm.JobState("RUNNING"), slurm.JobState("PENDING", "Priority")]
     assert slurm.summary(queue) == "1 pending, 1 running"
-    queue += [slurm.State("PENDING", "PartitionTimeLimit"), slurm.State("CANCELLED")]
+    queue += [slurm.JobState("PENDING", "PartitionTimeLimit"), slurm.JobState("CANCELLED")]
     assert slurm.summary(queue) == "2 pending, 1 running (PartitionTimeLimit)"
-    assert slurm.summary([slurm.State("COMPLETED")]) == ""
+    assert slurm.summary([slurm.JobState("COMPLETED")]) == ""
 
 
 def test_why_a_job_failed_is_said_in_words(tmp_path):
@@ -158,7 +158,7 @@ def test_results_that_lay_there_before_are_never_unpickled(tmp_path):
 
 def test_a_start_that_is_refused_leaves_no_folder(tmp_path):
     asked = SimpleNamespace(job_set=(("cluster=local", "memory=3"),), jobs=1)
-    with pytest.raises(SceneError, match="memory"), jobs.private_folder(tmp_path / "a/b") as own:
+    with pytest.raises(InputError, match="memory"), jobs.private_folder(tmp_path / "a/b") as own:
         jobs.executor(asked, own)
     assert not (tmp_path / "a").exists()
 
@@ -169,7 +169,7 @@ def test_a_dry_run_tells_where_jobs_start_and_what_is_not_used_there(monkeypatch
     words = "local; not used, as there is no SLURM here: slurm_partition"
     assert jobs.plan(partition) == words
     wrong = SimpleNamespace(jobs=2, job_set=(("gpu=8",),))
-    with pytest.raises(SceneError, match="--job-set: .*gpu"):
+    with pytest.raises(InputError, match="--job-set: .*gpu"):
         jobs.plan(wrong)
 
 

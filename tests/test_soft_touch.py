@@ -14,10 +14,9 @@ from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.lanewise import lanewise
 from codesign_jax.engines.structured.laws.cones import make_cone
 from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
-from tests import small
-from tests import test_kernel_pairs as oracle
-from tests.planted import Fault, chosen, planted, simulate
-from tests.test_finger_pairs import curled
+from tests.helpers import grasps
+from tests.helpers.curled_hands import batched, curled
+from tests.helpers.planted_faults import Fault, chosen, planted, simulate
 
 BOUND = 1e-8
 """As in test_kernel_pairs.py."""
@@ -85,9 +84,9 @@ def soften(the_scene, model, data):
 def simulated():
     """Relative errors of a step's accelerations, of each fault's world and of a sound one."""
     with jax.enable_x64(True):
-        the_scene = small.pinch("sphere", links=2, **SETTINGS)
+        the_scene = grasps.pinch("sphere", links=2, **SETTINGS)
         model, data, fields = curled(the_scene, 3, 1.9, 0.045)
-        fields, qpos, qvel, ctrl = oracle.batched([(model, data, fields)] * (len(FAULTS) + 1))
+        fields, qpos, qvel, ctrl = batched([(model, data, fields)] * (len(FAULTS) + 1))
         with planted(FAULTS):
             run = jax.jit(partial(simulate, the_scene))
             ctrl = jnp.asarray(np.repeat(ctrl[:, None], 2, 1))

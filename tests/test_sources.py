@@ -12,7 +12,7 @@ import pytest
 
 from codesign_jax import programs, sources
 from codesign_jax.engines.structured import lanewise
-from tests import kernels
+from tests.helpers import kernels
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def code(tmp_path, monkeypatch):
 
 def imported(monkeypatch):
     """A process begins."""
-    monkeypatch.setattr(sources, "_imported", sources._state())
+    monkeypatch.setattr(sources, "at_import", sources._state())
     sources._read.cache_clear()
 
 

@@ -8,7 +8,6 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -17,43 +16,33 @@ from codesign_jax import rollout, scene
 from codesign_jax.compiler import host
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from tests import small, steps
+from tests.helpers import grasps, oracles
 
 pytestmark = pytest.mark.slow
 EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-24}
 """Limits at which the kernel solves a step to rounding in float64."""
 
 
-@functools.lru_cache(maxsize=4)
-def _placing(engine):
-    return jax.jit(lambda fields, qpos, qvel: engine.place(engine.reset(fields), qpos, qvel))
-
-
-def lanes_state(engine, scene, fields, qpos, qvel):
-    """The engine's state, one world, from MuJoCo's coordinates, with a cold start."""
-    return _placing(engine)(fields, jnp.asarray(qpos)[None], jnp.asarray(qvel)[None])
-
-
 def setting(shape, **params):
     """Scene, MuJoCo C's model and the engine's hand for a pinch grasp, in float64."""
-    scene = small.pinch(shape)
-    world, trial = small.hand_world(scene, **params)
+    scene = grasps.pinch(shape)
+    world, trial = grasps.hand_world(scene, **params)
     trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
-    fields, ctrl = small.world_inputs(scene, world, trial)
-    batch = small.repeat(fields, 1)
+    fields, ctrl = grasps.world_inputs(scene, world, trial)
+    batch = grasps.repeat(fields, 1)
     oracle = world_model(scene, fields)
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
     return scene, oracle, np.asarray(fields.start), batch, np.asarray(ctrl)
 
 
-@pytest.mark.parametrize("shape", small.SHAPES)
+@pytest.mark.parametrize("shape", grasps.SHAPES)
 def test_every_step_of_a_grasp_equals_mujocos(shape):
     """Converged accelerations along the kernel's own path, contacts included."""
     with jax.enable_x64(True):
         scene, _, _, fields, ctrl = setting(shape)
         engine, ctrl = StructuredEngine(scene, **EXACT), ctrl[None, :420]
-        found = steps.path(engine, fields, ctrl)
-    errors, far, touching = steps.against_mujoco(scene, fields, ctrl, found)
+        found = oracles.path(engine, fields, ctrl)
+    errors, far, touching = oracles.against_mujoco(scene, fields, ctrl, found)
     # A difference of velocities over 10 ms loses two of 16 digits, and MuJoCo's own Newton stops
     # at rounding of its cost.
     assert errors.max() < 1e-8 and far.max() < 1e-12
@@ -71,7 +60,7 @@ def test_free_motion_equals_mujoco_step_by_step():
         data.qpos[-5] += 0.5
         lifted = fields._replace(start=fields.start.copy())
         lifted.start[0, -5] += 0.5
-        found = steps.path(StructuredEngine(scene, **EXACT), lifted, ctrl[None, :20])
+        found = oracles.path(StructuredEngine(scene, **EXACT), lifted, ctrl[None, :20])
     for k in range(20):
         # Rounding of 1e-16 relative, grown over twenty steps of a stiff chain.
         np.testing.assert_allclose(found.qpos[0, k], data.qpos, rtol=0, atol=1e-12)
@@ -84,19 +73,19 @@ def test_free_motion_equals_mujoco_step_by_step():
 def test_worlds_that_end_early():
     """They change no verdict, and the block's other worlds no bit."""
     with jax.enable_x64(True):
-        scene = small.pinch("cylinder")
+        scene = grasps.pinch("cylinder")
         # On the way to this distance nothing is ever decided: every world runs to the end.
         patient = dataclasses.replace(
             scene, cost=dataclasses.replace(scene.cost, lost_distance=1e3)
         )
-        world, trial = small.hand_world(scene, pressure=190e3)
+        world, trial = grasps.hand_world(scene, pressure=190e3)
         lengths = np.linspace(0.07, 0.13, 10)
         arm = world.arm + 0.08 * (np.arange(6) == 2)
-        params = small.stack(
+        params = grasps.stack(
             *[world._replace(length=0 * world.length + x, arm=arm) for x in lengths]
         )
         back = jax.tree.map(lambda v: v[::-1], params)
-        trials = small.stack(*[trial] * len(lengths))
+        trials = grasps.stack(*[trial] * len(lengths))
 
         def traces(scene, *batches):
             engine = StructuredEngine(scene, tolerance=1e-16, iterations=30)
@@ -105,7 +94,7 @@ def test_worlds_that_end_early():
 
         early, reverse = traces(scene, params, back)
         (full,) = traces(patient, params)
-        short, long = (jax.tree.map(np.asarray, small.outcomes(scene, t)) for t in (early, full))
+        short, long = (jax.tree.map(np.asarray, grasps.outcomes(scene, t)) for t in (early, full))
     assert np.ptp(short.cost) > 1.0  # they end at very different times
     for field, whole in zip(short, long, strict=True):
         np.testing.assert_array_equal(field, whole)
@@ -116,7 +105,7 @@ def test_worlds_that_end_early():
 def test_a_world_fills_a_block(monkeypatch):
     """Five fingers do on CPUs with vectors of eight float32: here three on four lanes."""
     the_scene = scene.load("paper_spheres", hand_name="tripod3")
-    params, trials = small.random_worlds(the_scene, 0, 3)
+    params, trials = grasps.random_worlds(the_scene, 0, 3)
 
     def simulated():
         engine = StructuredEngine(the_scene)

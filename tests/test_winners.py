@@ -13,7 +13,7 @@ import pytest
 from codesign_jax import archives, rollout
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import make_engine
-from codesign_jax.scene import SceneError, parameters
+from codesign_jax.scene import InputError, parameters
 from scripts.winners import (
     files as winners_files,
 )
@@ -24,7 +24,7 @@ from scripts.winners import (
     variants as winners,
 )
 from scripts.winners.variants import STANDARD, VARIANTS, Finals, Task, Variant
-from tests import small
+from tests.helpers import grasps
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "data" / "reproduction"
@@ -51,7 +51,7 @@ def test_friction_and_stiffness_reach_mujoco_s_model():
     )
     space, trial = parameters.design_space(plain.hand), rollout.nominal_trial(plain)
     params = space.params(space.default())
-    before, after = (small.world_inputs(s, params, trial)[0] for s in (plain, changed))
+    before, after = (grasps.world_inputs(s, params, trial)[0] for s in (plain, changed))
     # In float32, to some roundings.
     np.testing.assert_allclose(after.pair_friction[:, :2], 1.3 * before.pair_friction[:, :2], 1e-5)
     np.testing.assert_allclose(after.jnt_stiffness, 0.8 * before.jnt_stiffness, 1e-5)
@@ -121,7 +121,7 @@ def test_a_drive_goes_on_where_it_stopped(finals, tmp_path, monkeypatch):
         np.testing.assert_array_equal(every[name], value)
     assert winners.gather(every, "23d", "MuJoCo C")[0].shape == (2, 1, 6)
     assert winners.gather(every, "23d", "nothing") is None
-    with pytest.raises(SceneError, match="size"):
+    with pytest.raises(InputError, match="size"):
         winners.drive(todo, path, {"size": "paper"})
 
 
@@ -156,18 +156,18 @@ def test_files_are_joined_with_their_runs(tmp_path):
         ("A", ["2d|x|0", "2d|y|0"]),
         ("B", ["2d|z|0"]),
     ]
-    with pytest.raises(SceneError, match="exists and is not among"):
+    with pytest.raises(InputError, match="exists and is not among"):
         winners_files.merge([a, b], out)
     c = stored(tmp_path / "c.npz", [{"command": "C", "calls": ["2d|z|0"]}], z=1)
-    with pytest.raises(SceneError, match="c.npz: its 2d|z|0|cost differs"):
+    with pytest.raises(InputError, match="c.npz: its 2d|z|0|cost differs"):
         winners_files.merge([out, c], out)
     other = tmp_path / "d.npz"
     archives.save(other, {})
     winners_files.write_runs(other, {"size": "cpu"}, [])
-    with pytest.raises(SceneError, match="size: cpu there, tiny wanted"):
+    with pytest.raises(InputError, match="size: cpu there, tiny wanted"):
         winners_files.merge([out, other], out)
     (tmp_path / "c.json").unlink()
-    with pytest.raises(SceneError, match="cannot be read from its .json"):
+    with pytest.raises(InputError, match="cannot be read from its .json"):
         winners_files.merge([out, c], out)
 
 

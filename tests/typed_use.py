@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from codesign_jax import (
+    InputError,
     Params,
-    SceneError,
     Status,
     Task,
     codesign,
@@ -26,7 +26,7 @@ def find_a_design(steps: int) -> np.ndarray:
     use_compilation_cache()
     try:
         grasping = scene.load("paper", overrides={"discretization.links": 5})
-    except SceneError as error:
+    except InputError as error:
         raise SystemExit("; ".join(error.problems)) from error
     space = parameters.design_space(grasping.hand, "2d")
     task = Task(grasping, space, trials=3)

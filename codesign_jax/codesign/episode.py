@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,7 +16,7 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
 from codesign_jax.programs import Program, shared
-from codesign_jax.scene import Constants, Scene, SceneError
+from codesign_jax.scene import Constants, InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
@@ -83,7 +84,7 @@ class Task:
         """Makes the engine.
 
         Raises:
-          SceneError: If the space is none, or there are no trials, or the engine is that of a scene
+          InputError: If the space is none, or there are no trials, or the engine is that of a scene
             of another structure, or worlds are to be recorded and to stop.
         """
         problems = []
@@ -93,7 +94,7 @@ class Task:
         if not isinstance(self.trials, int | np.integer) or self.trials < 1:
             problems.append(f"trials = {self.trials!r} must be a whole number, at least 1")
         if problems:
-            raise SceneError(problems)
+            raise InputError(problems)
         if self.engine is None:
             object.__setattr__(self, "engine", engines.make_engine(engines.DEFAULT, self.scene))
         axes.refuse_other(self.scene, self.engine)
@@ -102,8 +103,8 @@ class Task:
     @property
     def how(self) -> tuple[Any, ...]:
         """What its programs are built from, see `programs.shared`."""
-        shown = self.record_qpos, self.stop_when_lost
-        return self.scene, self.engine, self.space, self.trials, *shown, self.cost
+        recording = rollout.Recording(self.record_qpos, self.stop_when_lost, self.cost)
+        return self.scene, self.engine, self.space, self.trials, recording
 
     def evaluate(
         self, population: jax.Array, key: jax.Array, constants: Constants | None = None
@@ -118,7 +119,7 @@ class Task:
           constants: Numbers instead of the scene's, leaves of shape () or (trial,).
 
         Raises:
-          SceneError: If the population or the constants do not fit, and see `DesignSpace.check`,
+          InputError: If the population or the constants do not fit, and see `DesignSpace.check`,
             which warns of designs that are not legal.
         """
         self.space.refuse_population(population)
@@ -214,11 +215,9 @@ def _evaluation(
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-    cost: rollout.CostFunction | None,
+    recording: rollout.Recording,
 ) -> Callable[..., Outcome]:
-    how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
+    how = recording._asdict()
 
     def simulate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
         trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
@@ -234,11 +233,9 @@ def _episode(
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-    cost: rollout.CostFunction | None,
+    recording: rollout.Recording,
 ) -> EpisodeFunction:
-    how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
+    how = recording._asdict()
 
     def episode(
         state: State,
@@ -264,11 +261,11 @@ def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
     """Refuses a mask that is not one of the space's parameters.
 
     Raises:
-      SceneError: If its shape is another one.
+      InputError: If its shape is another one.
     """
     if np.shape(mask) != (space.num_parameters,):
         names = ", ".join(space.names)
-        raise SceneError(
+        raise InputError(
             [f"the mask has shape {np.shape(mask)}, not ({space.num_parameters},), that is {names}"]
         )
 

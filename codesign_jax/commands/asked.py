@@ -12,7 +12,7 @@ from codesign_jax import engines, optimize, own, runs
 from codesign_jax.commands import common, jobs, seeds
 from codesign_jax.runs import Settings
 from codesign_jax.scene import Scene, schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Optimize
@@ -28,7 +28,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     """Reads the scene and fills the settings.
 
     Raises:
-      SceneError: With the problems of both.
+      InputError: With the problems of both.
     """
     problems, scene = [], None
     try:
@@ -36,14 +36,14 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
             [*chain.from_iterable(options.overrides)], options.engine or engines.DEFAULT
         )
         scene = common.load_scene(options)
-    except SceneError as error:
+    except InputError as error:
         problems += error.problems
     schedules = options.schedule.split(",")
     optimizer = options.optimizer or optimize.DEFAULT
     if scene is not None and options.optimizer is None and not options.fresh:
         try:
             optimizer = _of_the_runs(options, scene) or optimizer
-        except SceneError as error:
+        except InputError as error:
             problems += error.problems
     settings = runs.make_settings(
         options.preset,
@@ -62,7 +62,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     if scene is not None and options.episodes is None and not options.fresh:
         try:
             settings = _as_the_runs(options, scene, settings)
-        except SceneError as error:
+        except InputError as error:
             problems += error.problems
     problems += _flag_problems(options)
     for name in schedules:
@@ -70,7 +70,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         found = runs.check(own, scene.hand if scene else None)
         problems += [problem for problem in found if problem not in problems]
     if problems or scene is None:
-        raise SceneError(problems)
+        raise InputError(problems)
     return scene, settings
 
 
@@ -88,7 +88,7 @@ def _flag_problems(options: "Optimize") -> list[str]:
         problems.append("--job-set needs --jobs: its parameters are those of jobs")
     try:
         jobs.parameters([*chain.from_iterable(options.job_set)])
-    except SceneError as error:
+    except InputError as error:
         problems += error.problems
     # Jobs have the devices of their own hosts, and check there.
     available = jax.local_device_count() if options.jobs is None else options.devices or 1
@@ -109,7 +109,7 @@ def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:
     One of somebody's own is not among them: only a command line has code imported.
 
     Raises:
-      SceneError: If the runs differ in it.
+      InputError: If the runs differ in it.
     """
     named = {"optimizer": optimize.DEFAULT, "cost": options.cost or runs.SCENE_COST}
     usual = runs.make_settings(options.preset, "", "", "", 0, **named)
@@ -122,7 +122,7 @@ def _as_the_runs(options: "Optimize", scene: Scene, settings: Settings) -> Setti
     """Settings with the episodes of the runs that are there: these may have been extended.
 
     Raises:
-      SceneError: If the runs differ in them.
+      InputError: If the runs differ in them.
     """
     folders = runs_of(options, scene, settings)
     episodes = runs.setting_of(folders, "episodes") or settings.episodes
@@ -143,7 +143,7 @@ def runs_of(options: "Optimize", scene: Scene, settings: Settings) -> dict[Path,
       settings: Settings of any of the runs.
 
     Raises:
-      SceneError: If --seeds is no list of seeds, or see `_folder`.
+      InputError: If --seeds is no list of seeds, or see `_folder`.
     """
     found = {}
     for name in options.schedule.split(","):
@@ -163,7 +163,7 @@ def seeds_of(options: "Optimize") -> list[int]:
     """Seeds of the runs.
 
     Raises:
-      SceneError: If --seeds is no list of them.
+      InputError: If --seeds is no list of them.
     """
     return [options.seed] if options.seeds is None else seeds.parse(options.seeds)
 
@@ -172,7 +172,7 @@ def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:
     """Folder of one run: --out, with a folder inside for each of several strategies and --seeds.
 
     Raises:
-      SceneError: If there is no --out, and what the files call hand or preset is no name of a
+      InputError: If there is no --out, and what the files call hand or preset is no name of a
         folder: whoever wrote them would choose a place on this disk.
     """
     if options.out is not None:
@@ -185,5 +185,5 @@ def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:
     name = "-".join(names)
     if name[0] in ".-~" or "/" in name or "\\" in name or len(os.fsencode(name)) > _LONGEST:
         given = schema.shown(name)
-        raise SceneError([f"{given}, of hand and preset, is no name of a folder: give --out"])
+        raise InputError([f"{given}, of hand and preset, is no name of a folder: give --out"])
     return Path("runs") / name

@@ -17,7 +17,7 @@ from codesign_jax import archives, batch, codesign
 from codesign_jax.codesign import Task
 from codesign_jax.engines import Engine
 from codesign_jax.runs import outcomes, rates
-from codesign_jax.runs.progress import Ticker, duration
+from codesign_jax.runs.progress import Live, duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome
@@ -98,7 +98,7 @@ def work(trials: Trials, size: int) -> rates.Work:
     return rates.batch_work(trials.scene, trials.engine, size * trials.count, devices=1)
 
 
-class Meter:
+class Meter(Live):
     """Grasps that were simulated: a live bar on a terminal, elsewhere a line now and then.
 
     Attributes:
@@ -110,24 +110,10 @@ class Meter:
         """Takes what is simulated, the number of grasps, and where to tell."""
         self.total, self._text, self._console = total, text, console
         columns = (*Progress.get_default_columns()[:-1], TimeRemainingColumn())
-        self._bar = Progress(
-            *columns, console=console, transient=True, disable=not console.is_terminal
-        )
+        super().__init__(console, *columns)
         self._task = self._bar.add_task(text, total=total)
-        self._ticker = Ticker(disable=console.is_terminal)
         self._ticker.begin(f"{text}: compiling, then {total} grasps")
         self.done, self._since, self._told = 0, None, time.monotonic()
-
-    def __enter__(self) -> "Meter":
-        """Shows the bar."""
-        self._bar.start()
-        self._ticker.__enter__()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Removes it."""
-        self._ticker.__exit__()
-        self._bar.stop()
 
     def found(self, grasps: int) -> None:
         """Counts grasps that an earlier process simulated."""

@@ -12,7 +12,7 @@ from codesign_jax.runs import choice
 from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 PRESET = "2d"
 """Design space where none is named."""
@@ -57,7 +57,7 @@ def find_case(options: Options, *, tell: Tell = common.warn) -> Case:
       tell: Called with what is amiss with the run, such as damaged checkpoints.
 
     Raises:
-      SceneError: If something is wrong with the flags, the run or the files.
+      InputError: If something is wrong with the flags, the run or the files.
     """
     return _from_run(options, tell) if options.run_folder else _from_flags(options)
 
@@ -78,7 +78,7 @@ def _from_run(options: Options, tell: Tell) -> Case:
     given = ["--design"] * bool(options.design) + [f for f, v in own.items() if v is not None]
     if given:
         flags = " and ".join(given)
-        raise SceneError([f"--run brings design, hand and scene of its own; leave out {flags}"])
+        raise InputError([f"--run brings design, hand and scene of its own; leave out {flags}"])
     folder: Path = options.run_folder  # type: ignore[assignment]
     scene, settings = runs.read_run(
         folder,
@@ -94,7 +94,7 @@ def _from_run(options: Options, tell: Tell) -> Case:
     design = chosen.design
     space = design_space(scene.hand, settings.preset)
     if len(design) != space.num_parameters:
-        raise SceneError(
+        raise InputError(
             [
                 f"--set leaves {space.num_parameters} parameters free in preset "
                 f"{settings.preset!r}; the run's designs have {len(design)}"

@@ -29,7 +29,7 @@ def overlaps(scene: Scene, designs: Params) -> np.ndarray:
     low = [lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
     if min(low) >= top:
         return np.zeros((len(shapes), len(low)))
-    return np.asarray(_depths(*_arguments(scene, designs)))
+    return np.asarray(depths(*_arguments(scene, designs)))
 
 
 def between_fingers(scene: Scene, designs: Params) -> np.ndarray:
@@ -144,7 +144,7 @@ def _arguments(scene: Scene, designs: Params) -> tuple[Scene, Constants, Params]
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _depths(scene: Scene, numbers: Constants, designs: Params) -> jax.Array:
+def depths(scene: Scene, numbers: Constants, designs: Params) -> jax.Array:
     """`start.depth` of designs with every object, shape (object, design); one program for all."""
     own = scene.with_constants(numbers)
 

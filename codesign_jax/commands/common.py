@@ -18,7 +18,7 @@ from codesign_jax.caches import use_compilation_cache
 from codesign_jax.commands import preflight
 from codesign_jax.scene import Scene, keypaths, library, objects, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 __all__ = [
     "SceneFlags",
@@ -29,7 +29,7 @@ __all__ = [
     "load_scene",
     "mesh_notes",
     "parse_design",
-    "preflight_notes",
+    "preflight_warnings",
     "solver_problems",
     "source_files",
     "use_compilation_cache",
@@ -63,7 +63,7 @@ def changes(options: Overriding) -> dict[keypaths.Path, Any]:
     """Values by key path that --robust and --set replace; what --set names holds.
 
     Raises:
-      SceneError: If an argument of --set is no pair of key and value.
+      InputError: If an argument of --set is no pair of key and value.
     """
     noise = dataclasses.asdict(objects.ROBUST) if options.robust else {}
     given = keypaths.parse(chain.from_iterable(options.overrides))
@@ -74,7 +74,7 @@ def load_scene(options: SceneFlags) -> Scene:
     """Reads the scene that a command's flags name.
 
     Raises:
-      SceneError: If a file or a value is wrong.
+      InputError: If a file or a value is wrong.
     """
     return scenes.load(
         options.scene or SCENE,
@@ -116,7 +116,7 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
       The design [SI units], shape (parameter,).
 
     Raises:
-      SceneError: With every unknown name, name given twice, value that is not a number and value
+      InputError: With every unknown name, name given twice, value that is not a number and value
         out of range.
     """
     values = dict(zip(space.names, space.in_units(space.default()), strict=True))
@@ -145,7 +145,7 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
         else:
             values[name] = value
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     return np.clip(space.from_units(np.array(list(values.values()))), space.low, space.high)
 
 
@@ -184,35 +184,35 @@ def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
       folder: Whether the path is a folder that will be filled instead.
 
     Raises:
-      SceneError: If the path cannot be written.
+      InputError: If the path cannot be written.
     """
     place = path.absolute() if folder else path.absolute().parent
     try:
         str(path.absolute()).encode()
     except UnicodeEncodeError as error:
         shown = ascii(str(path))
-        raise SceneError([f"{flag} {shown}: the name is no text in UTF-8"]) from error
+        raise InputError([f"{flag} {shown}: the name is no text in UTF-8"]) from error
     try:
         if not folder and path.is_dir():
-            raise SceneError([f"{flag} {path} cannot be written: it is a folder"])
+            raise InputError([f"{flag} {path} cannot be written: it is a folder"])
         while not place.exists():
             place = place.parent
         with tempfile.TemporaryFile(dir=place):
             pass
     except OSError as error:
         problem = f"{flag} {path} cannot be written: {error.strerror} ({place})"
-        raise SceneError([problem]) from error
+        raise InputError([problem]) from error
 
 
 def check_engine(name: str) -> None:
     """Refuses an engine that there is not.
 
     Raises:
-      SceneError: With the nearest name.
+      InputError: With the nearest name.
     """
     if name not in engines.NAMES:
         hint = schema.nearest(name, engines.NAMES)
-        raise SceneError([f"--engine {name!r} is not valid; {hint}"])
+        raise InputError([f"--engine {name!r} is not valid; {hint}"])
 
 
 def solver_problems(pairs: Sequence[str], engine: str) -> list[str]:
@@ -223,7 +223,7 @@ def solver_problems(pairs: Sequence[str], engine: str) -> list[str]:
       engine: The engine's name.
 
     Raises:
-      SceneError: If a pair is not KEY=VALUE.
+      InputError: If a pair is not KEY=VALUE.
     """
     if engine != "structured":
         return []
@@ -252,26 +252,25 @@ def mesh_notes(scene: Scene) -> list[str]:
     return notes
 
 
-def preflight_notes(
-    scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray], *, details: bool = False
+def preflight_warnings(
+    scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]
 ) -> list[str]:
-    """Warnings about designs that are about to be simulated, and notes if details are asked for.
+    """Warnings about designs that are about to be simulated.
 
     Args:
       scene: The scene.
       space: The design space.
       designs: Designs [SI units], each of shape (parameter,), by what to call them.
-      details: Whether to say what the steps do to the fingers' springs.
 
     Raises:
-      SceneError: If a design must not be simulated.
+      InputError: If a design must not be simulated.
     """
     stacked = np.array([*designs.values()], np.float32)
     params = params_of(space, stacked)
-    report = preflight.check(scene, params, [*designs], details=details)
+    report = preflight.check(scene, params, [*designs])
     if report.refusals:
-        raise SceneError(report.refusals)
-    return [f"warning: {text}" for text in report.warnings] + report.notes
+        raise InputError(report.refusals)
+    return [f"warning: {text}" for text in report.warnings]
 
 
 def counted(number: int, noun: str) -> str:

@@ -72,4 +72,4 @@ def _announce(
         f"(--tolerance {others[options.tolerance]}, off none)",
         markup=False,
     )
-    console.print(estimate.text([estimate.Part("", calls.work(trials, size), most)]))
+    console.print(estimate.text([estimate.TimedPart("", calls.work(trials, size), most)]))

@@ -9,7 +9,7 @@ from codesign_jax.runs.progress import duration
 UNKNOWN = "time: unknown; a short run with these effects and this engine measures the rate"
 
 
-class Part(NamedTuple):
+class TimedPart(NamedTuple):
     """Grasps of a command that one program simulates.
 
     Attributes:
@@ -23,7 +23,7 @@ class Part(NamedTuple):
     grasps: int
 
 
-def text(parts: Sequence[Part]) -> str:
+def text(parts: Sequence[TimedPart]) -> str:
     """Lines with the time of all parts, the shares of compiling and of the named ones, and why.
 
     Args:

@@ -12,14 +12,14 @@ from rich.console import Console
 from codesign_jax import codesign, engines, rollout, runs, types
 from codesign_jax.commands import common, estimate
 from codesign_jax.commands.case import Case, find_case
-from codesign_jax.commands.estimate import Part
+from codesign_jax.commands.estimate import TimedPart
 from codesign_jax.engines import make_engine
 from codesign_jax.report import verdicts
 from codesign_jax.runs import choice, rates, tables
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Evaluate
@@ -29,14 +29,14 @@ def main(options: "Evaluate") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input.
+      InputError: If something is wrong with the input.
     """
     common.use_compilation_cache()
     case = _of_particle(find_case(options), options)
     _check(options, case.engine)
     engine = make_engine(case.engine, case.scene)
     designs = {"the design": case.design}
-    notes = common.preflight_notes(case.scene, case.space, designs, details=options.dry_run)
+    notes = common.preflight_warnings(case.scene, case.space, designs)
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
         which = "best final design" if options.particle is None else f"particle {options.particle}"
@@ -51,9 +51,9 @@ def main(options: "Evaluate") -> int:
     if options.dry_run:
         _dry_run(case, options, console)
         return 0
-    one = _evaluate(case, engine, options, console)
+    one = simulate(case, engine, options, console)
     if options.render:
-        _render(case, engine, options, console)
+        draw(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
 
 
@@ -61,17 +61,17 @@ def _of_particle(case: Case, options: "Evaluate") -> Case:
     """The case of the final particle that was asked for, if one was.
 
     Raises:
-      SceneError: If there is no such particle.
+      InputError: If there is no such particle.
     """
     if options.particle is None:
         return case
     if options.run_folder is None:
-        raise SceneError(["--particle is one of a run: give its folder, or leave it out"])
+        raise InputError(["--particle is one of a run: give its folder, or leave it out"])
     record = choice.read_record(options.run_folder)
     particles = np.asarray(record.state.particles)
     problem = schema.range_problem("--particle", options.particle, "", 0, len(particles) - 1)
     if problem:
-        raise SceneError([problem])
+        raise InputError([problem])
     return case._replace(design=particles[options.particle])
 
 
@@ -94,15 +94,15 @@ def _check(options: "Evaluate", engine: str) -> None:
         problems.append(f"--out {options.out} must end in .csv")
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], engine)
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     for flag, path in (("--render", options.render), ("--out", options.out)):
         if path:
             common.check_place(flag, path)
 
 
 def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
-    def part(name: str, grasps: int) -> Part:
-        return Part(name, rates.batch_work(case.scene, case.engine, grasps, devices=1), grasps)
+    def part(name: str, grasps: int) -> TimedPart:
+        return TimedPart(name, rates.batch_work(case.scene, case.engine, grasps, devices=1), grasps)
 
     console.print(f"grasps: {options.trials}")
     parts = [part("", options.trials)]
@@ -112,7 +112,7 @@ def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
     console.print(estimate.text(parts), markup=False)
 
 
-def _evaluate(
+def simulate(
     case: Case, engine: engines.Engine, options: "Evaluate", console: Console
 ) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
@@ -150,12 +150,13 @@ def _untried(case: Case, options: "Evaluate") -> list[str]:
     ]
 
 
-def _render(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+    """Simulates grasps of the first objects and draws them."""
     try:
         from codesign_jax.report import animation
     except ImportError as error:
         message = f"--render needs {error.name}: pip install '.[viz]' in the checkout"
-        raise SceneError([message]) from error
+        raise InputError([message]) from error
     count = min(options.trials, len(case.scene.objects.object))
     trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)
     params = case.space.params(jnp.asarray(case.design, jnp.float32))

@@ -20,7 +20,7 @@ from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trial
 
 if TYPE_CHECKING:
@@ -32,17 +32,17 @@ def main(options: "Export") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input; nothing is written then.
+      InputError: If something is wrong with the input; nothing is written then.
     """
     common.use_compilation_cache()
     doubts: list[str] = []
     case = find_case(options, tell=doubts.append)
     if doubts:
-        raise SceneError([f"{doubt}. Nothing is exported" for doubt in doubts])
+        raise InputError([f"{doubt}. Nothing is exported" for doubt in doubts])
     _check(options, case)
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
-    notes = common.preflight_notes(case.scene, case.space, {"the design": case.design})
+    notes = common.preflight_warnings(case.scene, case.space, {"the design": case.design})
     simulating = options.tolerance != "off" and not options.no_sheet
     engine = make_engine(case.engine, case.scene) if simulating else None
     console = Console(highlight=False, soft_wrap=True)
@@ -53,9 +53,9 @@ def main(options: "Export") -> int:
         console.print(note, markup=False)
     try:
         with files.whole_folder(options.out, drift.PART) as folder:
-            _write(case, params, sizes, engine, folder, options, console)
+            write_files(case, params, sizes, engine, folder, options, console)
     except OSError as error:
-        raise SceneError([f"--out {options.out}: {error.strerror}"]) from error
+        raise InputError([f"--out {options.out}: {error.strerror}"]) from error
     except KeyboardInterrupt:
         console.print("stopped, nothing is exported; the same command goes on")
         return 130
@@ -101,7 +101,7 @@ def _check(options: "Export", case: Case) -> None:
         problems.append(f"--engine {case.engine!r} is not valid; {hint}")
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
 
 
 def _missing(options: "Export") -> list[str]:
@@ -119,7 +119,7 @@ def _missing(options: "Export") -> list[str]:
     return found
 
 
-def _write(
+def write_files(
     case: Case,
     params: Params,
     sizes: list[Size],

@@ -30,7 +30,7 @@ def main(path: Path, engine: str | None) -> int:
       engine: Engine that simulates; None for the run's.
 
     Raises:
-      SceneError: If the file is no failed world of a run, or the engine is unknown.
+      InputError: If the file is no failed world of a run, or the engine is unknown.
     """
     failure = failures.load(path)
     scene, settings = runs.read_run(path.resolve().parent.parent)

@@ -17,7 +17,7 @@ from codesign_jax.commands import common
 from codesign_jax.commands.case import find_case
 from codesign_jax.finger import Finger, Fit
 from codesign_jax.scene import schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Finger as Options
@@ -40,7 +40,7 @@ def main(options: "Options") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input, or the finger has no rest.
+      InputError: If something is wrong with the input, or the finger has no rest.
     """
     case = find_case(options)
     params = case.space.params(np.asarray(case.design))
@@ -52,7 +52,7 @@ def main(options: "Options") -> int:
     if options.out and options.out.suffix != ".csv":
         problems.append(f"--out {options.out} must end in .csv")
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     if options.out:
         common.check_place("--out", options.out)
     measured = options.measured and fingers.read(options.measured)
@@ -69,9 +69,9 @@ def main(options: "Options") -> int:
         table = {"pressure": np.linspace(0.0, top, POINTS)}
         table |= {n: np.zeros(POINTS) for n in ("angle", "tip_force", "blocked_force")}
     try:
-        _compare(mine, table, options, console)
+        compare(mine, table, options, console)
     except ValueError as error:
-        raise SceneError([str(error)]) from error
+        raise InputError([str(error)]) from error
     return 0
 
 
@@ -85,7 +85,7 @@ def _about(mine: Finger, number: int, hand: str) -> str:
     )
 
 
-def _compare(
+def compare(
     mine: Finger, table: dict[str, np.ndarray], options: "Options", console: Console
 ) -> None:
     """Prints and writes what was measured, predicted and fitted."""

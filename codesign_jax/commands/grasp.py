@@ -12,7 +12,7 @@ from codesign_jax.commands import common
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import choice
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
 if TYPE_CHECKING:
@@ -40,15 +40,15 @@ def find(options: "Shown") -> Asked:
     """The grasp that the flags name; simulates nothing.
 
     Raises:
-      SceneError: If something is wrong with the flags, the run or the files.
+      InputError: If something is wrong with the flags, the run or the files.
     """
     places = {"--episode": options.episode, "--particle": options.particle}
     places |= {"--trial": options.trial}
     given = " and ".join(flag for flag, value in places.items() if value is not None)
     if given and not options.run_folder:
-        raise SceneError([f"{given}: numbers of a run's trials.csv, so --run must say of which"])
+        raise InputError([f"{given}: numbers of a run's trials.csv, so --run must say of which"])
     if options.trial is not None and options.object is not None:
-        raise SceneError(["--trial and --object exclude each other: a trial has its object"])
+        raise InputError(["--trial and --object exclude each other: a trial has its object"])
     case = find_case(options)
     common.check_engine(case.engine)
     if options.run_folder is None:
@@ -59,7 +59,7 @@ def find(options: "Shown") -> Asked:
 def _of_run(case: Case, options: "Shown", folder: Path) -> Asked:
     """A row of trials.csv, or its design with an object of the scene's, without noise."""
     if options.objects is not None and options.object is None:
-        raise SceneError(["--objects replaces the run's: --object must say which one to grasp"])
+        raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
     place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
     record = choice.read_record(folder, tell=lambda text: None)  # `find_case` has said it
     found = choice.find_grasp(runs.read_run(folder)[0], record, **place)
@@ -82,13 +82,13 @@ def simulate(asked: Asked) -> "Replay":
     """Simulates the grasp and keeps its trajectory.
 
     Raises:
-      SceneError: If the extra for pictures is missing.
+      InputError: If the extra for pictures is missing.
     """
     try:
         from codesign_jax.report import animation
     except ImportError as error:
         message = f"pictures need {error.name}: pip install '.[viz]' in the checkout"
-        raise SceneError([message]) from error
+        raise InputError([message]) from error
     case = asked.case
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
     trials = jax.tree.map(lambda v: v[None], asked.trial)

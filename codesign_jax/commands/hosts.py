@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax
 
 from codesign_jax.commands import seeds, status
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Optimize
@@ -37,13 +37,13 @@ def check(text: str) -> tuple[str, int, int] | None:
     """Reads "ADDRESS:PORT,PROCESSES,INDEX"; None for "auto".
 
     Raises:
-      SceneError: If the text is neither.
+      InputError: If the text is neither.
     """
     if text == "auto":
         return None
     match = re.fullmatch(r"([^,\s]+:[0-9]{1,5}),([0-9]{1,5}),([0-9]{1,5})", text)
     if match is None or not int(match[3]) < int(match[2]):
-        raise SceneError(
+        raise InputError(
             [
                 f"--distributed {text!r} must be auto or ADDRESS:PORT,PROCESSES,INDEX, such as "
                 "node0:1234,2,0 on the first of two hosts"
@@ -60,7 +60,7 @@ def join(text: str) -> Hosts:
         listens, how many there are, and which one this is; see `check`.
 
     Raises:
-      SceneError: If the text is wrong, or the others cannot be met.
+      InputError: If the text is wrong, or the others cannot be met.
     """
     given = check(text)
     address, count, index = given or (None, None, None)
@@ -68,7 +68,7 @@ def join(text: str) -> Hosts:
     try:
         jax.distributed.initialize(address, count, index, shutdown_timeout_seconds=WAIT)
     except (RuntimeError, ValueError) as error:
-        raise SceneError([f"--distributed {text}: {error}"]) from error
+        raise InputError([f"--distributed {text}: {error}"]) from error
     return Hosts(jax.process_index(), jax.process_count())
 
 
@@ -82,7 +82,7 @@ def run(options: "Optimize") -> tuple[int, Hosts]:
       The command's exit status for these seeds, and which host this is.
 
     Raises:
-      SceneError: See `join`.
+      InputError: See `join`.
     """
     chosen = seeds.parse(options.seeds or "")
     here = join(options.distributed or "")

@@ -28,7 +28,7 @@ from codesign_jax.runs import RunResult, Settings
 from codesign_jax.runs.directory import EVENTS
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Optimize
@@ -50,7 +50,7 @@ def executor(options: "Optimize", folder: Path) -> Any:
       folder: Folder of submitit's files, see `private_folder`.
 
     Raises:
-      SceneError: If submitit is missing, or a parameter is none of its own.
+      InputError: If submitit is missing, or a parameter is none of its own.
     """
     submitit = _submitit()
     given = parameters([*chain.from_iterable(options.job_set)])
@@ -63,7 +63,7 @@ def executor(options: "Optimize", folder: Path) -> Any:
         made.update_parameters(**ours | asked)  # type: ignore[arg-type]
     # submitit asserts that a parameter's type is right.
     except (AssertionError, NameError, TypeError, ValueError, RuntimeError) as error:
-        raise SceneError([f"--job-set: {error}"]) from error
+        raise InputError([f"--job-set: {error}"]) from error
     return made
 
 
@@ -79,7 +79,7 @@ def plan(options: "Optimize") -> str:
     """Says where the runs would start; nothing is started or left behind.
 
     Raises:
-      SceneError: See `executor`.
+      InputError: See `executor`.
     """
     with tempfile.TemporaryDirectory() as folder:
         return where(executor(options, Path(folder)), options)
@@ -96,7 +96,7 @@ def private_folder(runs_folder: Path) -> Iterator[Path]:
       runs_folder: Folder of the runs; made if it is missing.
 
     Yields:
-      The folder; it and those made for it are removed if the block raises SceneError.
+      The folder; it and those made for it are removed if the block raises InputError.
     """
     name = f"{time.strftime('%Y-%m-%dT%H-%M-%S')}-{secrets.token_hex(4)}"
     folder = runs_folder / FOLDER / name
@@ -105,7 +105,7 @@ def private_folder(runs_folder: Path) -> Iterator[Path]:
     folder.mkdir(mode=0o700)  # fails if there is something of that name
     try:
         yield folder
-    except SceneError:
+    except InputError:
         shutil.rmtree(missing[-1])
         raise
 
@@ -114,7 +114,7 @@ def _submitit() -> Any:
     """The module, without its configuration of logging, which closes every handler there is.
 
     Raises:
-      SceneError: If it is missing.
+      InputError: If it is missing.
     """
     ours = "SUBMITIT_LOG_LEVEL" not in os.environ
     os.environ.setdefault("SUBMITIT_LOG_LEVEL", "NOCONFIG")
@@ -122,7 +122,7 @@ def _submitit() -> Any:
         import submitit
     except ImportError as error:
         message = "--jobs needs submitit: pip install '.[cluster]' in the checkout"
-        raise SceneError([message]) from error
+        raise InputError([message]) from error
     finally:
         if ours:  # jobs log as submitit does by default
             del os.environ["SUBMITIT_LOG_LEVEL"]
@@ -133,13 +133,13 @@ def parameters(pairs: Sequence[str]) -> dict[str, bool | int | float | str]:
     """Reads KEY=VALUE pairs; numbers, true and false become what submitit wants them to be.
 
     Raises:
-      SceneError: If a pair has no key or no value.
+      InputError: If a pair has no key or no value.
     """
     found: dict[str, bool | int | float | str] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not (key and equals and value):
-            raise SceneError([f"--job-set {pair!r} must be KEY=VALUE"])
+            raise InputError([f"--job-set {pair!r} must be KEY=VALUE"])
         found[key] = _value(value)
     return found
 
@@ -193,7 +193,7 @@ def run(
       Each run by its folder; None for one that did not finish.
 
     Raises:
-      SceneError: See `executor`; or if SLURM does not take the jobs.
+      InputError: See `executor`; or if SLURM does not take the jobs.
       KeyboardInterrupt: When all jobs were cancelled.
     """
     calls = {
@@ -209,7 +209,7 @@ def run(
             markup=False,
         )
         if made.cluster == "slurm":
-            place = slurm.Array(made, console)
+            place = slurm.JobArray(made, console)
         else:
             place = Processes(made, options.jobs or 1)
         place.start(calls)
@@ -324,7 +324,7 @@ def read(scene: Scene, folder: Path) -> RunResult | None:
     """The run in a folder as it is; None if it has no checkpoint, or every trial failed."""
     try:
         record = runs.load_record(folder, tell=common.warn)
-    except SceneError as error:
+    except InputError as error:
         common.warn(str(error))
         return None
     if record is None or record.failed_status() is not None:

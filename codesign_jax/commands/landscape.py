@@ -19,7 +19,7 @@ from codesign_jax.report.landscape import Landscape
 from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.scene_files import contents, write_scene
 from codesign_jax.scene import schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, failed
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ PART = "landscape.part"
 """What is done of a landscape, until it is finished."""
 
 
-class Grid(NamedTuple):
+class Plane(NamedTuple):
     """Designs over a grid of two parameters.
 
     Attributes:
@@ -47,7 +47,7 @@ def main(options: "Options") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input; nothing is written then.
+      InputError: If something is wrong with the input; nothing is written then.
     """
     common.use_compilation_cache()
     case = find_case(options)
@@ -65,13 +65,13 @@ def main(options: "Options") -> int:
         return 0
     part = folder / PART
     try:
-        simulated = _simulate(case, made.designs, options, console, part)
+        simulated = simulated_designs(case, made.designs, options, console, part)
     except KeyboardInterrupt:
         console.print("stopped; the same command goes on")
         return 130
     found = summarize(case, made, simulated, options.seed)
-    _report(case, found, console)
-    _write(case, found, folder, console)
+    print_summary(case, found, console)
+    write_files(case, found, folder, console)
     part.unlink(missing_ok=True)
     return 0
 
@@ -80,7 +80,7 @@ def _folder(options: "Options", case: Case) -> Path:
     """Where the files go: to the run, if it is the run's scene that is simulated.
 
     Raises:
-      SceneError: If the folder cannot be written.
+      InputError: If the folder cannot be written.
     """
     own = options.run_folder
     folder = Path("landscape")
@@ -98,7 +98,7 @@ def _refuse_other_scene(folder: Path, case: Case) -> None:
     """Refuses to replace scene files that are not those of the landscape.
 
     Raises:
-      SceneError: With their names.
+      InputError: With their names.
     """
     others = [
         str(folder / name)
@@ -106,7 +106,7 @@ def _refuse_other_scene(folder: Path, case: Case) -> None:
         if (folder / name).exists() and (folder / name).read_bytes() != content
     ]
     if others:
-        raise SceneError(
+        raise InputError(
             [f"--out: {', '.join(others)} would be replaced by the landscape's: choose another"]
         )
 
@@ -121,7 +121,7 @@ def _check(options: "Options", case: Case) -> None:
     problems = [problem for problem in found if problem]
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     common.check_engine(case.engine)
 
 
@@ -131,11 +131,11 @@ def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
     chosen = names or (known if len(known) == 2 else ())
     unknown = [name for name in chosen if name not in known]
     if unknown:
-        raise SceneError(
+        raise InputError(
             [f"--parameters {name!r} is not a parameter; {_meant(name, known)}" for name in unknown]
         )
     if len(set(chosen)) != 2 or len(chosen) != 2:
-        raise SceneError([f"--parameters must name two of {', '.join(known)}"])
+        raise InputError([f"--parameters must name two of {', '.join(known)}"])
     return known.index(chosen[0]), known.index(chosen[1])
 
 
@@ -147,7 +147,7 @@ def _meant(name: str, known: tuple[str, ...]) -> str:
     return schema.nearest(name, known)
 
 
-def grid(case: Case, columns: tuple[int, int], points: int) -> Grid:
+def grid(case: Case, columns: tuple[int, int], points: int) -> Plane:
     """A regular grid over the ranges of two parameters, ends included.
 
     Pressures are lowered under the limit that the walls set, as of every particle.
@@ -163,7 +163,7 @@ def grid(case: Case, columns: tuple[int, int], points: int) -> Grid:
     designs = np.tile(np.asarray(case.design, np.float32), (first.size, 1))
     designs[:, columns[0]], designs[:, columns[1]] = first.ravel(), second.ravel()
     projected = jax.jit(jax.vmap(space.project))(designs)
-    return Grid(columns, (axes[0], axes[1]), np.asarray(projected))
+    return Plane(columns, (axes[0], axes[1]), np.asarray(projected))
 
 
 def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Console) -> None:
@@ -171,14 +171,14 @@ def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Conso
     size = calls.equal(len(designs), calls.most_designs(trials))
     grasps = len(designs) * trials.count
     console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
-    console.print(estimate.text([estimate.Part("", calls.work(trials, size), grasps)]))
+    console.print(estimate.text([estimate.TimedPart("", calls.work(trials, size), grasps)]))
 
 
 def _trials(case: Case, options: "Options") -> Trials:
     return Trials(case.scene, case.engine, case.space, options.trials, options.seed)
 
 
-def _simulate(
+def simulated_designs(
     case: Case, designs: np.ndarray, options: "Options", console: Console, part: Path
 ) -> Outcome:
     """Simulates all designs in the same trials, some at a time; outcomes (design, trial).
@@ -202,7 +202,7 @@ def _simulate(
     return found
 
 
-def summarize(case: Case, made: Grid, found: Outcome, seed: int) -> Landscape:
+def summarize(case: Case, made: Plane, found: Outcome, seed: int) -> Landscape:
     """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
     space, shape = case.space, tuple(len(axis) for axis in made.axes)
     counted = ~failed(found.status)
@@ -222,7 +222,8 @@ def summarize(case: Case, made: Grid, found: Outcome, seed: int) -> Landscape:
     )
 
 
-def _report(case: Case, found: Landscape, console: Console) -> None:
+def print_summary(case: Case, found: Landscape, console: Console) -> None:
+    """Prints the number of good designs, the best one, and failed trials."""
     i, j = np.unravel_index(int(found.cost.argmin()), found.cost.shape)
     good = int((found.cost < codesign.SUCCESS_COST).sum())
     place = " ".join(
@@ -241,7 +242,8 @@ def _report(case: Case, found: Landscape, console: Console) -> None:
         console.print(f"{bad} of {found.cost.size * int(found.trials)} trials failed")
 
 
-def _write(case: Case, found: Landscape, folder: Path, console: Console) -> None:
+def write_files(case: Case, found: Landscape, folder: Path, console: Console) -> None:
+    """Writes the arrays, the figure, and the scene where no run has written it."""
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / PROVENANCE).exists():  # a run has its scene already
         write_scene(case.scene, folder)

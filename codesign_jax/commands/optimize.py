@@ -15,7 +15,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, files, runs
 from codesign_jax.commands import asked, common, estimate, hosts, jobs, reference, seeds, status
-from codesign_jax.commands.estimate import Part
+from codesign_jax.commands.estimate import TimedPart
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, rates
@@ -23,7 +23,7 @@ from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Optimize
@@ -33,7 +33,7 @@ def main(options: "Optimize") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input; nothing was created then.
+      InputError: If something is wrong with the input; nothing was created then.
     """
     common.use_compilation_cache()
     if options.distributed is not None:
@@ -49,7 +49,7 @@ def main(options: "Optimize") -> int:
         runs.check_folder(folder, scene, own, fresh=options.fresh, sources=sources)
     if asked.several(options):
         seeds.check_table(asked.table_folder(options))
-    notes = [*_preflight(scene, settings, options.dry_run), *common.mesh_notes(scene)]
+    notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
         _dry_run(plan, len(every), options)
@@ -96,7 +96,7 @@ def _distributed(options: "Optimize") -> int:
     if options.dry_run:
         problems.append("--dry-run knows one host: leave out --distributed to have its estimate")
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     code, here = hosts.run(options)
     if here.index or code == 2 or code >= 128:
         return code
@@ -173,13 +173,13 @@ def _jobs(options: "Optimize", scene: Scene, every: dict[Path, Settings]) -> int
     return int(any(result is None for result in results.values()))
 
 
-def _preflight(scene: Scene, settings: Settings, details: bool) -> list[str]:
+def _preflight(scene: Scene, settings: Settings) -> list[str]:
     """Checks the ends of the design space, as every particle lies between them.
 
     Only the ends themselves are refused or warned about: what a particle is later, its status says.
 
     Raises:
-      SceneError: If an end must not be simulated.
+      InputError: If an end must not be simulated.
     """
     space = design_space(scene.hand, settings.preset)
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}
@@ -187,7 +187,7 @@ def _preflight(scene: Scene, settings: Settings, details: bool) -> list[str]:
     projected = np.asarray(jax.vmap(space.project)(stacked))
     names = [f"design of the space's {n}" for n in ends]
     designs = dict(zip(names, projected, strict=True))
-    return common.preflight_notes(scene, space, designs, details=details)
+    return common.preflight_warnings(scene, space, designs)
 
 
 def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
@@ -215,7 +215,7 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     together = 1 if options.jobs else count
     work = rates.work(scene, settings, runs=together, devices=options.devices)
-    parts = [Part("", work, count * (settings.grasps + seed))]
+    parts = [TimedPart("", work, count * (settings.grasps + seed))]
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
         parts.append(reference.part(scene, settings, trials, count))

@@ -1,4 +1,4 @@
-"""Limits of step, stiffness, pressure and reach, checked before anything is simulated.
+"""Limits of stiffness, pressure and reach, checked before anything is simulated.
 
 The scene's own checks look at one number at a time; these look at what a design makes of them.
 """
@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from codesign_jax.commands import clearance
-from codesign_jax.model import morphology
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -19,104 +18,30 @@ SINK = 1e-3
 """Depth at rest [m] above which a contact is called soft: the paper's objects are 60 mm wide."""
 
 
-class Limits(NamedTuple):
-    """Numbers of one finger of one design.
-
-    Attributes:
-      slowest: Lowest natural frequency in bending [Hz].
-      fastest: Highest natural frequency of the chain in any direction [Hz].
-      undamped_step: Largest stable step of explicit springs without damping [s].
-      damped_step: The same with the material's damping, itself implicit [s]. Both for information,
-        as springs and damping are implicit in every engine.
-    """
-
-    slowest: float
-    fastest: float
-    undamped_step: float
-    damped_step: float
-
-
-class Report(NamedTuple):
+class Findings(NamedTuple):
     """What was found; each entry names the design, the value, its limit and the reason.
 
     Attributes:
       refusals: What must not be simulated.
       warnings: What may be, but may not mean what it seems to.
-      notes: For information.
     """
 
     refusals: list[str]
     warnings: list[str]
-    notes: list[str]
 
 
-def finger_limits(scene: Scene, params: Params, finger: int) -> Limits:
-    """Natural frequencies of a straight finger on a fixed palm, by its chain's mass matrix.
-
-    A mode of frequency omega and Kelvin-Voigt damping beta is stable with explicit springs if
-    h^2 k < 4 m + 2 h c, that is h < beta + sqrt(beta^2 + 4 / omega^2).
-
-    Args:
-      scene: The scene.
-      params: One design, NumPy arrays.
-      finger: Which finger.
-    """
-    beam = morphology.finger_beams(scene.hand, params)
-    n, length = scene.discretization.links, float(params.length[finger])
-    segment = length / n
-    density = float(beam.line_density[finger])
-    # Joints at the segments' midpoints; the last link is a half segment, the others whole ones.
-    joint = (np.arange(n) + 0.5) * segment
-    end = np.append(joint[1:], length)
-    mass, centre = density * (end - joint), 0.5 * (joint + end)
-    arm = np.maximum(centre[:, None] - joint[None], 0.0)
-    swing = arm.T @ (mass[:, None] * arm)
-    # Links are solid blocks whose centres lie half the height above the layer that carries joints.
-    height, width = float(params.height[finger]), scene.hand.section.width
-    along, up = (end - joint) ** 2 / 12, height**2 / 12
-    bend = swing + _blocks(mass * (along + up + height**2 / 4))
-    side = swing + _blocks(mass * (along + width**2 / 12))
-    twist = _blocks(mass * (up + width**2 / 12 + height**2 / 4))
-    squares = [float(beam.bending[finger]) / segment / _ends(bend)]
-    if scene.effects.lateral_bending:
-        squares.append(float(beam.lateral[finger]) / segment / _ends(side))
-    if scene.effects.twist:
-        squares.append(float(beam.torsion[finger]) / segment / _ends(twist))
-    omega = np.sqrt(np.array(squares))
-    beta, top = scene.hand.material.damping_time, omega.max()
-    step = beta + np.sqrt(beta**2 + 4 / top**2)
-    slowest, fastest = omega[0].min() / (2 * np.pi), top / (2 * np.pi)
-    return Limits(float(slowest), float(fastest), float(2 / top), float(step))
-
-
-def _blocks(inertia: np.ndarray) -> np.ndarray:
-    """Mass matrix of joints that each turn all links behind them with these inertias."""
-    behind = np.cumsum(inertia[::-1])[::-1]
-    index = np.arange(len(inertia))
-    return behind[np.maximum(index[:, None], index[None])]
-
-
-def _ends(matrix: np.ndarray) -> np.ndarray:
-    """Largest and smallest eigenvalue: the lowest and the highest frequency."""
-    values = np.linalg.eigvalsh(matrix)
-    return np.array([values[-1], values[0]])
-
-
-def check(
-    scene: Scene, designs: Params, names: list[str] | None = None, *, details: bool = True
-) -> Report:
+def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Findings:
     """Checks designs against the scene's limits; costs milliseconds and simulates nothing.
 
     Args:
       scene: The scene.
       designs: Parameters with leading axis (design,).
       names: What to call the designs; by default "design 0" and so on.
-      details: Whether the report has notes.
     """
     designs = Params(*(np.asarray(v, float) for v in designs))
     count = designs.length.shape[0]
     names = names or [f"design {i}" for i in range(count)]
-    report = Report([], _scene_warnings(scene), [])
+    report = Findings([], _scene_warnings(scene))
     sound = []
     for i, name in enumerate(names):
         one = Params(*(v[i] for v in designs))
@@ -131,8 +56,6 @@ def check(
         report.refusals.extend(
             _overlaps(scene, kept, [n for n, s in zip(names, sound, strict=True) if s])
         )
-        if details:
-            report.notes.append(_step_note(scene, kept))
     return report
 
 
@@ -236,21 +159,3 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
                 "further down, or set effects.finger_palm = false"
             )
     return found
-
-
-def _step_note(scene: Scene, designs: Params) -> str:
-    """Frequencies and what an explicit integrator would need, over all fingers of all designs."""
-    limits = [
-        finger_limits(scene, Params(*(v[i] for v in designs)), f)
-        for i in range(designs.length.shape[0])
-        for f in range(scene.num_fingers)
-    ]
-    h, beta = scene.discretization.timestep, scene.hand.material.damping_time
-    low, high = min(v.slowest for v in limits), max(v.fastest for v in limits)
-    bare, damped = min(v.undamped_step for v in limits), min(v.damped_step for v in limits)
-    return (
-        f"fingers vibrate at {low:.2g} to {high:,.0f} Hz; their springs are implicit, so stable at "
-        f"steps of {1e3 * h:g} ms, which act as a damping time of {1e3 * (beta + h):g} ms instead "
-        f"of {1e3 * beta:g} ms (explicit springs: below {1e3 * bare:.2g} ms, damped "
-        f"{1e3 * damped:.2g} ms)"
-    )

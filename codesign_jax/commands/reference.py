@@ -15,7 +15,7 @@ from rich.console import Console
 from codesign_jax import codesign, engines, rollout
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.common import counted
-from codesign_jax.commands.estimate import Part
+from codesign_jax.commands.estimate import TimedPart
 from codesign_jax.commands.flags import Subject
 from codesign_jax.engines import make_engine
 from codesign_jax.report.verdicts import Judged
@@ -47,7 +47,7 @@ def number_of_trials(asked: int | None, settings: Settings) -> int:
     return TRIALS if settings.engine == engines.DEFAULT and settings.test_trials else 0
 
 
-def part(scene: Scene, settings: Settings, trials: int, runs: int) -> Part:
+def part(scene: Scene, settings: Settings, trials: int, runs: int) -> TimedPart:
     """What the test takes, for an estimate.
 
     Args:
@@ -58,7 +58,7 @@ def part(scene: Scene, settings: Settings, trials: int, runs: int) -> Part:
     """
     finer = with_accuracy(scene, ACCURACY)
     work = rates.batch_work(finer, settings.engine, trials, devices=1)
-    return Part(f"the test at accuracy {ACCURACY}", work, trials * runs)
+    return TimedPart(f"the test at accuracy {ACCURACY}", work, trials * runs)
 
 
 def test(folder: Path, settings: Settings, trials: int, console: Console) -> Outcome:
@@ -83,7 +83,7 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
         work = rates.batch_work(case.scene, case.engine, trials, devices=1)
         words = f"reference test, {counted(trials, 'grasp')}"
         with Busy(console, words, rates.seconds(work)):
-            found = _simulate(case, settings, trials)
+            found = simulate(case, settings, trials)
             outcomes.save(folder / FILE, found, key)
             drawn = rollout.sample_trials(case.scene, _noise(settings), trials)
             tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
@@ -143,7 +143,7 @@ def _case(folder: Path, settings: Settings, trials: int) -> tuple[Case, str]:
     return case, outcomes.key(case.scene, case.engine, case.design[None], trials, settings.seed)
 
 
-def _simulate(case: Case, settings: Settings, trials: int) -> Outcome:
+def simulate(case: Case, settings: Settings, trials: int) -> Outcome:
     """Outcomes of the design in fresh trials, shape (trial,)."""
     task = codesign.Task(case.scene, case.space, trials, make_engine(case.engine, case.scene))
     population = jnp.asarray(case.design, jnp.float32)[None]

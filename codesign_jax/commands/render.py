@@ -7,7 +7,7 @@ from rich.console import Console
 from codesign_jax.commands import common, grasp
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Render
@@ -17,7 +17,7 @@ def main(options: "Render") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input.
+      InputError: If something is wrong with the input.
     """
     common.use_compilation_cache()
     _check(options)
@@ -25,8 +25,8 @@ def main(options: "Render") -> int:
     end = asked.case.scene.end_time
     late = [t for t in options.times if not 0 <= t <= end]
     if late:
-        raise SceneError([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
-    _draw(asked, options, Console(highlight=False, soft_wrap=True))
+        raise InputError([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
+    draw(asked, options, Console(highlight=False, soft_wrap=True))
     return 0
 
 
@@ -38,11 +38,12 @@ def _check(options: "Render") -> None:
         problems.append("--times are those of a strip (.png); a .gif shows the whole grasp")
     problem = schema.range_problem("--size", options.size, "pixels", 16, 4096)
     if problems or problem:
-        raise SceneError([*problems, *([problem] if problem else [])])
+        raise InputError([*problems, *([problem] if problem else [])])
     common.check_place("--out", options.out)
 
 
-def _draw(asked: grasp.Asked, options: "Render", console: Console) -> None:
+def draw(asked: grasp.Asked, options: "Render", console: Console) -> None:
+    """Simulates the grasp and draws it."""
     with Busy(console, "simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import animation

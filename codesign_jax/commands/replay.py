@@ -8,7 +8,7 @@ from rich.console import Console
 
 from codesign_jax.commands import common, failure, grasp
 from codesign_jax.runs.progress import Busy
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Replay
@@ -18,17 +18,17 @@ def main(options: "Replay") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input.
+      InputError: If something is wrong with the input.
     """
     common.use_compilation_cache()
     if options.path is not None:
         if options.run_folder is not None:
-            raise SceneError([f"{options.path} and --run {options.run_folder}: give one of them"])
+            raise InputError([f"{options.path} and --run {options.run_folder}: give one of them"])
         if not options.path.is_dir():
             return failure.main(options.path, options.engine)
         options.run_folder = options.path
     if options.out is not None and options.out.suffix != ".html":
-        raise SceneError([f"--out {options.out} must end in .html"])
+        raise InputError([f"--out {options.out} must end in .html"])
     path = options.out or _default(options.run_folder)
     common.check_place("--out", path)
     asked = grasp.find(options)
@@ -36,7 +36,7 @@ def main(options: "Replay") -> int:
     places = options.episode, options.particle, options.trial, options.object
     if options.run_folder is not None and places == (None,) * 4:
         failure.show_list(options.run_folder)
-    _write(asked, path, console)
+    write_page(asked, path, console)
     console.print(f"replay: {path} (for any browser, offline)", markup=False)
     if options.open:
         webbrowser.open(path.resolve().as_uri())
@@ -48,7 +48,8 @@ def _default(folder: Path | None) -> Path:
     return Path("replay.html") if folder is None else folder / "replay.html"
 
 
-def _write(asked: grasp.Asked, path: Path, console: Console) -> Path:
+def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
+    """Simulates the grasp and writes its page."""
     with Busy(console, "simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import viewer

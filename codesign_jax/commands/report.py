@@ -15,7 +15,7 @@ from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.record import Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Report
@@ -26,7 +26,7 @@ def main(options: "Report") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If the folder is no run, has no finished episode, or an extra is missing.
+      InputError: If the folder is no run, has no finished episode, or an extra is missing.
     """
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
@@ -37,7 +37,7 @@ def main(options: "Report") -> int:
         from codesign_jax.report.of_run import Run
     except ImportError as error:
         message = f"a report needs {error.name}: pip install '.[report]' in the checkout"
-        raise SceneError([message]) from error
+        raise InputError([message]) from error
     path = options.out or options.folder / "report.html"
     common.check_place("--out", path)
     notes: list[str] = []
@@ -53,7 +53,7 @@ def main(options: "Report") -> int:
     console = Console(highlight=False, soft_wrap=True)
     if why:
         console.print(f"{options.folder / reference.FILE} {why}: left out", markup=False)
-    shown = None if options.no_replay else _best_grasp(scene, settings, record, name, console)
+    shown = None if options.no_replay else best_grasp(scene, settings, record, name, console)
     with Busy(console, "writing the report"):
         page.write(run, shown, path)
     size = path.stat().st_size / 1e6
@@ -61,7 +61,7 @@ def main(options: "Report") -> int:
     return 0
 
 
-def _best_grasp(
+def best_grasp(
     scene: Scene, settings: Settings, record: Record, engine: str, console: Console
 ) -> "tuple[choice.Grasp, animation.Replay]":
     """The best grasp of the chosen design, simulated again to see how it moves."""

@@ -20,7 +20,7 @@ from codesign_jax.runs.dataset import Question, Shards
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def main(options: "Sample") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If something is wrong with the input; nothing was created then.
+      InputError: If something is wrong with the input; nothing was created then.
     """
     common.use_compilation_cache()
     _check(options)
@@ -49,7 +49,7 @@ def main(options: "Sample") -> int:
     dataset.refuse_other(options.out, question)
     design = question.space.default()
     designs = {"the default design": design}
-    notes = common.preflight_notes(scene, question.space, designs, details=options.dry_run)
+    notes = common.preflight_warnings(scene, question.space, designs)
     for note in [*notes, *common.mesh_notes(scene)]:
         console.print(note, markup=False)
     count = question.shards(options.designs)
@@ -85,7 +85,7 @@ def _check(options: "Sample") -> None:
         problems.append(f"--out {options.out} must end in .parquet")
     problems += common.solver_problems([*chain.from_iterable(options.overrides)], options.engine)
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     common.check_engine(options.engine)
     if not options.outcomes:
         parquet.library("codesign sample")
@@ -96,7 +96,7 @@ def _question(options: "Sample", scene: Scene) -> Question:
     """What is asked; without --chunk calls are as large as those that made what is there.
 
     Raises:
-      SceneError: If the hand has no such preset.
+      InputError: If the hand has no such preset.
     """
     design_space(scene.hand, options.preset)
     done = dataset.finished(options.out)
@@ -124,7 +124,7 @@ def _finished(options: "Sample", question: Question) -> bool:
     """Whether the file is there and has what is asked.
 
     Raises:
-      SceneError: If it has something else.
+      InputError: If it has something else.
     """
     done = dataset.finished(options.out)
     if done is None:
@@ -134,7 +134,7 @@ def _finished(options: "Sample", question: Question) -> bool:
         others.insert(0, f"designs {done[1]}, asked for are {options.designs}")
     if others:
         head = f"--out {options.out} has other grasps; choose another file, or delete it"
-        raise SceneError([head, *others])
+        raise InputError([head, *others])
     return True
 
 
@@ -142,7 +142,7 @@ def _dry_run(options: "Sample", question: Question, console: Console) -> None:
     work = rates.batch_work(
         question.scene, options.engine, question.chunk * options.trials, devices=1
     )
-    console.print(estimate.text([estimate.Part("", work, _grasps(options))]), markup=False)
+    console.print(estimate.text([estimate.TimedPart("", work, _grasps(options))]), markup=False)
     size = dataset.most_bytes(question, options.designs)
     console.print(f"size: at most about {size / 1e6:.1f} MB")
 

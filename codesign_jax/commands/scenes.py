@@ -8,7 +8,7 @@ from rich.table import Column, Table
 
 from codesign_jax import scene as scenes
 from codesign_jax.scene import effects, library, schema
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Scenes
@@ -18,11 +18,11 @@ def main(options: "Scenes") -> int:
     """Runs the command and returns the exit status.
 
     Raises:
-      SceneError: If a scene or the engine is unknown, or a scene has problems.
+      InputError: If a scene or the engine is unknown, or a scene has problems.
     """
     if options.engine is not None and options.engine not in effects.ENGINES:
         hint = schema.nearest(options.engine, effects.ENGINES)
-        raise SceneError([f"--engine {options.engine!r} is not valid; {hint}"])
+        raise InputError([f"--engine {options.engine!r} is not valid; {hint}"])
     engines = effects.ENGINES if options.engine is None else (options.engine,)
     names = library.available("scenes") if options.name is None else [options.name]
     console = Console(highlight=False)

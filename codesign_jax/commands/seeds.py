@@ -17,7 +17,7 @@ from codesign_jax.report import statistics, verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
@@ -55,16 +55,16 @@ def parse(text: str) -> list[int]:
     """Reads seeds such as "0-9" or "1,3,5-7", in ascending order.
 
     Raises:
-      SceneError: If the text is none, or names too many.
+      InputError: If the text is none, or names too many.
     """
     found: set[int] = set()
     for part in text.split(","):
         match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
         if last < first or last >= 2**31:
-            raise SceneError([f"--seeds {text!r} must be seeds such as 0-9 or 1,3,5"])
+            raise InputError([f"--seeds {text!r} must be seeds such as 0-9 or 1,3,5"])
         if last - first >= MOST or len(found) > MOST:
-            raise SceneError([f"--seeds {text!r} names more than {MOST} runs"])
+            raise InputError([f"--seeds {text!r} names more than {MOST} runs"])
         found |= set(range(first, last + 1))
     return sorted(found)
 
@@ -150,7 +150,7 @@ def check_table(folder: Path) -> None:
       folder: Folder of the table.
 
     Raises:
-      SceneError: If there is one.
+      InputError: If there is one.
     """
     path = folder / columns.SEEDS
     if not path.exists():
@@ -158,7 +158,7 @@ def check_table(folder: Path) -> None:
     with path.open("rb") as file:
         head = file.readline(1000)
     if not (head.startswith(b"seed,") and b",best_test_cost," in head):
-        raise SceneError(
+        raise InputError(
             [f"{path} is no table of runs, and would be replaced: choose another --out"]
         )
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from codesign_jax.runs import checkpoint
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 QUEUE_SECONDS = 10.0
 """Time between two calls of `squeue`, which the cluster's controller has to answer."""
@@ -34,7 +34,7 @@ NORMAL = {"None", "Priority", "Resources", "JobArrayTaskLimit", "BeginTime"}
 """Reasons for which jobs wait in any queue."""
 
 
-class State(NamedTuple):
+class JobState(NamedTuple):
     """State of a job in SLURM's words, and why it waits or ended."""
 
     name: str
@@ -50,11 +50,11 @@ def parameters(given: Mapping[str, Any]) -> dict[str, Any]:
         takes (`slurm_additional_parameters`) is such as "reservation=course,hint=compute_bound".
 
     Raises:
-      SceneError: If a run would be more than one process.
+      InputError: If a run would be more than one process.
     """
     many = [k for k in given if k.removeprefix("slurm_") in ("nodes", "tasks_per_node")]
     if any(given[name] != 1 for name in many):
-        raise SceneError([f"--job-set {many[0]}: a run is one process on one node"])
+        raise InputError([f"--job-set {many[0]}: a run is one process on one node"])
     found = dict(given)
     for name in {"slurm_setup", "slurm_teardown"} & {*given}:
         found[name] = [str(given[name])]
@@ -71,7 +71,7 @@ def parameters(given: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-class Array:
+class JobArray:
     """Jobs of one array."""
 
     def __init__(self, made: Any, console: Console):
@@ -81,14 +81,14 @@ class Array:
         self._made, self._console = made, console
         self._jobs: dict[Path, Any] = {}
         self._asked, self._said = float("-inf"), ""
-        self._states: dict[str, State] = {}
+        self._states: dict[str, JobState] = {}
         self._ended: dict[Path, float] = {}
 
     def start(self, calls: Mapping[Path, tuple[Any, ...]]) -> None:
         """Queues a call for each run folder.
 
         Raises:
-          SceneError: With SLURM's words, if it does not take them.
+          InputError: With SLURM's words, if it does not take them.
         """
         try:
             with self._made.batch():  # SLURM keeps an array within its number at a time
@@ -97,7 +97,7 @@ class Array:
             words = str(error).strip().splitlines()[-1:] or ["without a word"]
             problem = f"SLURM does not take the jobs: {words[0].removeprefix('sbatch: error: ')}"
             advice = "to use this machine instead: --job-set cluster=local"
-            raise SceneError([problem, advice]) from error
+            raise InputError([problem, advice]) from error
         array = next(iter(self._jobs.values())).job_id.split("_")[0]
         self._console.print(f"SLURM job {array}; to look at it: squeue --jobs {array}")
 
@@ -145,12 +145,12 @@ class Array:
         since = self._ended.get(folder)
         if since is None or time.monotonic() - since < RESULT_SECONDS:
             return ""
-        state = self._states.get(job_id, State("unknown: it has left the queue"))
+        state = self._states.get(job_id, JobState("unknown: it has left the queue"))
         # A job that was cancelled as it waited still has the reason for that.
         return state.name if state.reason in NORMAL else f"{state.name} ({state.reason})"
 
 
-def states(job_ids: Iterable[str]) -> dict[str, State] | None:
+def states(job_ids: Iterable[str]) -> dict[str, JobState] | None:
     """States of jobs by their id; those that SLURM has forgotten are missing.
 
     Args:
@@ -171,11 +171,11 @@ def states(job_ids: Iterable[str]) -> dict[str, State] | None:
     if asked.returncode:
         return {} if "Invalid job id" in asked.stderr else None
     lines = (line.strip().split("|") for line in asked.stdout.splitlines())
-    found = {parts[0]: State(*parts[1:]) for parts in lines if len(parts) == 3}
+    found = {parts[0]: JobState(*parts[1:]) for parts in lines if len(parts) == 3}
     return {job_id: found[job_id] for job_id in ids if job_id in found}
 
 
-def summary(found: Iterable[State]) -> str:
+def summary(found: Iterable[JobState]) -> str:
     """How many jobs run and wait, and why, if it is not for their turn."""
     counts: dict[str, int] = {}
     reasons = set()

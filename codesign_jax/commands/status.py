@@ -45,9 +45,9 @@ def of(run: Callable[[], int]) -> int:
         with _no_interrupt_lost():
             return run()
     except ValueError as error:
-        from codesign_jax.scene.schema import SceneError
+        from codesign_jax.scene.schema import InputError
 
-        if not isinstance(error, SceneError):
+        if not isinstance(error, InputError):
             raise
         for problem in error.problems:
             print(f"error: {problem}", file=sys.stderr)

@@ -20,7 +20,7 @@ import jax
 from codesign_jax.compiler import cache, ffi, host, nvptx, thread
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.compiler.handler import Handler
-from codesign_jax.compiler.layout import Layout
+from codesign_jax.compiler.layout import ONCHIP, Layout
 
 ENTRY = "kernel"
 """Name of the device code's entry point."""
@@ -182,16 +182,17 @@ def handler_code(name: str, layout: Layout) -> str:
     """The handler of a kernel, with a table of the kernel's handle and the driver's functions."""
     h = Handler(name, layout)
     h.globals.append(f"@{name}_table = global [{1 + len(CALLS)} x ptr] zeroinitializer\n")
-    c, blocks, count = h.code, h.blocks, len(layout.arrays)
+    c, blocks = h.code, h.blocks
+    places = [k for k, array in enumerate(layout.arrays) if array.role != ONCHIP]
     with c.when(c.let(f"icmp eq i64 {blocks}, 0")):
         c.end("ret ptr null")
     with c.when(c.let(f"icmp sgt i64 {blocks}, {2**31 - 1}")):
         h.fail(ffi.INVALID_ARGUMENT, h.message(f"kernel {name}: more blocks than a grid has"))
     stream = _stream(h)
-    addresses, params = c.local("ptr", count), c.local("ptr", count)
-    for k in range(count):
+    addresses, params = c.local("ptr", len(places)), c.local("ptr", len(places))
+    for k, array in enumerate(places):
         place = c.byte(addresses, 8 * k)
-        c.do(f"store ptr {h.data[k]}, ptr {place}")
+        c.do(f"store ptr {h.data[array]}, ptr {place}")
         c.do(f"store ptr {place}, ptr {c.byte(params, 8 * k)}")
     context = c.local("ptr")
     got = _call(h, "cuStreamGetCtx", f"ptr {stream}, ptr {context}")

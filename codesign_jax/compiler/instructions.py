@@ -20,6 +20,7 @@ class Instructions:
       lanes: Number of lanes of a block.
       lines: The instructions written so far.
       declared: Declarations of the functions that they call.
+      exchanged: Names of values that other lanes have computed.
     """
 
     def __init__(self, lanes: int):
@@ -29,6 +30,7 @@ class Instructions:
         self.declared: set[str] = set()
         self.count, self.here = 0, "entry"
         self.scalar_of: dict[str, Value] = {}  # splatted scalars, by vector
+        self.exchanged: set[str | None] = set()
 
     # What vectors and threads do differently
 

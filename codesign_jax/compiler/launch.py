@@ -14,7 +14,7 @@ import numpy as np
 from codesign_jax import memory_maps, sources
 from codesign_jax.compiler import ffi
 from codesign_jax.compiler.ffi import KernelUnavailable
-from codesign_jax.compiler.layout import INPUT, OUTPUT, SCRATCH, Array, Layout
+from codesign_jax.compiler.layout import INPUT, ONCHIP, OUTPUT, SCRATCH, Array, Layout
 
 OLDEST_LLVMLITE = (0, 45)
 OLDEST_GPU = (8, 0)
@@ -33,6 +33,9 @@ class Kernel(NamedTuple):
       shared: Places of inputs of one block that all blocks read; their leading axis is 1.
       scratch: Places among the outputs of scratch memory. Scratch does not outlive a block, so one
         buffer a thread suffices on a CPU; on a GPU every block has its own.
+      onchip: Places of further scratch memory that a GPU has in shared memory, if it is small
+        enough.
+      exchanged: Places of outputs where lanes read what other lanes write, see `Array`.
       level: LLVM's level of optimisation on a CPU, 1 or 2.
     """
 
@@ -41,16 +44,25 @@ class Kernel(NamedTuple):
     lanes: int
     shared: tuple[int, ...] = ()
     scratch: tuple[int, ...] = ()
+    onchip: tuple[int, ...] = ()
+    exchanged: tuple[int, ...] = ()
     level: int = 2
 
 
+SHARED_BYTES = 27_648
+"""Shared memory of a block of which eight, all that registers allow, share 228 kB (sm_90)."""
+
+
+@functools.cache
 def available(platform: str) -> str | None:
     """Why kernels cannot run on a platform, or None if they can.
 
     Args:
       platform: As `jax.default_backend` names it; "gpu" is only NVIDIA's.
     """
-    return _available(platform)
+    if platform not in ("cpu", "gpu"):
+        return f"kernels are compiled for CPUs and NVIDIA GPUs, not for {platform!r}"
+    return _llvmlite() or ffi.unsupported() or (_gpu() if platform == "gpu" else None)
 
 
 WARPS_EACH = 4
@@ -78,13 +90,13 @@ def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
         return host.vector_bytes() // np.dtype(dtype).itemsize
     lanes = 32
     if total is not None:
-        while lanes > FEWEST_LANES and 2 * total <= lanes * WARPS_EACH * _multiprocessors():
+        while lanes > FEWEST_LANES and 2 * total <= lanes * WARPS_EACH * multiprocessors():
             lanes //= 2
     return lanes
 
 
 @functools.cache
-def _multiprocessors() -> int:
+def multiprocessors() -> int:
     """Multiprocessors of this computer's first GPU; those of an A100 if it cannot be asked."""
     try:
         return int(getattr(jax.local_devices(backend="gpu")[0], "core_count", 108))
@@ -139,7 +151,7 @@ def launch(
     shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]
     results: list[jax.Array | None] = [None] * len(outputs)
     for k, result in zip(made, jax.ffi.ffi_call(name, shapes)(*inputs), strict=True):
-        results[k] = None if k in kernel.scratch else result
+        results[k] = None if k in (*kernel.scratch, *kernel.onchip) else result
     return results
 
 
@@ -169,14 +181,19 @@ def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:
     blocks = outputs[0].shape[0]
     for k, x in enumerate((*inputs, *outputs)):
         place = k - len(inputs)
-        role = INPUT if place < 0 else scratch if place in kernel.scratch else OUTPUT
+        unread = place in (*kernel.scratch, *kernel.onchip)
+        role = INPUT if place < 0 else scratch if unread else OUTPUT
+        size = np.prod(x.shape[1:]) * np.dtype(x.dtype).itemsize
+        if place in kernel.onchip and kernel.backend == "gpu" and size <= SHARED_BYTES:
+            role = ONCHIP
         shared = k in kernel.shared
         if x.shape[0] != (1 if shared else blocks):
             what = "is shared and must have one block" if shared else f"must have {blocks} blocks"
             raise ValueError(f"array {k} of shape {x.shape} {what}")
         if shared and role != INPUT:
             raise ValueError(f"array {k} is an output; only inputs can be shared")
-        arrays.append(Array(tuple(x.shape[1:]), np.dtype(x.dtype).name, role, shared))
+        name, exchanged = np.dtype(x.dtype).name, place in kernel.exchanged
+        arrays.append(Array(tuple(x.shape[1:]), name, role, shared, exchanged))
     return Layout(tuple(arrays), kernel.lanes)
 
 
@@ -198,13 +215,6 @@ def _varying(inputs: tuple) -> dict[str, Any]:
         "sharding": jax.sharding.NamedSharding(mesh, whole),
         "manual_axis_type": jax.sharding.ManualAxisType(varying=every),
     }
-
-
-@functools.cache
-def _available(platform: str) -> str | None:
-    if platform not in ("cpu", "gpu"):
-        return f"kernels are compiled for CPUs and NVIDIA GPUs, not for {platform!r}"
-    return _llvmlite() or ffi.unsupported() or (_gpu() if platform == "gpu" else None)
 
 
 def _llvmlite() -> str | None:

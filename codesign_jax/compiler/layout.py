@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-INPUT, OUTPUT, SCRATCH = "input", "output", "scratch"
+INPUT, OUTPUT, SCRATCH, ONCHIP = "input", "output", "scratch", "onchip"
 
 
 class Array(NamedTuple):
@@ -13,14 +13,17 @@ class Array(NamedTuple):
     Attributes:
       shape: Shape of the block that the kernel sees; the array has one axis more, in front.
       dtype: Name of its type, such as "float32".
-      role: `INPUT`; `OUTPUT`; or `SCRATCH`, memory of a block that nobody reads afterwards.
+      role: `INPUT`; `OUTPUT`; `SCRATCH`, memory of a block that nobody reads afterwards; or
+        `ONCHIP`, the same in a GPU's shared memory.
       shared: Whether all blocks read the same block (an input's leading axis is 1).
+      exchanged: Whether lanes read there what other lanes write, at places that differ.
     """
 
     shape: tuple[int, ...]
     dtype: str
     role: str = INPUT
     shared: bool = False
+    exchanged: bool = False
 
     @property
     def bytes(self) -> int:

@@ -47,7 +47,10 @@ def _folded(name: str, kind: str, *args: Value) -> Value | None:
 def _arithmetic(name: str) -> Rule:
     def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
         if is_float(a.kind):
-            return w.compute(f"f{name} contract", a, b)
+            # A product of one lane fused with another lane's rounded one would differ between the
+            # two: what lanes add up after an exchange must have the same bits on all of them.
+            fused = "" if name != "mul" and {a.text, b.text} & w.exchanged else " contract"
+            return w.compute(f"f{name}{fused}", a, b)
         known = _folded(name, a.kind, a, b) or _offset(name, a, b)
         return w.grown(name, a, b, known or w.compute(name, a, b))
 
@@ -184,7 +187,10 @@ def _power(w: "Writer", equation: Any, x: Value) -> Value:
 
 def _select_n(w: "Writer", equation: Any, which: Value, *cases: Value) -> Value:
     if which.kind == "b":
-        return w.select(which, cases[1], cases[0])
+        chosen = w.select(which, cases[1], cases[0])
+        if {case.text for case in cases} & w.exchanged:
+            w.exchanged.add(chosen.text)
+        return chosen
     result = cases[-1]
     for k in reversed(range(len(cases) - 1)):
         chosen = RULES["eq"](w, None, which, w.like(which, k))
@@ -218,7 +224,9 @@ def _reverse(w: "Writer", equation: Any, x: Value) -> Value:
     if x.is_known:
         known = np.broadcast_to(np.asarray(x.known), (w.lanes,))[source]
         return x._replace(known=known if np.ndim(x.known) else x.known)
-    return w.swap_lanes(w.splat(x), source)
+    swapped = w.swap_lanes(w.splat(x), source)
+    w.exchanged.add(swapped.text)
+    return swapped
 
 
 def _over_lanes(name: str) -> Rule:
@@ -271,6 +279,7 @@ RULES: dict[str, Rule] = {
     "select_n": _select_n,
     "convert_element_type": _convert,
     "iota": lambda w, e: w.lane_index(),
+    "population_count": lambda w, e, x: w.intrinsic("ctpop", x),
     "rev": _reverse,
     "reduce_max": _over_lanes("max"),
     "reduce_min": _over_lanes("min"),

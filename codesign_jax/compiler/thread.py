@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax.compiler.layout import Layout
+from codesign_jax.compiler.layout import ONCHIP, Layout
 from codesign_jax.compiler.prefetch import Ahead, adjacent, rounds_ahead
 from codesign_jax.compiler.values import LLVM_TYPES, SIZES, Ref, Value, kind_of
 from codesign_jax.compiler.writer import Writer
@@ -31,6 +31,8 @@ class ThreadWriter(Writer):
         # The loops around: line at which a body begins, rounds, and its reads by address.
         self.ahead: list[tuple[int, int, dict[str, Ahead]]] = []
         self.meeting = False  # between the loads of a group, before which the threads have met
+        # Where lanes exchange through memory, whether they have since they last met.
+        self.stored = self.loaded = False
         self.spans: set[int] = set()  # numbers of rows that are asked for at once
 
     def type(self, kind: str, wide: bool) -> str:
@@ -132,7 +134,12 @@ class ThreadWriter(Writer):
         foreign = self._is_foreign(ref, indices)
         if foreign and not self.meeting:
             self._meet()
-        text = self.emit(f"load {kind}, ptr addrspace(1) {place}, align {SIZES[ref.kind]}")
+        if ref.exchanged:
+            if self.stored:
+                self._meet()
+            self.loaded = True
+        space = f"ptr addrspace({ref.space})"
+        text = self.emit(f"load {kind}, {space} {place}, align {SIZES[ref.kind]}")
         if foreign:
             self.meeting = not self.last_of_group
             if self.last_of_group:
@@ -144,8 +151,12 @@ class ThreadWriter(Writer):
     def store(self, ref: Ref, indices: list[Value], value: Value) -> None:
         """See `Writer`."""
         _, _, place = self._address(ref, indices)
-        align = SIZES[ref.kind]
-        self.lines.append(f"store {self.typed(value)}, ptr addrspace(1) {place}, align {align}")
+        if ref.exchanged:
+            if self.loaded:
+                self._meet()
+            self.stored = True
+        space = f"ptr addrspace({ref.space})"
+        self.lines.append(f"store {self.typed(value)}, {space} {place}, align {SIZES[ref.kind]}")
 
     def _address(self, ref: Ref, indices: list[Value]) -> tuple[str, int, str]:
         """An element's address: a base, the offset from it in bytes, and both together."""
@@ -154,23 +165,26 @@ class ThreadWriter(Writer):
         for index, stride in zip(indices, strides, strict=True):
             offset += int(stride) * int(index.known)
             if not index.is_known:
-                base = self._step(base, index, int(stride))
+                base = self._step(base, index, int(stride), ref.space)
         if not offset:
             return base, 0, base
-        place = self.emit(f"getelementptr inbounds i8, ptr addrspace(1) {base}, i64 {offset}")
+        space = f"ptr addrspace({ref.space})"
+        place = self.emit(f"getelementptr inbounds i8, {space} {base}, i64 {offset}")
         return base, offset, place
 
-    def _step(self, base: str, index: Value, stride: int) -> str:
+    def _step(self, base: str, index: Value, stride: int, space: int) -> str:
         """Address `index` times `stride` bytes behind another one."""
-        return self._once((base, index.text, stride), lambda: self._behind(base, index, stride))
+        key = (base, index.text, stride)
+        return self._once(key, lambda: self._behind(base, index, stride, space))
 
-    def _behind(self, base: str, index: Value, stride: int) -> str:
+    def _behind(self, base: str, index: Value, stride: int, space: int) -> str:
         assert index.text is not None
         wide = index.text
         if index.kind != "i64":
             wide = self.emit(f"sext i32 {index.text} to i64")
         step = self.emit(f"mul nsw i64 {wide}, {stride}")
-        place = self.emit(f"getelementptr inbounds i8, ptr addrspace(1) {base}, i64 {step}")
+        pointer = f"ptr addrspace({space}) {base}"
+        place = self.emit(f"getelementptr inbounds i8, {pointer}, i64 {step}")
         self.growth[place] = self.growth.get(base, 0) + stride * self.growth.get(index.text, 0)
         self.born[place] = len(self.lines)
         return place
@@ -196,6 +210,7 @@ class ThreadWriter(Writer):
     def start(self, label: str) -> None:
         """See `Writer`; the two branches of a conditional know nothing of each other."""
         super().start(label)
+        self.stored = self.loaded = True
         if len(self.found) > 1:
             self.found[-1] = {}
 
@@ -224,6 +239,7 @@ class ThreadWriter(Writer):
         """Warp barrier: what threads stored before it is visible to all of them after it."""
         self.declared.add("declare void @llvm.nvvm.bar.warp.sync(i32)")
         self.lines.append(f"call void @llvm.nvvm.bar.warp.sync({self.all})")
+        self.stored = self.loaded = False
 
     def _read_ahead(self, base: str, offset: int) -> None:
         """Notes a read for the innermost loop in which its address is computed."""
@@ -281,15 +297,22 @@ def write(jaxpr: Any, layout: Layout, name: str) -> str:
     if not 1 <= lanes <= LANES:
         raise NotImplementedError(f"a block of {lanes} lanes: a warp has {LANES}")
     writer = ThreadWriter(lanes)
-    refs, start = [], []
+    refs, start, params, onchip = [], [], [], []
     for k, ((shape, dtype), array) in enumerate(zip(blocks, layout.arrays, strict=True)):
         kind = kind_of(dtype)
+        if array.role == ONCHIP:
+            onchip.append(
+                f"@s{k} = internal addrspace(3) global [{array.bytes} x i8] undef, align 16"
+            )
+            refs.append(Ref(f"@s{k}", shape, kind, 3, array.exchanged))
+            continue
         size = 0 if array.shared else SIZES[kind] * int(np.prod(shape))
         start += [
             f"%o{k} = mul i64 %block, {size}",
             f"%a{k} = getelementptr inbounds i8, ptr addrspace(1) %p{k}, i64 %o{k}",
         ]
-        refs.append(Ref(f"%a{k}", shape, kind))
+        refs.append(Ref(f"%a{k}", shape, kind, exchanged=array.exchanged))
+        params.append(f"ptr addrspace(1) noalias align 16 %p{k}")
     writer.run(jaxpr, [], refs)
     for rows in sorted(writer.spans):  # from a lane in the first row to that lane's own row
         start += [
@@ -299,7 +322,6 @@ def write(jaxpr: Any, layout: Layout, name: str) -> str:
             f"%elements{rows} = sext i32 %from{rows} to i64",
             f"%span{rows} = mul i64 %elements{rows}, 4",
         ]
-    params = ", ".join(f"ptr addrspace(1) noalias align 16 %p{k}" for k in range(len(blocks)))
     head = [
         "entry:",
         f"%lane = call range(i32 0, {lanes}) i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
@@ -314,7 +336,8 @@ def write(jaxpr: Any, layout: Layout, name: str) -> str:
     body = "\n".join([*head, *start, *writer.lines, "ret void"])
     return (
         'target triple = "nvptx64-nvidia-cuda"\n'
-        f"define ptx_kernel void @{name}({params}) #0 {{\n{body}\n}}\n"
+        + "".join(f"{line}\n" for line in onchip)
+        + f"define ptx_kernel void @{name}({', '.join(params)}) #0 {{\n{body}\n}}\n"
         + "\n".join(sorted(declared))
         + f'\nattributes #0 = {{ nounwind "nvvm.maxntid"="{lanes},1,1" }}\n'
         "attributes #1 = { nounwind memory(inaccessiblemem: readwrite) }\n"

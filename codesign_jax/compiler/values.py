@@ -42,11 +42,15 @@ class Ref(NamedTuple):
       address: LLVM name of its address.
       shape: Its shape.
       kind: Kind of its elements.
+      space: LLVM's address space: on a GPU 1 is global and 3 shared memory.
+      exchanged: Whether lanes read there what other lanes write.
     """
 
     address: str
     shape: tuple[int, ...]
     kind: str
+    space: int = 1
+    exchanged: bool = False
 
 
 def kind_of(dtype: Any) -> str:

@@ -202,8 +202,10 @@ class Writer(Instructions):
         values: dict[Any, Any] = {}
 
         def read(atom: Any) -> Any:
-            literal = isinstance(atom, core.Literal)
-            return self.constant(np.asarray(atom.val, atom.aval.dtype)) if literal else values[atom]
+            if not isinstance(atom, core.Literal):
+                return values[atom]
+            dtype = atom.aval.dtype  # pyright: ignore[reportAttributeAccessIssue]  # of its subclasses
+            return self.constant(np.asarray(atom.val, dtype))
 
         numbers = [self.constant(np.asarray(c)) for c in consts]
         values.update(zip(jaxpr.constvars, numbers, strict=True))

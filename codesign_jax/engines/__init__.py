@@ -23,9 +23,9 @@ def make_engine(name: str, scene: Scene) -> Engine:
       scene: The scene.
 
     Raises:
-      SceneError: If there is no such engine, if `scene` is not a `Scene`, or if the engine does not
+      InputError: If there is no such engine, if `scene` is not a `Scene`, or if the engine does not
         do what the scene asks for: effects, meshes, or a [solver] table that the engine does not
-        read, see `solver_problems`.
+        read, see `solver_problems`, or if the engine's package is missing.
 
     >>> from codesign_jax import make_engine, scene
     >>> grasping = scene.load("paper")
@@ -33,14 +33,17 @@ def make_engine(name: str, scene: Scene) -> Engine:
     'structured'
     >>> make_engine("mojoco", grasping)
     Traceback (most recent call last):
-    codesign_jax.scene.schema.SceneError: engine 'mojoco' unknown; did you mean 'mujoco'?
+    codesign_jax.scene.schema.InputError: engine 'mojoco' unknown; did you mean 'mujoco'?
     """
     if not isinstance(scene, Scene):
         words = f"scene is {scene!r}, not a Scene; scene.load({scene!r}) reads it"
-        raise schema.SceneError([words])
+        raise schema.InputError([words])
     if name == "mjx":
-        from codesign_jax.engines.mjx import MjxEngine
-
+        try:
+            from codesign_jax.engines.mjx import MjxEngine
+        except ImportError as error:
+            words = "engine mjx needs mujoco-mjx: pip install '.[mjx]' in the checkout"
+            raise schema.InputError([words]) from error
         return MjxEngine(scene)
     if name == "mujoco":
         from codesign_jax.engines.mujoco import MujocoEngine
@@ -50,9 +53,9 @@ def make_engine(name: str, scene: Scene) -> Engine:
         from codesign_jax.engines.structured import StructuredEngine
 
         if problems := solver_problems(scene):
-            raise schema.SceneError(problems)
+            raise schema.InputError(problems)
         return StructuredEngine(scene)
-    raise schema.SceneError([f"engine {name!r} unknown; {schema.nearest(name, NAMES)}"])
+    raise schema.InputError([f"engine {name!r} unknown; {schema.nearest(name, NAMES)}"])
 
 
 _INSTEAD = {"iterations": "iterations", "ls_iterations": "evaluations", "tolerance": "decrement"}

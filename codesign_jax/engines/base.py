@@ -7,7 +7,7 @@ import jax
 
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trace
 
 
@@ -112,7 +112,7 @@ def refuse_meshes(scene: Scene, engine: str) -> None:
     differ between the worlds of a batch, as the size noise asks for.
 
     Raises:
-      SceneError: with a line for each mesh in the scene.
+      InputError: with a line for each mesh in the scene.
     """
     problems = [
         f"not supported by engine {engine}: object {shape.name!r} is a mesh; use engine structured"
@@ -120,4 +120,4 @@ def refuse_meshes(scene: Scene, engine: str) -> None:
         if shape.mesh
     ]
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)

@@ -105,7 +105,7 @@ class MujocoEngine(Equal):
             part = slice(first, min(first + chunk, steps))
             if scene.effects.neo_hookean:
                 _apply_softening(scene, batch, fields, going)
-            new, taken, states = self._advance(batch, going, ctrl[going, part], trajectory)
+            new, taken, states = self.advance(batch, going, ctrl[going, part], trajectory)
             # MuJoCo warned (a bad control, state or inertia, a full contact list) and stopped.
             stopped = batch.warning[going, :, 0].any(1) | (taken == 0)
             count = part.stop - first
@@ -135,7 +135,7 @@ class MujocoEngine(Equal):
         last[going[good]] = state[good]
         return Trace(*series, last)
 
-    def _advance(
+    def advance(
         self, batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool
     ) -> tuple[Trace, np.ndarray, np.ndarray]:
         """Steps the given worlds through a chunk.

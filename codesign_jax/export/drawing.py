@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from codesign_jax.export.process import Size
-from codesign_jax.export.sheet import NAME, Drift, Section, places
+from codesign_jax.export.sheet import NAME, Drift, SheetSection, places
 from codesign_jax.export.tolerance import Side
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
@@ -23,7 +23,7 @@ def write(
     folder: Path,
     title: str,
     lines: Sequence[str],
-    content: Sequence[Section],
+    content: Sequence[SheetSection],
     *,
     scene: Scene,
     params: Params,
@@ -68,7 +68,7 @@ def _lines(text: str) -> list[str]:
     return textwrap.wrap(text, 165)
 
 
-def _table(figure: matplotlib.figure.Figure, top: float, section: Section) -> float:
+def _table(figure: matplotlib.figure.Figure, top: float, section: SheetSection) -> float:
     """Draws a section below `top` and returns where the next one begins, in figure's height."""
     figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
     top -= 0.015
@@ -96,7 +96,7 @@ def _notes(figure: matplotlib.figure.Figure, top: float, notes: Sequence[str]) -
 
 
 def _tolerance(
-    figure: matplotlib.figure.Figure, top: float, section: Section, drift: Drift
+    figure: matplotlib.figure.Figure, top: float, section: SheetSection, drift: Drift
 ) -> float:
     """A bar from the last good value on either side, a cross at the first bad one."""
     figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")

@@ -7,8 +7,8 @@ import manifold3d
 import numpy as np
 import trimesh
 
-from codesign_jax.export.casting import SEGMENTS, Parts, parts
-from codesign_jax.export.process import Process, Size, inlet
+from codesign_jax.export.casting import Parts, parts
+from codesign_jax.export.process import Process, Size
 
 FOLDER = "parts"
 FORMATS = ("stl", "3mf")
@@ -76,13 +76,6 @@ def mesh(solid: manifold3d.Manifold) -> trimesh.Trimesh:
 def read(path: Path) -> trimesh.Trimesh:
     """Reads a part back."""
     return trimesh.load_mesh(path)
-
-
-def finger_volume(size: Size, process: Process) -> float:
-    """Volume of a finger's silicone with its inlet [mm^3], by its dimensions."""
-    radius = inlet(size, process) / 2
-    hole = SEGMENTS / 2 * radius**2 * np.sin(2 * np.pi / SEGMENTS) * size.end
-    return size.volume - float(hole)
 
 
 def _save(path: Path, solid: manifold3d.Manifold) -> trimesh.Trimesh:

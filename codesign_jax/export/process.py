@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-from codesign_jax.scene.schema import SceneError, quantity, range_problem
+from codesign_jax.scene.schema import InputError, quantity, range_problem
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,7 @@ def sizes(
       process: The process.
 
     Raises:
-      SceneError: With every finger that has no room for a chamber.
+      InputError: With every finger that has no room for a chamber.
     """
     found, problems = [], []
     for i, given in enumerate(zip(lengths, heights, walls, strict=True)):
@@ -90,7 +90,7 @@ def sizes(
                 f"of {size.end:g} mm; give --end-wall (mm), or --no-parts and --no-sheet"
             )
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     return found
 
 

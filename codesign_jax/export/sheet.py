@@ -17,7 +17,7 @@ from codesign_jax.types import Params
 NAME = "build_sheet"
 
 
-class Section(NamedTuple):
+class SheetSection(NamedTuple):
     """A part of the sheet: a title, a table (or none) and sentences below it."""
 
     title: str
@@ -48,7 +48,7 @@ class Drift(NamedTuple):
 
 def sections(
     scene: Scene, params: Params, sizes: Sequence[Size], drift: Drift | None
-) -> list[Section]:
+) -> list[SheetSection]:
     """The sheet's content.
 
     Args:
@@ -62,7 +62,7 @@ def sections(
     return found + ([tolerance_section(drift)] if drift else [])
 
 
-def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> Section:
+def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
     density = scene.hand.material.density
     rows = []
     for i, (size, angle) in enumerate(zip(sizes, bends(scene, params), strict=True)):
@@ -88,7 +88,7 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> Section:
         " mm. Free bend: predicted by beam theory for a straight finger at its pressure, without "
         "load; measure it first."
     ]
-    return Section("Fingers", head, rows, notes)
+    return SheetSection("Fingers", head, rows, notes)
 
 
 def bends(scene: Scene, params: Params) -> np.ndarray:
@@ -105,7 +105,7 @@ def places(scene: Scene, params: Params) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(position)[:, :2], np.array(azimuth)
 
 
-def _mounts(scene: Scene, params: Params) -> Section:
+def _mounts(scene: Scene, params: Params) -> SheetSection:
     rows = []
     position, azimuth = places(scene, params)
     for i, (finger, (x, y), angle) in enumerate(
@@ -122,10 +122,10 @@ def _mounts(scene: Scene, params: Params) -> Section:
         f"{palm.mass:g} kg. Spread {np.degrees(float(params.spread)):.1f}°.",
     ]
     head = ("finger", "base x mm", "base y mm", "azimuth °", "tilt °")
-    return Section("Mounts", head, rows, notes)
+    return SheetSection("Mounts", head, rows, notes)
 
 
-def _material(scene: Scene) -> Section:
+def _material(scene: Scene) -> SheetSection:
     material, wrist = scene.hand.material, scene.hand.wrist
     notes = [
         f"Silicone: shear modulus {material.shear_modulus / 1e3:g} kPa, density "
@@ -137,10 +137,10 @@ def _material(scene: Scene) -> Section:
             f"Wrist: {wrist.linear_stiffness:g} N/m and {wrist.angular_stiffness:g} N m/rad, "
             f"damping {wrist.linear_damping:g} N s/m and {wrist.angular_damping:g} N m s/rad."
         )
-    return Section("Material and wrist", (), [], notes)
+    return SheetSection("Material and wrist", (), [], notes)
 
 
-def _control(scene: Scene, params: Params) -> Section:
+def _control(scene: Scene, params: Params) -> SheetSection:
     x, y, z, roll, pitch, yaw = np.asarray(params.arm, float)
     palm = scene.arm.zero_height + z
     top = f"{1e3 * scene.arm.start_height:.0f}"
@@ -159,16 +159,16 @@ def _control(scene: Scene, params: Params) -> Section:
         "commands.csv."
     ]
     head = ("phase", "time s", "palm above the table mm", "share of the pressures")
-    return Section("Grasp", head, rows, notes)
+    return SheetSection("Grasp", head, rows, notes)
 
 
-def tolerance_section(drift: Drift) -> Section:
+def tolerance_section(drift: Drift) -> SheetSection:
     """Tolerances as a table."""
     nominal = f"Of {drift.trials} grasps of the design itself {_percent(drift.nominal)} succeed"
     limit = f"{100 * WANTED:.0f} %"
     if not drift.rows:
         note = f"{nominal}, fewer than {limit}: it has no tolerance to give."
-        return Section("Tolerance", (), [], [note])
+        return SheetSection("Tolerance", (), [], [note])
     rows = []
     for row in drift.rows:
         sides = [part for side in (row.down, row.up) for part in _side(side)]
@@ -189,7 +189,7 @@ def tolerance_section(drift: Drift) -> Section:
             "--tolerance all moves each of them."
         )
     head = ("parameter", "unit", "value", "down to", "fails at", "up to", "fails at")
-    return Section(f"Tolerance: drift until fewer than {limit} succeed", head, rows, notes)
+    return SheetSection(f"Tolerance: drift until fewer than {limit} succeed", head, rows, notes)
 
 
 def _side(side: Side) -> tuple[str, str]:
@@ -206,7 +206,7 @@ def _percent(share: Interval) -> str:
     return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
 
-def markdown(title: str, lines: Sequence[str], content: Sequence[Section]) -> str:
+def markdown(title: str, lines: Sequence[str], content: Sequence[SheetSection]) -> str:
     """The sheet as Markdown.
 
     Args:
@@ -229,7 +229,7 @@ def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def write(folder: Path, title: str, lines: Sequence[str], content: Sequence[Section]) -> Path:
+def write(folder: Path, title: str, lines: Sequence[str], content: Sequence[SheetSection]) -> Path:
     """Writes the Markdown sheet; arguments as `markdown`."""
     path = folder / f"{NAME}.md"
     path.write_text(markdown(title, lines, content), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Optimisers behind ``init``, ``ask`` and ``tell``; they know arrays and costs, no physics.
+"""Optimisers behind `init`, `ask` and `tell`; they know arrays and costs, no physics.
 
 >>> import jax, numpy as np
 >>> from codesign_jax import optimize

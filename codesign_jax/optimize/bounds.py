@@ -13,16 +13,16 @@ from jax.typing import ArrayLike
 def reflect(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> jax.Array:
     """Fold values into [low, high] as if both bounds were mirrors.
 
-    A triangle wave of period ``2 (high - low)``, so any number of reflections costs the same.
+    A triangle wave of period `2 (high - low)`, so any number of reflections costs the same.
     Values inside are returned bitwise. Clipping would pile particles on the bounds instead.
 
     Args:
-        x: Finite values, any shape.
-        low: Lower bounds, broadcastable to ``x``.
-        high: Upper bounds, not below ``low``; where equal, the result is that bound.
+      x: Finite values, any shape.
+      low: Lower bounds, broadcastable to `x`.
+      high: Upper bounds, not below `low`; where equal, the result is that bound.
 
     Returns:
-        Values in [low, high], shape of ``x``.
+      Values in [low, high], shape of `x`.
     """
     x, low, high = jnp.asarray(x), jnp.asarray(low), jnp.asarray(high)
     width = high - low
@@ -39,11 +39,11 @@ def strictly_below(x: ArrayLike, limit: ArrayLike) -> jax.Array:
     float grid also covers the rounding of a limit that is one product of exact factors.
 
     Args:
-        x: Values, any shape.
-        limit: Exclusive upper limits, broadcastable to ``x``.
+      x: Values, any shape.
+      limit: Exclusive upper limits, broadcastable to `x`.
 
     Returns:
-        Values below ``limit``, shape of ``x``.
+      Values below `limit`, shape of `x`.
     """
     x = jnp.asarray(x)
     limit = jnp.asarray(limit, x.dtype)
@@ -56,13 +56,13 @@ class Space:
     """A box of parameters with an optional extra constraint.
 
     A pytree: bounds are leaves, so that another box of the same size does not recompile;
-    ``project`` is static and compared by identity, so make it once.
+    `project` is static and compared by identity, so make it once.
 
     Attributes:
-        low: Lower bounds in the unit of each parameter, shape (parameter,).
-        high: Upper bounds, not below ``low``, shape (parameter,).
-        project: Maps one particle inside the box, shape (parameter,), to one that also satisfies
-            the constraint and is still in the box. Must return a feasible particle unchanged.
+      low: Lower bounds in the unit of each parameter, shape (parameter,).
+      high: Upper bounds, not below `low`, shape (parameter,).
+      project: Maps one particle inside the box, shape (parameter,), to one that also satisfies
+        the constraint and is still in the box. Must return a feasible particle unchanged.
     """
 
     low: ArrayLike
@@ -75,7 +75,7 @@ class Space:
         """Check bounds that are values; tracers and tree placeholders pass.
 
         Raises:
-            ValueError: If the bounds differ in shape, are not finite, or are in the wrong order.
+          ValueError: If the bounds differ in shape, are not finite, or are in the wrong order.
         """
         if not all(_is_value(bound) for bound in (self.low, self.high)):
             return
@@ -88,7 +88,7 @@ class Space:
             raise ValueError(f"parameter {at[-1]} has low {low[at]} and high {high[at]}")
 
     def constrain(self, particles: jax.Array) -> jax.Array:
-        """Apply ``project`` to each particle, shape (particle, parameter)."""
+        """Apply `project` to each particle, shape (particle, parameter)."""
         return particles if self.project is None else jax.vmap(self.project)(particles)
 
 

@@ -3,7 +3,7 @@
 The strategies work on unit coordinates, 0 at a parameter's lower and 1 at its upper bound. They are
 told the points that they asked for, while what is evaluated is their mirror image inside the bounds
 with the constraint applied, so that they see a periodic landscape without walls (as in Hansen's
-pycma, ``BoundTransform``).
+pycma, `BoundTransform`).
 
 Sources: Hansen (2016), "The CMA evolution strategy: a tutorial", arXiv:1604.00772; Salimans et al.
 (2017), "Evolution strategies as a scalable alternative to reinforcement learning",
@@ -33,9 +33,9 @@ from codesign_jax.optimize.resampling import MAX_PARTICLES
 
 # Four ASCII letters each, as the particle filter's.
 STREAM_ASK = 0x61736B20
-"""Stream of the strategy's draws in ``ask`` ("ask ")."""
+"""Stream of the strategy's draws in `ask` ("ask ")."""
 STREAM_TELL = 0x74656C6C
-"""Stream of its draws in ``tell`` ("tell")."""
+"""Stream of its draws in `tell` ("tell")."""
 STREAM_START = 0x73747274
 """Stream of a swarm's first positions ("strt")."""
 
@@ -52,7 +52,7 @@ EVOSAX = tuple(LEAST)
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evolution:
-    """A strategy of evosax behind ``init``, ``ask`` and ``tell``.
+    """A strategy of evosax behind `init`, `ask` and `tell`.
 
     The state's particles are the best ones so far, best first; among equal costs newer ones come
     first. Closed parameters have the values of the best one. When a schedule opens other parameters
@@ -60,12 +60,12 @@ class Evolution:
     the selection says nothing about closed ones.
 
     Attributes:
-        keeps_best: True: the state's particles are the best so far; see ``Optimizer.keeps_best``.
-        space: Bounds and constraint of the parameters.
-        name: "cma-es" and "open-es", from the seed particle; "pso", a swarm over the whole box that
-            the seed particle attracts first; "random", uniform in the box.
-        sigma: First standard deviation of CMA-ES, and that of OpenAI-ES, as a fraction of the
-            parameter range; pycma's documentation advises a quarter of the domain.
+      keeps_best: True: the state's particles are the best so far; see `Optimizer.keeps_best`.
+      space: Bounds and constraint of the parameters.
+      name: "cma-es" and "open-es", from the seed particle; "pso", a swarm over the whole box that
+        the seed particle attracts first; "random", uniform in the box.
+      sigma: First standard deviation of CMA-ES, and that of OpenAI-ES, as a fraction of the
+        parameter range; pycma's documentation advises a quarter of the domain.
     """
 
     keeps_best = True
@@ -78,8 +78,8 @@ class Evolution:
         """Check the static fields.
 
         Raises:
-            ValueError: If there is no such strategy or ``sigma`` is not positive.
-            ModuleNotFoundError: If evosax is not installed.
+          ValueError: If there is no such strategy or `sigma` is not positive.
+          ModuleNotFoundError: If evosax is not installed.
         """
         if self.name not in LEAST or not self.sigma > 0:
             raise ValueError(f"need a name of {', '.join(LEAST)} and sigma > 0: {self}")
@@ -90,11 +90,11 @@ class Evolution:
             raise ModuleNotFoundError(message, name=error.name) from error
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
-        """The state before episode 0; see ``Optimizer.init``.
+        """The state before episode 0; see `Optimizer.init`.
 
         Raises:
-            TypeError: If ``key`` is not a typed key.
-            ValueError: If the shape of the seed particle or the number of particles is wrong.
+          TypeError: If `key` is not a typed key.
+          ValueError: If the shape of the seed particle or the number of particles is wrong.
         """
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST[self.name]:
@@ -111,7 +111,7 @@ class Evolution:
         return state._replace(memory=memory)
 
     def ask(self, state: State, mask: ArrayLike) -> jax.Array:
-        """Particles to evaluate; see ``Optimizer.ask``.
+        """Particles to evaluate; see `Optimizer.ask`.
 
         The constraint of the space may change a closed parameter, as with the particle filter.
         """
@@ -124,10 +124,10 @@ class Evolution:
     def tell(
         self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
     ) -> tuple[State, Info]:
-        """The next state and the episode's report; see ``Optimizer.tell``.
+        """The next state and the episode's report; see `Optimizer.tell`.
 
         Raises:
-            ValueError: If shapes do not match.
+          ValueError: If shapes do not match.
         """
         assert state.memory is not None
         cost = check_told(state, population, cost)
@@ -216,17 +216,17 @@ def fitness(name: str, cost: jax.Array) -> jax.Array:
 
 
 def learning_rate(sigma: float, width: int) -> float:
-    """Step of OpenAI-ES along its gradient, ``sqrt(2 pi width) GAIN sigma**2``.
+    """Step of OpenAI-ES along its gradient, `sqrt(2 pi width) GAIN sigma**2`.
 
-    The strategy's gradient is the mean of ``rank z / sigma`` over draws ``mean + sigma z``, with
-    ranks from -1/2 to 1/2.  At the distance ``d`` from the minimum of a bowl, ``d`` far below
-    ``sigma``, costs are ``2 d sigma z_1`` beside ``sigma**2 |z|**2``, whose standard deviation is
-    ``sigma**2 sqrt(2 width)``; a rank has the correlation ``sqrt(2 / width) d / sigma`` with the
-    draw along ``d``, and their mean product is that over ``2 sqrt(pi)``.
+    The strategy's gradient is the mean of `rank z / sigma` over draws `mean + sigma z`, with
+    ranks from -1/2 to 1/2.  At the distance `d` from the minimum of a bowl, `d` far below
+    `sigma`, costs are `2 d sigma z_1` beside `sigma**2 |z|**2`, whose standard deviation is
+    `sigma**2 sqrt(2 width)`; a rank has the correlation `sqrt(2 / width) d / sigma` with the
+    draw along `d`, and their mean product is that over `2 sqrt(pi)`.
 
     Args:
-        sigma: Standard deviation of the draws.
-        width: Number of parameters.
+      sigma: Standard deviation of the draws.
+      width: Number of parameters.
     """
     return float(np.sqrt(2 * np.pi * width) * GAIN * sigma**2)
 

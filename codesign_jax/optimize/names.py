@@ -35,12 +35,12 @@ def make_optimizer(name: str, space: Space) -> Optimizer:
     """An optimiser with its default constants; those of the particle filter are the paper's.
 
     Args:
-        name: One of ``NAMES``.
-        space: Bounds and constraint of the parameters.
+      name: One of `NAMES`.
+      space: Bounds and constraint of the parameters.
 
     Raises:
-        ValueError: If there is no such optimiser.
-        ModuleNotFoundError: If it needs evosax, which is not installed.
+      ValueError: If there is no such optimiser.
+      ModuleNotFoundError: If it needs evosax, which is not installed.
     """
     if name not in NAMES:
         raise ValueError(problem(name))
@@ -53,8 +53,8 @@ def problem(name: str, num_particles: int | None = None) -> str | None:
     """What speaks against an optimiser, in words; None if nothing does.
 
     Args:
-        name: Its name.
-        num_particles: Particles of a run, to be checked as well.
+      name: Its name.
+      num_particles: Particles of a run, to be checked as well.
     """
     if name not in NAMES:
         near = difflib.get_close_matches(name, NAMES, n=1)

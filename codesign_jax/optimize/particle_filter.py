@@ -1,11 +1,11 @@
-"""Particle filter optimisation behind ``init``, ``ask`` and ``tell``.
+"""Particle filter optimisation behind `init`, `ask` and `tell`.
 
 Source: Deimel, Irmisch, Wall, Brock (2017), section VI.1 and Fig. 5. One episode is
 
     population = filter.ask(state, mask)                    # step 1: move
     state, info = filter.tell(state, population, cost)      # steps 3 and 4: weight, resample
 
-with the simulation, step 2, in between; see ``protocol``. The draws of a particle depend neither on
+with the simulation, step 2, in between; see `protocol`. The draws of a particle depend neither on
 the number of particles nor on the point of resumption.
 """
 
@@ -38,15 +38,15 @@ STREAM_RESAMPLE = 0x72736D70
 class ParticleFilter:
     """Configuration of the particle filter optimisation.
 
-    Can be closed over or passed through ``jit``: the bounds are leaves, the rest is static.
+    Can be closed over or passed through `jit`: the bounds are leaves, the rest is static.
 
     Attributes:
-        keeps_best: False: resampling replaces all particles; see ``Optimizer.keeps_best``.
-        space: Bounds and constraint of the parameters.
-        sigma: Standard deviation of a move as a fraction of the parameter range. The paper writes
-            "variance sigma = 0.05 x parameter range"; only the reading as a standard deviation has
-            the unit of the parameter.
-        alpha: Cost offset of the weight; keeps one perfect episode from taking over all particles.
+      keeps_best: False: resampling replaces all particles; see `Optimizer.keeps_best`.
+      space: Bounds and constraint of the parameters.
+      sigma: Standard deviation of a move as a fraction of the parameter range. The paper writes
+        "variance sigma = 0.05 x parameter range"; only the reading as a standard deviation has
+        the unit of the parameter.
+      alpha: Cost offset of the weight; keeps one perfect episode from taking over all particles.
     """
 
     keeps_best = False
@@ -59,7 +59,7 @@ class ParticleFilter:
         """Check the static fields.
 
         Raises:
-            ValueError: If ``sigma`` is negative or ``alpha`` not positive.
+          ValueError: If `sigma` is negative or `alpha` not positive.
         """
         if not self.sigma >= 0 or not self.alpha > 0:
             raise ValueError(f"need sigma >= 0 and alpha > 0: {self.sigma=}, {self.alpha=}")
@@ -68,16 +68,16 @@ class ParticleFilter:
         """Place all particles at the seed particle.
 
         Args:
-            key: Typed key from ``jax.random.key``; the root of all draws of this run.
-            seed_particle: Parameters to start from, shape (parameter,).
-            num_particles: Number of particles, 1 to ``MAX_PARTICLES``.
+          key: Typed key from `jax.random.key`; the root of all draws of this run.
+          seed_particle: Parameters to start from, shape (parameter,).
+          num_particles: Number of particles, 1 to `MAX_PARTICLES`.
 
         Returns:
-            The state before episode 0.
+          The state before episode 0.
 
         Raises:
-            TypeError: If ``key`` is not a typed key.
-            ValueError: If the shape of the seed particle or the number of particles is wrong.
+          TypeError: If `key` is not a typed key.
+          ValueError: If the shape of the seed particle or the number of particles is wrong.
         """
         seed_particle = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         particles = jnp.tile(seed_particle, (num_particles, 1))
@@ -93,11 +93,11 @@ class ParticleFilter:
         constraint is not changed by it.
 
         Args:
-            state: Current state; not changed, so asking again gives the same population.
-            mask: True where a parameter is open, bool, shape (parameter,).
+          state: Current state; not changed, so asking again gives the same population.
+          mask: True where a parameter is open, bool, shape (parameter,).
 
         Returns:
-            Particles to evaluate, shape (particle, parameter).
+          Particles to evaluate, shape (particle, parameter).
         """
         low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
         n, width = state.particles.shape
@@ -112,21 +112,21 @@ class ParticleFilter:
     ) -> tuple[State, Info]:
         """Weight and resample the population: steps 3 and 4 of Fig. 5.
 
-        ``weight = 1 / (alpha + cost)`` (section VI.1), then stochastic universal sampling with one
+        `weight = 1 / (alpha + cost)` (section VI.1), then stochastic universal sampling with one
         uniform number. A cost that is not finite gets weight zero; where none is finite, every
         particle survives once. The weight needs costs of at least zero; lower ones count as zero.
 
         Args:
-            state: State that ``population`` was asked from.
-            population: Evaluated particles, shape (particle, parameter).
-            cost: Mean cost over the trials of each particle, shape (particle,); lower is better.
-            mask: Not used: resampling copies whole particles.
+          state: State that `population` was asked from.
+          population: Evaluated particles, shape (particle, parameter).
+          cost: Mean cost over the trials of each particle, shape (particle,); lower is better.
+          mask: Not used: resampling copies whole particles.
 
         Returns:
-            The state of the next episode and what happened in this one.
+          The state of the next episode and what happened in this one.
 
         Raises:
-            ValueError: If shapes do not match.
+          ValueError: If shapes do not match.
         """
         cost = check_told(state, population, cost)
         finite = jnp.isfinite(cost)

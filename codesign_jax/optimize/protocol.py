@@ -1,12 +1,12 @@
-"""What every optimiser has in common: ``init``, ``ask`` and ``tell``, a state and a report.
+"""What every optimiser has in common: `init`, `ask` and `tell`, a state and a report.
 
 One episode of any of them is
 
     population = optimizer.ask(state, mask)
     state, info = optimizer.tell(state, population, cost, mask)
 
-with the simulation in between. All three functions are pure and work under ``jit``, ``vmap`` over
-a leading run axis of state, mask and cost, and ``lax.scan``.
+with the simulation in between. All three functions are pure and work under `jit`, `vmap` over
+a leading run axis of state, mask and cost, and `lax.scan`.
 """
 
 from typing import Any, NamedTuple, Protocol
@@ -24,14 +24,14 @@ class State(NamedTuple):
     """What one episode hands to the next.
 
     Attributes:
-        particles: What the run has found so far, which the final test takes: the particles after
-            resampling of the particle filter, the best ones so far of other optimisers; shape
-            (particle, parameter).
-        episode: Number of finished episodes, int32, scalar.
-        key: Root key. It never changes: draws fold in stream and episode, so they do not depend on
-            the point of resumption.
-        memory: What else the optimiser remembers, as nested dictionaries of arrays, so that it can
-            be saved as it is; None if there is nothing.
+      particles: What the run has found so far, which the final test takes: the particles after
+        resampling of the particle filter, the best ones so far of other optimisers; shape
+        (particle, parameter).
+      episode: Number of finished episodes, int32, scalar.
+      key: Root key. It never changes: draws fold in stream and episode, so they do not depend on
+        the point of resumption.
+      memory: What else the optimiser remembers, as nested dictionaries of arrays, so that it can
+        be saved as it is; None if there is nothing.
     """
 
     particles: jax.Array
@@ -44,15 +44,15 @@ class Info(NamedTuple):
     """What one episode reports.
 
     Attributes:
-        cost: Costs as given, shape (particle,).
-        weight: Normalised weights, shape (particle,); equal where no cost is finite, and for an
-            optimiser that does not weigh.
-        ancestors: Row of the population that each new particle of the state copies, -1 if it is
-            from an earlier episode; int32, shape (particle,).
-        best_index: Row of the population with the lowest finite cost, int32, scalar.
-        best_cost: Lowest finite cost, inf if there is none, scalar.
-        mean_cost: Mean of the finite costs, inf if there are none, scalar.
-        effective_sample_size: ``1 / sum(weight**2)``, between 1 and the number of particles.
+      cost: Costs as given, shape (particle,).
+      weight: Normalised weights, shape (particle,); equal where no cost is finite, and for an
+        optimiser that does not weigh.
+      ancestors: Row of the population that each new particle of the state copies, -1 if it is
+        from an earlier episode; int32, shape (particle,).
+      best_index: Row of the population with the lowest finite cost, int32, scalar.
+      best_cost: Lowest finite cost, inf if there is none, scalar.
+      mean_cost: Mean of the finite costs, inf if there are none, scalar.
+      effective_sample_size: `1 / sum(weight**2)`, between 1 and the number of particles.
     """
 
     cost: jax.Array
@@ -65,10 +65,10 @@ class Info(NamedTuple):
 
 
 class Optimizer(Protocol):
-    """What ``Task.episode`` and ``Task.run`` take; also one of your own.
+    """What `Task.episode` and `Task.run` take; also one of your own.
 
     It is an argument of jitted programs and so has to be a pytree, such as a dataclass registered
-    with ``jax.tree_util.register_dataclass``: arrays as leaves, everything else static.
+    with `jax.tree_util.register_dataclass`: arrays as leaves, everything else static.
     """
 
     @property
@@ -81,7 +81,7 @@ class Optimizer(Protocol):
         """Whether the state's particles are the best of all episodes, chosen by their costs.
 
         A class attribute is enough. The outcomes that chose such particles are better than the
-        particles are, so the final test of a run (``runs.loop``) counts new trials only. Otherwise
+        particles are, so the final test of a run (`runs.loop`) counts new trials only. Otherwise
         it also counts the outcomes of the last episode, as in the paper.
         """
         ...
@@ -93,9 +93,9 @@ class Optimizer(Protocol):
         """The state before episode 0.
 
         Args:
-            key: Typed key from ``jax.random.key``; the root of all draws of this run.
-            seed_particle: Parameters to start from, shape (parameter,).
-            num_particles: Particles that every episode evaluates.
+          key: Typed key from `jax.random.key`; the root of all draws of this run.
+          seed_particle: Parameters to start from, shape (parameter,).
+          num_particles: Particles that every episode evaluates.
         """
         ...
 
@@ -103,10 +103,10 @@ class Optimizer(Protocol):
         """Particles to evaluate, shape (particle, parameter), inside the space.
 
         Args:
-            state: Current state.
-            mask: True where a parameter is open, bool, shape (parameter,). Closed parameters have
-                values of the state's particles. Where all are closed, the result is these
-                particles: that is how particles are tested with an episode's own program.
+          state: Current state.
+          mask: True where a parameter is open, bool, shape (parameter,). Closed parameters have
+            values of the state's particles. Where all are closed, the result is these
+            particles: that is how particles are tested with an episode's own program.
         """
         ...
 
@@ -116,11 +116,11 @@ class Optimizer(Protocol):
         """The state of the next episode and what happened in this one.
 
         Args:
-            state: State that ``population`` was asked from.
-            population: Evaluated particles, shape (particle, parameter).
-            cost: Mean cost over the trials of each particle, shape (particle,); lower is better,
-                and what is not finite has failed.
-            mask: Mask that ``population`` was asked with.
+          state: State that `population` was asked from.
+          population: Evaluated particles, shape (particle, parameter).
+          cost: Mean cost over the trials of each particle, shape (particle,); lower is better,
+            and what is not finite has failed.
+          mask: Mask that `population` was asked with.
         """
         ...
 
@@ -128,12 +128,12 @@ class Optimizer(Protocol):
 def check_start(
     space: Space, key: jax.Array, seed_particle: ArrayLike, num_particles: int, most: int
 ) -> jax.Array:
-    """Checks the arguments of ``init``; returns the seed particle as an array of floats.
+    """Checks the arguments of `init`; returns the seed particle as an array of floats.
 
     Raises:
-        TypeError: If ``key`` is not a typed key.
-        ValueError: If the shape of the seed particle or the number of particles is wrong, or the
-            seed particle lies far outside the box.
+      TypeError: If `key` is not a typed key.
+      ValueError: If the shape of the seed particle or the number of particles is wrong, or the
+        seed particle lies far outside the box.
     """
     if not jnp.issubdtype(kind := jnp.result_type(key), jax.dtypes.prng_key):
         raise TypeError(f"key must be a typed key from jax.random.key, got {kind}")
@@ -160,10 +160,10 @@ def _refuse_far(space: Space, particle: jax.Array) -> None:
 
 
 def check_told(state: State, population: jax.Array, cost: ArrayLike) -> jax.Array:
-    """Checks the arguments of ``tell``; returns the costs as an array of the population's type.
+    """Checks the arguments of `tell`; returns the costs as an array of the population's type.
 
     Raises:
-        ValueError: If shapes do not match.
+      ValueError: If shapes do not match.
     """
     cost = jnp.asarray(cost, population.dtype)
     if population.shape != state.particles.shape or cost.shape != population.shape[:1]:
@@ -182,9 +182,9 @@ def summarize(cost: jax.Array, weight: jax.Array, ancestors: jax.Array) -> Info:
     """The report of an episode.
 
     Args:
-        cost: Costs, shape (particle,).
-        weight: Weights, not necessarily normalised, shape (particle,).
-        ancestors: See ``Info``.
+      cost: Costs, shape (particle,).
+      weight: Weights, not necessarily normalised, shape (particle,).
+      ancestors: See `Info`.
     """
     finite = jnp.isfinite(cost)
     ranked = jnp.where(finite, cost, jnp.inf)

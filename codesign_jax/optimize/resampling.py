@@ -14,28 +14,28 @@ def stochastic_universal(u: ArrayLike, weights: ArrayLike) -> jax.Array:
     """Draw as many ancestors as there are weights with one uniform number.
 
     Baker (1987), "Reducing bias and inefficiency in the selection algorithm"; step 4 of Fig. 5 in
-    Deimel et al. (2017). ``n`` equally spaced pointers ``(i + u) / n`` are looked up in the
+    Deimel et al. (2017). `n` equally spaced pointers `(i + u) / n` are looked up in the
     cumulative weights.
 
     The weights are first rounded to integers that sum to about 2**30, and everything after that
-    is exact. So each count is the floor or ceiling of ``n * w`` (``w`` the normalised weight, to
-    a relative ``n / 2**31``), the counts sum to ``n``, equal weights give the identity for every
-    ``u``, a weight of zero is never drawn, and the result does not depend on the order in which a
+    is exact. So each count is the floor or ceiling of `n * w` (`w` the normalised weight, to
+    a relative `n / 2**31`), the counts sum to `n`, equal weights give the identity for every
+    `u`, a weight of zero is never drawn, and the result does not depend on the order in which a
     device sums. A float32 cumulative sum guarantees none of these but the second.
 
     Weights that are negative or not finite count as zero. Where no positive weight is left, the
     result is the identity: every particle survives once.
 
     Args:
-        u: Uniform number in [0, 1), scalar.
-        weights: Weights, not necessarily normalised, shape (particle,). Subnormal numbers may
-            count as zero; so do weights below about ``2**-31`` of the sum.
+      u: Uniform number in [0, 1), scalar.
+      weights: Weights, not necessarily normalised, shape (particle,). Subnormal numbers may
+        count as zero; so do weights below about `2**-31` of the sum.
 
     Returns:
-        Ancestor indices in ascending order, int32, shape (particle,).
+      Ancestor indices in ascending order, int32, shape (particle,).
 
     Raises:
-        ValueError: If ``weights`` is not a vector of 1 to ``MAX_PARTICLES`` numbers.
+      ValueError: If `weights` is not a vector of 1 to `MAX_PARTICLES` numbers.
     """
     weights = jnp.asarray(weights, jnp.float32)
     if weights.ndim != 1 or not 1 <= weights.shape[0] <= MAX_PARTICLES:

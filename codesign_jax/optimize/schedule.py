@@ -14,7 +14,7 @@ NAMES = (
     "single",
     *(f"switch-{switches}" for switches in (1, 2, 4, 8, 16, 32)),
 )
-"""Strategies of the paper's section VI.4; ``switch-K`` takes other K as well."""
+"""Strategies of the paper's section VI.4; `switch-K` takes other K as well."""
 
 
 def schedule(
@@ -27,25 +27,25 @@ def schedule(
 
     The strategies of Deimel et al. (2017), section VI.4 and Fig. 7:
 
-    * ``concurrent``: every parameter in every episode (co-design).
-    * ``morphology``, ``control``: that domain only, whatever ``first`` says.
-    * ``single``: the domain ``first`` only ("s.d.").
-    * ``switch-K``: one domain at a time, starting in ``first``, with exactly K switches. The
+    * `concurrent`: every parameter in every episode (co-design).
+    * `morphology`, `control`: that domain only, whatever `first` says.
+    * `single`: the domain `first` only ("s.d.").
+    * `switch-K`: one domain at a time, starting in `first`, with exactly K switches. The
       K + 1 blocks differ in length by at most one episode.
 
     Args:
-        name: Strategy, see above.
-        is_morphology: True for a morphology parameter, False for a control parameter, bool,
-            shape (parameter,).
-        episodes: Number of episodes, at least 1.
-        first: Domain of the first episode for ``single`` and ``switch-K``.
+      name: Strategy, see above.
+      is_morphology: True for a morphology parameter, False for a control parameter, bool,
+        shape (parameter,).
+      episodes: Number of episodes, at least 1.
+      first: Domain of the first episode for `single` and `switch-K`.
 
     Returns:
-        True where a parameter is open, bool, shape (episode, parameter).
+      True where a parameter is open, bool, shape (episode, parameter).
 
     Raises:
-        ValueError: If an argument is invalid, K is not below ``episodes``, or the strategy needs
-            a domain without parameters.
+      ValueError: If an argument is invalid, K is not below `episodes`, or the strategy needs
+        a domain without parameters.
     """
     domain = np.asarray(is_morphology)
     if domain.dtype != bool or domain.ndim != 1:

@@ -4,7 +4,7 @@ Grasps are noisy: a design that loses none of three objects may lose one in ten.
 particle is believed.  The mean of an evolution strategy moves where particles keep their objects on
 the whole; the average of these means over the episodes, recent ones weighing more, has less noise
 still, and no trial chose it.  Each average is simulated as particle 0 of the next episode, and the
-final test takes the last ones.
+final test takes the newest one and an early one.
 
 The strategy is OpenAI's.  Its draws come in mirrored pairs and designs of equal cost have equal
 weight, so that its mean stays where it is while all particles keep all of their objects; that of
@@ -41,9 +41,9 @@ from codesign_jax.optimize.resampling import MAX_PARTICLES
 STREAM_SCREEN = 0x72616E64
 """Stream of the random designs ("rand")."""
 STREAM_MOVE = 0x636D6173
-"""Stream of the strategy's draws in ``ask`` ("cmas")."""
+"""Stream of the strategy's draws in `ask` ("cmas")."""
 STREAM_TELL = 0x636D6174
-"""Stream of its draws in ``tell`` ("cmat")."""
+"""Stream of its draws in `tell` ("cmat")."""
 LEAST = 3
 """Fewest particles: the average, and two for the strategy to rank."""
 STRATEGIES = {"open-es": OPEN_SIGMA, "cma-es": 0.2}
@@ -58,24 +58,23 @@ class Screened:
     The first episodes simulate random designs, uniform in the parameters that the schedule opens,
     and the next ones the best of these again, in other trials: a start in the wrong place costs
     more than they do.  Later ones simulate the average so far, as particle 0, and draws of the
-    strategy.  The first particles of the state are the averages of the last episodes, newest first,
-    before there are enough of them the best random designs behind these; all others are the newest.
-    When a schedule opens other parameters, strategy and average start anew at particle 0.
+    strategy.  Particle 1 of the state is the average after a third of these, at most as many ago as
+    there are particles: a guard against a mean that has left a good place.  All others are the
+    newest average; more finalists would only have one of them chosen by luck.  When a schedule
+    opens other parameters, strategy and average start anew at particle 0.
 
     Attributes:
-        keeps_best: True: the final test counts new trials only; see ``Optimizer.keeps_best``.
-        screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
-        space: Bounds and constraint of the parameters.
-        strategy: One of ``STRATEGIES``. With "open-es", whose draws come in pairs, the last one of
-            an even number of particles is the strategy's mean.
-        screening: Episodes of random designs.
-        retests: Episodes that simulate the best of them again.
-        sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
-            that of ``STRATEGIES``.
-        finalists: Averages that the final test takes. Older ones are worse by more than a dozen
-            trials show, so that a test of many would choose one of them by luck.
-        recency: After ``t`` episodes of the strategy its mean has weight ``recency / (t + recency
-            - 1)`` in the average: 1 is the plain average, more forgets the first means sooner.
+      keeps_best: True: the final test counts new trials only; see `Optimizer.keeps_best`.
+      screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
+      space: Bounds and constraint of the parameters.
+      strategy: One of `STRATEGIES`. With "open-es", whose draws come in pairs, the last one of
+        an even number of particles is the strategy's mean.
+      screening: Episodes of random designs.
+      retests: Episodes that simulate the best of them again.
+      sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
+        that of `STRATEGIES`.
+      recency: After `t` episodes of the strategy its mean has weight `recency / (t + recency
+        - 1)` in the average: 1 is the plain average, more forgets the first means sooner.
     """
 
     keeps_best = True
@@ -86,30 +85,27 @@ class Screened:
     screening: int = dataclasses.field(default=3, metadata={"static": True})
     retests: int = dataclasses.field(default=2, metadata={"static": True})
     sigma: float = dataclasses.field(default=0.0, metadata={"static": True})
-    finalists: int = dataclasses.field(default=3, metadata={"static": True})
     recency: float = dataclasses.field(default=4.0, metadata={"static": True})
 
     def __post_init__(self) -> None:
         """Check the static fields.
 
         Raises:
-            ValueError: If one of them is out of its range.
+          ValueError: If one of them is out of its range.
         """
         if self.strategy not in STRATEGIES:
             raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
-        least = min(self.screening, self.retests + 1, self.finalists, self.recency)
-        if not (least >= 1 and self.sigma >= 0):
-            needed = "screening, finalists, recency >= 1, retests >= 0 and sigma >= 0"
-            raise ValueError(f"need {needed}: {self}")
+        if not (min(self.screening, self.retests + 1, self.recency) >= 1 and self.sigma >= 0):
+            raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma >= 0: {self}")
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
-        """The state before episode 0; see ``Optimizer.init``.
+        """The state before episode 0; see `Optimizer.init`.
 
         The seed particle gives the parameters that a schedule closes from the start.
 
         Raises:
-            TypeError: If ``key`` is not a typed key.
-            ValueError: If the shape of the seed particle or the number of particles is wrong.
+          TypeError: If `key` is not a typed key.
+          ValueError: If the shape of the seed particle or the number of particles is wrong.
         """
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST:
@@ -118,11 +114,12 @@ class Screened:
         memory = {
             "mask": jnp.ones(seed.shape, bool),
             "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
+            "way": state.particles,
         }
         return state._replace(memory=memory | self._start(state))
 
     def ask(self, state: State, mask: ArrayLike) -> jax.Array:
-        """Particles to evaluate; see ``Optimizer.ask``.
+        """Particles to evaluate; see `Optimizer.ask`.
 
         The constraint of the space may change a closed parameter, as with the particle filter.
         """
@@ -137,10 +134,10 @@ class Screened:
     def tell(
         self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
     ) -> tuple[State, Info]:
-        """The next state and the episode's report; see ``Optimizer.tell``.
+        """The next state and the episode's report; see `Optimizer.tell`.
 
         Raises:
-            ValueError: If shapes do not match.
+          ValueError: If shapes do not match.
         """
         assert state.memory is not None
         cost = check_told(state, population, cost)
@@ -153,9 +150,6 @@ class Screened:
         costs = jnp.concatenate([ranked, jnp.where(tests > 0, jnp.inf, known)])
         best = jnp.argsort(costs)[: len(cost)]
         screened = jnp.concatenate([population, state.particles])[best]
-        # Later the average that was simulated comes before the earlier ones.
-        averages = jnp.concatenate([population[:1], state.particles[:-1]])
-        averages = averages.at[self.finalists :].set(population[0])
         unit, asked, memory = self._asked(state, mask)
         algorithm, params = self._strategy(state)
         points = slice(1, 1 + algorithm.population_size)
@@ -165,14 +159,19 @@ class Screened:
         weight = self.recency / (memory["averaged"] + self.recency)
         average = memory["average"] + weight * (new.mean - memory["average"])
         now = {"average": average, "averaged": memory["averaged"] + 1, "strategy": arrays(new)}
+        # The averages that were simulated, newest first, and which of them the final test takes.
+        way = jnp.concatenate([population[:1], state.memory["way"][:-1]])
+        rows, third = jnp.arange(len(cost)), 2 * now["averaged"] // 3
+        finalists = way[jnp.where(rows == 1, jnp.minimum(third, len(cost) - 1), 0)]
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
+            "way": jnp.where(screens, state.memory["way"], way),
             "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
             "cost": jnp.where(screens, costs[best], state.memory["cost"]),
         }
-        rows = jnp.arange(len(cost))
-        copied = jnp.where((rows == 0) | (rows >= self.finalists), 0, -1)
-        copied = jnp.where(screens, jnp.where(best < len(cost), best, -1), copied)
-        particles = jnp.where(screens, screened, averages)
+        copied = jnp.where(
+            screens, jnp.where(best < len(cost), best, -1), jnp.where(rows == 1, -1, 0)
+        )
+        particles = jnp.where(screens, screened, finalists)
         next_state = State(particles, state.episode + 1, state.key, following)
         return next_state, summarize(cost, jnp.ones_like(cost), copied.astype(jnp.int32))
 

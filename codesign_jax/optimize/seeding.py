@@ -21,15 +21,15 @@ class NoSeed(RuntimeError):
 
 
 def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
-    """Uniform particles of the box, projected; candidate j depends on ``key`` and j alone.
+    """Uniform particles of the box, projected; candidate j depends on `key` and j alone.
 
     Args:
-        key: Typed key from ``jax.random.key``.
-        space: Bounds and constraint of the parameters.
-        indices: Numbers of the candidates, int, shape (particle,).
+      key: Typed key from `jax.random.key`.
+      space: Bounds and constraint of the parameters.
+      indices: Numbers of the candidates, int, shape (particle,).
 
     Returns:
-        Particles, shape (particle, parameter).
+      Particles, shape (particle, parameter).
     """
     low, high = jnp.asarray(space.low, float), jnp.asarray(space.high, float)
     key = jax.random.fold_in(key, STREAM_SEED)
@@ -55,25 +55,25 @@ def rejection_sample(
 
     Deimel et al. (2017), section VI.4: seeds are drawn with cost > 2.0 to avoid runs whose initial
     particles already contain a solution. Candidates are accepted in the order of their number, so
-    the result is the same for every ``batch`` as far as ``evaluate`` treats particles alone.
+    the result is the same for every `batch` as far as `evaluate` treats particles alone.
 
     Args:
-        key: Typed key from ``jax.random.key``.
-        space: Bounds and constraint of the parameters.
-        evaluate: Costs of particles, (particle, parameter) -> (particle,). Always called with
-            ``batch`` particles. A cost that is not finite is never accepted.
-        num_seeds: Number of seed particles to find.
-        threshold: Cost above which a candidate is accepted.
-        batch: Candidates evaluated at once.
-        max_batches: Evaluations after which to give up.
+      key: Typed key from `jax.random.key`.
+      space: Bounds and constraint of the parameters.
+      evaluate: Costs of particles, (particle, parameter) -> (particle,). Always called with
+        `batch` particles. A cost that is not finite is never accepted.
+      num_seeds: Number of seed particles to find.
+      threshold: Cost above which a candidate is accepted.
+      batch: Candidates evaluated at once.
+      max_batches: Evaluations after which to give up.
 
     Returns:
-        Seeds, shape (seed, parameter), their costs, shape (seed,), and the number of candidates
-        drawn up to and with the last seed.
+      Seeds, shape (seed, parameter), their costs, shape (seed,), and the number of candidates
+      drawn up to and with the last seed.
 
     Raises:
-        ValueError: If a count is below 1 or ``evaluate`` returns another shape.
-        NoSeed: If ``max_batches`` did not hold enough seeds.
+      ValueError: If a count is below 1 or `evaluate` returns another shape.
+      NoSeed: If `max_batches` did not hold enough seeds.
     """
     asked = rejection(
         key, space, num_seeds, threshold=threshold, batch=batch, max_batches=max_batches
@@ -90,25 +90,25 @@ def rejection(
     batch: int = 64,
     max_batches: int = 100,
 ) -> Generator[jax.Array, ArrayLike, tuple[jax.Array, jax.Array, int]]:
-    """``rejection_sample`` as a generator, for whoever evaluates several searches at once.
+    """`rejection_sample` as a generator, for whoever evaluates several searches at once.
 
     Args:
-        key: See ``rejection_sample``, as the others.
-        space: Box of the candidates.
-        num_seeds: Number of seed particles to find.
-        threshold: Cost above which a candidate is accepted.
-        batch: Candidates of one request.
-        max_batches: Requests after which to give up.
+      key: See `rejection_sample`, as the others.
+      space: Box of the candidates.
+      num_seeds: Number of seed particles to find.
+      threshold: Cost above which a candidate is accepted.
+      batch: Candidates of one request.
+      max_batches: Requests after which to give up.
 
     Yields:
-        Candidates, shape (particle, parameter); it is sent their costs, shape (particle,).
+      Candidates, shape (particle, parameter); it is sent their costs, shape (particle,).
 
     Returns:
-        See ``rejection_sample``.
+      See `rejection_sample`.
 
     Raises:
-        ValueError: See ``rejection_sample``.
-        NoSeed: See ``rejection_sample``.
+      ValueError: See `rejection_sample`.
+      NoSeed: See `rejection_sample`.
     """
     if min(num_seeds, batch, max_batches) < 1:
         raise ValueError(f"counts must be at least 1: {num_seeds=}, {batch=}, {max_batches=}")
@@ -147,12 +147,12 @@ def translated(
     """A generator that asks for what another one asks for, in other terms.
 
     Args:
-        asking: The other one.
-        request: What to yield for what it asks for.
-        reply: What to send it for what is sent here.
+      asking: The other one.
+      request: What to yield for what it asks for.
+      reply: What to send it for what is sent here.
 
     Returns:
-        What it returns.
+      What it returns.
     """
     try:
         wanted = next(asking)

@@ -92,7 +92,7 @@ def frames(
     Returns:
       Frames, uint8, shape (frame, height, width, 3).
     """
-    way = _opengl()
+    way = opengl_backend()
     if way is None:
         return sketches(scene, grasp, times, size=size)
     qpos, index = _states(scene, grasp, times)
@@ -189,7 +189,7 @@ def write_strip(
 
 
 def _announce(notify: Callable[[str], None]) -> None:
-    if _opengl() is None:
+    if opengl_backend() is None:
         notify(f"no OpenGL here: drawing sketches; for pictures: apt-get install {_PACKAGES}")
 
 
@@ -250,7 +250,7 @@ def _visual_model(scene: Scene, grasp: Replay) -> mujoco.MjModel:
 
 
 @functools.cache
-def _opengl() -> str | None:
+def opengl_backend() -> str | None:
     """The way to OpenGL that works here, tried on a small scene: EGL, OSMesa or none."""
     chosen = os.environ.get("MUJOCO_GL")
     tiny = mujoco.MjModel.from_xml_string(

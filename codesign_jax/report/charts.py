@@ -1,7 +1,6 @@
 """Interactive charts of a run for its report (plotly, the extra `report`)."""
 
 import itertools
-from typing import NamedTuple
 
 import numpy as np
 import plotly.graph_objects as go
@@ -9,6 +8,7 @@ import plotly.io
 from plotly.subplots import make_subplots
 
 from codesign_jax.codesign import CONVERGED_COST
+from codesign_jax.report.landscape import Landscape
 from codesign_jax.runs.record import History
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import WARNINGS, Status
@@ -20,24 +20,6 @@ _LAYOUT = {
     "font": {"family": "system-ui, sans-serif", "size": 13},
 }
 _COLUMNS = 3  # of the grid of parameters
-
-
-class Landscape(NamedTuple):
-    """The mean cost over a grid of two parameters.
-
-    Attributes:
-      names: Names of the two parameters.
-      units: Their units.
-      first: Values of the first one in its unit, shape (n,).
-      second: Values of the second one, shape (m,).
-      cost: Mean cost, shape (n, m).
-    """
-
-    names: tuple[str, str]
-    units: tuple[str, str]
-    first: np.ndarray
-    second: np.ndarray
-    cost: np.ndarray
 
 
 def html(figure: go.Figure, name: str) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from codesign_jax import archives, files
 from codesign_jax.runs import columns
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 FILE = "landscape.npz"
 TABLE = columns.LANDSCAPE
@@ -51,12 +51,15 @@ def save(found: Landscape, folder: Path) -> list[Path]:
         for n, u in zip(found.names, found.units, strict=True)
     ]
     with files.atomically(table) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*axes, *columns.MORE[TABLE].columns])
+        names = [*axes, *columns.MORE[TABLE].columns]
+        writer = csv.DictWriter(file, names, lineterminator="\n")
+        writer.writeheader()
         for i, j in np.ndindex(*found.cost.shape):
-            point = [f"{v:.9g}" for v in (found.first[i], found.second[j], found.cost[i, j])]
-            counts = [found.kept[i, j], found.counted[i, j], found.trials]
-            writer.writerow(point + [int(v) for v in counts])
+            place = dict(zip(axes, (found.first[i], found.second[j]), strict=True))
+            numbers = {n: f"{v:.9g}" for n, v in (place | {"mean_cost": found.cost[i, j]}).items()}
+            counts = {"kept_trials": found.kept[i, j], "counted_trials": found.counted[i, j]}
+            counts["trials"] = found.trials
+            writer.writerow(numbers | {name: int(v) for name, v in counts.items()})
     return [npz, table]
 
 
@@ -64,7 +67,7 @@ def load(path: Path) -> Landscape:
     """Reads the arrays of a landscape.
 
     Raises:
-      SceneError: If the file holds none.
+      InputError: If the file holds none.
     """
     try:
         stored = archives.load(path)
@@ -73,4 +76,4 @@ def load(path: Path) -> Landscape:
         problem = (
             f"{path} is not a landscape of this version ({error}); codesign landscape writes one"
         )
-        raise SceneError([problem]) from error
+        raise InputError([problem]) from error

@@ -18,7 +18,7 @@ from codesign_jax import files, own
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.manifest import PROVENANCE, digests
 from codesign_jax.runs.scene_files import MESHES, NAMES
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 LOCK, MARKER = ".lock", ".start.json"
 _OURS = {*FILES, *TABLES, LOCK, MARKER}
@@ -37,17 +37,17 @@ def refuse_foreign(path: Path) -> None:
     """Refuses a folder with files of other names than a run's.
 
     Raises:
-      SceneError: With their names.
+      InputError: With their names.
     """
     if path.is_symlink() and not path.exists():
-        raise SceneError([f"--out {path} is a symbolic link to nothing"])
+        raise InputError([f"--out {path} is a symbolic link to nothing"])
     if path.exists() and not path.is_dir():
-        raise SceneError([f"--out {path} is a file"])
+        raise InputError([f"--out {path} is a file"])
     others = [name for name in _top(path) if _named(name) not in _OURS]
     if LOCK in _top(path) and not _is_lock(path / LOCK):
         others.append(LOCK)
     if others:
-        raise SceneError(
+        raise InputError(
             [f"--out {path} holds other files ({_some(others)}); choose another folder"]
         )
 
@@ -56,7 +56,7 @@ def refuse_unmarked(path: Path) -> None:
     """Refuses a folder that is no run and holds more than what a start that was cut short left.
 
     Raises:
-      SceneError: With what is there and what to do.
+      InputError: With what is there and what to do.
     """
     if (path / PROVENANCE).exists():
         return
@@ -68,7 +68,7 @@ def refuse_unmarked(path: Path) -> None:
         hint = f"if it is a run that lost {PROVENANCE}, put that back from a copy and it goes on"
     else:
         hint = "they may be yours, or of a start that was cut short"
-    raise SceneError(
+    raise InputError(
         [
             f"--out {path} holds {_some(others)} and no {PROVENANCE}: {hint}. Nothing was changed. "
             "Choose another folder, or delete these files yourself, if nobody needs them"
@@ -84,12 +84,12 @@ def refuse_to_delete(path: Path, sources: tuple[Path, ...] = ()) -> None:
       sources: Files that the command reads.
 
     Raises:
-      SceneError: With what is in the way.
+      InputError: With what is in the way.
     """
     place = path.resolve()
     read = [str(file) for file in sources if place in file.resolve().parents]
     if read:
-        raise SceneError(
+        raise InputError(
             [
                 f"--fresh would delete {_some(read)}, which this command reads: copy the files of "
                 "the scene to another folder, or choose another --out"
@@ -97,12 +97,12 @@ def refuse_to_delete(path: Path, sources: tuple[Path, ...] = ()) -> None:
         )
     links = [name for name in _all(path) if (path / name).is_symlink()]
     if links:
-        raise SceneError(
+        raise InputError(
             [f"--fresh deletes no symbolic links ({_some(links)} in {path}): delete them yourself"]
         )
     others = [name for name in _all(path) if not _is_of_a_run(path, name)]
     if others:
-        raise SceneError(
+        raise InputError(
             [
                 f"--fresh would delete {_some(others)} in {path}, which are no files of a run: "
                 "move them elsewhere first, or choose another folder"

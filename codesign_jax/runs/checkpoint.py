@@ -139,7 +139,7 @@ class Checkpoints:
         for path in sorted((self.folder / str(step)).rglob("*")):
             if path.is_file():
                 name = path.relative_to(self.folder).as_posix()
-                lines.append(f"{_file_digest(path)}  {name}")
+                lines.append(f"{file_digest(path)}  {name}")
         with files.atomically(self._digests(step)) as part:
             part.write_text("\n".join(lines) + "\n")
 
@@ -230,7 +230,7 @@ class Checkpoints:
                 return "", f"{path.name} is damaged"
             if file.exists() and not file.is_file():
                 return "", f"{name} is no file"
-            if _file_digest(file) != expected_file:
+            if file_digest(file) != expected_file:
                 return "", f"the SHA-256 digest of {name} differs"
         return expected, ""
 
@@ -286,7 +286,8 @@ def digest(arrays: Arrays) -> str:
     return total.hexdigest()
 
 
-def _file_digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's bytes."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

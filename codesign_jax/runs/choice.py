@@ -12,7 +12,7 @@ from codesign_jax.runs.reading import Tell, load_record
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.tables import failure_counts, status_names
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import SceneError, range_problem
+from codesign_jax.scene.schema import InputError, range_problem
 from codesign_jax.types import Outcome, Trial, failed
 
 
@@ -62,11 +62,11 @@ def read_record(folder: Path, *, tell: Tell | None = None) -> Record:
       tell: Called with what is amiss, see `runs.load_record`; None to warn.
 
     Raises:
-      SceneError: If it has no finished episode, or none that can be read.
+      InputError: If it has no finished episode, or none that can be read.
     """
     record = load_record(folder, tell=tell)
     if record is None or record.done == 0:
-        raise SceneError([f"run {folder} has no finished episode yet"])
+        raise InputError([f"run {folder} has no finished episode yet"])
     return record
 
 
@@ -139,7 +139,7 @@ def find_grasp(
       trial: Index of the trial; None for its best one.
 
     Raises:
-      SceneError: If the run has no such episode, particle or trial.
+      InputError: If the run has no such episode, particle or trial.
     """
     history = record.history
     _, particles, trials = history.trials.cost.shape
@@ -150,7 +150,7 @@ def find_grasp(
     )
     found = [range_problem(n, v, "", low, high) for n, v, low, high in asked if v is not None]
     if problems := [problem for problem in found if problem]:
-        raise SceneError(problems)
+        raise InputError(problems)
     chosen = choose(scene, record)
     last = record.done - 1 if particle is not None else chosen.episode
     e = last if episode is None else episode - 1

@@ -10,7 +10,7 @@ from codesign_jax.types import WARNINGS, Status
 
 
 @dataclasses.dataclass(frozen=True)
-class Table:
+class CsvTable:
     """A table of results.
 
     Attributes:
@@ -40,7 +40,7 @@ _PARTICLE = "index of the particle, from 0"
 _FAILED = "trials that failed, which count neither as kept nor as lost (see `status`)"
 
 TABLES = {
-    "episodes.csv": Table(
+    "episodes.csv": CsvTable(
         "an episode",
         {
             "episode": _EPISODE,
@@ -53,7 +53,7 @@ TABLES = {
         "best_",
         "the particle of the lowest cost, as simulated",
     ),
-    "particles.csv": Table(
+    "particles.csv": CsvTable(
         "a particle of an episode",
         {
             "episode": _EPISODE,
@@ -69,7 +69,7 @@ TABLES = {
         "",
         "the particle as simulated",
     ),
-    "trials.csv": Table(
+    "trials.csv": CsvTable(
         "a trial of a particle of an episode",
         {
             "episode": _EPISODE,
@@ -94,7 +94,7 @@ TABLES = {
             "step; empty if it is not known, as of engines mujoco and mjx",
         },
     ),
-    "tests.csv": Table(
+    "tests.csv": CsvTable(
         "a final particle in the final test",
         {
             "particle": _PARTICLE,
@@ -113,7 +113,7 @@ TABLES = {
 SEEDS, LANDSCAPE, REFERENCE = "seeds.csv", "landscape.csv", "reference.csv"
 
 MORE = {
-    SEEDS: Table(
+    SEEDS: CsvTable(
         "a run of `codesign optimize` with several seeds or strategies, in the folder of the runs",
         {
             "seed": "the run's seed",
@@ -138,7 +138,7 @@ MORE = {
             "run": "the run's folder, from that of the table",
         },
     ),
-    LANDSCAPE: Table(
+    LANDSCAPE: CsvTable(
         "a point of the grid of `codesign landscape`; its first two columns are the two parameters "
         "in the hand file's units, such as `length_mm` and `arm_z_mm`",
         {
@@ -184,7 +184,7 @@ design follow."""
 MAY_BE_EMPTY = ("first_bad_step", "steps_at_limit", "residual")
 """Those of `GRASPS` whose values may be missing."""
 
-MORE[REFERENCE] = Table(
+MORE[REFERENCE] = CsvTable(
     "a fresh trial of the chosen design at accuracy `reference`; `codesign evaluate --out` writes "
     "the same columns of its trials",
     {

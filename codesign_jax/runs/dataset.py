@@ -32,7 +32,7 @@ from codesign_jax.runs.tables import design_columns, noise_values, status_names
 from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome
 
 QUESTION = "question.json"
@@ -162,7 +162,7 @@ def begun(path: Path) -> dict[str, Any] | None:
     """The question of an unfinished file, as `Question.described`; None if there is none.
 
     Raises:
-      SceneError: If it cannot be read.
+      InputError: If it cannot be read.
     """
     try:
         return json.loads((folder_of(path) / QUESTION).read_text(encoding="utf-8"))
@@ -170,14 +170,14 @@ def begun(path: Path) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError) as error:
         problem = f"{folder_of(path) / QUESTION} cannot be read: {error}"
-        raise SceneError([problem]) from error
+        raise InputError([problem]) from error
 
 
 def finished(path: Path) -> tuple[dict[str, Any], int] | None:
     """Question, as `Question.described`, and number of designs of a file; None if there is none.
 
     Raises:
-      SceneError: If the file is not one of grasps of random designs.
+      InputError: If the file is not one of grasps of random designs.
     """
     if not path.exists():
         return None
@@ -187,14 +187,14 @@ def finished(path: Path) -> tuple[dict[str, Any], int] | None:
         return json.loads(metadata[b"question"]), json.loads(metadata[b"designs"])
     except (OSError, KeyError, ValueError, pa.ArrowException) as error:
         problem = f"--out {path} is there already, and is no file of `codesign sample`"
-        raise SceneError([f"{problem}; choose another"]) from error
+        raise InputError([f"{problem}; choose another"]) from error
 
 
 def refuse_other(path: Path, question: Question) -> None:
     """Refuses to go on with what was begun for another question.
 
     Raises:
-      SceneError: With what differs, or if the folder of shards holds other files.
+      InputError: With what differs, or if the folder of shards holds other files.
     """
     folder, before = folder_of(path), begun(path)
     head = f"{folder} has a part of other grasps; choose another --out, or delete the folder"
@@ -205,7 +205,7 @@ def refuse_other(path: Path, question: Question) -> None:
     else:
         others = [] if before is None else differences(before, question)
     if others:
-        raise SceneError([head] if before is None else [head, *others])
+        raise InputError([head] if before is None else [head, *others])
 
 
 @contextlib.contextmanager
@@ -217,7 +217,7 @@ def open_shards(path: Path, question: Question) -> Iterator[Shards]:
       question: What it will have.
 
     Raises:
-      SceneError: If another process writes there, and see `refuse_other`.
+      InputError: If another process writes there, and see `refuse_other`.
     """
     folder = folder_of(path)
     folder.mkdir(parents=True, exist_ok=True)
@@ -225,7 +225,7 @@ def open_shards(path: Path, question: Question) -> Iterator[Shards]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise SceneError([f"--out {path} is in use by another process"]) from error
+            raise InputError([f"--out {path} is in use by another process"]) from error
         refuse_other(path, question)
         # What a killed process was writing.
         for left in (*folder.glob("*.tmp"), *path.parent.glob(f"{path.name}.*.tmp")):

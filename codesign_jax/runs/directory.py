@@ -22,7 +22,7 @@ from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 EVENTS = "events.log"
 """Log of a run folder: what happened when, a line each."""
@@ -77,7 +77,7 @@ def open_run(
       The folder and what the user should know about resuming in it.
 
     Raises:
-      SceneError: If the folder holds other files, belongs to another scene or other settings
+      InputError: If the folder holds other files, belongs to another scene or other settings
         (with a diff; more episodes extend the run), or is in use; nothing is changed then.
     """
     sources = tuple(sources)
@@ -123,7 +123,7 @@ def check_folder(
       sources: Files that the scene was read from.
 
     Raises:
-      SceneError: See `open_run`.
+      InputError: See `open_run`.
     """
     belongings.refuse_foreign(path)
     belongings.refuse_unmarked(path)
@@ -136,7 +136,7 @@ def check_folder(
     else:
         _refuse_other(path, scene, settings, stored)
         if reading.lost_all(path):
-            raise SceneError([reading.lost_all(path)])
+            raise InputError([reading.lost_all(path)])
 
 
 def setting_of(paths: Iterable[Path], name: str) -> Any:
@@ -147,7 +147,7 @@ def setting_of(paths: Iterable[Path], name: str) -> Any:
       name: Name of the setting.
 
     Raises:
-      SceneError: If the runs differ in it, or one cannot be read.
+      InputError: If the runs differ in it, or one cannot be read.
     """
     found = [path for path in paths if (path / PROVENANCE).exists()]
     values = {path: manifest.read_provenance(path)["settings"][name] for path in found}
@@ -157,7 +157,7 @@ def setting_of(paths: Iterable[Path], name: str) -> Any:
         told = f"{one} {name}" if isinstance(one, int) else f"{name} {one}"
         problem = f"{least} has {told} and {most} {values[most]}: say by --{name} what all "
         problem += "are to have"
-        raise SceneError([problem])
+        raise InputError([problem])
     return next(iter(values.values()), None)
 
 
@@ -170,10 +170,10 @@ def _locked(path: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             owner = file.read(64).strip() or "?"
-            raise SceneError([f"--out {path} is in use by process {owner}"]) from error
+            raise InputError([f"--out {path} is in use by process {owner}"]) from error
         except OSError as error:
             problem = f"--out {path} cannot be locked: {error.strerror}; choose another folder"
-            raise SceneError([problem]) from error
+            raise InputError([problem]) from error
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
@@ -249,10 +249,10 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
     if problems:
         head = f"--out {path} holds another run; choose another folder, or --fresh to delete it"
         shown = [head, *_own_command(stored), *(p.rstrip() for p in problems + extension)]
-        raise SceneError(shown)
+        raise InputError(shown)
     if extension:
         hint = "leave out --episodes to go on with it, or choose another folder"
-        raise SceneError([f"--out {path}: {problem}; {hint}" for problem in extension])
+        raise InputError([f"--out {path}: {problem}; {hint}" for problem in extension])
 
 
 def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from codesign_jax import archives, types
 from codesign_jax.codesign import EpisodeInfo
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
 FOLDER = "failures"
@@ -68,10 +68,10 @@ def load(path: Path) -> Failure:
     """Reads a failed world.
 
     Raises:
-      SceneError: If the file is not one.
+      InputError: If the file is not one.
     """
     if not path.exists():
-        raise SceneError([f"{path}: there is no such file or folder"])
+        raise InputError([f"{path}: there is no such file or folder"])
     try:
         values = archives.load(path)
         trial = Trial(**{name: values[f"trial_{name}"] for name in Trial._fields})
@@ -80,4 +80,4 @@ def load(path: Path) -> Failure:
         return Failure(values["design"], trial, values["state"], status, bad_step, place)  # type: ignore[arg-type]
     except (OSError, ValueError, KeyError, TypeError) as error:
         problem = f"{path} is not a failed world of a run, which are .npz files in its {FOLDER}/"
-        raise SceneError([problem]) from error
+        raise InputError([problem]) from error

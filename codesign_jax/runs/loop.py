@@ -100,7 +100,7 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
       settings: Settings without `settings.check`'s problems.
 
     Raises:
-      SceneError: If an optimiser or a cost of the user's own is none; see `own`.
+      InputError: If an optimiser or a cost of the user's own is none; see `own`.
     """
     space, mask = design_space(scene.hand, settings.preset), masks_of(scene, settings)
     engine = make_engine(settings.engine, scene)

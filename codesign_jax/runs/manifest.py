@@ -17,7 +17,7 @@ from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs import scene_files
 from codesign_jax.runs.settings import Settings, check
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 PROVENANCE = "provenance.json"
 """File that makes a folder a run."""
@@ -70,7 +70,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
     """Reads provenance.json of a run folder; settings that it lacks have their defaults.
 
     Raises:
-      SceneError: If it is not a run folder, the file is damaged, or the run of a newer version.
+      InputError: If it is not a run folder, the file is damaged, or the run of a newer version.
     """
     file = path / PROVENANCE
     try:
@@ -83,7 +83,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
             why = f"it has no {PROVENANCE}" if _exists(path) else "there is no such folder"
         else:
             why = f"{PROVENANCE} cannot be read: {error.strerror}"
-        raise SceneError([f"{path} is not a run folder: {why}{_runs_inside(path)}"]) from error
+        raise InputError([f"{path} is not a run folder: {why}{_runs_inside(path)}"]) from error
     except UnicodeDecodeError as error:
         raise _damaged(file, "it is no text in UTF-8") from error
     try:
@@ -93,7 +93,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
     if problem := _problem(stored):
         raise _damaged(file, problem)
     if stored.get("schema", 0) > SCHEMA:
-        raise SceneError(
+        raise InputError(
             [
                 f"{path} was made by a newer version of codesign-jax (its folders have schema "
                 f"{stored['schema']}, this version reads up to {SCHEMA}): use that version"
@@ -124,7 +124,7 @@ def changed_files(path: Path, stored: Mapping[str, Any]) -> list[str]:
         return found
     try:
         texts = scene_files.scene_texts(scenes.load(path / "scene.toml"))
-    except SceneError:
+    except InputError:
         return found
     return [n for n in found if sha256(texts[n].encode()).hexdigest() != noted[n]]
 
@@ -137,14 +137,14 @@ def refuse_changed(path: Path, stored: Mapping[str, Any]) -> None:
       stored: Its provenance.
 
     Raises:
-      SceneError: With what to do about it.
+      InputError: With what to do about it.
     """
     changed = changed_files(path, stored)
     if not changed:
         return
     missing = [name for name in changed if not (path / name).exists()]
     what = "is missing" if missing == changed else "was changed"
-    raise SceneError(
+    raise InputError(
         [
             f"{', '.join(str(path / name) for name in changed)} {what} since the run was made, so "
             "that its results are not those of this scene. Put back the file as it was. To try "
@@ -155,8 +155,8 @@ def refuse_changed(path: Path, stored: Mapping[str, Any]) -> None:
     )
 
 
-def _damaged(file: Path, why: str) -> SceneError:
-    return SceneError(
+def _damaged(file: Path, why: str) -> InputError:
+    return InputError(
         [f"{file} is damaged: {why}. Put it back from a copy, or choose another folder"]
     )
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codesign_jax import files
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Status
 
 STATUS_BITS = {str(int(bit)): bit.name for bit in Status if bit}
@@ -52,14 +52,14 @@ def library(what: str) -> ModuleType:
       what: What needs it, such as a flag, for the error.
 
     Raises:
-      SceneError: If it is not installed; says how to install it.
+      InputError: If it is not installed; says how to install it.
     """
     try:
         import pyarrow
         import pyarrow.parquet
     except ModuleNotFoundError as error:
         message = f"{what} needs {error.name}: pip install '.[parquet]' in the checkout"
-        raise SceneError([message]) from error
+        raise InputError([message]) from error
     return pyarrow
 
 

@@ -7,7 +7,7 @@ whenever nothing else was printed for a few seconds.
 import sys
 import threading
 import time
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import rich.console
 import rich.progress
@@ -69,21 +69,36 @@ class Ticker:
             self.tick()
 
 
-class Busy:
+class Live:
+    """A bar where there is a terminal, else lines on the standard error; a context manager."""
+
+    def __init__(self, console: rich.console.Console, *columns: rich.progress.ProgressColumn):
+        """Takes where to tell, and the bar's columns."""
+        self._bar = rich.progress.Progress(
+            *columns, console=console, transient=True, disable=not console.is_terminal
+        )
+        self._ticker = Ticker(disable=console.is_terminal)
+
+    def __enter__(self) -> Self:
+        """Shows the bar."""
+        self._bar.start()
+        self._ticker.__enter__()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Removes it; lines stay."""
+        self._ticker.__exit__()
+        self._bar.stop()
+
+
+class Busy(Live):
     """Shows that something of unknown progress goes on, and for how long; a context manager."""
 
     def __init__(self, console: rich.console.Console, text: str, expected: float | None = None):
         """Takes what goes on, and how long that is expected to take [s], if it is known."""
-        self._ticker = Ticker(disable=console.is_terminal)
-        self._ticker.begin(text, expected)
         columns = rich.progress.SpinnerColumn(), rich.progress.TextColumn("{task.description}")
-        self._bar = rich.progress.Progress(
-            *columns,
-            rich.progress.TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
+        super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
+        self._ticker.begin(text, expected)
         about = "" if expected is None else f" (about {duration(expected)})"
         self._task = self._bar.add_task(text + about, total=None)
 
@@ -92,19 +107,8 @@ class Busy:
         self._ticker.rename(text)
         self._bar.update(self._task, description=text)
 
-    def __enter__(self) -> "Busy":
-        """Shows it."""
-        self._bar.start()
-        self._ticker.__enter__()
-        return self
 
-    def __exit__(self, *exception: object) -> None:
-        """Ends it."""
-        self._ticker.__exit__()
-        self._bar.stop()
-
-
-class Progress:
+class Progress(Live):
     """Reports a run's episodes and its final test; use as a context manager."""
 
     def __init__(
@@ -125,29 +129,11 @@ class Progress:
         """
         self.total, self._test, self._after = total, test, after
         self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
-        columns = (
-            rich.progress.BarColumn(),
-            rich.progress.TextColumn("{task.description}"),
-            rich.progress.TimeElapsedColumn(),
-        )
-        self._bar = rich.progress.Progress(
-            *columns, console=self.console, transient=True, disable=not self.console.is_terminal
-        )
+        columns = rich.progress.BarColumn(), rich.progress.TextColumn("{task.description}")
+        super().__init__(self.console, *columns, rich.progress.TimeElapsedColumn())
         self._task = self._bar.add_task("", total=None)
-        self._ticker = Ticker(disable=self.console.is_terminal)
         self._watches: list[Stopwatch] = []
         self._seconds, self._grasps, self._tested, self._told = 0.0, 0, 0, 0.0
-
-    def __enter__(self) -> "Progress":
-        """Starts the bar."""
-        self._bar.start()
-        self._ticker.__enter__()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Removes the bar; the lines stay."""
-        self._ticker.__exit__()
-        self._bar.stop()
 
     def message(self, text: str) -> None:
         """Prints a line above the bar."""

@@ -17,7 +17,7 @@ from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import Settings
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 Tell = Callable[[str], None]
 """Takes a sentence about what is amiss with a run."""
@@ -39,7 +39,7 @@ def read_run(
       overrides: Values by key path that replace the run's; see `scene.load`.
 
     Raises:
-      SceneError: If it is not a run folder, or its scene is no longer the one it was made with.
+      InputError: If it is not a run folder, or its scene is no longer the one it was made with.
     """
     stored = manifest.read_provenance(path)
     manifest.refuse_changed(path, stored)
@@ -57,11 +57,11 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
       tell: Called with what is amiss, such as newer checkpoints that are damaged; None to warn.
 
     Raises:
-      SceneError: If the folder is no run, no checkpoint of it can be read, or they are another's.
+      InputError: If the folder is no run, no checkpoint of it can be read, or they are another's.
     """
     tell = tell or (lambda text: warnings.warn(text, stacklevel=3))
     if problem := lost_all(folder):
-        raise SceneError([problem])
+        raise InputError([problem])
     if not (folder / "checkpoints").is_dir():
         return None
     stored = manifest.read_provenance(folder)
@@ -74,7 +74,7 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
         record = records.from_arrays(found.arrays)
         records.refuse_other(record, settings, found.step)
     except (RunError, OSError) as error:
-        raise SceneError([f"run {folder}: {error}"]) from error
+        raise InputError([f"run {folder}: {error}"]) from error
     if found.damaged:
         steps = "; ".join(f"{step}: {reason}" for step, reason in found.damaged)
         test = "with" if record.test is not None else "without"
@@ -112,4 +112,4 @@ def _none(folder: Path, found: Restored) -> None:
     episodes = tables.episodes_in(folder)
     if found.damaged or episodes:
         damaged = f"no checkpoint that is whole ({steps})" if steps else "no checkpoint"
-        raise SceneError([f"run {folder} has {damaged}, {lost(episodes)}"])
+        raise InputError([f"run {folder} has {damaged}, {lost(episodes)}"])

@@ -187,7 +187,10 @@ def refuse_other(
         "they are of another seed": not np.array_equal(jax.random.key_data(record.state.key), seed),
         f"they are not of {n} particles of {d} parameters": particles != (n, d)
         or history.population.shape != (room, n, d),
-        f"they are not of {t} trials": any(np.shape(v) != (room, n, t) for v in history.trials),
+        f"they are not of {t} trials": any(
+            np.shape(v) != (room, n, t)  # type: ignore[call-overload]  # one may be None
+            for v in history.trials
+        ),
         f"checkpoint {step} holds episode {record.done}": own != step,
         f"they have {record.done} episodes of {e}": not 0 <= record.done <= min(room, e),
     }

@@ -61,7 +61,7 @@ class Settings:
 # the optimisers that are compared with the paper's share; and those of the screened searches, by
 # docs/notes/search.md.
 _SIZES = {"2d": (10, 6, 64, 36), "": (60, 6, 128, 72)}
-_SCREENED_SIZES = {"2d": (13, 3, 23, 6), "": (25, 3, 30, 6)}
+_SCREENED_SIZES = {"2d": (13, 3, 21, 12), "": (25, 3, 28, 12)}
 
 _RANGES = {
     "particles": (1, MAX_PARTICLES),
@@ -141,7 +141,7 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     if hand is not None:
         try:
             space = design_space(hand, settings.preset)
-        except schema.SceneError as error:
+        except schema.InputError as error:
             found += [f"--{problem}" for problem in error.problems]
     low, high = _RANGES["episodes"]
     if low <= settings.episodes <= high:  # it is as long as the run

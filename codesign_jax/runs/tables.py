@@ -23,6 +23,9 @@ from codesign_jax.types import WARNINGS, Outcome, Status, Trial
 
 TESTS = "tests.csv"
 
+Row = dict[str, Any]
+"""Values by the columns' names, see `columns`."""
+
 
 def design_columns(space: DesignSpace) -> list[str]:
     """Names of the parameters with their units, e.g. length_mm and pressure_0_kPa."""
@@ -43,13 +46,13 @@ def write_episodes(
       start: First episode.
       stop: Episode after the last.
     """
-    for name, (head, rows) in _of_episodes(scene, space, history, range(start, stop)).items():
+    for name, rows in _of_episodes(scene, space, history, range(start, stop)).items():
+        path, text = folder / name, _text(name, space, rows, named=start == 0)
         if start == 0:
-            _replace(folder / name, _text([head, *rows]))
+            _replace(path, text)
         else:
-            path = folder / name
             with files.naming(path), path.open("a", newline="", encoding="utf-8") as file:
-                file.write(_text(rows))
+                file.write(text)
 
 
 def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: FinalTest) -> None:
@@ -61,8 +64,7 @@ def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: F
       particles: Final particles [SI units], shape (particle, parameter).
       test: Their test.
     """
-    head, rows = _of_test(space, particles, test)
-    _replace(folder / TESTS, _text([head, *rows]))
+    _replace(folder / TESTS, _text(TESTS, space, _of_test(space, particles, test)))
 
 
 def mend(
@@ -84,8 +86,8 @@ def mend(
     if test is not None:
         wanted[TESTS] = _of_test(space, np.asarray(record.state.particles), test)
     differing = []
-    for name, (head, rows) in wanted.items():
-        text = _text([head, *rows])
+    for name, rows in wanted.items():
+        text = _text(name, space, rows)
         if _content(folder / name) != text.encode():
             _replace(folder / name, text)
             differing.append(name)
@@ -128,18 +130,15 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
     """
     names, noise = [s.name for s in scene.objects.object], noise_values(trials)
 
-    def row(t: int) -> list:
+    def row(t: int) -> Row:
         one = jax.tree.map(lambda v: np.asarray(v)[t], outcomes)
-        drawn = [_number(float(v[t])) for v in noise.values()]
-        numbers = [_number(float(one.cost)), _number(float(one.lost_time))]
-        bad_step = int(one.bad_step)
-        ending = [VERDICTS[verdicts(one)], *numbers, status_names(one.status)]
-        ending += [bad_step if bad_step >= 0 else "", _told(one.capped), _told(one.residual)]
-        return [t, names[int(trials.shape[t])], *drawn, *ending]
+        found = {"trial": t, "object": names[int(trials.shape[t])]}
+        drawn = {name: _number(v[t]) for name, v in noise.items()}
+        return found | drawn | {"verdict": VERDICTS[verdicts(one)]} | _ending(one)
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = (row(t) for t in range(len(outcomes.cost)))
-    _replace(path, _text([[*MORE[REFERENCE].columns], *rows]))
+    _replace(path, written([*MORE[REFERENCE].columns], rows))
 
 
 def describe(space: DesignSpace, design: np.ndarray) -> str:
@@ -168,77 +167,118 @@ def _counts(status: np.ndarray, bits: Iterable[Status]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
 
 
-def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[list]:
+def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[Row]:
     for e in span:
         best = int(np.argmin(history.cost[e]))
-        failed = int(types.failed(history.trials.status[e]).sum())
-        size = 1 / (history.weight[e] ** 2).sum()
-        costs = [_number(history.cost[e].mean()), _number(history.cost[e, best])]
-        yield [e + 1, *costs, failed, _number(size), *_designs(space, history.population[e])[best]]
+        yield {
+            "episode": e + 1,
+            "mean_cost": _number(history.cost[e].mean()),
+            "best_cost": _number(history.cost[e, best]),
+            "failed_trials": int(types.failed(history.trials.status[e]).sum()),
+            "effective_sample_size": _number(1 / (history.weight[e] ** 2).sum()),
+            **_designs("episodes.csv", space, history.population[e, best : best + 1])[0],
+        }
 
 
-def _particles(history: History, space: DesignSpace, span: range) -> Iterator[list]:
+def _particles(history: History, space: DesignSpace, span: range) -> Iterator[Row]:
     for e in span:
-        for i, design in enumerate(_designs(space, history.population[e])):
-            numbers = [_number(history.cost[e, i]), _number(history.weight[e, i])]
-            yield [e + 1, i, *numbers, history.ancestors[e, i], *design]
+        for i, design in enumerate(_designs("particles.csv", space, history.population[e])):
+            yield {
+                "episode": e + 1,
+                "particle": i,
+                "cost": _number(history.cost[e, i]),
+                "weight": _number(history.weight[e, i]),
+                "next_copies_particle": history.ancestors[e, i],
+                **design,
+            }
 
 
-def _trials(history: History, scene: Scene, span: range) -> Iterator[list]:
+def _trials(history: History, scene: Scene, span: range) -> Iterator[Row]:
     names, trials = [s.name for s in scene.objects.object], history.trials
     for e in span:
-        for i, t in np.ndindex(*history.trials.cost.shape[1:]):
-            numbers = [_number(trials.cost[e, i, t]), _number(trials.lost_time[e, i, t])]
-            status = status_names(trials.status[e, i, t])
-            bad_step = int(trials.bad_step[e, i, t])
-            row = [e + 1, i, t, names[t % len(names)], *numbers, status]
-            solved = (
-                _told(v if v is None else v[e, i, t]) for v in (trials.capped, trials.residual)
-            )
-            yield [*row, bad_step if bad_step >= 0 else "", *solved]
+        for i, t in np.ndindex(*trials.cost.shape[1:]):
+            own = {"episode": e + 1, "particle": i, "trial": t, "object": names[t % len(names)]}
+            yield own | _ending(jax.tree.map(lambda v, at=(e, i, t): v[at], trials))
 
 
 def _told(value: Any) -> str:
     """A number; empty if it is not one, or none was told."""
-    return "" if value is None or np.isnan(value) else _number(float(value))
+    return "" if value is None or np.isnan(value) else _number(value)
 
 
-def _designs(space: DesignSpace, population: np.ndarray) -> list[list[str]]:
-    return [[_number(v) for v in row] for row in space.in_units(population)]
+def _ending(outcome: Outcome) -> Row:
+    """The columns of a trial that say how it ended; the outcome's entries are numbers."""
+    bad_step = int(outcome.bad_step)
+    return {
+        "cost": _number(outcome.cost),
+        "lost_time_s": _number(outcome.lost_time),
+        "status": status_names(outcome.status),
+        "first_bad_step": bad_step if bad_step >= 0 else "",
+        "steps_at_limit": _told(outcome.capped),
+        "residual": _told(outcome.residual),
+    }
 
 
-def _number(value: float) -> str:
-    return f"{value:.9g}"
+def _designs(table: str, space: DesignSpace, population: np.ndarray) -> list[Row]:
+    """The columns of designs in a table."""
+    names = TABLES[table].head(design_columns(space))[-len(space.names) :]
+    values = space.in_units(population)
+    return [dict(zip(names, map(_number, design), strict=True)) for design in values]
+
+
+def _number(value: Any) -> str:
+    return f"{float(value):.9g}"
 
 
 def _of_episodes(
     scene: Scene, space: DesignSpace, history: History, span: range
-) -> dict[str, tuple[list[str], Iterable[list]]]:
-    """Head and rows of the tables of episodes, by the files' names."""
-    designs = design_columns(space)
-    rows = {
+) -> dict[str, Iterable[Row]]:
+    """Rows of the tables of episodes, by the files' names."""
+    return {
         "episodes.csv": _episodes(history, space, span),
         "particles.csv": _particles(history, space, span),
         "trials.csv": _trials(history, scene, span),
     }
-    return {name: (TABLES[name].head(designs), values) for name, values in rows.items()}
 
 
-def _of_test(
-    space: DesignSpace, particles: np.ndarray, test: FinalTest
-) -> tuple[list[str], Iterable[list]]:
-    """Head and rows of the table of the final test."""
+def _of_test(space: DesignSpace, particles: np.ndarray, test: FinalTest) -> Iterator[Row]:
+    """Rows of the table of the final test."""
     failed = types.failed(np.asarray(test.trials.status))
-    rows = (
-        [i, _number(test.cost[i]), failed.shape[1], failed[i].sum(), int(test.success[i]), *design]
-        for i, design in enumerate(_designs(space, particles))
-    )
-    return TABLES[TESTS].head(design_columns(space)), rows
+    for i, design in enumerate(_designs(TESTS, space, particles)):
+        yield {
+            "particle": i,
+            "test_cost": _number(test.cost[i]),
+            "trials": failed.shape[1],
+            "failed_trials": failed[i].sum(),
+            "success": int(test.success[i]),
+            **design,
+        }
 
 
-def _text(rows: Iterable[list]) -> str:
+def _text(table: str, space: DesignSpace, rows: Iterable[Row], *, named: bool = True) -> str:
+    """Text of a table of `columns.TABLES`; without `named` that of further rows."""
+    return written(TABLES[table].head(design_columns(space)), rows, named=named)
+
+
+def written(head: list[str], rows: Iterable[Row], *, named: bool = True) -> str:
+    """Text of a table.
+
+    Args:
+      head: Names of its columns, in their order.
+      rows: Values by the columns' names.
+      named: Whether it begins with the names.
+
+    Raises:
+      ValueError: If a row has other columns.
+    """
     text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    writer = csv.DictWriter(text, head, lineterminator="\n")
+    if named:
+        writer.writeheader()
+    for row in rows:
+        if missing := [name for name in head if name not in row]:
+            raise ValueError(f"a row of the table has no {', '.join(missing)}")
+        writer.writerow(row)
     return text.getvalue()
 
 

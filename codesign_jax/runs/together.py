@@ -88,7 +88,7 @@ def optimize(
         left that is shown includes it.
 
     Raises:
-      SceneError: If a folder cannot be used; see `open_run`.
+      InputError: If a folder cannot be used; see `open_run`.
       ValueError: If the plans are not variants of one.
     """
     found: dict[Path, RunResult | Exception] = {}

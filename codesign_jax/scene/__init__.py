@@ -10,12 +10,12 @@ effect means, `schema` the checks of files, `meshes` objects of any shape.
 (4, 900, 0.01)
 >>> scene.load("paper", overrides={"gravty": 3.7})
 Traceback (most recent call last):
-codesign_jax.scene.schema.SceneError: gravty is not a known key; did you mean 'gravity'?
+codesign_jax.scene.schema.InputError: gravty is not a known key; did you mean 'gravity'?
 """
 
 from codesign_jax.scene.description import Constants, Scene, by_structure
 from codesign_jax.scene.loading import check_together, load, load_accuracy, with_accuracy
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from codesign_jax.scene.tables import (
     Accuracy,
     Arm,
@@ -43,7 +43,7 @@ __all__ = [
     "Phases",
     "Pneumatics",
     "Scene",
-    "SceneError",
+    "InputError",
     "Solver",
     "by_structure",
     "check_together",

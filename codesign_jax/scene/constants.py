@@ -6,13 +6,14 @@
 >>> constants.check(grasping, mars)
 >>> constants.check(grasping, mars._replace(gravity=-3.7))
 Traceback (most recent call last):
-codesign_jax.scene.schema.SceneError: constants.gravity = -3.7 is outside [0, 100] m/s^2
+codesign_jax.scene.schema.InputError: constants.gravity = -3.7 is outside [0, 100] m/s^2
 """
 
 from collections.abc import Iterator
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -28,7 +29,7 @@ def check(scene: Scene, constants: Constants) -> None:
       constants: The numbers; leaves of shape () or (n,), with the same n.
 
     Raises:
-      SceneError: With every key that is missing, unknown, not a number, not finite, of another
+      InputError: With every key that is missing, unknown, not a number, not finite, of another
         shape or outside the range of its file; or if contacts of the palm would begin farther from
         a mesh than its distances reach.
     """
@@ -42,7 +43,7 @@ def check(scene: Scene, constants: Constants) -> None:
     if not problems and _known(constants):
         problems = check_together(scene.with_constants(constants), "constants")
     if problems:
-        raise schema.SceneError(problems)
+        raise schema.InputError(problems)
     radius, noise = constants.hand.palm.contact_radius, constants.objects.noise.size
     if not any(isinstance(v, jax.core.Tracer) for v in (radius, noise)):
         reach.refuse(scene.objects, float(np.asarray(radius).max()), float(np.asarray(noise).max()))

@@ -179,7 +179,7 @@ class Scene(SceneFile):
           An int, or a traced array of shape () where the scene's numbers are traced.
 
         Raises:
-          SceneError: If the grasp has no such phase.
+          InputError: If the grasp has no such phase.
 
         >>> from codesign_jax import scene
         >>> grasping = scene.load("paper")
@@ -188,7 +188,7 @@ class Scene(SceneFile):
         """
         ends = self.phase_ends
         if phase is not None and phase not in ends:
-            raise schema.SceneError([self._no_phase(phase)])
+            raise schema.InputError([self._no_phase(phase)])
         last = self.steps_to(ends[phase or self._judged]) - 1
         return int(last) if isinstance(last, (int, float)) else last.astype(int)
 

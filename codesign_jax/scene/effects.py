@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 ENGINES = ("structured", "mujoco", "mjx")
 """Names of the engines; `engines.make_engine` builds them."""
@@ -95,7 +95,7 @@ def refuse(effects: Any, engine: str) -> None:
       engine: Name of the engine.
 
     Raises:
-      SceneError: With a line for each effect that it cannot do.
+      InputError: With a line for each effect that it cannot do.
     """
     problems = []
     for name, reason in refusals(effects, engine).items():
@@ -105,7 +105,7 @@ def refuse(effects: Any, engine: str) -> None:
             f"({reason}); use engine {' or '.join(able)}"
         )
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
 
 
 def setting(effects: Any, name: str) -> str:

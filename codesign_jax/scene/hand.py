@@ -6,7 +6,7 @@
 (3, 56000.0)
 >>> hand.load("tripod")
 Traceback (most recent call last):
-codesign_jax.scene.schema.SceneError: hands: 'tripod' unknown; did you mean 'tripod3'?
+codesign_jax.scene.schema.InputError: hands: 'tripod' unknown; did you mean 'tripod3'?
 """
 
 import dataclasses
@@ -54,7 +54,7 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
       overrides: Values by key path that replace the file's; see `keypaths`.
 
     Raises:
-      SceneError: with every problem in the file.
+      InputError: with every problem in the file.
     """
     path = library.find("hands", name)
     problems: list[str] = []
@@ -71,7 +71,7 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
         if not problems:
             _check_sections(hand, path.name, problems)
     if problems or hand is None:
-        raise schema.SceneError(keypaths.as_given(problems, places))
+        raise schema.InputError(keypaths.as_given(problems, places))
     return hand
 
 

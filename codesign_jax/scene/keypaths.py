@@ -23,7 +23,7 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
       pairs: The pairs; a value is TOML, and what is none, such as a bare word, is a string.
 
     Raises:
-      SceneError: With every pair that is not KEY=VALUE.
+      InputError: With every pair that is not KEY=VALUE.
     """
     found: dict[Path, Any] = {}
     problems = []
@@ -37,7 +37,7 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
             found.pop(path, None)  # values are applied in the order in which they were given
             found[path] = _toml_value(text)
     if problems:
-        raise schema.SceneError(problems)
+        raise schema.InputError(problems)
     return found
 
 
@@ -49,16 +49,16 @@ def flatten(values: Mapping[Any, Any]) -> dict[Path, Any]:
         further keys.
 
     Raises:
-      SceneError: If a key is neither, or tables or keys are nested too deep.
+      InputError: If a key is neither, or tables or keys are nested too deep.
     """
     if library.too_deep(values):
         deepest = library.DEEPEST
-        raise schema.SceneError([f"values are nested more than {deepest} tables deep"])
+        raise schema.InputError([f"values are nested more than {deepest} tables deep"])
     found: dict[Path, Any] = {}
     for key, value in values.items():
         path = _path(key) if isinstance(key, str) else key
         if not (isinstance(path, tuple) and path and all(isinstance(part, str) for part in path)):
-            raise schema.SceneError(
+            raise schema.InputError(
                 [f"{schema.shown(key)} is no key path such as 'solver.iterations'"]
             )
         if isinstance(value, Mapping):

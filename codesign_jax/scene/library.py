@@ -38,24 +38,24 @@ def find(kind: str, name: str | Path) -> Path:
     """Resolves a built-in name or a path ending in .toml to a file.
 
     Raises:
-      SceneError: if neither a file nor a built-in of that name exists.
+      InputError: if neither a file nor a built-in of that name exists.
     """
     path = Path(name)
     if path.suffix == ".toml":
         if is_file(path):
             return path
-        raise schema.SceneError([f"{kind}: no file {schema.shown(str(path))}"])
+        raise schema.InputError([f"{kind}: no file {schema.shown(str(path))}"])
     built_in = available(kind)
     if str(name) in built_in:
         return built_in[str(name)]
     if os.path.isdir(path) or path.suffix:  # never raises, as of a name that is too long
-        raise schema.SceneError([f"{kind}: {schema.shown(str(path))} {_no_file(kind, path)}"])
+        raise schema.InputError([f"{kind}: {schema.shown(str(path))} {_no_file(kind, path)}"])
     beside = path.with_name(path.name + ".toml") if path.name else path
     if is_file(beside):
         hint = f"did you mean the file {schema.shown(str(beside))}?"
     else:
         hint = schema.nearest(str(name), built_in)
-    raise schema.SceneError([f"{kind}: {schema.shown(str(name))} unknown; {hint}"])
+    raise schema.InputError([f"{kind}: {schema.shown(str(name))} unknown; {hint}"])
 
 
 def _no_file(kind: str, path: Path) -> str:
@@ -75,33 +75,33 @@ def is_file(path: Path) -> bool:
     """Whether a path is a file that can be asked for: not too long a name, no folder that is shut.
 
     Raises:
-      SceneError: If the system does not say, with its reason.
+      InputError: If the system does not say, with its reason.
     """
     try:
         return path.is_file()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name, of some versions
         why = error.strerror if isinstance(error, OSError) else error
-        raise schema.SceneError([f"{schema.shown(str(path))}: {why}"]) from error
+        raise schema.InputError([f"{schema.shown(str(path))}: {why}"]) from error
 
 
 def read(path: Path) -> dict[str, Any]:
     """Reads a TOML file.
 
     Raises:
-      SceneError: if the file cannot be read or is too large, is not UTF-8 text or not valid TOML,
+      InputError: if the file cannot be read or is too large, is not UTF-8 text or not valid TOML,
         with the parser's position.
     """
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise schema.SceneError([f"{path.name}: {error.strerror}"]) from error
+        raise schema.InputError([f"{path.name}: {error.strerror}"]) from error
     if len(data) > MOST_BYTES:
-        raise schema.SceneError([f"{path.name}: has more than {MOST_BYTES:,} bytes"])
+        raise schema.InputError([f"{path.name}: has more than {MOST_BYTES:,} bytes"])
     try:
         table = parse(data.decode("utf-8"))
     except (ValueError, OverflowError, RecursionError) as error:
-        raise schema.SceneError([f"{path.name}: not valid TOML: {why_not(error)}"]) from error
+        raise schema.InputError([f"{path.name}: not valid TOML: {why_not(error)}"]) from error
     return table
 
 

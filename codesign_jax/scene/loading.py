@@ -33,7 +33,7 @@ def load(
         e.g. {"discretization": {"links": 5}, "hand.material.shear_modulus": 60e3}; see `keypaths`.
 
     Raises:
-      SceneError: with every problem of the scene, the hand and the objects.
+      InputError: with every problem of the scene, the hand and the objects.
     """
     path = library.find("scenes", name)
     table = library.read(path)
@@ -57,10 +57,10 @@ def load(
         try:
             source = _beside(path, named) if chosen is None else chosen
             parts[key] = loader(source, overrides=inside[key])
-        except schema.SceneError as error:
+        except schema.InputError as error:
             problems += error.problems
     if problems or parsed is None:
-        raise schema.SceneError(problems)
+        raise schema.InputError(problems)
     parts["objects"] = reach.fit(parts["objects"], parts["hand"])
     names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
     return Scene(**parts, **{n: getattr(parsed, n) for n in names})
@@ -73,13 +73,13 @@ def load_accuracy(name: str | Path) -> Accuracy:
       name: Name of a built-in preset, or a path ending in .toml.
 
     Raises:
-      SceneError: with every problem of the file.
+      InputError: with every problem of the file.
     """
     path = library.find("accuracy", name)
     problems: list[str] = []
     preset = schema.parse(Accuracy, library.read(path), path.name, problems)
     if problems or preset is None:
-        raise schema.SceneError(problems)
+        raise schema.InputError(problems)
     return preset
 
 
@@ -91,7 +91,7 @@ def with_accuracy(scene: Scene, name: str | Path) -> Scene:
       name: As of `load_accuracy`.
 
     Raises:
-      SceneError: with every problem of the preset's file.
+      InputError: with every problem of the preset's file.
     """
     tables = {key: getattr(scene, key) for key in _OF_ACCURACY}
     preset = load_accuracy(name)
@@ -107,7 +107,7 @@ def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str,
         return {}
     try:
         preset = load_accuracy(name)
-    except schema.SceneError as error:
+    except schema.InputError as error:
         problems += error.problems
         return {}
     return {key: getattr(preset, key) for key in _OF_ACCURACY}

@@ -193,7 +193,7 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
       overrides: Values by key path that replace the file's; see `keypaths`.
 
     Raises:
-      SceneError: with every problem in the file and in its meshes.
+      InputError: with every problem in the file and in its meshes.
     """
     path = library.find("objects", name)
     problems: list[str] = []
@@ -203,17 +203,17 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
     parsed = schema.parse(_ObjectSetFile, table, path.name, problems)
     problems = keypaths.as_given(problems, places)
     if parsed is None:
-        raise schema.SceneError(problems)
+        raise schema.InputError(problems)
     if not parsed.object:
         problems.append(f"{path.name}.object must name at least one object")
     names = [shape.name for shape in parsed.object]
     for name in sorted({n for n in names if names.count(n) > 1}):
         problems.append(f"{path.name}.object {name}: the name is given {names.count(name)} times")
     if too_large := _size_problems(parsed, path):
-        raise schema.SceneError(problems + too_large)
+        raise schema.InputError(problems + too_large)
     shapes = [_shape(shape, path, problems) for shape in parsed.object]
     if problems:
-        raise schema.SceneError(problems)
+        raise schema.InputError(problems)
     found = tuple(s for s in shapes if s is not None)
     return ObjectSet(parsed.name, parsed.description, parsed.noise, parsed.table, found)
 
@@ -265,7 +265,7 @@ def _mesh_shape(values: dict, path: Path, where: str, problems: list[str]) -> Sh
             repaired=bool(values["repair"]),
             voxel_error=values["voxel_error"] or 5e-4,
         )
-    except schema.SceneError as error:
+    except schema.InputError as error:
         problems += [f"{where}: {p}" for p in error.problems]
         return None
     # Written back as a mass, so that the same file read again gives the same object.

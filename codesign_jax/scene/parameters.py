@@ -13,7 +13,7 @@ only.
 array([0.095, 0.03 ])
 >>> space.params(np.array([95.0, 0.03]))
 Traceback (most recent call last):
-codesign_jax.scene.schema.SceneError: length = 95.0 is outside [0.001, 1] m; did you mean 0.095? ...
+codesign_jax.scene.schema.InputError: length = 95.0 is outside [0.001, 1] m; did you mean 0.095? ...
 """
 
 import dataclasses
@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -97,7 +98,7 @@ class DesignSpace:
         """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,).
 
         Raises:
-          SceneError: If it has another shape, and see `refuse_unit_slips`.
+          InputError: If it has another shape, and see `refuse_unit_slips`.
         """
         self._refuse_shape(design, "")
         self.refuse_unit_slips(design)
@@ -140,7 +141,7 @@ class DesignSpace:
           Designs first to first + n - 1 [SI], shape (n, parameter).
 
         Raises:
-          SceneError: If `key` is not one typed key, or `n` is no whole number or below 1.
+          InputError: If `key` is not one typed key, or `n` is no whole number or below 1.
         """
         _refuse_draws(key, n)
         return _sampled(self, n, key, first)
@@ -155,7 +156,7 @@ class DesignSpace:
           designs: Design vectors [SI], shape (..., parameter).
 
         Raises:
-          SceneError: With every such number and its suggested value, or if the last axis is not
+          InputError: With every such number and its suggested value, or if the last axis is not
             that of the parameters. Of pressures that are all nearly zero, a warning is given.
         """
         self._refuse_shape(designs, "..., ")
@@ -167,7 +168,7 @@ class DesignSpace:
         for name, row, column in zip(self.names, rows, columns, strict=True):
             found += unit_slips.slips(name, row, column)
         if found:
-            raise schema.SceneError(found)
+            raise schema.InputError(found)
         unit_slips.hint_at_kilopascals(columns[[row == "pressure" for row in rows]])
 
     def check(self, designs: np.typing.ArrayLike) -> None:
@@ -179,7 +180,7 @@ class DesignSpace:
           designs: Design vectors [SI], shape (..., parameter).
 
         Raises:
-          SceneError: If a number is not finite, and see `refuse_unit_slips`. Of designs outside of
+          InputError: If a number is not finite, and see `refuse_unit_slips`. Of designs outside of
             the bounds or above the pressure limit, which are simulated all the same, a warning is
             given.
         """
@@ -209,7 +210,7 @@ class DesignSpace:
             if any_bad
         ]
         if found:
-            raise schema.SceneError(found)
+            raise schema.InputError(found)
 
     def _outside(
         self, units: Sequence[str], low: np.ndarray, high: np.ndarray, rows: np.ndarray
@@ -232,12 +233,12 @@ class DesignSpace:
         """Refuses what are not designs of this space, shape (particle, parameter).
 
         Raises:
-          SceneError: If the shape is another one.
+          InputError: If the shape is another one.
         """
         if np.ndim(population) != 2:
             shape = np.shape(population)
             hint = "; population[None] makes a batch of one" if len(shape) == 1 else ""
-            raise schema.SceneError(
+            raise schema.InputError(
                 [f"population has shape {shape}, not (particle, parameter){hint}"]
             )
         self._refuse_shape(population, "particle, ")
@@ -247,7 +248,7 @@ class DesignSpace:
         if shape[-1:] != (count,) or (not leading and len(shape) > 1):
             names = ", ".join(self.names)
             hint = "; jax.vmap maps over designs" if not leading and len(shape) > 1 else ""
-            raise schema.SceneError(
+            raise schema.InputError(
                 [f"designs have shape {shape}, not ({leading}{count},): {names}{hint}"]
             )
 
@@ -264,7 +265,7 @@ class DesignSpace:
         """Converts design vectors from SI to the hand file's units, shape (..., parameter).
 
         Raises:
-          SceneError: If the last axis is not that of the parameters.
+          InputError: If the last axis is not that of the parameters.
         """
         self._refuse_shape(design, "..., ")
         return np.asarray(design) / np.asarray(self.scale)
@@ -276,7 +277,7 @@ class DesignSpace:
         simulated, though no optimiser proposes it.
 
         Raises:
-          SceneError: If the last axis is not that of the parameters, or a number is not finite.
+          InputError: If the last axis is not that of the parameters, or a number is not finite.
         """
         self._refuse_shape(design, "..., ")
         given, scale = np.asarray(design, float), np.asarray(self.scale)
@@ -326,11 +327,11 @@ def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
 def _refuse_draws(key: Any, n: Any) -> None:
     """Refuses what no designs can be drawn from."""
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
-        raise schema.SceneError([f"n = {n!r} designs must be a whole number, at least 1"])
+        raise schema.InputError([f"n = {n!r} designs must be a whole number, at least 1"])
     shape, kind = jnp.shape(key), jnp.result_type(key)
     if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
         words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
-        raise schema.SceneError([words])
+        raise schema.InputError([words])
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -367,7 +368,7 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
         for a table of 23 parameters).
 
     Raises:
-      SceneError: if the hand has no such preset.
+      InputError: if the hand has no such preset.
     """
     total = sum(hand.width(p) for p in hand.parameter)
     if preset in ("full", f"{total}d"):
@@ -376,7 +377,7 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
         known = {p.name: p for p in hand.preset}
         if preset not in known:
             hint = _hint(preset, [*known, "full", f"{total}d"])
-            raise schema.SceneError([f"preset {preset!r} unknown for hand {hand.name}; {hint}"])
+            raise schema.InputError([f"preset {preset!r} unknown for hand {hand.name}; {hint}"])
         chosen = known[preset]
     return _build(hand, chosen, everything=not chosen.free)
 

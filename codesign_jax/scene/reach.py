@@ -73,7 +73,7 @@ def refuse(objects: ObjectSet, radius: float, size_noise: float | None = None) -
       size_noise: Standard deviation of the object's size instead of the set's.
 
     Raises:
-      SceneError: With every mesh.
+      InputError: With every mesh.
     """
     needed = of(radius * (1 - 1e-6), objects.noise.size if size_noise is None else size_noise)
     problems = [
@@ -84,4 +84,4 @@ def refuse(objects: ObjectSet, radius: float, size_noise: float | None = None) -
         if shape.mesh and shape.mesh.reach < needed
     ]
     if problems:
-        raise schema.SceneError(problems)
+        raise schema.InputError(problems)

@@ -38,16 +38,16 @@ _UNKNOWN = 20
 """Most unknown keys of a table that are named."""
 
 
-class SceneError(ValueError):
+class InputError(ValueError):
     """Bad input, with all of its problems.
 
     Attributes:
       problems: One message for each problem found.
 
-    >>> from codesign_jax import SceneError, scene
+    >>> from codesign_jax import InputError, scene
     >>> try:
     ...     scene.load("paper", overrides={"gravity": -1, "discretization.links": 0})
-    ... except SceneError as error:
+    ... except InputError as error:
     ...     print(error)
     discretization.links = 0 is outside [1, 200]
     gravity = -1 is outside [0, 100] m/s^2

@@ -3,6 +3,7 @@
 import warnings
 
 import jax
+import jax.core
 import numpy as np
 
 from codesign_jax.scene import schema
@@ -19,7 +20,7 @@ def refuse(params: Params) -> None:
     As `DesignSpace.refuse_unit_slips`, for parameters with any leading axes.
 
     Raises:
-      SceneError: With every such number and its suggested value.
+      InputError: With every such number and its suggested value.
     """
     if any(isinstance(v, jax.core.Tracer) for v in params):
         return
@@ -28,7 +29,7 @@ def refuse(params: Params) -> None:
     values |= {name: np.asarray(params.arm)[..., i] for i, name in enumerate(arm)}
     found = [slip for name, v in values.items() for slip in slips(name, name, np.asarray(v))]
     if found:
-        raise schema.SceneError(found)
+        raise schema.InputError(found)
     hint_at_kilopascals(np.asarray(params.pressure, float))
 
 

@@ -28,9 +28,7 @@ SCENES = Path(codesign_jax.__file__).parent / "scenes" / "accuracy"
 
 def parse() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--json", type=Path, default=Path("runs/accuracy.json"))
     parser.add_argument("--parts", type=lambda s: s.split(","), default=list(study.PARTS))
     parser.add_argument("--engines", type=lambda s: s.split(","), default=["structured", "mujoco"])
@@ -43,7 +41,6 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--budget", type=float, default=1e9, help="seconds to begin cases in")
     parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
-    provenance.add_commit(parser)
     parser.add_argument("--merge", type=Path, nargs="+", help="write these files into one and stop")
     parser.add_argument("--list", action="store_true", help="print the cases and stop")
     parser.add_argument("--report", action="store_true", help="draw what docs/data holds and stop")

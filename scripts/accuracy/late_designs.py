@@ -1,6 +1,6 @@
 """Late designs of the default scene at finer steps, links and meshes, and how deep fingers cross.
 
-python -m scripts.accuracy.late_designs --json docs/data/late_designs.json     # 4 minutes of an H200
+python -m scripts.accuracy.late_designs --json docs/data/late_designs.json
 
 The designs are final particles of the 23-parameter searches in docs/data/paper_fingers, which were
 made before fingers touched the palm.  The table of the hard cases reads the file (case 24 and 35).
@@ -87,7 +87,7 @@ def _model(scene: Scene, params: Params, trial: Trial) -> mujoco.MjModel:
     """MuJoCo's model of a world, with which states are read."""
     from codesign_jax.engines.mujoco import world_model
 
-    return world_model(scene, jax.tree.map(np.asarray, _fields(scene.structure, params, trial)))
+    return world_model(scene, jax.tree.map(np.asarray, _fields(scene, params, trial)))
 
 
 @functools.partial(jax.jit, static_argnums=0)

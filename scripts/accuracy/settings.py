@@ -116,7 +116,7 @@ class Setting:
           **names: Hand and object set, see `scene.load`.
 
         Raises:
-          SceneError: If the scene refuses the setting.
+          InputError: If the scene refuses the setting.
         """
         return scenes.load("paper", overrides=merge(self.overrides(), more or {}), **names)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from scripts.accuracy.settings import Setting
 from scripts.shared import output, provenance
 
@@ -75,7 +75,7 @@ class Store:
         start = time.perf_counter()
         try:
             record = case.run()
-        except SceneError as error:
+        except InputError as error:
             record = {"refused": "; ".join(error.problems)}
         except Exception as error:  # a setting that fails is a result of the study
             last = traceback.extract_tb(error.__traceback__)[-1]

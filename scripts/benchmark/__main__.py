@@ -48,9 +48,7 @@ GROWTH = (
 
 def arguments() -> argparse.Namespace:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--json", type=Path, required=True, help="results, kept and extended")
     parser.add_argument(
         "--engines",
@@ -66,7 +64,6 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--budget", type=float, default=2400.0, help="seconds in all")
     parser.add_argument("--quick", action="store_true", help="a few worlds and steps: does it run?")
-    provenance.add_commit(parser)
     return parser.parse_args()
 
 

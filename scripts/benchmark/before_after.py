@@ -7,7 +7,6 @@ All cases are compiled at once, each in a process, and run one after the other, 
 states in pairs. The file is written again after each of them.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -28,12 +27,9 @@ CASES = (
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--before", type=Path, required=True, help="folder of the other state")
     parser.add_argument("--json", type=Path, default=Path("runs/before_after.json"))
-    provenance.add_commit(parser)
     arguments = parser.parse_args()
     started = []
     for name, worlds in CASES:

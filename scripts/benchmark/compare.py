@@ -12,7 +12,6 @@ adds the structured engine with other limits of its solver: Newton iterations of
 evaluations of an iteration, relative decrement.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from functools import partial
@@ -106,15 +105,12 @@ def show(name: str, c: dict) -> str:
 
 def main() -> None:
     """Runs the engines, compares each with MuJoCo C and writes the file."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--trials", type=int, default=2000)
     parser.add_argument("--mjx-trials", type=int, default=120, help="0 leaves stock MJX out")
     parser.add_argument("--chunk", type=int, default=500)
     parser.add_argument("--designs", choices=("usual", "grid"), default="usual")
     parser.add_argument("--limits", type=limits, nargs="+", default=[], metavar="24/14/1e-6")
-    provenance.add_commit(parser)
     parser.add_argument("--json", type=Path, required=True)
     args = parser.parse_args()
     scene = work.variant()

@@ -11,7 +11,6 @@ busy machine its rate is a lower bound.  The file keeps all calls, with the proc
 measured again keeps the calls that it has.
 """
 
-import argparse
 import json
 import os
 import time
@@ -86,14 +85,11 @@ def merged(old: dict[str, Any] | None, new: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     """Measures the cases and writes the file after each."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--worlds", type=int, nargs="+", default=[60, 360])
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE")
     parser.add_argument("--calls", type=int, default=9)
-    provenance.add_commit(parser)
     args = parser.parse_args()
     found: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {}
     records = {(r["case"], r["worlds"]): r for r in found.get("records", [])}

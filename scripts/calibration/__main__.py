@@ -29,7 +29,7 @@ from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import keypaths, parameters
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from scripts.calibration import files, score, sets
 from scripts.calibration.surrogate import Plan
 from scripts.calibration.wave import Size, Wave, keep
@@ -92,11 +92,11 @@ def parse() -> argparse.Namespace:
 def chosen_sets(args: argparse.Namespace, count: int) -> tuple[np.ndarray, str]:
     """The sets of a wave in the unit cube, and where they come from."""
     if args.after and args.like:
-        raise SceneError(["--after and --like exclude each other"])
+        raise InputError(["--after and --like exclude each other"])
     if args.best and not args.like:
-        raise SceneError(["--best needs --like"])
+        raise InputError(["--best needs --like"])
     if args.others and not args.best:
-        raise SceneError(["--others needs --best"])
+        raise InputError(["--others needs --best"])
     if args.like:
         [earlier] = files.read_scores([args.like])
         units = earlier.data["units"][: args.sets]
@@ -115,7 +115,7 @@ def build(args: argparse.Namespace) -> tuple[Wave, dict[str, object]]:
     size = Size(args.points or points, args.trials or trials, args.chunk or chunk)
     for name, value in (("--sets", args.sets), ("--points", args.points)):
         if value is not None and value < 2:
-            raise SceneError([f"{name} {value} must be at least 2"])
+            raise InputError([f"{name} {value} must be at least 2"])
     effects = {"effects.surface": args.surface, "effects.finger_finger": args.fingers}
     changes = keypaths.flatten({**overrides, **effects}) | keypaths.parse(args.set)
     the_scene = scene.load(SCENE, overrides=changes)
@@ -134,7 +134,7 @@ def build(args: argparse.Namespace) -> tuple[Wave, dict[str, object]]:
             seed=args.seed,
         )
     except ValueError as error:
-        raise SceneError([str(error)]) from error
+        raise InputError([str(error)]) from error
     print(f"{size.worlds:,} grasps a set, {size.sets} set(s) a call, {wave.steps} call(s)")
     return wave, files.settings(the_scene, size, units, args.seed, fidelity)
 
@@ -154,7 +154,7 @@ def simulate(args: argparse.Namespace) -> int:
         False,
     )
     if store.refused:
-        raise SceneError([f"{state} {store.refused}: delete it by --fresh to start anew"])
+        raise InputError([f"{state} {store.refused}: delete it by --fresh to start anew"])
     try:
         grasps = wave.run(store, lambda text: print(text, flush=True))
     except KeyboardInterrupt:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from codesign_jax.optimize import ParticleFilter
-from codesign_jax.scene import Scene, SceneError
+from codesign_jax.scene import InputError, Scene
 from codesign_jax.types import Status
 from scripts.calibration import score, sets, summary
 from scripts.calibration.surrogate import Plan, filled, make_runs
@@ -66,28 +66,28 @@ def read(path: Path) -> tuple[Arrays, dict[str, Any]]:
     """Reads arrays and notes of NAME.npz and NAME.json.
 
     Raises:
-      SceneError: If a file is missing or damaged.
+      InputError: If a file is missing or damaged.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             data = {key: file[key] for key in file.files}
         return data, json.loads(path.with_suffix(".json").read_text())
     except (OSError, ValueError, KeyError, EOFError) as error:
-        raise SceneError([f"{path} and its .json cannot be read: {error}"]) from error
+        raise InputError([f"{path} and its .json cannot be read: {error}"]) from error
 
 
 def read_scores(paths: Sequence[Path]) -> list[Scored]:
     """Reads scores of waves.
 
     Raises:
-      SceneError: If a file is missing, damaged or holds no scores.
+      InputError: If a file is missing, damaged or holds no scores.
     """
     found = []
     for path in paths:
         data, notes = read(path)
         missing = {"units", "distances", "landscape"} - set(data)
         if missing or data["units"].shape[1:] != (len(sets.OPEN),):
-            raise SceneError([f"{path} holds no scores of a wave with {len(sets.OPEN)} constants"])
+            raise InputError([f"{path} holds no scores of a wave with {len(sets.OPEN)} constants"])
         found.append(Scored(path.stem.removesuffix(SCORES), data, notes))
     return found
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from codesign_jax.scene import SceneError
+from codesign_jax.scene import InputError
 from scripts.calibration import figures, files, score, sets
 from scripts.calibration.files import Scored
 from scripts.shared.tables import fill
@@ -43,11 +43,11 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
       The tables in Markdown.
 
     Raises:
-      SceneError: If the folder holds no scores.
+      InputError: If the folder holds no scores.
     """
     waves = files.read_scores(sorted(data.glob(f"*{files.SCORES}.npz")))
     if not waves:
-        raise SceneError([f"{data} holds no scores: run wave and score first"])
+        raise InputError([f"{data} holds no scores: run wave and score first"])
     groups: dict[str, list[Scored]] = {}
     for wave in waves:
         groups.setdefault(wave.fidelity, []).append(wave)

@@ -10,7 +10,7 @@ from scipy.stats import qmc
 
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene import constants as checks
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 CLEARANCE = 0.002
 """Smallest gap between the sections of a pair of fingers at a spread of zero [m]."""
@@ -137,10 +137,10 @@ def numbers(scene: Scene, chosen: Mapping[str, np.ndarray]) -> Constants:
       Constants, leaves of shape () or, where a set decides them, (set,).
 
     Raises:
-      SceneError: If a finger's base point lies on a circle, or a value is out of its range.
+      InputError: If a finger's base point lies on a circle, or a value is out of its range.
     """
     if any(f.base is None for f in scene.hand.finger):
-        raise SceneError(
+        raise InputError(
             [f"hand {scene.hand.name!r}: calibration moves base points; give each finger a base"]
         )
     c = scene.constants()

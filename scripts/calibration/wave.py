@@ -81,7 +81,7 @@ class Wave:
           seed: Seed of the trials.
 
         Raises:
-          SceneError: If the sets do not fit the scene.
+          InputError: If the sets do not fit the scene.
           ValueError: If the trials are no multiple of the objects, or there is no set.
         """
         shapes = len(scene.objects.object)

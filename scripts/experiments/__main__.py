@@ -23,16 +23,14 @@ from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
 from codesign_jax.runs.parquet import library
 from codesign_jax.scene import Scene, keypaths, parameters
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from scripts.experiments import landscape, parquet, plan, results, strategies
 from scripts.shared import output, provenance
 
 
 def parse() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("experiment", choices=[*plan.PAPER, "types", "figures"])
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
     parser.add_argument(
@@ -55,7 +53,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--devices", type=int, help="by default all that are visible")
     parser.add_argument("--every", type=int, default=4, help="episodes between checkpoints")
     parser.add_argument("--fresh", action="store_true", help="delete what is there of it")
-    provenance.add_commit(parser)
     parser.add_argument(
         "--trials",
         type=Path,
@@ -232,5 +229,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except SceneError as error:
+    except InputError as error:
         sys.exit(f"error: {error}")

@@ -24,15 +24,12 @@ from scripts.shared import output, provenance
 
 def parse() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--json", type=Path, default=Path("runs/devices.json"))
     parser.add_argument("--experiment", choices=["2d", "23d"], default="23d")
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="short")
     parser.add_argument("--counts", type=lambda s: [int(n) for n in s.split(",")], default=[1, 2])
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    provenance.add_commit(parser)
     return parser.parse_args()
 
 

@@ -173,9 +173,7 @@ def _kept(
 
 def parse() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     names = lambda text: text.split(",")  # noqa: E731 - three options read the same
     parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
     parser.add_argument("--scene", default="paper", help="that of the experiments")
@@ -188,7 +186,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--report", action="store_true", help="print the tables and stop")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
     parser.add_argument("--table", default="fresh", help="name of that table's marks")
-    provenance.add_commit(parser)
     return parser.parse_args()
 
 
@@ -202,7 +199,7 @@ def main() -> int:
             common.use_compilation_cache()
             run(args)
         text = report(args.data)
-    except (scene.SceneError, FileNotFoundError) as error:
+    except (scene.InputError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
     print(text)
     if args.page:

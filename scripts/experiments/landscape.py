@@ -10,7 +10,7 @@ from codesign_jax import batch
 from codesign_jax.commands import calls
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.engines import make_engine
-from codesign_jax.scene import Scene, SceneError
+from codesign_jax.scene import InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from scripts.experiments.plan import Landscape
 from scripts.experiments.strategies import Arrays
@@ -71,7 +71,7 @@ def simulate(
     size = calls.equal(len(flat), min(most, -(-len(flat) // len(batch.take(devices)))))
     run = Calls(trials, make_engine(engine, scene), size, part, flat, devices=devices)
     if run.refused:
-        raise SceneError([f"{part} {run.refused}: choose another --out, or delete it"])
+        raise InputError([f"{part} {run.refused}: choose another --out, or delete it"])
     with Meter(plan.name, plan.grasps, console) as meter:
         outcome = run(flat, meter)
     shape = (plan.points, plan.points, plan.trials)

@@ -62,7 +62,7 @@ def write_strategies(
       notes: Provenance, kept as JSON in the schema's metadata.
 
     Raises:
-      SceneError: If pyarrow is missing.
+      InputError: If pyarrow is missing.
     """
     # The first columns of the test repeat the last episode's grasps.
     test = {f"test_{v}": found[f"test_{v}"][..., plan.trials :] for v in _OUTCOME if _TEST in found}

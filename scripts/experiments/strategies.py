@@ -37,7 +37,7 @@ def plans(
       seed: Seed of run 0.
 
     Raises:
-      SceneError: If the scene's hand has no such design space.
+      InputError: If the scene's hand has no such design space.
     """
     sizes = {n: getattr(plan, n) for n in ("particles", "trials", "episodes", "test_trials")}
     how = plan.preset, plan.strategies[0], plan.first()[0], engine
@@ -66,7 +66,7 @@ def gather(plan: Strategies, folder: Path, seed: int) -> Arrays | None:
       (run,). None if a run has not begun.
 
     Raises:
-      SceneError: If a run cannot be read.
+      InputError: If a run cannot be read.
     """
     every = [
         [runs.load_record(place) for place in places]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from scripts.faults import shim
-from scripts.faults.zygote import Forked, Zygote
+from scripts.faults.forked import Forked, Server
 
 LIMIT = 300.0
 """Time that a process may take on a busy machine [s]; the longest take 30 s on an idle one."""
@@ -42,16 +42,16 @@ class Hung(Exception):
 
 
 class Bench:
-    """A worker's place: one process, its fork for others, one folder.
+    """A worker's place: one process, what starts others, one folder.
 
     Attributes:
       folder: Folder of finished runs and of what cases leave, until their end.
       shim: The preloaded library.
     """
 
-    def __init__(self, folder: Path, library: Path, zygote: Zygote):
-        """Takes the worker's folder, the preloaded library and the process to fork."""
-        self.folder, self._library, self._zygote = folder, library, zygote
+    def __init__(self, folder: Path, library: Path, server: Server):
+        """Takes the worker's folder, the preloaded library and what starts processes."""
+        self.folder, self._library, self._server = folder, library, server
         self.shim = shim.Shim(library)
         self.scratch_folders = Path(tempfile.mkdtemp(prefix="case-", dir=folder))
         self._log = self.scratch_folders / "output"
@@ -125,9 +125,9 @@ class Bench:
         if armed is not None and real:
             changed |= shim.environment(self._library, *armed)
         elif armed is not None:
-            arm = [str(self._library), str(armed[0].absolute()), armed[1], int(armed[2])]
+            arm = self._library, armed[0].absolute(), armed[1], int(armed[2])
         words = [str(a) for a in arguments]
-        return self._zygote.start(words, log, environment=changed, arm=arm, real=real)
+        return self._server.start(words, log, environment=changed, arm=arm, real=real)
 
     def finish(self, process: Forked, limit: float = LIMIT) -> Said:
         """Waits for a process.

@@ -250,7 +250,7 @@ def _changed(content: bytes, chance: random.Random) -> bytes:
 def archive(bench: Bench, number: int) -> Result:
     """A file of arrays with a damage is refused by its own error, or holds what was written."""
     from codesign_jax.archives import ArchiveError
-    from codesign_jax.scene.schema import SceneError
+    from codesign_jax.scene.schema import InputError
 
     which = number % len(_ARCHIVES)
     make, read = _ARCHIVES[which]
@@ -264,7 +264,7 @@ def archive(bench: Bench, number: int) -> Result:
     path.write_bytes(other)
     try:
         found = read(path)
-    except (SceneError, ArchiveError):
+    except (InputError, ArchiveError):
         return Result("refused")
     except Exception as error:
         return Result("escaped", f"{make.__name__}: {error!r}")

@@ -103,11 +103,11 @@ def scenes(bench: Bench, number: int) -> Result:
 
 def _same_scene(run: Path, whole: Path) -> bool:
     from codesign_jax import scene
-    from codesign_jax.scene.schema import SceneError
+    from codesign_jax.scene.schema import InputError
 
     try:
         return scene.load(run / "scene.toml") == scene.load(whole / "scene.toml")
-    except SceneError:
+    except InputError:
         return False
 
 

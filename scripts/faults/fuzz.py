@@ -21,7 +21,7 @@ import trimesh
 from codesign_jax import cli
 from codesign_jax import scene as scenes
 from codesign_jax.runs import scene_files
-from codesign_jax.scene import SceneError, keypaths, library, meshes
+from codesign_jax.scene import InputError, keypaths, library, meshes
 from scripts.faults.hostile import (
     NUMBER,
     NUMBERS,
@@ -43,8 +43,8 @@ def _category(trial: Callable[[], str], others: tuple[type[BaseException], ...] 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             result = trial()
-    except SceneError as error:
-        result = "refused" if str(error).strip() else "escaped: SceneError: without a word"
+    except InputError as error:
+        result = "refused" if str(error).strip() else "escaped: InputError: without a word"
     except KeyboardInterrupt:
         raise
     except BaseException as error:
@@ -118,7 +118,7 @@ def _reads_back(loaded: scenes.Scene, folder: Path) -> str:
         (folder / name).write_text(text, encoding="utf-8")
     try:
         again = scenes.load(folder / "scene.toml")
-    except SceneError as error:
+    except InputError as error:
         return f"escaped: what was written is refused: {error.problems[0][:200]}"
     if again != loaded and scene_files.scene_texts(again) != texts:
         return "escaped: what was written reads back as another scene"

@@ -32,7 +32,7 @@ class Ended(Exception):
 
 
 class Worker:
-    """A process of `worker`, its fork for others and all that they start end with it."""
+    """A process of `worker`, with which all end that it starts."""
 
     def __init__(self, folder: Path, library: Path, environment: dict[str, str]):
         """Starts it.
@@ -47,6 +47,8 @@ class Worker:
         # A cache of XLA's for GPUs, whose path would be a part of each program's key: programs
         # would not be found in a copy of their folder.
         own["JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES"] = "none"
+        # Forks and new interpreters begin in other folders than this one.
+        own["PYTHONPATH"] = str(Path(__file__).parents[2])
         program = [sys.executable, "-m", "scripts.faults.worker"]
         program += ["--folder", str(folder), "--library", str(library)]
         with (folder / f"worker-{threading.get_ident()}.log").open("ab") as log:

@@ -72,7 +72,7 @@ def judged(said: Said, run: Path, whole: Path, tallies: dict[str, int] | None = 
     return Result("same", "", tallies or {})
 
 
-def _operations(bench: Bench) -> int:
+def count_operations(bench: Bench) -> int:
     """File operations of an uninterrupted run, fewer than a few that vary."""
     path = bench.folder / "finished" / "operations"
     with bench.making(path) as new:
@@ -88,7 +88,7 @@ def _operations(bench: Bench) -> int:
 
 def _place(bench: Bench, number: int, of: int) -> int:
     """The operation of a case: the cases are spread over a run, then between one another."""
-    step = _operations(bench) / of
+    step = count_operations(bench) / of
     return 1 + int(step * (number % of) + step / 2 + 0.37 * step * (number // of)) % int(step * of)
 
 

@@ -4,8 +4,6 @@ Reads a line of JSON for each request on stdin, and writes a line for each finis
 """
 
 import argparse
-import contextlib
-import importlib
 import json
 import os
 import signal
@@ -14,7 +12,7 @@ import time
 import traceback
 from pathlib import Path
 
-from scripts.faults import zygote
+from scripts.faults import forked
 from scripts.faults.store import Result
 
 MODULES = "modules.json"
@@ -30,20 +28,19 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--library", type=Path, required=True)
     options = parser.parse_args()
-    zygote.end_with_parent()
-    zygote.obey_permissions()
+    forked.end_with_parent()
+    forked.obey_permissions()
     # A shell that starts the harness in the background lets it ignore what cases send.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     nothing = os.open(os.devnull, os.O_RDWR)
     os.dup2(nothing, 0)
     os.dup2(2, 1)  # what a case writes by mistake is no answer
-    _import(options.folder / MODULES)
-    fork = zygote.Zygote()
-    # Only now: these modules import what uses JAX.
+    server = forked.Server(_imported(options.folder / MODULES))
+    # Only now: a fork imports this module again, and these take seconds.
     from scripts.faults import bench, cases, finished
 
-    here = bench.Bench(options.folder, options.library, fork)
+    here = bench.Bench(options.folder, options.library, server)
     for line in requests:
         request = json.loads(line)
         if "prepare" in request:
@@ -68,14 +65,10 @@ def main() -> None:
     os._exit(0)  # threads of interrupted cases may go on
 
 
-def _import(path: Path) -> None:
-    """Imports what a command will need, so that its forks need not."""
+def _imported(path: Path) -> list[str]:
+    """Names of what a command will need, so that its forks need not import it."""
     names = json.loads(path.read_text()) if path.exists() else []
-    for name in (*_FIRST, *names):
-        if name.startswith(_LATER):
-            continue
-        with contextlib.suppress(Exception):
-            importlib.import_module(name)
+    return [name for name in (*_FIRST, *names) if not name.startswith(_LATER)]
 
 
 if __name__ == "__main__":

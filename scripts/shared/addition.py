@@ -16,13 +16,10 @@ def parser(description: str | None, name: str) -> argparse.ArgumentParser:
       description: The module's docstring.
       name: Name of the study, and of the file where none is given.
     """
-    made = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    made = provenance.parser(description)
     made.add_argument("--json", type=Path, default=Path(f"runs/{name}.json"))
     made.add_argument("--report", action="store_true", help="draw what the file holds and stop")
     made.add_argument("--page", type=Path, help="page whose table is filled in")
-    provenance.add_commit(made)
     return made
 
 

@@ -30,6 +30,14 @@ def command() -> str:
     return shlex.join(["python", *program, *sys.argv[1:]])
 
 
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """A command line with the module's docstring and the option --commit."""
+    raw = argparse.RawDescriptionHelpFormatter
+    made = argparse.ArgumentParser(description=description, formatter_class=raw)
+    add_commit(made)
+    return made
+
+
 def add_commit(parser: argparse.ArgumentParser) -> None:
     """Adds the option --commit to a command line."""
     parser.add_argument("--commit", help="commit of the code where there is no repository to ask")

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from codesign_jax import scene
 from codesign_jax.batch import LIMIT
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 from scripts.shared import provenance
 from scripts.winners import files as winners_files
 from scripts.winners import variants as winners
@@ -31,9 +31,7 @@ MESH_TRIALS = 8
 
 def parse() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = provenance.parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/winners.npz"))
     parser.add_argument("--size", choices=list(SIZES), default="paper")
     parser.add_argument("--experiments", type=lambda s: s.split(","), default=["23d", "2d"])
@@ -42,7 +40,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
     parser.add_argument("--budget", type=float, default=1e9, help="seconds to begin calls in")
-    provenance.add_commit(parser)
     parser.add_argument("--merge", type=Path, nargs="+", metavar="FILE", help="joined into --out")
     parser.add_argument("--data", type=Path, default=Path("docs/data/reproduction"))
     parser.add_argument("--report", action="store_true", help="draw what --data holds and stop")
@@ -55,7 +52,7 @@ def variants(args: argparse.Namespace) -> list[Variant]:
     """The variants asked for.
 
     Raises:
-      SceneError: If a name is unknown.
+      InputError: If a name is unknown.
     """
     known = {v.name: v for v in VARIANTS}
     for text in args.extra:
@@ -64,7 +61,7 @@ def variants(args: argparse.Namespace) -> list[Variant]:
     names = args.variants or list(known)
     unknown = [n for n in names if n not in known]
     if unknown:
-        raise SceneError([f"--variants {n!r} unknown; valid: {', '.join(known)}" for n in unknown])
+        raise InputError([f"--variants {n!r} unknown; valid: {', '.join(known)}" for n in unknown])
     return [known[n] for n in names]
 
 

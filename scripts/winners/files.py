@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codesign_jax import archives
-from codesign_jax.scene import SceneError
+from codesign_jax.scene import InputError
 from scripts.shared import output
 
 Arrays = dict[str, Any]
@@ -33,7 +33,7 @@ def read(path: Path) -> tuple[Arrays, dict[str, Any], list[Run]]:
       path: The .npz file; its .json lies beside it.
 
     Raises:
-      SceneError: If what made them cannot be read.
+      InputError: If what made them cannot be read.
       ArchiveError: If the results are damaged.
     """
     try:
@@ -41,7 +41,7 @@ def read(path: Path) -> tuple[Arrays, dict[str, Any], list[Run]]:
         settings = notes.pop("settings")
     except (OSError, ValueError, KeyError) as error:
         problem = f"what made {path} cannot be read from its .json: {error}"
-        raise SceneError([problem]) from error
+        raise InputError([problem]) from error
     results = archives.load(path)
     runs = notes["runs"] if "runs" in notes else _early(notes, calls(results))
     return results, settings, runs
@@ -51,13 +51,13 @@ def refuse_others(path: Path, found: dict[str, Any], settings: dict[str, Any]) -
     """Refuses results of other settings.
 
     Raises:
-      SceneError: With what differs.
+      InputError: With what differs.
     """
     wanted = json.loads(json.dumps(settings))
     different = [k for k in {*found, *wanted} if found.get(k) != wanted.get(k)]
     if different:
         text = "; ".join(f"{k}: {found.get(k)} there, {wanted.get(k)} wanted" for k in different)
-        raise SceneError([f"{path} belongs to something else ({text}); delete it to start anew"])
+        raise InputError([f"{path} belongs to something else ({text}); delete it to start anew"])
 
 
 def _early(notes: dict[str, Any], keys: list[str]) -> list[Run]:
@@ -97,11 +97,11 @@ def merge(paths: Sequence[Path], out: Path) -> list[str]:
       The calls of the new file.
 
     Raises:
-      SceneError: If a file cannot be read, if settings or the numbers of a call differ, or if
+      InputError: If a file cannot be read, if settings or the numbers of a call differ, or if
         `out` exists and is not joined.
     """
     if out.exists() and out.resolve() not in [p.resolve() for p in paths]:
-        raise SceneError([f"{out} exists and is not among the files to join"])
+        raise InputError([f"{out} exists and is not among the files to join"])
     joined, settings, runs = read(paths[0])
     for path in paths[1:]:
         results, other, more = read(path)
@@ -119,4 +119,4 @@ def _same_numbers(a: Arrays, b: Arrays, path: Path) -> None:
     for key in sorted(set(calls(a)) & set(calls(b))):
         for part in (f"{key}|cost", f"{key}|status"):
             if not np.array_equal(a[part], b[part], equal_nan=True):
-                raise SceneError([f"{path}: its {part} differs from that of the files before it"])
+                raise InputError([f"{path}: its {part} differs from that of the files before it"])

@@ -213,7 +213,7 @@ def drive(
       The results, and whether all calls are done.
 
     Raises:
-      SceneError: If the file belongs to other settings.
+      InputError: If the file belongs to other settings.
       ArchiveError: If it is damaged.
     """
     begin, longest = time.monotonic(), 0.0

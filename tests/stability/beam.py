@@ -11,10 +11,10 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import morphology
 from codesign_jax.types import Params
 from scripts.accuracy import beam
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.beams import Finger, finger_scene
 from tests.stability.bench import bench
 from tests.stability.table import Found, case
-from tests.test_beam_oracles import Finger, finger_scene
 
 HEIGHT, WALL = 0.020, 0.005
 
@@ -41,8 +41,8 @@ class Rod:
         self.links, self.length, self.h = links, length, self.bench.h
         one = np.ones(1)
         params = Params(length * one, height * one, wall * one, np.zeros(()), np.zeros(6), 0 * one)
-        self.fields = self.bench.fields([params], [small.still()])
-        self.model = world_model(self.bench.scene, small.nth(self.fields, 0))
+        self.fields = self.bench.fields([params], [grasps.still()])
+        self.model = world_model(self.bench.scene, grasps.nth(self.fields, 0))
         self.data, self.lay = mujoco.MjData(self.model), model.layout(self.bench.scene)
         material = self.bench.scene.hand.material
         self.beam = morphology.beam(

@@ -15,7 +15,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import Scene
-from tests import small, steps
+from tests.helpers import grasps, oracles
 
 FIRM = scene.load("paper").contact
 """Contact of the standard scene: its stiffness and impratio were chosen against creep."""
@@ -64,7 +64,7 @@ def pinch(**settings) -> Scene:
     for key, value in settings.items():
         table, name = key.split("__")
         overrides.setdefault(table, {})[name] = value
-    return scene.load("paper_spheres", hand_name=small.DATA / "pinch.toml", overrides=overrides)
+    return scene.load("paper_spheres", hand_name=grasps.DATA / "pinch.toml", overrides=overrides)
 
 
 @functools.lru_cache(maxsize=8)
@@ -108,14 +108,14 @@ class Bench:
         """Model fields of worlds, float64 NumPy arrays with a leading world axis."""
         with floats(True):
             worlds = zip(*(jax.tree.map(jnp.asarray, v) for v in (params, trials)), strict=True)
-            found = [small.world_inputs(self.scene, p, t)[0] for p, t in worlds]
+            found = [grasps.world_inputs(self.scene, p, t)[0] for p, t in worlds]
             return jax.tree.map(lambda *v: np.stack(v), *found)
 
     def commands(self, params, trials) -> np.ndarray:
         """The grasp's controls, (world, time, nu)."""
         with floats(True):
             worlds = zip(*(jax.tree.map(jnp.asarray, v) for v in (params, trials)), strict=True)
-            return np.stack([small.world_inputs(self.scene, p, t)[1] for p, t in worlds])
+            return np.stack([grasps.world_inputs(self.scene, p, t)[1] for p, t in worlds])
 
     def hold(self, seconds: float, *rows) -> np.ndarray:
         """Constant controls, a row for each world, (world, time, nu)."""
@@ -142,7 +142,7 @@ class Bench:
             np.concatenate([path.qvel[:, 1:], speed], 1),
         )
 
-    def path(self, fields, ctrl, qpos=None, qvel=None) -> steps.Path:
+    def path(self, fields, ctrl, qpos=None, qvel=None) -> oracles.Path:
         """As `run` in the structured engine: the states before every step."""
         qpos = fields.start if qpos is None else np.asarray(qpos)
         qvel = np.zeros((len(ctrl), qpos.shape[1] - 1)) if qvel is None else np.asarray(qvel)
@@ -151,7 +151,7 @@ class Bench:
     def _mujoco(self, fields, ctrl, qpos, qvel, masses) -> History:
         out = []
         for w in range(len(ctrl)):
-            compiled = world_model(self.scene, small.nth(fields, w))
+            compiled = world_model(self.scene, grasps.nth(fields, w))
             data, rows = mujoco.MjData(compiled), []
             data.qpos[:], data.qvel[:] = qpos[w], qvel[w]
             thing = compiled.body_mass[-1], compiled.body_inertia[-1].copy()
@@ -161,13 +161,13 @@ class Bench:
                     compiled.body_mass[-1], compiled.body_inertia[-1] = (factor * v for v in thing)
                     compiled.dof_M0[-6:-3], compiled.dof_M0[-3:] = (factor * v for v in thing)
                 data.ctrl[:] = u
-                steps.soften(self.scene, small.nth(fields, w), data)
+                oracles.soften(self.scene, grasps.nth(fields, w), data)
                 mujoco.mj_step(compiled, data)
                 rows.append((data.qpos.copy(), data.qvel.copy()))
             out.append([np.stack(v) for v in zip(*rows, strict=True)])
         return History(*(np.stack(v) for v in zip(*out, strict=True)))
 
-    def _structured(self, fields, ctrl, qpos, qvel, masses=None) -> tuple[steps.Path, tuple]:
+    def _structured(self, fields, ctrl, qpos, qvel, masses=None) -> tuple[oracles.Path, tuple]:
         """States before every step, and (qpos, qvel) after the last one, (world, 1, ...)."""
         dtype = jnp.float64 if self.wide else jnp.float32
         with floats(self.wide):
@@ -185,7 +185,7 @@ class Bench:
                 rows.append([np.asarray(v, np.float64) for v in row])
             rows = [np.concatenate(v, 1) for v in zip(*rows, strict=True)]
         after = tuple(v[:, count - 1 : count] for v in rows[4:])
-        return steps.Path(*(v[:, :count] for v in rows[:4])), after
+        return oracles.Path(*(v[:, :count] for v in rows[:4])), after
 
     @functools.cached_property
     def _program(self):
@@ -198,7 +198,7 @@ class Bench:
         def advance(hand, state, ctrl):
             found, end = engine.advance(hand, state, ctrl)
             last = engine.qpos(end)[:, None], engine.qvel(end)[:, None]
-            before = [found[name] for name in steps.Path._fields]
+            before = [found[name] for name in oracles.Path._fields]
             after = [
                 jnp.concatenate([a[:, 1:], b], 1) for a, b in zip(before[:2], last, strict=True)
             ]

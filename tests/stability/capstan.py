@@ -7,11 +7,11 @@ import numpy as np
 
 from codesign_jax import model
 from codesign_jax.scene import hand
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.tables import GRAVITY
 from tests.stability.bench import bench
 from tests.stability.oracle import TIGHT
 from tests.stability.table import Found, case
-from tests.test_contact import GRAVITY
 
 RADIUS, FRICTION, LINKS = 0.05, 0.3, 30
 RUN_UP, HANGING = 0.03, 0.05  # straight parts before and behind the cylinder [m]
@@ -25,7 +25,7 @@ SPIN, WAIT, TIME = -0.02, 1.0, 2.0  # the cylinder's [rad/s]; times to settle an
 def belt():
     """One finger that bends only, its palm below it; the cylinder lies on a table of ice."""
     off = ("lateral_bending", "twist", "finger_table", "palm_object", "palm_table", "wrist")
-    base = small.pinch(
+    base = grasps.pinch(
         "cylinder",
         links=LINKS,
         contact__friction_ratio=30.0,
@@ -46,7 +46,7 @@ def belt():
 def laid_over(b):
     """Fields of the belt: light, limp, loaded at the tip, laid over the cylinder from +x to -x."""
     length = RUN_UP + np.pi * RADIUS + HANGING
-    params, trial = small.hand_world(b.scene, length=length)
+    params, trial = grasps.hand_world(b.scene, length=length)
     params = params._replace(arm=np.array([RADIUS, 0, RADIUS - RUN_UP, np.pi, 0, 0]))
     fields, lay = b.fields([params], [trial]), model.layout(b.scene)
     # What is left of the implicit inertia holds still what tension alone would make whip.

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import integrate
 
 from codesign_jax import model, scene
-from tests import small
+from tests.helpers import grasps
 from tests.stability.bench import bench
 from tests.stability.table import Found, case
 
@@ -28,7 +28,7 @@ def crossed(links=10, rings=2, points=8):
     size = {"links": links, "hull_rings": rings, "hull_points": points}
     base = scene.load(
         "paper",
-        hand_name=small.DATA / "pinch.toml",
+        hand_name=grasps.DATA / "pinch.toml",
         overrides={"effects": dict.fromkeys(others, False), "discretization": size},
     )
     return dataclasses.replace(base, gravity=0.0)
@@ -43,7 +43,7 @@ def straight(b, places, depths, roll):
       depths: How deep their sections' outlines are in one another [m], shape (world,).
       roll: Turn of the first finger about its own axis.
     """
-    params, trial = small.hand_world(b.scene, length=LENGTH)
+    params, trial = grasps.hand_world(b.scene, length=LENGTH)
     count = len(depths)
     fields = b.fields([params] * count, [trial] * count)
     fields.start[:, 2] = 1.0
@@ -107,7 +107,7 @@ def overlap(depth, a, b, roll):
 
 def expected(b, depths, roll):
     """Force of an elastic skin of stiffness k / w^2 an area on both fingers' outlines [N]."""
-    width, height = b.scene.hand.section.width, small.hand_world(b.scene)[0].height[0]
+    width, height = b.scene.hand.section.width, grasps.hand_world(b.scene)[0].height[0]
     stiffness = b.scene.contact.normal_stiffness / width**2
     return stiffness * np.array([overlap(d, width / 2, height / 2, roll) for d in depths])
 
@@ -210,7 +210,7 @@ def pressed(roll, step, precision):
 def sinks(roll, engine, step, precision):
     """Depth under 15 N, over that at which the fingers' axes meet."""
     depth, b = pressed(roll, step, precision), exact(step, precision)
-    half = small.hand_world(b.scene)[0].height[0] / 2
+    half = grasps.hand_world(b.scene)[0].height[0] / 2
     middle = half + lowest(roll, b.scene.hand.section.width / 2, half)
     under = depth[:, LOADS.argmax()]
     assert np.all(depth[:, 5] > 5e-4), "the load does not press them together"
@@ -230,7 +230,17 @@ once = {"steps": (1.0,), "precisions": ("float64",)}  # a force at rest does not
 fingers = "two crossed hull fingers"
 by = "error of the force against the quadrature of the overlap, relative"
 case(34, f"{fingers}, flat on flat", f"{by}; default mesh", precisions=("float64",))(on_flat)
-case(34, f"{fingers}, flat on flat", f"{by}; worst of 5, 10 and 20 links", **once)(by_links)
+coarse = (
+    "with five links rings of vertices stand 11 mm apart, twice as far as by default: the error "
+    "falls with the square of that"
+)
+case(
+    34,
+    f"{fingers}, flat on flat",
+    f"{by}; worst of 5, 10 and 20 links",
+    failures={(1.0, "float64"): coarse},
+    **once,
+)(by_links)
 for kind, turn in ROLLED.items():
     title, own = f"{fingers}, {kind}", kind.split()[0]
     case(34, title, f"{by}; 256 points a link", name=f"mesh_{own}", **once)(

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from codesign_jax import model, scene
-from tests import small
+from tests.helpers import grasps
 from tests.stability.bench import bench
 from tests.stability.oracle import Reader
 from tests.stability.table import Found, case
@@ -31,7 +31,7 @@ def deepest(step, precision, *, palm=True):
     b = bench(default(palm=palm), "structured", step, precision)
     hands = []
     for length, pressure in HANDS:
-        params, trial = small.hand_world(b.scene, length=length, wall=WALL, height=0.015)
+        params, trial = grasps.hand_world(b.scene, length=length, wall=WALL, height=0.015)
         hands.append((params, pressure))
     fields = b.fields([h for h, _ in hands], [trial] * len(hands))
     fingers = b.scene.num_fingers
@@ -88,5 +88,16 @@ def without(engine, step, precision):
 
 one = {"unit": "m", "precisions": ("float32",)}
 curl = (35, "fingers of the default scene curl onto the palm")
-case(*curl, "deepest point of a finger in the palm", steps=(1.0, 0.5, 0.25), **one)(curls)
+STRIKES = (
+    "thin fingers that roll up within half a second strike the palm; at rest they are at most "
+    "3 mm deep"
+)
+failing = {(step, "float32"): STRIKES for step in (1.0, 0.5, 0.25)}
+case(
+    *curl,
+    "deepest point of a finger in the palm",
+    steps=(1.0, 0.5, 0.25),
+    failures=failing,
+    **one,
+)(curls)
 case(*curl, "the same without that contact", lower=True, steps=(1.0,), **one)(without)

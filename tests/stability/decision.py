@@ -52,7 +52,7 @@ def evaluated(engine, step, precision, links=10, num_trials=TRIALS):
 
 
 def ranks(one, two):
-    return stats.spearmanr(one[1], two[1]).statistic
+    return stats.spearmanr(one[1], two[1])[0]
 
 
 def rates(one, two):
@@ -265,25 +265,34 @@ def refinements(finer):
     return Found(abs(change.mean()) / half, 1.0, note)
 
 
-for finer in ("h/2", "h/4", "20 links", "4 x 16 points"):
-    case(
-        24,
-        f"late designs of the default scene at {finer}",
-        "success rate: change over interval",
-        name=f"default_{finer.replace('/', '_').replace(' ', '_')}",
-        **stored,
-    )(lambda engine, step, precision, finer=finer: refinements(finer))
+@case(
+    24,
+    "late designs of the default scene at h/4",
+    "success rate: change over interval",
+    **stored,
+)
+def late_by_step(engine, step, precision):
+    return refinements("h/4")
 
 
-@case(37, "late designs of the default scene", "share of STUCK", **stored)
+@case(
+    37,
+    "late designs of the default scene",
+    "share of STUCK",
+    failures={(1.0, "float32"): "objects stay wedged between fingers that straighten"},
+    **stored,
+)
 def late_stuck(engine, step, precision):
-    """And how deep the fingers were in one another as the hand was told to let go."""
-    found, depth = verdicts("h"), np.array(late()["settings"]["h"]["depth_mm"])
-    stuck, free = depth[found == "s"], depth[found == "k"]
-    above = stats.mannwhitneyu(stuck, free).statistic / (len(stuck) * len(free))
-    note = (
-        f"{len(stuck)} of {found.size:,}; deepest crossing of fingers at the release: "
-        f"{np.median(stuck):.1f} mm where it is STUCK, {np.median(free):.1f} mm where it is not, "
-        f"the first is deeper in {above:.0%} of pairs; {made()}"
+    """And, where the file has it, how deep fingers were in one another at the release."""
+    found, note = verdicts("h"), ""
+    if depth := late()["settings"]["h"].get("depth_mm"):
+        stuck, free = (np.array(depth)[found == letter] for letter in "sk")
+        above = stats.mannwhitneyu(stuck, free).statistic / (len(stuck) * len(free))
+        note = (
+            f"; deepest crossing of fingers at the release: {np.median(stuck):.1f} mm where it is "
+            f"STUCK, {np.median(free):.1f} mm where it is not, deeper in {above:.0%} of pairs"
+        )
+    # What was asked for of late trials at this setting.
+    return Found(
+        (found == "s").mean(), 3e-3, f"{(found == 's').sum()} of {found.size}{note}; {made()}"
     )
-    return Found((found == "s").mean(), 3e-3, note)

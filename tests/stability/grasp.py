@@ -12,11 +12,11 @@ from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
 from codesign_jax.types import Params, failed
 from scripts.shared.work import NUDGE
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.grasps import GOOD
 from tests.stability.bench import CREEP, FIRM, bench, floats, refined
 from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
-from tests.test_grasp import GOOD
 
 
 @functools.cache
@@ -40,7 +40,7 @@ def design(the_scene, **changes) -> Params:
 def whole(the_bench, designs, shapes=(0,)):
     """Histories of whole grasps, designs times objects."""
     params = [p for p in designs for _ in shapes]
-    trials = [small.still(s) for _ in designs for s in shapes]
+    trials = [grasps.still(s) for _ in designs for s in shapes]
     fields = the_bench.fields(params, trials)
     return the_bench.run(fields, the_bench.commands(params, trials))
 
@@ -48,7 +48,7 @@ def whole(the_bench, designs, shapes=(0,)):
 def whole_inputs(the_bench, designs, shapes=(0,)):
     """Fields and controls of whole grasps, designs times objects."""
     params = [p for p in designs for _ in shapes]
-    trials = [small.still(s) for _ in designs for s in shapes]
+    trials = [grasps.still(s) for _ in designs for s in shapes]
     return the_bench.fields(params, trials), the_bench.commands(params, trials)
 
 
@@ -185,12 +185,12 @@ def zero_gap(engine, step, precision):
     low = dataclasses.replace(paper(), arm=dataclasses.replace(paper().arm, start_height=reach))
     b = bench(low, engine, step, precision)
     params = design(b.scene, length=180, arm_z=60)
-    fields = b.fields([params], [small.still()])
+    fields = b.fields([params], [grasps.still()])
     reader = Reader(b.scene, fields)
     data, spheres = reader.at(fields.start[0]), reader.lay.spheres.ravel()
     gap = (data.geom_xpos[spheres, 2] - reader.model.geom_size[spheres, 0]).min()
     fields.start[0, 2] -= gap
-    ctrl = np.repeat(b.commands([params], [small.still()])[:, :1], round(1 / b.h), 1)
+    ctrl = np.repeat(b.commands([params], [grasps.still()])[:, :1], round(1 / b.h), 1)
     ctrl[0, :, 2] = fields.start[0, 2]
     return resting(b, fields, ctrl, 1.0, 0.3)
 
@@ -205,10 +205,10 @@ def release(engine, step, precision):
     base = refined(paper(), step)
     designs = [design(base, length=x, pressure=p) for x in (80, 86, 92) for p in (110, 130, 150)]
     params = [p for p in designs for _ in range(3)]
-    trials = [small.still(s) for _ in designs for s in range(3)]
+    trials = [grasps.still(s) for _ in designs for s in range(3)]
     with floats(precision == "float64" and engine == "structured"):
         chosen = make_engine(engine, base)
-        batch = (small.stack(*params), small.stack(*trials))
+        batch = (grasps.stack(*params), grasps.stack(*trials))
         run = jax.jit(lambda p, t: rollout.simulate(base, chosen, p, t, record_qpos=True))
         result, trace = jax.tree.map(np.asarray, run(*batch))
     held = (result.cost == 0) & ~failed(result.status)

@@ -3,19 +3,19 @@
 import numpy as np
 
 from codesign_jax import model
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.tables import GRAVITY
 from tests.stability.bench import CHUNK, CREEP, FIRM, bench, pinch
 from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
 from tests.stability.touch import at_height
-from tests.test_contact import GRAVITY
 
 # --- 12: pinch -------------------------------------------------------------------------------
 
 
 def lifted(the_bench, seconds):
     """Fields and controls of the box lifted by two fingers and held for a time."""
-    params, trial = small.hand_world(the_bench.scene, length=0.09, pressure=190e3)
+    params, trial = grasps.hand_world(the_bench.scene, length=0.09, pressure=190e3)
     params = at_height(params, 0.05)
     fields, ctrl = the_bench.fields([params], [trial]), the_bench.commands([params], [trial])
     ctrl = ctrl[:, : round(4.5 / the_bench.h)]
@@ -100,7 +100,7 @@ case(*ramp, engine="mujoco", quick=((1.0, "float64"),))(pinch_drops)
 
 def pressed(b):
     """Links of 4 g close on a cuboid of 2000 times their mass, which the table carries."""
-    params, trial = small.hand_world(b.scene, length=0.09, pressure=190e3)
+    params, trial = grasps.hand_world(b.scene, length=0.09, pressure=190e3)
     params = at_height(params, 0.05)
     fields = b.fields([params], [trial])
     link = fields.body_mass[0, model.layout(b.scene).bodies[0, 0]]
@@ -137,7 +137,7 @@ case(*heavy, "largest speed at rest", unit="rad/s", engine="mujoco", quick=((1.0
 def squeeze(engine, step, precision):
     """Opposed fingers on the box from 3.5 s on; largest finger speed from 7 to 8 s."""
     b = bench(pinch(), engine, step, precision)
-    params, trial = small.hand_world(b.scene, length=0.09, pressure=190e3)
+    params, trial = grasps.hand_world(b.scene, length=0.09, pressure=190e3)
     params = at_height(params, 0.05)
     fields = b.fields([params], [trial])
     ctrl = b.commands([params], [trial])[:, : round(3.5 / b.h)]

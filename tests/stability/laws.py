@@ -6,12 +6,12 @@ import numpy as np
 from scipy import optimize
 
 from codesign_jax import model
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.closed_forms import moment
 from tests.stability.bench import bench, pinch
 from tests.stability.oracle import Reader, along, exact
 from tests.stability.table import Found, case
 from tests.stability.touch import SPHERE, at_height, held
-from tests.test_effects_physics import moment
 
 AGAINST_C = "accelerations along the path against MuJoCo C, relative"
 TWO = (1.0, 0.5)
@@ -28,7 +28,7 @@ def crossing():
 
 def curling(b):
     """A whole grasp of the sphere by fingers that are longer than the object is wide."""
-    params, trial = small.hand_world(b.scene, length=0.13, pressure=190e3, spread=0.3)
+    params, trial = grasps.hand_world(b.scene, length=0.13, pressure=190e3, spread=0.3)
     params = at_height(params, 0.04)
     trial = trial._replace(shape=np.int32(SPHERE), position=np.array([0.002, 0.004]))
     return b.fields([params], [trial]), b.commands([params], [trial])
@@ -61,7 +61,7 @@ case(29, "whole grasp of fingers that cross", AGAINST_C, steps=TWO)(crossing_fin
 
 def sideways(b):
     """Lateral angles of 80 to 95 degrees, where bending and twist have one axis; then let go."""
-    params, trial = small.hand_world(b.scene, length=0.12)
+    params, trial = grasps.hand_world(b.scene, length=0.12)
     fields = b.fields([params], [trial])
     qpos, random = np.repeat(fields.start, 4, 0), np.random.default_rng(30)
     qpos[:, 2] = [1.0, 1.0, 0.12, 0.10]  # two hands in the air, two that press on box and table
@@ -115,7 +115,7 @@ def rubber():
 
 def squeezing(b):
     """A whole grasp of the cuboid."""
-    params, trial = small.hand_world(b.scene, length=0.09, pressure=150e3)
+    params, trial = grasps.hand_world(b.scene, length=0.09, pressure=150e3)
     params = at_height(params, 0.05)
     return b.fields([params], [trial]), b.commands([params], [trial])
 
@@ -128,7 +128,7 @@ def free_curvature(engine, step, precision):
     """Free fingers at rest at 60 kPa against the law's stress integrated over the section."""
     b = bench(rubber(), engine, step, precision)
     pressure, height, wall = 60e3, 0.020, 0.005
-    params, trial = small.hand_world(b.scene, length=0.09)
+    params, trial = grasps.hand_world(b.scene, length=0.09)
     fields = b.fields([params], [trial])
     fields.start[0, 2] = 1.0
     ctrl = held(b, fields, 4.0)

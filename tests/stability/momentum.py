@@ -9,7 +9,7 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.scene import hand
-from tests import small
+from tests.helpers import grasps
 from tests.stability.bench import bench, pinch
 from tests.stability.table import Found, case
 from tests.stability.touch import SPHERE, held, worlds
@@ -37,7 +37,7 @@ def collision(base, engine, step, precision, *, bend=0.0):
     tolerance = {"float32": 1e-12, "float64": 1e-24}[precision]
     b = bench(base, engine, step, precision, tolerance)
     fields = worlds(b, SPHERE)
-    compiled = world_model(b.scene, small.nth(fields, 0))
+    compiled = world_model(b.scene, grasps.nth(fields, 0))
     data = mujoco.MjData(compiled)
     qpos = fields.start.copy()
     qpos[0, 2] = 1.0

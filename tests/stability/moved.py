@@ -7,13 +7,13 @@ import numpy as np
 from scipy import integrate
 
 from codesign_jax.scene import objects
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.tables import GRAVITY, MU
 from tests.stability.bench import bench, pinch
 from tests.stability.hold import lifted
 from tests.stability.oracle import Reader, along
 from tests.stability.table import Found, case
 from tests.stability.touch import CUBOID, SPHERE, at_height, held, worlds
-from tests.test_contact import GRAVITY, MU
 
 HALF = 0.030  # half a side of the cuboid, and radius of the sphere [m]
 
@@ -109,7 +109,7 @@ for what, unit, function in (
 
 def edge_first(b):
     """A grasp of the cuboid by two opposite vertical edges: turned by 45 degrees, tilted a bit."""
-    params, trial = small.hand_world(b.scene, length=0.09, pressure=190e3)
+    params, trial = grasps.hand_world(b.scene, length=0.09, pressure=190e3)
     params = at_height(params, 0.05)
     trial = trial._replace(yaw=np.array(np.pi / 4), arm_tilt=np.array([0.03, 0.02]))
     return b.fields([params], [trial]), b.commands([params], [trial])

@@ -5,7 +5,7 @@ import numpy as np
 
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
-from tests import small, steps
+from tests.helpers import grasps, oracles
 from tests.stability.bench import bench
 from tests.stability.table import Found
 
@@ -46,7 +46,7 @@ def along(base, step, precision, make, least=1, rounding=1.0) -> Found:
     fields, ctrl, *start = make(b)
     found = b.path(fields, ctrl, *start)
     stride = max(1, ctrl.shape[1] // STATES)
-    errors, _, touching = steps.against_mujoco(b.scene, fields, ctrl, found, stride)
+    errors, _, touching = oracles.against_mujoco(b.scene, fields, ctrl, found, stride)
     assert touching.max() >= least, "nothing touches: the case would be vacuous"
     error = errors.max() if precision == "float64" else np.quantile(errors, 0.95)
     note = f"{errors.size} states, up to {touching.max()} contacts"
@@ -59,7 +59,7 @@ class Reader:
 
     def __init__(self, the_scene, fields, world=0):
         self.scene, self.lay = the_scene, model.layout(the_scene)
-        self.fields = small.nth(fields, world)
+        self.fields = grasps.nth(fields, world)
         self.model = world_model(the_scene, self.fields)
         self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
         self.data = mujoco.MjData(self.model)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from codesign_jax import model
-from tests import small
+from tests.helpers import grasps
 from tests.stability.bench import bench, pinch
 from tests.stability.oracle import Reader
 from tests.stability.table import Found, case
@@ -40,7 +40,7 @@ def pressed_forces(b, shape=SPHERE, deep=DEEP):
     Returns:
       The forces, shape (place,), and the distance of the object's centre from what is deepest.
     """
-    params, trial = small.hand_world(b.scene, length=0.1)
+    params, trial = grasps.hand_world(b.scene, length=0.1)
     size = np.float64(0.5 if shape == CUBOID else 1.0)  # a whole one would reach the palm
     trial = trial._replace(shape=np.int32(shape), size=size)
     fields = b.fields([params] * PLACES, [trial] * PLACES)

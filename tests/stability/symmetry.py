@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from codesign_jax import model
 from codesign_jax.scene import hand
-from tests import small
+from tests.helpers import grasps
 from tests.stability.bench import bench, pinch
 from tests.stability.table import Found, case
 
@@ -40,7 +40,7 @@ def rigid():
 
 def asymmetric(b):
     """Fields, controls and start of a grasp off the middle, tilted and turned, without spread."""
-    params, trial = small.hand_world(b.scene, length=0.09, pressure=190e3, spread=0.0)
+    params, trial = grasps.hand_world(b.scene, length=0.09, pressure=190e3, spread=0.0)
     params = params._replace(
         length=np.array([0.090, 0.094]), arm=params.arm + 0.05 * (np.arange(6) == 2)
     )
@@ -207,7 +207,7 @@ def unit_scaling(engine, step, precision):
     found = []
     for s, base in ((1.0, exact()), (3.0, three_times())):
         b = bench(base, engine, step, precision, EXACTLY[precision])
-        params, trial = small.hand_world(b.scene)
+        params, trial = grasps.hand_world(b.scene)
         arm = (
             params.arm * 0
             + np.array([0.004, 0.003, 0.05, 0.05, 0.02, 0.1]) * np.r_[[s] * 3, 1, 1, 1]

@@ -8,18 +8,18 @@ import numpy as np
 
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
-from tests import small
+from tests.helpers import grasps
+from tests.helpers.tables import GRAVITY, MASS, MU, Table
 from tests.stability.bench import bench, pinch
 from tests.stability.table import Found, case
-from tests.test_contact import GRAVITY, MASS, MU, Table
 
 CUBOID, CYLINDER, SPHERE = range(3)
 
 
 def worlds(the_bench, *shapes, **changes):
     """Fields of default hands, one for each object."""
-    params, _ = small.hand_world(the_bench.scene, **changes)
-    trials = [small.still(s) for s in shapes]
+    params, _ = grasps.hand_world(the_bench.scene, **changes)
+    trials = [grasps.still(s) for s in shapes]
     return the_bench.fields([params] * len(shapes), trials)
 
 
@@ -74,7 +74,7 @@ case(*resting, "penetration", unit="m", engine="mujoco")(sunk)
 @case(10, "objects at rest", "sum of contact forces over weight, error", engine="mujoco")
 def weight(engine, step, precision):
     worst = 0.0
-    for shape in small.SHAPES:
+    for shape in grasps.SHAPES:
         table = Table(shape, discretization__timestep=0.01 * step)
         table.run(10.0)
         force, total = np.zeros(6), 0.0
@@ -134,7 +134,7 @@ def spawned(engine, step, precision):
     """A sphere 10 mm deep in the table, in a finger's side, in the palm; without gravity, 1 s."""
     b = bench(weightless(), engine, step, precision)
     fields = worlds(b, SPHERE, SPHERE, SPHERE)
-    compiled = world_model(b.scene, small.nth(fields, 0))
+    compiled = world_model(b.scene, grasps.nth(fields, 0))
     data, qpos = mujoco.MjData(compiled), fields.start.copy()
     radius, deep = compiled.geom_size[-1, 0], 0.010
     qpos[0, -5] -= deep
@@ -159,9 +159,9 @@ case(*inside, unit="m/s", engine="mujoco", quick=((1.0, "float64"),))(spawned)
 
 def thrown(the_bench):
     """History of 0.1 s of a sphere thrown with 5 m/s at a finger of 2 mm walls."""
-    params, trial = small.hand_world(the_bench.scene, wall=0.002)
-    fields = the_bench.fields([params], [small.still(SPHERE)])
-    compiled = world_model(the_bench.scene, small.nth(fields, 0))
+    params, trial = grasps.hand_world(the_bench.scene, wall=0.002)
+    fields = the_bench.fields([params], [grasps.still(SPHERE)])
+    compiled = world_model(the_bench.scene, grasps.nth(fields, 0))
     data, qpos = mujoco.MjData(compiled), fields.start.copy()
     qpos[0, -7:-4] = middle_of_finger(compiled, data, qpos[0]) + [0, 0.137, 0]
     qvel = np.zeros((1, compiled.nv))

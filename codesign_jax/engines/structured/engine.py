@@ -11,6 +11,7 @@ from codesign_jax.engines.base import Equal, Staged
 from codesign_jax.engines.structured import coordinates, transforms
 from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
 from codesign_jax.engines.structured.kernel.adjoint import Path, recorded
+from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.laws import meshes
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
@@ -20,6 +21,10 @@ from codesign_jax.types import Status, Trace
 
 FAR = 1e30
 """A bound that no number exceeds."""
+
+
+PIECE = 1024
+"""Worlds of a piece in which `StructuredEngine` computes the tables of teams."""
 
 
 class StepInfo(NamedTuple):
@@ -73,7 +78,7 @@ class StructuredEngine(Equal):
         Raises:
           ValueError: If a segment has no step, or there is none to truncate.
           KernelUnavailable: If kernels cannot run on this device.
-          SceneError: If a mesh's distance cannot be put on a grid, or was read for a hand with
+          InputError: If a mesh's distance cannot be put on a grid, or was read for a hand with
             smaller contact spheres.
         """
         effects.refuse(scene.effects, self.name)
@@ -158,15 +163,44 @@ class StructuredEngine(Equal):
           KernelUnavailable: If the kernel cannot be compiled for this device, or called there.
         """
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
-        hand, start = world_constants(self.scene, fields), self.reset(fields)
-        found, end = self._run(program, hand, start, ctrl, trajectory=trajectory)
-        return self._trace(found, end, trajectory)
+        inputs = self._inputs(program, fields, ctrl)
+        try:
+            out = program.execute(inputs, trajectory=trajectory)
+        except KernelUnavailable as error:
+            raise _unavailable(str(error)) from error
+        return self._trace(*program.outputs(out, len(ctrl), trajectory=trajectory), trajectory)
+
+    def _inputs(self, program: Program, fields: ModelFields, ctrl: jax.Array) -> tuple:
+        """The kernel's arguments, see `Program.inputs`.
+
+        XLA fuses a program of another number of worlds in another way and rounds in another way.
+        Where a block is one world its numbers are therefore computed in pieces of one size.
+        """
+        hand = world_constants(self.scene, fields)
+        if program.team == 1:
+            return program.inputs(hand, self.reset(fields), ctrl)
+
+        def tables(fields: ModelFields) -> tuple:
+            own = world_constants(self.scene, fields), self.reset(fields)
+            return (*program.pack_hand(own[0]), *program.pack_state(own[1]))
+
+        pieces = max(2, -(-len(ctrl) // PIECE))  # XLA would do without a loop of one round
+
+        def split(x: jax.Array) -> jax.Array:
+            return lengthened(x, 0, pieces * PIECE).reshape(pieces, PIECE, *x.shape[1:])
+
+        found = jax.lax.map(tables, jax.tree.map(split, fields))
+        blocks = -(-len(ctrl) // program.block)
+        packed = [x.reshape(-1, *x.shape[2:])[:blocks] for x in found]
+        mesh = () if hand.mesh is None else (hand.mesh.values[None],)
+        return (*packed, *program.pack_controls(ctrl), *mesh)
 
     def record(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
     ) -> tuple[Trace, Path]:
         """`simulate`, and what a derivative reads of it."""
-        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
+        # A lane a finger, as the reverse pass has it, which simulates segments again.
+        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl), team=1)
         inputs = program.inputs(world_constants(self.scene, fields), self.reset(fields), ctrl)
         try:
             out = program.execute(inputs, trajectory=trajectory, states=self.segment or 1)
@@ -187,24 +221,29 @@ class StructuredEngine(Equal):
         def program(width: int) -> Program:
             return Program(self.scene, self.limits, backend=jax.default_backend(), width=width)
 
+        team = program(1).team  # lanes that share a column of a table
+
         def pack(fields: ModelFields, ctrl: jax.Array) -> tuple[tuple, tuple]:
             here = program(lanes or lanes_here(self.scene, ctrl.dtype))
+            if team > 1:
+                inputs = self._inputs(here, fields, ctrl)
+                return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
             hand, state = world_constants(self.scene, fields), self.reset(fields)
             # What is calculated is apart from how it is laid out, so that XLA rounds alike
             # whatever the width.
             inputs = here.inputs(*jax.lax.optimization_barrier((hand, state, ctrl)))
             return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
 
-        # The last axis of the first table, in and out, are the lanes of a block.
+        # The last axis of the first table, in and out, are the fingers of a block.
         def launch(blocks: tuple, common: tuple) -> tuple:
             try:
-                here, inputs = program(blocks[0].shape[-1]), (*blocks, *common)
+                here, inputs = program(blocks[0].shape[-1] * team), (*blocks, *common)
                 return tuple(here.execute(inputs, trajectory=trajectory))
             except KernelUnavailable as error:
                 raise _unavailable(str(error)) from error
 
         def unpack(out: tuple, worlds: int) -> Trace:
-            here = program(out[0].shape[-1])
+            here = program(out[0].shape[-1] * team)
             outputs = here.outputs(out, worlds, trajectory=trajectory)
             found, end = jax.lax.optimization_barrier(outputs)
             return self._trace(found, end, trajectory)
@@ -215,9 +254,12 @@ class StructuredEngine(Equal):
         series = found["distance"], found["height"], found["speed"]
         shape = (*series[0].shape, 0)
         qpos = found["qpos"] if trajectory else jnp.zeros(shape, series[0].dtype)
-        # The decrement is a share of forces times accelerations, its root one of forces.
-        force = jnp.sqrt(jnp.maximum(found["residual"], 0.0))
-        return Trace(*series, qpos, self._status(found), coordinates.flat(end), force)
+        # The decrement is a share of forces times accelerations, its root one of forces.  What a
+        # step that converged leaves is rounding.
+        left = jnp.where(found["residual"] > self.limits.tolerance, found["residual"], 0.0)
+        return Trace(
+            *series, qpos, self._status(found), coordinates.flat(end), residual=jnp.sqrt(left)
+        )
 
     @staticmethod
     def _run(program: Program, *args, **record) -> tuple[dict[str, jax.Array], State]:

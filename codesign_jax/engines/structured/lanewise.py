@@ -112,7 +112,8 @@ class _Call:
         places: dict[int, int] = {}
         values: list = []
         shells: list = []
-        key = [identity.of(function), tree, jax.config.jax_enable_x64]
+        wide = jax.config.jax_enable_x64  # type: ignore[attr-defined]  # set when JAX starts
+        key = [identity.of(function), tree, wide]
         for leaf in leaves:
             if isinstance(leaf, Lanes):
                 leaf = _emptied(leaf, values, places)

@@ -47,7 +47,8 @@ def reverse(
         return hand_bar, program.summed(world_bar), *rest
     size, (hand, world, _, _, arm, pressure, *grid) = engine.segment, inputs
     steps, count = arm.shape[1], path.finger.shape[1]
-    again = Program(engine.scene, engine.limits, backend=program.backend, width=program.size)
+    how = {"backend": program.backend, "width": program.size, "team": 1}
+    again = Program(engine.scene, engine.limits, **how)  # type: ignore[arg-type]
 
     def split(x: jax.Array) -> jax.Array:
         """(block, time, ...) to (segment, block, time of the segment, ...)."""

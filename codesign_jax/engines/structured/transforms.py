@@ -144,7 +144,8 @@ def _adjoint(
         bars = bars._replace(path=program.rows_of(_gathered(taken, cotangent.qpos)))
     path, bars = jax.tree.map(program.by_block, (path, bars))
     found = segments.reverse(engine, program, tables, path, bars, trajectory=trajectory)
-    fields_bar, ctrl_bar = pull_inputs(program.sound(found, path.taken))
+    sound = program.sound  # pyright: ignore[reportAttributeAccessIssue]  # an AdjointProgram here
+    fields_bar, ctrl_bar = pull_inputs(sound(found, path.taken))
     # A world that never moved, such as one of fields that are not numbers, has no derivative.
     return jax.tree.map(partial(_of_worlds, taken[:, 0] > 0), (fields_bar, ctrl_bar))
 

@@ -22,7 +22,7 @@ MAX_NODES = 3_000_000  # 12 MB in float32
 MAX_WORK = 3e10  # faces times nodes
 _LARGE = 300_000  # nodes; more take a second
 _NEAR = 0.002  # how far from the surface "near the surface" goes [m]
-_WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
+WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
 _ENDING = ".npz"  # of the files in the cache
 
 
@@ -176,7 +176,7 @@ def cached(
         return stored
     start = time.perf_counter()
     grid = build(vertices, faces, bound, reach)
-    if time.perf_counter() - start > _WORTH_KEEPING:
+    if time.perf_counter() - start > WORTH_KEEPING:
         _write(path, grid)
     return grid
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 _SYMMETRIC = 1e-6
 
 
-class Body(NamedTuple):
+class MassProperties(NamedTuple):
     """A homogeneous body; its frame sits at the centre of mass along the principal axes.
 
     Attributes:
@@ -28,14 +28,14 @@ class Body(NamedTuple):
     inertia: np.ndarray
 
 
-def body(vertices: np.ndarray, faces: np.ndarray) -> Body:
+def body(vertices: np.ndarray, faces: np.ndarray) -> MassProperties:
     """Mass properties of a watertight mesh; vertices [m] in the file's frame."""
     # Near the origin and of order one: products of five lengths in metres drown in rounding.
     middle, scale = vertices.mean(0), np.ptp(vertices, axis=0).max()
     unit = trimesh.Trimesh((vertices - middle) / scale, faces, process=False).mass_properties
     tensor = np.asarray(unit["inertia"]) / unit["volume"] * scale**2
     axes = principal_axes(tensor)
-    return Body(
+    return MassProperties(
         volume=float(unit["volume"] * scale**3),
         centre=np.asarray(unit["center_mass"]) * scale + middle,
         axes=axes,

@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 
 from codesign_jax.scene import library
-from codesign_jax.scene.schema import SceneError, shown
+from codesign_jax.scene.schema import InputError, shown
 
 # What trimesh logs, tracebacks of what it tried first among it, is no message for a terminal.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -49,28 +49,28 @@ def read(path: Path) -> Read:
     """Reads a mesh file of one of `FORMATS`.
 
     Raises:
-      SceneError: If there is no such file, it is too large, or it is no mesh.
+      InputError: If there is no such file, it is too large, or it is no mesh.
     """
     if not library.is_file(path):
-        raise SceneError([f"no file {shown(str(path))}"])
+        raise InputError([f"no file {shown(str(path))}"])
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         valid = ", ".join(f".{name}" for name in FORMATS)
-        raise SceneError([f"{path.name}: is no mesh file that is read; valid: {valid}"])
+        raise InputError([f"{path.name}: is no mesh file that is read; valid: {valid}"])
     try:
         with path.open("rb") as file:
             content = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise SceneError([f"{path.name}: {error.strerror}"]) from error
+        raise InputError([f"{path.name}: {error.strerror}"]) from error
     if len(content) > MOST_BYTES:
-        raise SceneError([f"{path.name}: has more than {MOST_BYTES >> 20} MiB; use fewer faces"])
+        raise InputError([f"{path.name}: has more than {MOST_BYTES >> 20} MiB; use fewer faces"])
     try:
         vertices, faces = _parse(content, kind)
     except Exception as error:  # every format has its own parser with its own exceptions
         why = shown(str(error))[1:-1] or type(error).__name__
-        raise SceneError([f"{path.name}: cannot be read as a mesh: {why}"]) from error
+        raise InputError([f"{path.name}: cannot be read as a mesh: {why}"]) from error
     if problem := _problem(vertices, faces):
-        raise SceneError([f"{path.name}: {problem}"])
+        raise InputError([f"{path.name}: {problem}"])
     return Read(vertices, faces, content, hashlib.sha256(content).hexdigest())
 
 

@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 _MERGE = 1e-5  # vertices closer than this fraction of the size are one
 
@@ -37,7 +37,7 @@ def repair(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _merge(vertices: np.ndarray, faces: np.ndarray, report: list[str]):
     near = _MERGE * np.ptp(vertices, axis=0).max()
-    pairs = cKDTree(vertices).query_pairs(near, output_type="ndarray")
+    pairs = KDTree(vertices).query_pairs(near, output_type="ndarray")
     if not len(pairs):
         return vertices, faces
     ones, n = np.ones(len(pairs), bool), len(vertices)

@@ -9,7 +9,7 @@ import numpy as np
 
 from codesign_jax.scene.meshes import grid, mass, reading, repair, support
 from codesign_jax.scene.reach import LEAST
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
@@ -86,17 +86,17 @@ class Solid:
         """Signed distances; built when first asked for.
 
         Raises:
-          SceneError: if the bound asks for too fine a grid, or the surface cuts through itself.
+          InputError: if the bound asks for too fine a grid, or the surface cuts through itself.
         """
         known = self.voxel_error, self.reach
         try:
             built = grid.cached(self.digest, self.vertices, self.faces, *known)
         except ValueError as error:
-            raise SceneError([f"{self.path.name}: {error}"]) from error
+            raise InputError([f"{self.path.name}: {error}"]) from error
         # Where parts overlap, the mesh counts a volume twice and the distance has inner walls.
         filled = np.clip(0.5 - built.values / built.cell, 0.0, 1.0).sum() * built.cell**3
         if abs(filled - self.volume) > 0.1 * self.volume:
-            raise SceneError(
+            raise InputError(
                 [
                     f"{self.path.name}: the surface encloses {self.volume * 1e6:.1f} cm^3 but "
                     f"{filled * 1e6:.1f} cm^3 lie inside it: it cuts through itself"
@@ -115,7 +115,7 @@ def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
       voxel_error: Bound on the error of the signed distance [m].
 
     Raises:
-      SceneError: with every problem of the mesh.
+      InputError: with every problem of the mesh.
     """
     vertices, faces, content, digest = reading.read(path)
     repairs: list[str] = []
@@ -126,7 +126,7 @@ def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
             vertices, faces, repairs = repair.repair(vertices, faces)
         problems += surface_problems(vertices, faces, repaired)
     if problems:
-        raise SceneError([f"{path.name}: {p}" for p in problems])
+        raise InputError([f"{path.name}: {p}" for p in problems])
     vertices = vertices * UNITS[unit]
     body = mass.body(vertices, faces)
     options = f"{unit} {repaired} {voxel_error!r}"

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 _CHUNK = 1 << 14  # points at once: the pairs' arrays stay in the cache
-_MOST_PIECES = 1_000_000  # 200 MB and some seconds
+MOST_PIECES = 1_000_000  # 200 MB and some seconds
 
 
 class Surface(NamedTuple):
@@ -35,7 +35,7 @@ class Surface(NamedTuple):
     normal: np.ndarray
     edge_normal: np.ndarray
     corner_normal: np.ndarray
-    tree: cKDTree
+    tree: KDTree
     piece: np.ndarray
     reach: float
 
@@ -68,7 +68,7 @@ def prepare(vertices: np.ndarray, faces: np.ndarray) -> Surface:
     longest = np.sqrt(2 * np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1).sum() / 2000)
     # Each cut makes four of a face: of thin rods with many sides there would be tens of millions.
     long = np.linalg.norm(edge, axis=2).max(1)
-    while (4.0 ** np.ceil(np.log2(np.maximum(long / longest, 1)))).sum() > _MOST_PIECES:
+    while (4.0 ** np.ceil(np.log2(np.maximum(long / longest, 1)))).sum() > MOST_PIECES:
         longest *= 2
     cut = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=20, return_index=True)
     points, pieces, piece = cut[0], cut[1], cut[-1]
@@ -77,7 +77,7 @@ def prepare(vertices: np.ndarray, faces: np.ndarray) -> Surface:
     inward = np.cross(normal[:, None], edge)
     return Surface(
         corner, edge, inward, normal, at_edge[which].reshape(-1, 3, 3), at_vertex[faces],
-        cKDTree(centroid), np.asarray(piece), float(reach),
+        KDTree(centroid), np.asarray(piece), float(reach),
     )  # fmt: skip
 
 

@@ -71,6 +71,10 @@ class Cotangents(NamedTuple):
 class AdjointProgram(Program):
     """Tables and kernel of a rollout's derivative."""
 
+    def __init__(self, *args: Any, **how: Any):
+        """As `Program`, a lane a finger."""
+        super().__init__(*args, **{**how, "team": 1})
+
     remembers = {"hull": ("vertex",), "pairs": ("owner", "sphere")}
 
     def _tables(self) -> None:

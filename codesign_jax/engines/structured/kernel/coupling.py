@@ -108,6 +108,11 @@ class Coupling:
 
         work = jax.lax.while_loop(going, body, start)[-1]
         more = self._result(lanes([work > 0], (), wide=False))
+        self._settle()
+        return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), step, more)
+
+    def _settle(self) -> None:
+        """Adds the last right side's factors to the first one's."""
 
         def add(i: Any, x: jax.Array) -> jax.Array:
             z = lanewise(jnp.add, *self.problem.read("z", "z_again", item=i))
@@ -115,7 +120,6 @@ class Coupling:
             return x
 
         jax.lax.fori_loop(0, self.links, add, jnp.int32(0))
-        return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), step, more)
 
     def _begin(self, busy: Lanes) -> None:
         """Stores the first residual, and the contacts' relative motion by the uncorrected step."""
@@ -155,7 +159,7 @@ class Coupling:
             return lanewise(both, sums, pairing.half, left, answer, pairs.stiff(hessian, answer))
 
         sums = pairs.each(add, [zeros((), self.problem.like)] * 2)
-        size, bent = (self.block.fold(v.lane, jnp.add) for v in sums)
+        size, bent = (self.block.total(v.lane) for v in sums)
         return size, bent
 
     def _advance(self, length: jax.Array, turn: jax.Array) -> jax.Array:
@@ -193,7 +197,7 @@ class Coupling:
             return lanewise(add, gain, pairing.half, along, first)
 
         gain = pairs.each(store, zeros((), self.problem.like))
-        return self.block.fold(gain.lane, jnp.add)
+        return self.block.total(gain.lane)
 
     def _result(self, kept: Lanes) -> Iterate:
         """Solves once more, with the sum of all steps; where that is no descent, without it."""

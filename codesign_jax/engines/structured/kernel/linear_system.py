@@ -203,15 +203,7 @@ class Elimination:
         rigid = self.problem.rigid
 
         def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> tuple:
-            force = Forces(
-                palm.smooth_palm - palm.palm.times(now.palm_motion),
-                None,  # type: ignore[arg-type]
-                palm.smooth_object - palm.object.times(now.object_motion),
-                palm.smooth_wrist - palm.armature * now.wrist,
-                None,  # type: ignore[arg-type]
-            )
-            matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
-            node = el.add_palm(node, matrices, force, pushes)
+            node, force = with_palm(now, palm, node, pushes)
             if rigid:
                 obj = el.solve_object(node.q, node.r_object)
                 none = jnp.zeros_like(obj)
@@ -235,6 +227,21 @@ class Elimination:
             return step, Eliminated(kept[0], kept[1], node.q, work)
 
         return lanewise(solve, now, self.problem.palm, node, slots)
+
+
+def with_palm(
+    now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict
+) -> tuple[el.Quadratic, Forces]:
+    """Adds palm and object, with the forces that an iterate leaves unbalanced, to the fingers."""
+    force = Forces(
+        palm.smooth_palm - palm.palm.times(now.palm_motion),
+        None,  # type: ignore[arg-type]
+        palm.smooth_object - palm.object.times(now.object_motion),
+        palm.smooth_wrist - palm.armature * now.wrist,
+        None,  # type: ignore[arg-type]
+    )
+    matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
+    return el.add_palm(node, matrices, force, pushes), force
 
 
 def add_terms(terms: list[el.JointTerms]) -> el.JointTerms:

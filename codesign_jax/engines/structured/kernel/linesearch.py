@@ -84,17 +84,21 @@ class LineSearch:
         )
         tip = self.prepare_row(self.links, last, last, step)
         between = [problem.pairs.prepare_all()] if problem.pairs else []
-        touch = lanewise(lambda t: total(t), [touch, *tip, *between])
-        for contacts in problem.slots:
+        touch = self.prepare_slots(lanewise(lambda t: total(t), [touch, *tip, *between]), step)
+        slope, curvature, touch = self.block.sum((slope, curvature, touch))
+        slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
+        return slope, curvature, touch
+
+    def prepare_slots(self, touch: Lanes, step: Iterate) -> Lanes:
+        """Adds the slopes of the palm's and the object's contacts along the step."""
+        for contacts in self.problem.slots:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
                 rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)
                 return lanewise(jnp.add, sum_, contacts.prepare_linesearch(i, rel))
 
             touch = loop(contacts.set.count, add, touch, self.block.size)
-        slope, curvature, touch = self.block.sum((slope, curvature, touch))
-        slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
-        return slope, curvature, touch
+        return touch
 
     def prepare_row(self, row: Any, before: Lanes, after: Lanes, step: Iterate) -> list[Lanes]:
         """Slopes of a row's contacts along the step of the links before and behind it."""
@@ -106,6 +110,31 @@ class LineSearch:
             for c in self.problem.skin
         ]
         return [c.prepare_linesearch(row, motion) for c, motion in names]
+
+    def total(self, sums: list[Lanes]) -> list[Lanes]:
+        """What the lanes of a world have found, summed."""
+        return self.block.sum(sums)
+
+    def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
+        """First and second derivative of the contacts' cost by the step length, at alpha."""
+
+        def add(i: Any, sums: list, sets: list) -> list:
+            for contacts in sets:
+                new = contacts.slopes(i, alpha)
+                sums = lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
+            return sums
+
+        problem = self.problem
+        sums = [zeros((), self.like)] * 2
+        links, surface = (self.links, problem.fingers), (self.links + 1, problem.skin)
+        for count, sets in (links, surface):
+            if sets:
+                sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
+        for c in problem.slots:
+            sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
+        if problem.pairs:
+            sums = problem.pairs.slopes_of_all(alpha, sums)
+        return sums
 
     def find(
         self,
@@ -126,23 +155,7 @@ class LineSearch:
         """
 
         def evaluate(alpha: Lanes) -> tuple[Lanes, Lanes]:
-            def add(i: Any, sums: list, sets: list) -> list:
-                for contacts in sets:
-                    new = contacts.slopes(i, alpha)
-                    sums = lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
-                return sums
-
-            problem = self.problem
-            sums = [zeros((), self.like)] * 2
-            links, surface = (self.links, problem.fingers), (self.links + 1, problem.skin)
-            for count, sets in (links, surface):
-                if sets:
-                    sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
-            for c in problem.slots:
-                sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
-            if problem.pairs:
-                sums = problem.pairs.slopes_of_all(alpha, sums)
-            one, two = self.block.sum(sums)
+            one, two = self.total(self.contact_slopes(alpha))
             return lanewise(
                 lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
             )

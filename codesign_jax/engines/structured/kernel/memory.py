@@ -214,18 +214,49 @@ class Block:
     Attributes:
       fingers: Number of fingers, a power of two.
       worlds: Number of worlds.
+      team: Lanes that share the work of a finger, a power of two; see `teams`.
       size: Number of lanes.
       lane: The lanes, shape (lane,).
       world: World of each lane, shape (lane,).
       finger: Finger of each lane, shape (lane,).
+      mate: Number of each lane in its team, shape (lane,); `own`: column of its finger in tables.
     """
 
-    def __init__(self, fingers: int, worlds: int):
+    def __init__(self, fingers: int, worlds: int, team: int = 1):
         """Makes the indices, inside a kernel."""
-        self.fingers, self.worlds, self.size = fingers, worlds, fingers * worlds
+        self.fingers, self.worlds, self.team = fingers, worlds, team
+        self.size = fingers * worlds * team
         self.lane = lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
         count = jnp.int32(worlds)
         self.world, self.finger = jax.lax.rem(lane, count), jax.lax.div(lane, count)
+        self.own = lane
+        if team > 1:
+            self.mate = jax.lax.rem(self.finger, jnp.int32(team))
+            self.finger = jax.lax.div(self.finger, jnp.int32(team))
+            self.own = self.finger * worlds + self.world
+
+    def over_team(self, array: jax.Array, combine: Callable) -> jax.Array:
+        """`fold` over the lanes of each team."""
+        return self._swapped(array, combine, self.worlds, self.worlds * self.team)
+
+    def total(self, array: jax.Array) -> jax.Array:
+        """The sum over all lanes of each world."""
+        return self.fold(self.over_team(array, jnp.add), jnp.add)
+
+    def dealt(self, count: int, k: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+        """The item of each lane in round k when a team shares `count`, and which lanes have one."""
+        if self.team == 1:
+            return k, None
+        item = k * self.team + self.mate
+        return jnp.minimum(item, count - 1), item < count
+
+    def alone(self, which: jax.Array) -> jax.Array:
+        """Of the lanes of a team, which are all true or all false, only the first one."""
+        return which if self.team == 1 else which & (self.mate == 0)
+
+    def rounds(self, count: int) -> int:
+        """Number of those rounds."""
+        return -(-count // self.team)
 
     def fold(self, array: jax.Array, combine: Callable) -> jax.Array:
         """Every finger's value combined, on all lanes of the world.
@@ -237,8 +268,11 @@ class Block:
           array: Numbers of every lane, shape (lane,).
           combine: Function of two such arrays.
         """
-        distance = self.worlds
-        while distance < self.size:
+        return self._swapped(array, combine, self.worlds * self.team, self.size)
+
+    def _swapped(self, array: jax.Array, combine: Callable, first: int, end: int) -> jax.Array:
+        distance = first
+        while distance < end:
             pairs = array.reshape(-1, 2, distance)
             array = combine(array, jax.lax.rev(pairs, (1,)).reshape(self.size))
             distance *= 2

@@ -14,6 +14,11 @@ from codesign_jax.engines.structured.kernel.linesearch import LINE_TOLERANCE, Li
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop, solid
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
 from codesign_jax.engines.structured.kernel.slots import only
+from codesign_jax.engines.structured.kernel.team_solver import (
+    TeamCoupling,
+    TeamElimination,
+    TeamLineSearch,
+)
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
 
@@ -30,8 +35,11 @@ class Newton:
     def __init__(self, problem: Problem):
         """Takes the step's problem."""
         self.problem, self.block = problem, problem.block
-        self.elimination, self.search = Elimination(problem), LineSearch(problem)
-        self.chord = Chord(problem) if problem.slotted else None
+        one = problem.block.team == 1
+        self.elimination = (Elimination if one else TeamElimination)(problem)
+        self.search = (LineSearch if one else TeamLineSearch)(problem)
+        self.coupling = Coupling if one else TeamCoupling
+        self.chord = Chord(problem) if problem.slotted and one else None
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -151,7 +159,7 @@ class Newton:
         done = done._replace(work=lanewise(jnp.add, done.work, work))
 
         def correct() -> Iterate:
-            return Coupling(self.problem, pairs, done).correct(step, idle)
+            return self.coupling(self.problem, pairs, done).correct(step, idle)
 
         return choose(pairs.touching_now(), correct, step, self.block.size), done
 

@@ -55,6 +55,8 @@ class Packing(Tables):
         arrays["alive"] = jnp.ones((1, worlds), dtype)
         arrays["object_id"] = hand.object_id.astype(dtype)
         narrow = {k: arrays[k] for k in self.world.groups}
+        if self.team > 1:  # XLA rounds alike however many worlds it lays out
+            wide, narrow = jax.lax.optimization_barrier((wide, narrow))
         packed = self.world.pack(1, self.block, **narrow)
         ids = np.arange(packed.shape[0] * self.block).reshape(-1, 1, self.block)
         alive = np.arange(self.world.rows)[:, None] == self.world.offset["alive"]
@@ -97,7 +99,7 @@ class Packing(Tables):
         blocks = jnp.moveaxis(ctrl.reshape(-1, self.block, steps, ctrl.shape[2]), 1, 3)
         arm, pressure = blocks[:, :, :6], blocks[:, :, 6:]
         pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]
-        return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.size)
+        return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.columns)
 
     def path_rows(self, states: bool) -> tuple[int, int]:
         """Numbers of rows of the state's tables that are recorded: all, or the positions."""

@@ -19,6 +19,7 @@ from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
+from codesign_jax.engines.structured.kernel.teams import team_sum, where
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import hull, sections
 from codesign_jax.engines.structured.world_model import apply_columns
@@ -54,6 +55,8 @@ class Search:
 
     def read(self, name: str, item: Any, pairing: Pairing | None = None) -> Lanes:
         """Where the lanes' own fingers are, or those that they are paired with."""
+        if pairing is not None and self.block.team > 1:
+            return self.scratch.gather(self.ref, f"pair.{name}", item, pairing.lane)
         own = self.scratch.read(self.ref, f"pair.{name}", item)
         return own if pairing is None else pairing.swap(own)
 
@@ -114,32 +117,39 @@ class Search:
 
     def _rows_on_palm(self) -> None:
         """Enters one contact of all vertices of a row."""
-        first, d = first_on_palm(self.p.links), self.p.scene.discretization
-        count = d.hull_rings * d.hull_points
+        first = first_on_palm(self.p.links)
 
         def one(i: Any) -> None:
             row, ball = i + first, self.read("ball", i + first)
-
-            def vertices() -> None:
-                links, kind = self._links(row), skin.kind_of(row, self.p.links)
-
-                def add(k: Any, sums: Lanes) -> Lanes:
-                    vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
-                    ends = lanewise(sections.on_palm, vertex, links, self.palm)
-                    return lanewise(sections.add_vertex, sums, *ends)
-
-                sums = loop(count, add, zeros((sections.SUMS,), self.like), self.block.size)
-                self._enter_on_palm(lanewise(sections.pressure, sums)[0], row)
-
             (_, _, near), _ = lanewise(sections.ball_on_palm, ball, self.palm)
-            any_of(near.lane < 0, vertices)
+            any_of(near.lane < 0, lambda: self._row_on_palm(row, None))
 
         each(self.p.links + 1 - first, one)
 
-    def _enter_on_palm(self, place: tuple, row: Any, sphere: Any = 0) -> None:
+    def _row_on_palm(self, row: Any, there: jax.Array | None) -> None:
+        """Enters one contact of all vertices of a row; there: lanes that have one to try."""
+        d, links = self.p.scene.discretization, self._links(row)
+        count, kind = d.hull_rings * d.hull_points, skin.kind_of(row, self.p.links)
+
+        def add(k: Any, sums: Lanes) -> Lanes:
+            k, mine = self.block.dealt(count, k)
+            vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
+            ends = lanewise(sections.on_palm, vertex, links, self.palm)
+            new = lanewise(sections.add_vertex, sums, *ends)
+            return new if mine is None else where(mine, new, sums)
+
+        start = zeros((sections.SUMS,), self.like)
+        sums = loop(self.block.rounds(count), add, start, self.block.size)
+        place = lanewise(sections.pressure, team_sum(self.block, sums))[0]
+        self._enter_on_palm(place, row, there=there)
+
+    def _enter_on_palm(
+        self, place: tuple, row: Any, sphere: Any = 0, there: jax.Array | None = None
+    ) -> None:
         """Gives a slot to a contact with the palm, whose motion the sides' are relative to."""
         pairs = self.pairs
         which = (place[2].lane < 0) & (self.block.finger < self.p.num_fingers)
+        which = which if there is None else self.block.alone(which & there)
 
         def enter() -> None:
             moves = [pairs.side(name, row) for name in ("motion", "vel")]
@@ -147,7 +157,7 @@ class Search:
                 fields = pairs.begin(place, *moves)
             number = lanes([self.like + jnp.asarray(row, self.like.dtype)], (1, 1), wide=True)
             fields |= {"row": number} | pairs.remembered({"owner": 1.0, "sphere": sphere})
-            pairs.add(0, which, fields, self.block.lane)
+            pairs.add(0, which, fields, self.block.own)
 
         any_of(which, enter)
 
@@ -181,6 +191,7 @@ class Search:
         """Balls around the vertices of every row."""
 
         def one(row: Any) -> None:
+            row, _ = self.block.dealt(self.p.links + 1, row)
             kind = skin.kind_of(row, self.p.links)
             ball = self.p.hand.read(self.step.hand, "ball", kind)
             joint, before, after = self._links(row)
@@ -188,7 +199,7 @@ class Search:
             whole = lanewise(lambda c, r: jnp.concatenate([c[:, 0], r]), centre, reach)
             self.write("ball", whole, row)
 
-        each(self.p.links + 1, one)
+        each(self.block.rounds(self.p.links + 1), one)
 
     def _links(self, row: Any, pairing: Pairing | None = None) -> tuple[Lanes, Lanes, Lanes]:
         """Joint of a row, and the frames of the links before and behind it."""
@@ -274,6 +285,7 @@ class Search:
             away = lanewise(sections.ring_outside, ring, own_size, size).lane
 
             def add(k: Any, sums: Lanes) -> Lanes:
+                k, _ = self.block.dealt(each_ring, k)  # of which teams have a multiple of theirs
                 vertex = read(first + k)
                 away = lanewise(sections.outside, vertex, ring, size).lane
 
@@ -285,13 +297,13 @@ class Search:
                 return choose(anywhere(tried & ~away), within, sums, self.block.size)
 
             def points() -> Lanes:
-                return loop(each_ring, add, sums, self.block.size)
+                return loop(self.block.rounds(each_ring), add, sums, self.block.size)
 
             return choose(anywhere(tried & ~away), points, sums, self.block.size)
 
-        sums = loop(rings, ring, start, self.block.size)
+        sums = team_sum(self.block, loop(rings, ring, start, self.block.size))
         one, two = lanewise(sections.pressure, sums)
-        which = there & (one[2].lane < 0)
+        which = self.block.alone(there & (one[2].lane < 0))
 
         def enter() -> None:
             moves = self._moves(rows, pairing)
@@ -341,6 +353,10 @@ class Search:
             dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
             for place, value in zip(ends, (mine, theirs), strict=True)
         ]
+        if self.block.team > 1:  # each finger of a pair may have found another contact
+            for side, number in zip(kept, rows, strict=True):
+                side["row"] = lanes([number.astype(self.like.dtype)], (1, 1), wide=True)
+            return pairs.enter(row, which, owner, kept[0], kept[1], {"step": none})
         numbers = [v.astype(self.like.dtype) for v in rows]
         side = jnp.where(owner, self.like + numbers[0], self.like + numbers[1])
         alike = {"row": lanes([side], (1, 1), wide=True), "step": none}

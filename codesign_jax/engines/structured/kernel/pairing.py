@@ -39,7 +39,7 @@ class Pairing:
         block = self.block
         arrays, rebuild = solid(tree, block.size)
         for digit in range(block.fingers.bit_length() - 1):
-            distance = block.worlds << digit
+            distance = block.worlds * block.team << digit
             chosen = jax.lax.bitwise_and(self.number, jnp.int32(1 << digit)) > 0
             arrays = [
                 jnp.where(chosen, jax.lax.rev(a.reshape(-1, 2, distance), (1,)).reshape(-1), a)

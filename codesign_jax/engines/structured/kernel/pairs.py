@@ -226,7 +226,7 @@ class BoundPairs(BoundSlots):
             field: lanewise(jnp.where, side, value, theirs[field]) for field, value in mine.items()
         }
         touch = which | (~owner & (fields["gap"].lane < 0))
-        self.add(row, touch, fields | alike, self.block.lane)
+        self.add(row, touch, fields | alike, self.block.own)
 
     def each(self, body: Callable, start: Any) -> Any:
         """Folds body(item, pairing, tree of lanes) over all slots in use."""
@@ -281,7 +281,7 @@ class BoundPairs(BoundSlots):
         """What sides have at the rows of a slot's lanes; zeros where nothing touches."""
         groups = self.table.groups
         if self.set.gathers:
-            row, lane = self.read("row", item).lane.astype(jnp.int32), self.block.lane
+            row, lane = self.read("row", item).lane.astype(jnp.int32), self.block.own
             return [self.table.gather(self.ref, f"side.{name}", row, lane) for name in names]
         like = jnp.zeros((self.set.size,), self.ref.dtype)
         start = [zeros(groups[f"side.{name}"][1], like) for name in names]
@@ -328,7 +328,7 @@ class BoundPairs(BoundSlots):
         if not self.set.gathers:
             return OwnSide(self.place(item), None, None)
         row = self.read("row", item).lane.astype(jnp.int32)
-        wrench = self.table.gather(self.ref, "side.push", row, self.block.lane)
+        wrench = self.table.gather(self.ref, "side.push", row, self.block.own)
         return OwnSide(self.place(item), row, wrench)
 
     def load(self, item: Any, own: OwnSide, force: Lanes, pairing: Pairing) -> None:
@@ -343,7 +343,7 @@ class BoundPairs(BoundSlots):
             any_of(pairing.palm.lane, lambda: self._push_palm(item, more))
         if own.row is not None and own.wrench is not None:
             sums = lanewise(jnp.add, own.wrench, more)
-            self.table.scatter(self.ref, "side.push", sums, own.row, self.block.lane)
+            self.table.scatter(self.ref, "side.push", sums, own.row, self.block.own)
             return
 
         def add(row: Any, chosen: jax.Array, nothing: list) -> list:
@@ -369,19 +369,10 @@ class BoundPairs(BoundSlots):
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and adds up wrenches."""
         self.clear_wrenches()
-        contacts = self.set.contacts
-
-        def response(place, cone, jar):
-            found = contact.constraint_update(contacts(place, cone), jar)
-            return found.hessian, found.force
 
         def store(item: Any, pairing: Pairing) -> None:
             own = self.own_side(item)
-            jar = lanewise(tree_add_scaled, alpha, self.read("jar", item), self.read("step", item))
-            self.write("jar", jar, item)
-            hessian, force = lanewise(response, own.place, self.cone, jar)
-            self.write("hessian", hessian, item)
-            self.load(item, own, force, pairing)
+            self.load(item, own, self.update_constraint(item, own.place, alpha), pairing)
 
         self.do(store)
 

@@ -44,6 +44,19 @@ class Memory(NamedTuple):
     scratch: MemoryLayout
     scratch_ref: Any
     contacts: dict[str, BoundContacts]
+    onchip: MemoryLayout | None = None
+    onchip_ref: Any = None
+
+    @property
+    def tables(self) -> list[tuple[MemoryLayout, Any]]:
+        """The tables with their references."""
+        found = [(self.hand, self.hand_ref), (self.state, self.state_ref)]
+        more = (self.scratch, self.scratch_ref), (self.onchip, self.onchip_ref)
+        return [*found, *((t, r) for t, r in more if t is not None)]
+
+    def table(self, name: str) -> tuple[MemoryLayout, Any]:
+        """The table that has a name, with its reference."""
+        return next((t, r) for t, r in self.tables if name in t.groups)
 
 
 class Problem:
@@ -68,10 +81,8 @@ class Problem:
         self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
         self.pairs: BoundPairs | None = m.contacts.get("finger_finger")  # type: ignore[assignment]
         self.fingers = [m.contacts[n] for n in ("finger_object", "finger_table") if n in m.contacts]
-        self.skin: list[BoundSlots] = [
-            c  # type: ignore[misc]
-            for n, c in m.contacts.items()
-            if n.startswith("hull_")
+        self.skin: list[BoundSlots] = [  # type: ignore[assignment]  # hull sets are slots
+            c for n, c in m.contacts.items() if n.startswith("hull_")
         ]
         self.slots = [c for n, c in m.contacts.items() if not n.startswith(("finger", "hull_"))]
         self.slotted = [*self.skin, *([self.pairs] if self.pairs else [])]
@@ -82,23 +93,18 @@ class Problem:
 
         Of the joints' armature that of this step, if it changes.
         """
-        m = self.m
-        if "armature_now" in m.scratch.groups:
+        if "armature_now" in self.m.scratch.groups:
             names = tuple("armature_now" if n == "armature" else n for n in names)
-        tables = ((m.hand, m.hand_ref), (m.state, m.state_ref), (m.scratch, m.scratch_ref))
         found = []
         for name in names:
-            table, ref = next((t, r) for t, r in tables if name in t.groups)
+            table, ref = self.m.table(name)
             found.append(table.read(ref, name, item))
         return found
 
     def write(self, name: str, value: Lanes, item: Any) -> None:
         """Writes to the table that has the name."""
-        m = self.m
-        if name in m.state.groups:
-            m.state.write(m.state_ref, name, value, item)
-        else:
-            m.scratch.write(m.scratch_ref, name, value, item)
+        table, ref = self.m.table(name)
+        table.write(ref, name, value, item)
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
         """Adds the last step to a link's "acc" or "motion", and returns the sum."""

@@ -16,7 +16,7 @@ from jax.experimental import pallas as pl
 from codesign_jax import sources, verdict
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.kernel import speed
+from codesign_jax.engines.structured.kernel import speed, teams
 from codesign_jax.engines.structured.kernel.memory import Block, anywhere
 from codesign_jax.engines.structured.kernel.packing import Packing
 from codesign_jax.engines.structured.kernel.step import Step
@@ -46,7 +46,15 @@ class Limits(NamedTuple):
 class Program(Packing):
     """Tables and kernel of a scene's rollout for one size of block."""
 
-    def __init__(self, scene: Scene, limits: Limits, *, backend: str = "gpu", width: int = 32):
+    def __init__(
+        self,
+        scene: Scene,
+        limits: Limits,
+        *,
+        backend: str = "gpu",
+        width: int = 32,
+        team: int | None = None,
+    ):
         """Lays out the memory.
 
         Args:
@@ -55,16 +63,20 @@ class Program(Packing):
           backend: "gpu", "cpu", or "interpreter", which is Pallas' own and slow.
           width: Lanes of a block, a power of two; more if a world has more fingers. By default
             those of a warp.
+          team: Lanes that share the work of a finger, 1 or `teams.TEAM`; by default what the scene
+            and the backend make faster. Sums depend on it, and so do last bits.
         """
-        super().__init__(scene, backend=backend, width=width)
+        super().__init__(scene, backend=backend, width=width, team=team)
         self.limits = limits
         self.trace = (*TRACE, "overflow") if self.slotted else TRACE
 
     @classmethod
-    def here(cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None) -> "Program":
+    def here(
+        cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None, **how: Any
+    ) -> "Program":
         """The program for this device, type and number of worlds, see `lanes_here`."""
         width = lanes_here(scene, dtype, worlds)
-        return cls(scene, limits, backend=jax.default_backend(), width=width)
+        return cls(scene, limits, backend=jax.default_backend(), width=width, **how)
 
     def run(self, hand: WorldModel, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
         """Runs a rollout; returns `trace` by name, shape (world, time)."""
@@ -114,6 +126,10 @@ class Program(Packing):
         origin = repr((self.scene.structure, self.limits, trajectory, states))
         shared = (len(inputs) - 1,) if self.meshes else ()
         kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
+        if self.team > 1:
+            last = len(outputs) - 1
+            kernel = kernel._replace(origin=f"{origin} {self.team}", onchip=(last,))
+            kernel = kernel._replace(exchanged=(2, last))
         return launch(call, inputs, outputs, kernel)
 
     def outputs(
@@ -149,14 +165,16 @@ class Program(Packing):
         """The kernel of arguments as a function of them, and its outputs."""
         blocks, steps, dtype = inputs[0].shape[0], inputs[4].shape[1], inputs[4].dtype
         shapes = [
-            (blocks, self.finger_state.rows, self.size),
+            (blocks, self.finger_state.rows, self.columns),
             (blocks, self.world_state.rows, self.block),
-            (blocks, self.scratch.rows, self.size),
+            (blocks, self.scratch.rows, self.columns),
             (blocks, steps, len(self.trace), self.block),
         ]
         for stride, whole in _records(trajectory, states):
             (angles, places), count = self.path_rows(whole), -(-steps // stride)
-            shapes += [(blocks, count, angles, self.size), (blocks, count, places, self.block)]
+            shapes += [(blocks, count, angles, self.columns), (blocks, count, places, self.block)]
+        if self.team > 1:
+            shapes += [(blocks, self.onchip.rows, self.columns)]
 
         outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
         call = pl.pallas_call(
@@ -188,8 +206,14 @@ class Program(Packing):
             trace,
             *path,
         ) = rest
-        block = Block(self.fingers, self.block)
-        step = Step(self, block, hand, world, finger_state, world_state, scratch, grid)
+        block, onchip = Block(self.fingers, self.block, self.team), None
+        if self.team > 1:
+            share = partial(teams.SharedColumns, block)
+            *path, onchip = path
+            hand, finger_state0, pressure = map(share, (hand, finger_state0, pressure))
+            finger_state, scratch, onchip = map(share, (finger_state, scratch, onchip))
+            path[::2] = map(share, path[::2])
+        step = Step(self, block, hand, world, finger_state, world_state, scratch, grid, onchip)
         own = block.world
         _copy(finger_state0, finger_state, self.finger_state.rows)
         _copy(world_state0, world_state, self.world_state.rows, own)

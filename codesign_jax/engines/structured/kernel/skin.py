@@ -164,31 +164,32 @@ class Skin:
           before: The link before it.
           after: The link behind it.
         """
-        kind = kind_of(row, self.links)
+        kind, block = kind_of(row, self.links), self.step.block
         moves = {c.set.name: self._moves(c.set.name, before, after) for c in self.sets}
         ball = self.step.p.hand.read(self.step.hand, "ball", kind)
         centre, reach = lanewise(hull.ball_around, joint, before.frame, after.frame, ball)
         for slots in self.sets:
-            slots.clear(row)
+            slots.clear(row)  # pyright: ignore[reportAttributeAccessIssue]  # hull sets are slots
             _, _, gap = self.step.geometry(slots.set.name, centre, reach, self.at, self.thing)
 
             def vertices(slots: BoundSlots = slots) -> None:
                 def one(v: jax.Array, x: jax.Array) -> jax.Array:
-                    self._vertex(row, kind * self.k + v, slots, joint, before, after, moves)
+                    v, mine = block.dealt(self.k, v)
+                    self._vertex(row, kind * self.k + v, slots, joint, before, after, moves, mine)
                     return x
 
-                jax.lax.fori_loop(0, self.k, one, jnp.int32(0))
+                jax.lax.fori_loop(0, block.rounds(self.k), one, jnp.int32(0))
 
             any_of(gap.lane < 0, vertices)
 
-    def _vertex(self, row, item, slots, joint, before, after, moves) -> None:
+    def _vertex(self, row, item, slots, joint, before, after, moves, mine) -> None:
         vertex = self.step.p.hand.read(self.step.hand, "vertex", item)
         place = lanewise(hull.placed, vertex, joint, before.frame, after.frame)
         point, image, weight, share = place
         name = slots.set.name
         where, normal, gap = self.step.geometry(name, point, 0.0, self.at, self.thing)
 
-        which = gap.lane < 0
+        which = gap.lane < 0 if mine is None else mine & (gap.lane < 0)
         if self.step.p.fingers > self.step.p.num_fingers:  # the others fill up
             which = which & (self.step.block.finger < self.step.p.num_fingers)
 
@@ -196,7 +197,7 @@ class Skin:
             arm = lanewise(lambda *places: hull.lever(*places), weight, image, where, point)
             kept = slots.begin((where, normal, gap, arm, share), *moves[name])
             kept |= slots.remembered({"vertex": item})
-            slots.add(row, which, kept, self.step.block.lane)
+            slots.add(row, which, kept, self.step.block.own)
 
         any_of(which, store)
 

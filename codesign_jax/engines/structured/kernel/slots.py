@@ -16,7 +16,9 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.counts import Counts
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, full, solid
+from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import contact
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts
 from codesign_jax.scene import Scene
 
@@ -239,6 +241,20 @@ class BoundSlots(BoundContacts):
         mine, item = k < self._counts.of(row), jnp.full((self.set.size,), first + k, jnp.int32)
         empty, spare = self.set.count - 1, self.set.slots  # that of the first row
         return Slot(*(jnp.where(mine, item, jnp.int32(away)) for away in (empty, spare)))
+
+    def update_constraint(self, item: Any, place: tuple, alpha: Lanes) -> Lanes:
+        """Adds the last step to jar; stores the Hessian and returns the force, of one slot."""
+        contacts = self.set.contacts
+
+        def response(place, cone, jar):
+            found = contact.constraint_update(contacts(place, cone), jar)
+            return found.hessian, found.force
+
+        jar = lanewise(tree_add_scaled, alpha, self.read("jar", item), self.read("step", item))
+        self.write("jar", jar, item)
+        hessian, force = lanewise(response, place, self.cone, jar)
+        self.write("hessian", hessian, item)
+        return force
 
     def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Adds the last step to jar; the row's contact inertia (9, 9) and wrench (9,)."""

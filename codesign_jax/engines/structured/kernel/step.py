@@ -22,6 +22,8 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Memory, Palm
 from codesign_jax.engines.structured.kernel.skin import Side, Skin
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.kernel.spheres import Spheres
+from codesign_jax.engines.structured.kernel.team_search import TeamSearch
+from codesign_jax.engines.structured.kernel.team_solver import team_rows
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws import inertia
@@ -69,11 +71,16 @@ class Step:
         world_state: Any,
         scratch: Any,
         grid: Any = None,
+        onchip: Any = None,
     ):
-        """Takes the kernel's lanes and memory; grid: distances of all meshes, if there are any."""
+        """Takes the kernel's lanes and memory.
+
+        The last two, of scenes with meshes and of teams: distances of all meshes, and the table of
+        shared memory.
+        """
         self.p, self.block, self.hand, self.world = program, block, hand, world
         self.finger_state, self.world_state, self.scratch = finger_state, world_state, scratch
-        self.grid = grid
+        self.grid, self.onchip = grid, onchip
 
     def constant(self, name: str) -> Lanes:
         """A constant of the worlds."""
@@ -152,6 +159,8 @@ class Step:
         bound = {c.name: c.bind(p.scratch, self.scratch, self.constant) for c in p.sets}
         state_table, scratch = (p.finger_state, self.finger_state), (p.scratch, self.scratch)
         memory = Memory(*hand, *state_table, *scratch, bound)
+        if p.team > 1:
+            memory = memory._replace(onchip=p.onchip, onchip_ref=self.onchip)
         return state, at, thing, memory, *self._forward(state, at, pressure, memory, thing)
 
     def _overflow(self, bound: dict[str, Any], waiting: jax.Array) -> jax.Array:
@@ -190,7 +199,8 @@ class Step:
         )
 
         pairs = m.contacts.get("finger_finger")
-        search = Search(self, pairs, at) if isinstance(pairs, BoundPairs) else None
+        looks = Search if p.team == 1 else TeamSearch
+        search = looks(self, pairs, at) if isinstance(pairs, BoundPairs) else None
         if search:
             search.start(motion, vel, frame, origin)
         spheres = Spheres(self, at, m, thing)
@@ -202,12 +212,17 @@ class Step:
             before = Side(frame, motion, vel)
             joint = self.joint(i) | {"pressure": pressure}
             run = partial(link_forces, p.scene)
-            carry, stored = lanewise(run, carry[:5], self.link_constants(i), joint)
+            constants = self.link_constants(i)
+            carry, stored = lanewise(run, carry[:5], constants, joint)
+            centre = stored["body_centre"]
             stored |= {"step_acc": zeros((p.axes,), like), "step_motion": wide}
+            if p.team > 1:
+                stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
             for name, value in stored.items():
-                m.scratch.write(self.scratch, name, value, i)
+                table, ref = m.table(name)
+                table.write(ref, name, value, i)
             share = p.hand.read(self.hand, "share", i + 1)
-            middle = lanewise(lambda m, c, s: m + s * c, middle, stored["body_centre"], share)
+            middle = lanewise(lambda m, c, s: m + s * c, middle, centre, share)
             spheres.of_link(i, carry)
             if search:
                 search.link(i, carry[4], carry[2], carry[1], carry[0])

@@ -3,11 +3,12 @@
 from functools import partial
 
 from codesign_jax import verdict
-from codesign_jax.engines.structured.kernel import objects, pair_search, skin
+from codesign_jax.engines.structured.kernel import objects, pair_search, skin, teams
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_slots
+from codesign_jax.engines.structured.kernel.team_slots import TeamHullSet, TeamPairSet
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.model import layout
 from codesign_jax.model.layout import palm_touches
@@ -24,22 +25,29 @@ class Tables:
       links: Moving links of a finger; `axes`: axes of a joint.
       fingers: Fingers of a block, a power of two; `num_fingers`: those of the scene.
       block: Worlds of a block; `size`: its lanes.
+      team: Lanes of a finger; `columns`: columns of the tables of fingers, which they share.
       k: Contact spheres of a link; `palm_groups`: of the palm, for each finger's lanes.
       sets: The contacts.
-      hand: Rows of the hand's table; likewise `world`, `finger_state`, `world_state`, `scratch`.
+      hand: Rows of the hand's table; likewise `world`, `finger_state`, `world_state`, `scratch`,
+        and with teams `onchip`.
     """
 
     remembers: dict[str, tuple[str, ...]] = {"hull": (), "pairs": ()}
     """Further numbers of the slots of the hull and of contacts between fingers."""
 
-    def __init__(self, scene: Scene, *, backend: str, width: int):
+    def __init__(self, scene: Scene, *, backend: str, width: int, team: int | None = None):
         """Lays out the memory, see `Program`."""
         self.backend = backend
         self.scene, self.lay = scene, layout(scene)
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()
-        self.num_fingers, self.block = n, max(1, width // self.fingers)
-        self.size = self.fingers * self.block
+        self.team = team or teams.lanes_of_a_finger(scene, backend, self.fingers)
+        # On a GPU a team's block is one world: nothing depends on what others do.
+        alone = self.team > 1 and backend == "gpu"
+        self.num_fingers = n
+        self.block = 1 if alone else max(1, width // (self.fingers * self.team))
+        self.columns = self.fingers * self.block
+        self.size = self.columns * self.team
         self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
         self.palm_groups = -(-self.lay.palm.size // self.fingers)
         self.meshes = bool(shapes.mesh_indices(scene))
@@ -61,17 +69,28 @@ class Tables:
         between = e.finger_finger and self.num_fingers > 1
         if between or e.finger_palm:
             block, slots = (self.fingers, self.block), pair_slots(self.scene)
-            how = {"gathers": self.backend in GATHERING, "remembers": self.remembers["pairs"]}
-            sets.append(PairSet(self.scene, block, self.links, slots, **how))
+            how = {"gathers": self.gathers, "remembers": self.remembers["pairs"]}
+            if self.team == 1:
+                sets.append(PairSet(self.scene, block, self.links, slots, **how))
+            else:
+                block = (*block, self.team)
+                sets.append(TeamPairSet(self.scene, block, self.links, slots, **how))
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
         on_table = [make("object_table", -(-4 // self.fingers), 1)] if e.object_table else []
         return [*sets, *on_table]
 
+    @property
+    def gathers(self) -> bool:
+        """Whether lanes read rows of their own."""
+        return self.backend in GATHERING or self.team > 1
+
     def _skin(self, name: str) -> HullSet:
-        slots, gathers = hull_slots(self.scene), self.backend in GATHERING
-        how = name, self.links + 1, slots, self.size
-        return HullSet(self.scene, *how, gathers=gathers, remembers=self.remembers["hull"])
+        how = name, self.links + 1, hull_slots(self.scene), self.size
+        if self.team > 1:
+            return TeamHullSet(self.scene, *how, (self.fingers, self.block, self.team))
+        kept = self.remembers["hull"]
+        return HullSet(self.scene, *how, gathers=self.gathers, remembers=kept)
 
     def _tables(self) -> None:
         n, a = self.links, self.axes
@@ -162,4 +181,8 @@ class Tables:
             fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
         if any(isinstance(s, PairSet) for s in self.sets):
             fields |= pair_search.fields(n, self.k)
+        if self.team > 1:
+            onchip = teams.fields(n, a)
+            self.onchip = MemoryLayout.by_item(True, **onchip)
+            fields = {name: f for name, f in fields.items() if name not in {*onchip, *teams.UNUSED}}
         self.scratch = MemoryLayout.by_item(True, **fields)

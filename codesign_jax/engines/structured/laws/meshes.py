@@ -17,7 +17,7 @@ import numpy as np
 
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.scene import Scene, by_structure
-from codesign_jax.scene.schema import SceneError
+from codesign_jax.scene.schema import InputError
 
 # Grids begin at multiples of this index, which a float32 holds exactly up to 2^31.
 _ALIGNED = 128
@@ -57,7 +57,7 @@ def tables(scene: Scene) -> Tables | None:
     """Builds the grids of a scene's meshes; None without any.
 
     Raises:
-      SceneError: with every mesh whose distance cannot be put on a grid.
+      InputError: with every mesh whose distance cannot be put on a grid.
     """
     problems: list[str] = []
     grids, supports = {}, {}
@@ -66,10 +66,10 @@ def tables(scene: Scene) -> Tables | None:
             continue
         try:
             grids[i], supports[i] = shape.mesh.grid, shape.mesh.support
-        except SceneError as error:
+        except InputError as error:
             problems += [f"object {shape.name!r}: {p}" for p in error.problems]
     if problems:
-        raise SceneError(problems)
+        raise InputError(problems)
     if not grids:
         return None
     count = len(scene.objects.object)

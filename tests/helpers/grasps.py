@@ -12,9 +12,14 @@ from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Trial
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 # The primitives, which are also the names of the one-object sets in data/.
 SHAPES = ("box", "cylinder", "capsule", "sphere")
+
+
+# Found by a random search over symmetric designs, straight above the object; in the files' units.
+GOOD = {"length": 86, "height": 24.5, "wall": 5, "spread": 55, "arm_z": 58, "pressure": 130}
+"""A design of the paper's hand that holds all its objects, in the units of the hand's file."""
 
 
 @functools.cache
@@ -29,6 +34,21 @@ def pinch(shape="box", links=3, **settings):
         hand_name=DATA / "pinch.toml",
         object_set=DATA / f"{shape}.toml",
         overrides=overrides,
+    )
+
+
+def short_grasp():
+    """Half a second: the hand comes down beside the box, closes and begins to lift."""
+    return pinch(
+        "box",
+        phases__approach=0.2,
+        phases__inflate=0.35,
+        phases__lift=0.5,
+        effects__disturb=False,
+        effects__ungrasp=False,
+        effects__palm_object=False,
+        effects__palm_table=False,
+        arm__start_height=0.15,
     )
 
 
@@ -103,6 +123,16 @@ def hand_world(the_scene, **changes):
         params = nth(space.params(space.default()), ...)
     changes = {k: 0 * getattr(params, k) + v for k, v in changes.items()}
     return params._replace(**changes), still()
+
+
+@functools.lru_cache(maxsize=4)
+def _placing(engine):
+    return jax.jit(lambda fields, qpos, qvel: engine.place(engine.reset(fields), qpos, qvel))
+
+
+def lanes_state(engine, scene, fields, qpos, qvel):
+    """The engine's state, one world, from MuJoCo's coordinates, with a cold start."""
+    return _placing(engine)(fields, jnp.asarray(qpos)[None], jnp.asarray(qvel)[None])
 
 
 def nth(tree, index):

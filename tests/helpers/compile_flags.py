@@ -1,7 +1,6 @@
 """How XLA and kernels compile where programs run for milliseconds and compile for seconds."""
 
 import os
-import threading
 from importlib import metadata
 
 _ONE_THREAD = ("--xla_cpu_parallel_codegen_split_count=1",)
@@ -38,28 +37,3 @@ def use(flags: tuple[str, ...] = FLAGS) -> None:
     os.environ.setdefault("XLA_FLAGS", " ".join(flags))
     # Every operation of a program would carry the lines of code from which it was called.
     os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
-
-
-_PROGRAMS = 100
-"""Programs that share a context of MLIR, which keeps their constants."""
-
-
-def share_contexts() -> None:
-    """One context of MLIR for many programs of a thread: JAX makes one for each, of 3 ms.
-
-    A test session lowers three thousand programs.  JAX's function is an inner one: where a version
-    lacks it, programs have contexts of their own.
-    """
-    from jax._src.interpreters import mlir
-
-    make, own = getattr(mlir, "make_ir_context", None), threading.local()
-    if make is None:
-        return
-
-    def shared():
-        if not getattr(own, "left", 0):
-            own.context, own.left = make(), _PROGRAMS
-        own.left -= 1
-        return own.context
-
-    mlir.make_ir_context = shared

@@ -1,11 +1,10 @@
 """What the GPU suite simulates on both devices; run as a program it stores the CPU's results.
 
-python tests/gpu_cases.py short/spheres RESULTS.npz
+python -m tests.helpers.gpu_cases short/spheres RESULTS.npz
 """
 
 import sys
 from functools import partial
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -14,7 +13,7 @@ from codesign_jax import cost, rollout
 from codesign_jax import scene as scenes
 from codesign_jax.engines.structured import StructuredEngine
 from scripts.shared import work
-from tests import quick_compile, reverse, small
+from tests.helpers import compile_flags, differences, grasps
 
 STEPS = 230
 """Steps of a short grasp: through the approach and the first touch into the inflation."""
@@ -43,8 +42,8 @@ WHOLE = {"spheres": {}, "hull and fingers": EFFECTS["hull and fingers"]}
 
 def inputs(scene, count):
     """Model fields and controls of random worlds."""
-    params, trials = small.random_worlds(scene, 3, count)
-    return small.batch_inputs(scene, params, trials)
+    params, trials = grasps.random_worlds(scene, 3, count)
+    return grasps.batch_inputs(scene, params, trials)
 
 
 def short_scene(name):
@@ -52,11 +51,11 @@ def short_scene(name):
     if name == "mesh":
         return scenes.load(
             "paper_spheres",
-            hand_name=small.DATA / "pinch.toml",
+            hand_name=grasps.DATA / "pinch.toml",
             object_set="household",
             overrides={"discretization": {"links": 2}},
         )
-    return small.pinch("cylinder", links=2, **EFFECTS[name])
+    return grasps.pinch("cylinder", links=2, **EFFECTS[name])
 
 
 def short(name):
@@ -75,9 +74,9 @@ def slopes(name):
     """Derivatives of eight steps of a curled hand by every group of numbers, in float64."""
     with jax.enable_x64(True):
         scene, backend = short_scene(name), jax.default_backend()
-        case = reverse.Case(scene, reverse.curled(scene, 8), backend=backend)
+        case = differences.Case(scene, differences.curled(scene, 8), backend=backend)
         tables = case.many(1)
-        bars = case.bars(tables, case.execute(tables), [reverse.weights_of(case.start)])
+        bars = case.bars(tables, case.execute(tables), [differences.weights_of(case.start)])
         return {"slopes": case.along(bars)}
 
 
@@ -98,11 +97,10 @@ def whole(name):
 
 def main(case, path):
     """Stores what one case finds."""
-    quick_compile.use(quick_compile.OPTIMIZED)  # XLA compiles the model fields only
+    compile_flags.use(compile_flags.OPTIMIZED)  # XLA compiles the model fields only
     kind, name = case.split("/", 1)
     np.savez(path, **{"short": short, "slopes": slopes, "whole": whole}[kind](name))
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
     main(*sys.argv[1:])

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from tests.small import DATA
+from tests.helpers.grasps import DATA
 
 HEAD = (DATA / "box.toml").read_text().split("[[object]]")[0]
 

@@ -25,7 +25,7 @@ from codesign_jax.engines.structured.linear.tree import (
     relative,
 )
 from codesign_jax.engines.structured.world_model import world_constants
-from tests import small
+from tests.helpers import grasps
 
 FLOOR = 100.0
 """Smallest scale of relative errors of accelerations, ten g: at rest they are rounding."""
@@ -70,7 +70,7 @@ def against_mujoco(scene, fields, ctrl, found, stride=1):
     h, lay = scene.discretization.timestep, model.layout(scene)
     errors, far, touching = [], [], []
     for world in range(len(ctrl)):
-        own = small.nth(fields, world)
+        own = grasps.nth(fields, world)
         compiled = world_model(scene, own)
         compiled.opt.tolerance, compiled.opt.iterations, compiled.opt.ls_iterations = 0.0, 200, 50
         data = mujoco.MjData(compiled)

@@ -9,7 +9,7 @@ from codesign_jax import model, scene
 from codesign_jax.scene import parameters
 from codesign_jax.types import Trace
 
-TINY = Path(__file__).parent / "data" / "tiny.toml"
+TINY = Path(__file__).parents[1] / "data" / "tiny.toml"
 
 
 class ToyEngine:

@@ -6,11 +6,11 @@ import sys
 import time
 
 import pytest
-from toy import TINY
 
 from codesign_jax import cli, runs
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
+from tests.helpers.toy_engine import TINY
 
 EPISODES = 14  # enough that a signal after the third finds the run on its way
 

@@ -14,7 +14,7 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.engines.structured import StructuredEngine, coordinates
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, recorded
-from tests import small
+from tests.helpers import grasps
 
 EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-26}
 """Solved to rounding: differences divide the solver's error by twice the step."""
@@ -45,8 +45,8 @@ class Weights(NamedTuple):
 
 def curled(scene, steps, *, bend=0.9, height=0.07, seed=1):
     """A hand with bent fingers around the object, all of it moving."""
-    params, trial = small.hand_world(scene, length=0.1)
-    fields, ctrl = small.world_inputs(scene, params, trial)
+    params, trial = grasps.hand_world(scene, length=0.1)
+    fields, ctrl = grasps.world_inputs(scene, params, trial)
     random, lay, qpos = np.random.default_rng(seed), model.layout(scene), np.array(fields.start)
     angles = 0.1 * random.normal(size=lay.dofs.shape)
     angles[..., 0] += bend
@@ -90,7 +90,7 @@ class Case:
         fields = jax.tree.map(lambda v: jnp.asarray(v)[None], start.fields)
         state = engine.reset(fields)
         state = engine.place(state, engine.qpos(state), jnp.asarray(start.qvel)[None])
-        return small.lanes(scene, fields), state
+        return grasps.lanes(scene, fields), state
 
     def world(self, table, k=0):
         """A world's numbers of a table, (block, ..., lane or world) to (..., finger or 1)."""

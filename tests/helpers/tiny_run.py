@@ -6,9 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from toy import TINY
 
 from codesign_jax import cli
+from tests.helpers.toy_engine import TINY
 
 RUN = [
     *("optimize", "--scene", str(TINY), "--seed", "3", "--engine", "mujoco"),

@@ -1,0 +1,490 @@
+"""Newton's linear system, conjugate gradients and line search by teams of lanes, see `teams`."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
+from codesign_jax.engines.structured.kernel.linear_system import Elimination, with_palm
+from codesign_jax.engines.structured.kernel.linesearch import LineSearch, _rest
+from codesign_jax.engines.structured.kernel.memory import loop
+from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
+from codesign_jax.engines.structured.kernel.teams import (
+    AGAIN,
+    FORCES,
+    TEAM,
+    UNUSED,
+    Parts,
+    chosen,
+    team_sum,
+)
+from codesign_jax.engines.structured.lanes import contract, dot, inverse_spd, total
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.linear import elimination as el
+
+
+class Team:
+    """A problem's numbers as the lanes of a team share them."""
+
+    def __init__(self, problem: Problem):
+        """Takes the problem."""
+        m, block = problem.m, problem.block
+        self.problem, self.block, self.like = problem, block, problem.like
+        self.chip = Parts(block, m.onchip, m.onchip_ref)
+        self.scratch = Parts(block, m.scratch, m.scratch_ref)
+        self.forces = self.mask(block.mate == FORCES)
+
+    def mask(self, which: jax.Array, *, wide: bool = True) -> Lanes:
+        """A condition of the lanes."""
+        return lanes([which], (), wide=wide)
+
+    def one(self, value: jax.Array) -> Lanes:
+        """A number of each lane."""
+        return lanes([value], (), wide=True)
+
+    def axes(self, i: Any) -> Lanes:
+        """A joint's motion subspace, all of it on all lanes, shape (axis, 6)."""
+        return self.problem.read("axes", item=i)[0][:, :6]
+
+    def spread(self, **columns: Lanes) -> list[Lanes]:
+        """Columns (row,) of the lanes as matrices on all lanes, shape (row, TEAM)."""
+        for name, value in columns.items():
+            self.chip.put_rows(f"shared.{name}", value)
+        return self.problem.read(*(f"shared.{name}" for name in columns))
+
+    def vector(self, component: jax.Array) -> Lanes:
+        """Components of lanes as a vector on all lanes, shape (6,)."""
+        self.chip.put("shared.f", component)
+        return self.problem.read("shared.f")[0][:6]
+
+    def column(self, matrix: Lanes, forces: Lanes) -> Lanes:
+        """The lanes' columns of a matrix (6, 6) and of forces (6,) that all lanes have."""
+        masks = [self.mask(self.block.mate == k) for k in range(6)]
+
+        def pick(matrix, forces, at, masks):
+            found = jnp.where(at, forces, 0.0)
+            for k, mask in enumerate(masks):
+                found = jnp.where(mask, matrix[:, k], found)
+            return found
+
+        return lanewise(pick, matrix, forces, self.forces, masks)
+
+    def eliminate(
+        self, node: list[Lanes], axes: Lanes, armature: Lanes, more: tuple[Lanes, ...]
+    ) -> tuple[list[Lanes], el.Kept, Lanes]:
+        """`elimination.eliminate_and_keep` by columns.
+
+        Args:
+          node: The lanes' columns of P with r, of C, and of Q with r_o, shape (6,) each.
+          axes: Motion subspace, on all lanes.
+          armature: Diagonal joint inertia.
+          more: What contacts and joint forces add to the columns of U with y and of H, and to D.
+
+        Returns:
+          The columns left; those of w with z and of g, and D^-1; the lane's part of y'z.
+        """
+
+        def project(node, axes, more):
+            return [contract(axes, v[None], 1) + m for v, m in zip(node, more, strict=True)]
+
+        def invert(axes, u, armature, more):
+            n = axes.shape[0]
+            eye = jnp.eye(n, dtype=axes.dtype)[:, :, None, None]
+            own = contract(axes[:, None], u[None], 2) + eye * armature[:, None]
+            return inverse_spd(own + jnp.swapaxes(more, 0, 1))
+
+        def reduce(node, u, h, columns, inverse, forces):
+            w, g = (contract(inverse, v[None], 1) for v in columns)
+            work = jnp.where(forces, dot(columns[0], w), 0.0)
+            g = jnp.where(forces, -w, g)
+            p, c, q = node
+            p = p - contract(u, w[:, None], 0)
+            c, q = c - contract(u, g[:, None], 0), q - contract(h, g[:, None], 0)
+            return [p, c, q], w, g, work
+
+        columns = lanewise(project, node[:2], axes, more[:2])
+        u, h, d = self.spread(u=columns[0], h=columns[1], d=more[2])
+        u, h, d = u[:, :6], h[:, :6], d[:, : axes.shape[0]]
+        inverse = lanewise(invert, axes, u, armature, d)
+        node, w, g, work = lanewise(reduce, node, u, h, columns, inverse, self.forces)
+        return node, el.Kept(el.Factors(w, g, None), inverse), work  # type: ignore[arg-type]
+
+    def accelerations(
+        self, kept: el.Kept, parent: jax.Array, obj: jax.Array, z: Lanes | None, at: int = FORCES
+    ) -> Lanes:
+        """Joint accelerations of the lanes' components of the parent's and the object's motion.
+
+        Args:
+          kept: Columns of w and g.
+          parent: Component of the parent's motion, zero on lanes without one.
+          obj: Component of the object's motion.
+          z: Joint accelerations at rest; None if a lane has them in its column of w.
+          at: That lane.
+        """
+        own = self.mask(self.block.mate == at)
+
+        def part(w, g, parent, obj, own):
+            moved = g * obj - w * parent
+            return moved if z is not None else jnp.where(own, w, moved)
+
+        w, g, _ = kept.factors
+        found = team_sum(self.block, lanewise(part, w, g, self.one(parent), self.one(obj), own))
+        return found if z is None else lanewise(jnp.add, found, z)
+
+    def again(self, axes: list, kept: el.Kept, r: jax.Array, ro: jax.Array, turned: Any) -> tuple:
+        """`elimination.eliminate_again` of the lanes' components; also the joint accelerations.
+
+        Args:
+          axes: The lanes' components of the axes; zero on lanes without one.
+          kept: Columns of w and g, and D^-1.
+          r: Component of the force.
+          ro: Component of the force on the object.
+          turned: What is added to it for the joint alone.
+        """
+        y = [self.block.over_team(s * (r + turned), jnp.add) for s in axes]
+
+        def reduce(kept, r, ro, y):
+            w, g, _ = kept.factors
+            return r - dot(w, y), ro + dot(g, y), contract(kept.inverse, y[None], 1)
+
+        value = lanes(y, (len(y),), wide=True)
+        r, ro, z = lanewise(reduce, kept, self.one(r), self.one(ro), value)
+        return r.lane, ro.lane, z  # pyright: ignore[reportAttributeAccessIssue]  # lanewise gives Lanes
+
+    def link(self, i: Any) -> el.Kept:
+        """What a link's elimination has left, by columns."""
+        factors = el.Factors(self.chip.rows("w", i), self.chip.rows("g", i), None)  # type: ignore[arg-type]
+        return el.Kept(factors, self.problem.read("inverse", item=i)[0])
+
+    def outward(self, i: Any, parent: jax.Array, obj: jax.Array, at: int) -> tuple:
+        """A joint's accelerations and its link's motion, by components; see `accelerations`."""
+        a = self.accelerations(self.link(i), parent, obj, None, at)
+        axes = self.chip.rows("axes", i)
+        return a, lanewise(lambda p, s, a: p + dot(s, a), self.one(parent), axes, a).lane
+
+    def put_link(self, i: Any, before: jax.Array, motion: jax.Array, palm: jax.Array) -> None:
+        """`BoundPairs.put_link` by components."""
+        pairs = self.problem.pairs
+        assert pairs is not None
+        self.scratch.put("side.motion", motion - palm if pairs.set.palm else motion, i + 1)
+        self.scratch.put("side.turn", motion - before, i)
+
+    def narrowed(self, value: Lanes) -> Lanes:
+        """What is the same on all lanes of a world, as its own."""
+        return Lanes(value.parts, (*value.shape[:-2], 1, value.shape[-1]), value.dtype)
+
+    def wrist(self, kept: list[el.Kept], axes: list[Lanes], obj: Lanes, z: list | None) -> Iterate:
+        """Substitutes back at the wrist: slides, then hinges."""
+        motion, found = lanewise(jnp.zeros_like, obj), []
+        part = chosen(self.block, obj)
+        for k in (1, 0):
+            a = self.accelerations(kept[k], chosen(self.block, motion), part, z and z[k])
+            found.append(a)
+            motion = lanewise(lambda m, s, a: m + contract(s, a[:, None], 0), motion, axes[k], a)
+        wrist = lanewise(lambda a: jnp.concatenate(a), found)
+        return Iterate(self.narrowed(wrist), self.narrowed(motion), obj)
+
+
+class TeamElimination(Elimination):
+    """The elimination by columns."""
+
+    def __init__(self, problem: Problem):
+        """Takes the problem."""
+        super().__init__(problem)
+        self.team = Team(problem)
+        one = jnp.ones_like(self.like)
+        mate = self.block.mate
+        unit = [jnp.where(mate == k, one, 0.0) for k in range(6)]
+        none = jnp.zeros_like(self.like)
+        self.unit = lanes([*unit, none, none, none], (9,), wide=True)
+
+    def backward(self, alpha: Lanes) -> tuple[Any, Lanes]:
+        """See `Elimination`; the node is the lanes' columns of P with r, C, and Q with r_o."""
+        problem, team, pairs = self.problem, self.team, self.problem.pairs
+        assert pairs is not None
+        pairs.update_constraints(alpha)
+        for contacts in problem.skin:
+            contacts.update_constraints(alpha)  # type: ignore[attr-defined]
+
+        def add_link(p, forces, force, column):
+            return p + jnp.where(forces, force, column)
+
+        def joint(axes, armature, tau, acc, turned, row, held, spin, forces):
+            tau = tau - armature * acc + contract(axes[:, :3], turned[None], 1)
+            u, h, d = (contract(axes[:, :3], v[None], 1) for v in (row[6:], held[6:], spin))
+            return u + jnp.where(forces, tau, 0.0), h, d
+
+        def step(i: Any, carry: tuple) -> tuple:
+            (p, c, q), work = carry
+            axes, acc = team.axes(i), problem.move("acc", i, alpha)
+            part = team.chip.get("motion", i) + alpha.lane * team.chip.get("step_motion", i)
+            team.chip.put("motion", part, i)
+            column = team.chip.rows("matrix", i)
+            (motion,) = problem.read("motion", item=i)
+            force = team.scratch.get("smooth", i) - lanewise(dot, column, motion).lane
+            force = team.vector(force + team.scratch.get("side.push", i + 1))
+            p = lanewise(add_link, p, team.forces, force, column)
+            tau, armature = problem.read("tau", "armature", item=i)
+            turned = pairs.pushed(i)[6:]
+            row, held, spin = self.columns(i, axes)
+            more = lanewise(joint, axes, armature, tau, acc, turned, row, held, spin, team.forces)
+            node, kept, done = team.eliminate([p, c, q], axes, armature, more)
+            for name, value in zip("wg", kept.factors[:2], strict=True):
+                team.chip.put_rows(name, value, i)
+            problem.write("inverse", kept.inverse, i)
+            return self.add_columns(node, row, held), lanewise(jnp.add, work, done)
+
+        none = zeros((6,), self.like)
+        row, held, _ = self.columns(self.links, None)
+        start = self.add_columns([none] * 3, row, held), zeros((), self.like)
+        (p, c, q), work = loop(self.links, step, start, self.block.size, reverse=True)
+        first = pairs.pushed(0)[:6]
+        p = lanewise(add_link, p, team.forces, first, none)
+        whole = self.block.fold(self.block.over_team(work.lane, jnp.add), jnp.add)
+        return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
+
+    def columns(self, row: Any, axes: Lanes | None) -> tuple[Lanes, Lanes, Lanes]:
+        """What a row's contacts add, see `TeamHull.columns`: all, those held, and to D."""
+        team = self.team
+        if axes is None:
+            second = zeros((9,), self.like)
+        else:
+            # D = S U' + ..., where U has the contacts' part already: the joint's own columns of
+            # X'KX, less that part.
+            own = [team.chip.get("axes", row, k, TEAM) for k in range(6)]
+            axis = lanes(own, (6,), wide=True)
+            second = lanewise(lambda s: jnp.concatenate([-s, s[:3]]), axis)
+        held, found = zeros((9,), self.like), []
+        for contacts in self.problem.skin:
+            found.append(contacts.columns(row, self.unit, second, team.forces))  # type: ignore[attr-defined]
+            if contacts.set.on_object:
+                held = found[-1][0]
+        whole, spin = lanewise(lambda f: jax.tree.map(lambda *x: total(x), *f), found)
+        return whole, held, spin
+
+    def add_columns(self, node: list[Lanes], row: Lanes, held: Lanes) -> list[Lanes]:
+        """Adds a row's contacts to the link before it."""
+
+        def add(node, row, held, forces):
+            p, c, q = node
+            held = held[:6]
+            return [p + row[:6], c + held, q + jnp.where(forces, -held, held)]
+
+        return lanewise(add, node, row, held, self.team.forces)
+
+    def at_palm(self, now: Iterate, node: Any, slots: dict) -> tuple[Iterate, Eliminated]:
+        """See `Elimination`."""
+        team, rigid = self.team, self.problem.rigid
+
+        def own(now, palm, pushes):
+            none = jnp.zeros_like(palm.smooth_palm)
+            square = jnp.zeros((6, *none.shape), none.dtype)
+            empty = el.Quadratic(square, square, square, none, none)
+            node, force = with_palm(now, palm, empty, pushes)
+            return node, force.wrist
+
+        palm = self.problem.palm
+        whole, twist = lanewise(own, now, palm, slots)
+        none = lanewise(jnp.zeros_like, whole.r)
+        added = [
+            team.column(matrix, force)
+            for matrix, force in ((whole.p, whole.r), (whole.c, none), (whole.q, whole.r_object))
+        ]
+        node = lanewise(_plus, list(node), added)
+        kept, work = [], [zeros((), self.like)]
+        axes = [palm.axes, lanewise(el.wrist_slides, palm.armature)]
+        for k, joint in enumerate((slice(3, 6), slice(0, 3))):
+            if rigid:
+                break
+            y = lanewise(lambda t, f: jnp.where(f, t, 0.0), twist[joint], team.forces)
+            none = zeros((3,), self.like)
+            node, new, done = team.eliminate(node, axes[k], palm.armature[joint], (y, none, none))
+            kept.append(new)
+            work.append(done)
+        (q,) = team.spread(q=node[2])
+        square, ro = team.narrowed(q[:, :6]), team.narrowed(q[:, FORCES])
+        obj = lanewise(el.solve_object, square, ro)
+        part = self.block.over_team(lanewise(lambda w: total(w), work).lane, jnp.add)
+        part = lanewise(lambda w, r, o: w + dot(r, o), lanes([part], (), wide=False), ro, obj)
+        if rigid:
+            none = lanewise(jnp.zeros_like, obj)
+            return Iterate(none, none, obj), Eliminated(None, None, square, part)
+        step = team.wrist(kept, axes, obj, None)
+        return step, Eliminated(kept[0], kept[1], square, part)
+
+
+class TeamCoupling(Coupling):
+    """Conjugate gradients whose sweeps are by components."""
+
+    def __init__(self, problem: Problem, *rest: Any):
+        """See `Coupling`."""
+        super().__init__(problem, *rest)
+        self.team = Team(problem)
+
+    def again(self) -> Iterate:
+        """See `Coupling`."""
+        team, none = self.team, jnp.zeros_like(self.problem.like)
+        turns = self.block.mate < 3
+
+        def step(i: Any, carry: tuple) -> tuple:
+            r, ro = (v.lane for v in carry)
+            axes = [team.chip.get("axes", i, TEAM * k) for k in range(self._axes)]
+            r = r + team.scratch.get("side.push", i + 1)
+            turned = jnp.where(turns, team.scratch.get("side.push", i, 6), 0.0)
+            r, ro, z = team.again(axes, team.link(i), r, ro, turned)
+            for k, part in enumerate(z.parts.ravel()):
+                self._row(i, k, AGAIN, part)
+            return team.one(r), team.one(ro)
+
+        start = team.one(none), team.one(none)
+        r, ro = loop(self.links, step, start, self.block.size, reverse=True)
+        r = r.lane + team.scratch.get("side.push", 0)
+        r, ro = (self.block.fold(v, jnp.add) for v in (r, ro.lane))
+        return self._wrist(r, ro)
+
+    @property
+    def _axes(self) -> int:
+        return self.team.chip.table.groups["axes"][1][0]
+
+    def _row(self, i: Any, k: int, lane: int, value: jax.Array | None = None) -> jax.Array:
+        """A lane's number in row k of w, on all lanes; or stores it."""
+        table, ref = self.team.chip.table, self.team.chip.ref
+        place = i * table.stride["w"] + (table.offset["w"] + TEAM * k + lane)
+        if value is not None:
+            ref[place] = value
+        return ref[place]
+
+    def _settle(self) -> None:
+        def add(i: Any, x: jax.Array) -> jax.Array:
+            for k in range(self._axes):
+                self._row(i, k, FORCES, self._row(i, k, FORCES) + self._row(i, k, AGAIN))
+            return x
+
+        jax.lax.fori_loop(0, self.links, add, jnp.int32(0))
+
+    def _wrist(self, r: jax.Array, ro: jax.Array) -> Iterate:
+        team, done, palm = self.team, self.done, self.problem.palm
+        z, kept = [], [done.hinges, done.slides]
+        axes = [palm.axes, lanewise(el.wrist_slides, palm.armature)]
+        for k, own in enumerate(kept):
+            if own is None:
+                break
+            parts = [chosen(self.block, axes[k][n]) for n in range(3)]
+            r, ro, new = team.again(parts, own, r, ro, 0.0)
+            z.append(new)
+        force = team.narrowed(team.vector(ro))
+        obj = lanewise(el.solve_object, done.q, force)
+        if not z:
+            none = lanewise(jnp.zeros_like, obj)
+            return Iterate(none, none, obj)
+        return team.wrist(kept, axes, obj, z)  # type: ignore[arg-type]
+
+    def substitute(self, z: str, step: Iterate) -> None:
+        """See `Coupling`."""
+        team, at = self.team, FORCES if z == "z" else AGAIN
+        palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
+
+        def one(i: Any, parent: Lanes) -> Lanes:
+            _, motion = team.outward(i, parent.lane, obj, at)
+            team.put_link(i, parent.lane, motion, palm)
+            return team.one(motion)
+
+        self.pairs.put_palm(self.problem.widened(step.palm_motion))
+        loop(self.links, one, team.one(palm + 0 * obj), self.block.size)
+
+
+class TeamLineSearch(LineSearch):
+    """The line search of which each lane has a part."""
+
+    def __init__(self, problem: Problem):
+        """Takes the problem."""
+        super().__init__(problem)
+        self.team = Team(problem)
+
+    def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
+        """See `LineSearch`."""
+        problem, team, pairs = self.problem, self.team, self.problem.pairs
+        assert pairs is not None
+        palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
+        first = team.one(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
+
+        def smooth(sums, column, motion, moved, smooth, part, first, armature, acc, tau, a):
+            slope, curvature = sums
+            joints = total([(armature[k] * acc[k] - tau[k]) * a[k] for k in range(a.shape[0])])
+            stiff = total([armature[k] * a[k] * a[k] for k in range(a.shape[0])])
+            slope = slope + first * joints - (smooth - dot(column, motion)) * part
+            return [slope, curvature + first * stiff + dot(column, moved) * part]
+
+        def one(i: Any, carry: tuple) -> tuple:
+            parent, sums = carry
+            a, part = team.outward(i, parent.lane, obj, FORCES)
+            problem.write("step_acc", a, i)
+            team.chip.put("step_motion", part, i)
+            team.put_link(i, parent.lane, part, palm)
+            numbers = problem.read("armature", "acc", "tau", item=i)
+            push, column = team.one(team.scratch.get("smooth", i)), team.chip.rows("matrix", i)
+            motion, moved = problem.read("motion", "step_motion", item=i)
+            sums = lanewise(
+                smooth, sums, column, motion, moved, push, team.one(part), first, *numbers, a
+            )
+            return team.one(part), sums
+
+        wide = problem.widened(step.palm_motion)
+        pairs.put_palm(wide)
+        start = team.one(palm + 0 * obj), [zeros((), self.like)] * 2
+        _, (slope, curvature) = loop(self.links, one, start, self.block.size)
+        touch = self.prepare_slots(zeros((), self.like), step)
+        terms = [lanewise(jnp.multiply, touch, first), pairs.prepare_all()]
+        for contacts in problem.skin:
+            terms.append(contacts.prepare_all(pairs, step.palm_motion, step.object_motion))  # type: ignore[attr-defined]
+        touch = lanewise(lambda t: total(t), terms)
+        slope, curvature, touch = self.total([slope, curvature, touch])
+        slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
+        return slope, curvature, touch
+
+    def total(self, sums: list[Lanes]) -> list[Lanes]:
+        """See `LineSearch`."""
+        return self.block.sum([team_sum(self.block, v) for v in sums])
+
+    def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
+        """See `LineSearch`."""
+        problem, sums = self.problem, [zeros((), self.like)] * 2
+        first = self.team.one(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
+
+        def plus(sums: list[Lanes], new: list[Lanes]) -> list[Lanes]:
+            return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
+
+        for c in problem.slots:
+            add = lambda i, s, c=c: plus(s, c.slopes(i, alpha))  # noqa: E731
+            sums = loop(c.set.count, add, sums, self.block.size)
+        sums = [lanewise(jnp.multiply, v, first) for v in sums]
+        for c in problem.skin:
+            sums = c.fold(None, lambda item, s, c=c: plus(s, c._slopes(item, alpha)), sums)
+        assert problem.pairs is not None
+        return problem.pairs.slopes_of_all(alpha, sums)
+
+
+def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
+    """What a link leaves for the solver, with rows of eight as columns, see `teams.fields`.
+
+    Args:
+      stored: The same by name, see `step.link_forces`.
+      body: Arguments of `make_body`.
+    """
+
+    def wide(axes, *body):
+        matrix = make_body(*body).matrix()
+        return tuple(
+            jnp.concatenate([m, jnp.zeros((len(m), TEAM - 6, *m.shape[2:]), m.dtype)], 1)
+            for m in (axes, matrix)
+        )
+
+    axes, matrix = lanewise(wide, stored["axes"], *body)
+    unused = UNUSED
+    return {k: v for k, v in stored.items() if k not in unused} | {"axes": axes, "matrix": matrix}
+
+
+def _plus(one, other):
+    return [a + b for a, b in zip(one, other, strict=True)]

@@ -1,0 +1,63 @@
+"""Hands whose fingers touch one another, and one step of many by the kernel."""
+
+import jax
+import mujoco
+import numpy as np
+
+from codesign_jax import model
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.engines.structured.world_model import world_constants
+from tests.helpers import grasps
+
+SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 2}
+
+
+def curled(the_scene, seed, bend, height):
+    """Model, data and lanes of a hand with random joint angles about a bend, object between."""
+    hand, trial = grasps.hand_world(the_scene, length=0.1)
+    fields, _ = grasps.world_inputs(the_scene, hand, trial)
+    oracle = model.compile_model(the_scene, hand, trial)
+    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
+    data, random = mujoco.MjData(oracle), np.random.default_rng(seed)
+    lay, qpos = model.layout(the_scene), np.array(fields.start)
+    qpos[2] = height
+    angles = 0.1 * random.normal(size=lay.dofs.shape)
+    angles[..., 0] += bend
+    qpos[6 : 6 + lay.dofs.size] = angles.ravel()
+    data.qpos[:], data.qvel[:] = qpos, 0.3 * random.normal(size=oracle.nv)
+    data.ctrl[:6] = qpos[:6]
+    data.ctrl[6:] = 60e3
+    return oracle, data, jax.tree.map(lambda x: x[None], fields)
+
+
+def kinds(oracle, data):
+    """Numbers of contacts between two fingers and of a finger with the object."""
+    names = [
+        [mujoco.mj_id2name(oracle, mujoco.mjtObj.mjOBJ_GEOM, int(g)) for g in pair]
+        for pair in data.contact.geom
+    ]
+    fingers = [sum(n.startswith("finger") for n in pair) for pair in names]
+    held = sum("finger" in a + b and "object" in a + b for a, b in names)
+    return fingers.count(2), held
+
+
+def one_step(scene, limits=None):
+    """The compiled step of worlds from qpos and qvel under ctrl: qvel after it, and the trace."""
+    engine = StructuredEngine(scene)
+    program = Program.here(scene, limits or Limits(100, 40, 1e-24), np.float64)
+
+    @jax.jit
+    def run(fields, qpos, qvel, ctrl):
+        start = engine.place(engine.reset(fields), qpos, qvel)
+        trace, end = program.simulate(world_constants(scene, fields), start, ctrl[:, None])
+        return engine.qvel(end), trace
+
+    return run
+
+
+def batched(worlds):
+    """Fields, qpos, qvel and ctrl of several (model, data, fields)."""
+    fields = jax.tree.map(lambda *x: np.concatenate(x), *(f for _, _, f in worlds))
+    data = [d for _, d, _ in worlds]
+    return fields, *(np.stack([getattr(d, n) for d in data]) for n in ("qpos", "qvel", "ctrl"))

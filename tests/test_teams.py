@@ -1,0 +1,67 @@
+"""Teams of lanes, a GPU's way to share a finger's work, against a lane a finger; both on a CPU."""
+
+import jax
+import numpy as np
+import pytest
+
+from codesign_jax import scene as scenes
+from codesign_jax.compiler import launch
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.kernel import Limits, Program, teams
+from codesign_jax.engines.structured.world_model import world_constants
+from scripts.shared import work
+from tests.helpers import gpu_cases
+
+LIMITS = Limits(60, 30, 1e-18)
+
+
+def rollouts(scene, fields, ctrl, widths):
+    """What kernels with teams of 8 lanes and of one record, as float64 and solved to rounding."""
+    engine = StructuredEngine(scene)
+    for team, width in zip((teams.TEAM, 1), widths, strict=True):
+        program = Program(scene, LIMITS, backend="cpu", width=width, team=team)
+        assert (program.team, program.size) == (team, width)
+
+        @jax.jit
+        def run(fields, ctrl, program=program):
+            start = engine.reset(fields)
+            hand = world_constants(scene, fields)
+            return program.simulate(hand, start, ctrl, trajectory=True)[0]
+
+        yield jax.tree.map(np.asarray, run(fields, ctrl))
+
+
+@pytest.mark.slow  # quick: test_one_finger_is_one_team; on a GPU test_effects compares with a CPU
+def test_teams_follow_the_same_path_in_contact():
+    """The default scene from curled fingers on: hull, table, palm, and fingers on one another."""
+    with jax.enable_x64(True):
+        scene = scenes.load("paper")
+        plain = scenes.load("paper", overrides={"effects": {"surface": "spheres"}})
+        starts, ctrl = work.window(plain, 8, 20, distinct=8)
+        made, _ = work.inputs(scene, work.make_worlds(scene, 8))
+        fields = jax.tree.map(np.asarray, made._replace(start=starts.start))
+        got, want = rollouts(scene, fields, np.asarray(ctrl), (64, 16))
+    assert (want["iterations"] > 6).any() and (want["distance"][:, -1] < 0.2).any()
+    # Sums round differently by 1e-16, and contact multiplies it by up to seven in a step.
+    assert np.abs(got["qpos"] - want["qpos"]).max() < 1e-10
+    assert max(r["residual"].max() for r in (got, want)) < 1e-16
+
+
+def test_one_finger_is_one_team():
+    """Teams depend on the scene's structure and the backend, and nothing on the batch."""
+    paper, spheres = scenes.load("paper"), scenes.load("paper_spheres")
+    eight = work.variant(fingers=8)
+    limits = Limits(8, 8, 1e-6)
+    for scene, backend, want in (
+        (paper, "gpu", teams.TEAM),
+        (paper, "cpu", 1),
+        (spheres, "gpu", 1),
+        (eight, "gpu", 1),
+    ):
+        programs = [Program(scene, limits, backend=backend, width=w) for w in (4, 8, 32)]
+        assert {p.team for p in programs} == {want}
+    program = Program(paper, limits)
+    assert (program.block, program.size) == (1, 32)
+    assert 4 * program.onchip.rows * program.columns <= launch.SHARED_BYTES
+    pinch = Program(gpu_cases.short_scene("hull and fingers"), limits)
+    assert (pinch.fingers, pinch.block, pinch.columns, pinch.size) == (2, 1, 2, 16)

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax import sources
-from codesign_jax.compiler.launch import KernelUnavailable, available
+from codesign_jax.compiler import launch
+from codesign_jax.compiler.launch import KernelUnavailable
 from codesign_jax.engines.base import Equal, Staged
 from codesign_jax.engines.structured import coordinates, transforms
 from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
@@ -82,7 +83,7 @@ class StructuredEngine(Equal):
             smaller contact spheres.
         """
         effects.refuse(scene.effects, self.name)
-        if (reason := available(jax.default_backend())) is not None:
+        if (reason := launch.available(jax.default_backend())) is not None:
             raise _unavailable(reason)
         reach.refuse(scene.objects, reach.contact_radius(scene.hand))
         if segment is not None and segment < 1:

@@ -99,7 +99,7 @@ VARIANTS: dict[str, Variant] = {
     "neo-Hookean": Variant(changes=("effects.neo_hookean=true",)),
     "lateral threshold": Variant(changes=("effects.lateral_threshold=true",)),
     "soft touch": Variant(changes=("effects.soft_touch=true",)),
-    "spheres": Variant(changes=("effects.surface=spheres", "effects.finger_palm=false")),
+    "spheres": Variant(changes=("effects.surface=spheres",)),
     "fingers pass each other": Variant(changes=("effects.finger_finger=false",)),
     "fingers pass the palm": Variant(changes=("effects.finger_palm=false",)),
     "constants": Variant(drawn=True),

@@ -21,7 +21,8 @@ from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import InputError
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
-from scripts.experiments import figures, landscape, plan, report, results, strategies, study
+from scripts.experiments import __main__ as experiments
+from scripts.experiments import figures, landscape, marks, plan, report, results, strategies, study
 from scripts.experiments.plan import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
@@ -387,6 +388,60 @@ def test_what_was_not_run_is_said(tmp_path):
     assert figures.label("switch-16") == "16"
 
 
+def test_shares_of_several_processes_make_the_whole(toy, finished, tmp_path, monkeypatch):
+    """Each takes every second run; the list of strategies may grow, and all processes are noted."""
+    monkeypatch.setitem(plan.SMALL["tiny"], "2d", PLAN)
+    monkeypatch.setitem(plan.OVERRIDES, "tiny", ())
+    base = [
+        "scripts.experiments",
+        "2d",
+        "--size",
+        "tiny",
+        "--scene",
+        str(TINY),
+        "--out",
+        str(tmp_path),
+    ]
+    base += ["--seed", str(SEED)]
+
+    def call(*more):
+        monkeypatch.setattr(sys, "argv", [*base, *more])
+        code = experiments.main()
+        path = tmp_path / "2d.json"
+        return code, json.loads(path.read_text()) if path.exists() else None
+
+    some = ["--strategies", "single,switch-2"]
+    assert call(*some, "--share", "1/2", "--commit", "abc") == (0, None)
+    assert call(*some, "--gather") == (0, None), "some runs have not begun"
+    call(*some, "--share", "2/2", "--commit", "abc")
+    code, notes = call(*some, "--gather", "--commit", "xyz")
+    assert code == 0 and (notes["commit"], notes["grasps"]) == ("abc", 2 * 2 * 18 * 7)
+    assert [p["grasps"] for p in notes["processes"]] == [2 * 18 * 8] * 2, "and its seeds"
+    assert notes["settings"]["plan"]["strategies"] == ["single", "switch-2"]
+    _, notes = call("--commit", "def")
+    assert (notes["commit"], notes["grasps"]) == ("abc, def", PLAN.grasps)
+    arrays, _ = study.load(tmp_path, "2d")
+    space = design_space(scenes.load(TINY).hand, "2d")
+    whole = results.of_strategies(PLAN, scenes.load(TINY), space, finished[1])
+    assert all(np.array_equal(arrays[name], value) for name, value in whole.items())
+    times = [{"ended": 10.0, "seconds": 4.0}, {"ended": 12.0, "seconds": 5.0}]
+    assert results.wall_seconds([*times, {"ended": 20.0, "seconds": 1.0}]) == 7.0
+
+
+def test_designs_on_the_way_are_those_of_their_episodes(finished):
+    """Episodes that the grasps allow, with what finds the seed and what chooses counted."""
+    folder, got = finished
+    folders = strategies.folders(PLAN, folder, SEED)["concurrent"]
+    tested = PLAN.particles * marks.ROUNDS
+    at = [18 + 18 * e + tested for e in (1, 3, 9)]
+    found = marks.read(folders, [at[0], at[1] + 17, at[2]])
+    assert found["episodes"].tolist() == [1, 3] and found["grasps"].tolist() == at[:2]
+    assert found["seeds"].tolist() == [SEED, SEED + 1]
+    np.testing.assert_array_equal(found["cost"], got["cost"][-1][:, [0, 2]].swapaxes(0, 1))
+    with pytest.raises(InputError, match="has begun"):
+        marks.read([*folders, folder / "none"], at)
+
+
 @pytest.mark.slow
 def test_the_script_simulates_and_draws(tmp_path):
     def call(*arguments):
@@ -407,7 +462,7 @@ def test_the_script_simulates_and_draws(tmp_path):
     done = call(*run, "--trials", str(tmp_path / "trials.npz"), "--commit", "abc")
     assert done.returncode == 0, done.stderr
     notes = json.loads((tmp_path / "2d.json").read_text())
-    assert (notes["commit"], notes["grasps"], notes["processes"]) == ("abc", 72, 1)
+    assert (notes["commit"], notes["grasps"], len(notes["processes"])) == ("abc", 72, 1)
     assert call(*run, "--commit", "def").returncode == 0
     assert json.loads((tmp_path / "2d.json").read_text()) == notes, "who made them stays"
     with np.load(tmp_path / "trials.npz") as trials:

@@ -428,18 +428,18 @@ def test_shares_of_several_processes_make_the_whole(toy, finished, tmp_path, mon
     assert results.wall_seconds([*times, {"ended": 20.0, "seconds": 1.0}]) == 7.0
 
 
-def test_designs_on_the_way_are_those_of_their_episodes(finished):
+def test_particles_on_the_way_are_those_of_their_episodes(finished):
     """Episodes that the grasps allow, with what finds the seed and what chooses counted."""
     folder, got = finished
     folders = strategies.folders(PLAN, folder, SEED)["concurrent"]
-    tested = PLAN.particles * marks.ROUNDS
-    at = [18 + 18 * e + tested for e in (1, 3, 9)]
-    found = marks.read(folders, [at[0], at[1] + 17, at[2]])
-    assert found["episodes"].tolist() == [1, 3] and found["grasps"].tolist() == at[:2]
+    other = 18 + PLAN.particles * marks.ROUNDS
+    found = marks.read(folders, [other + 18 * e + 5 for e in (1, 3, 9)])
+    assert sorted(found) == ["cost36", "cost72", "particles36", "particles72", "seeds"]
     assert found["seeds"].tolist() == [SEED, SEED + 1]
-    np.testing.assert_array_equal(found["cost"], got["cost"][-1][:, [0, 2]].swapaxes(0, 1))
+    for name, episode in (("cost36", 0), ("cost72", 2)):
+        np.testing.assert_array_equal(found[name], got["cost"][-1][:, episode])
     with pytest.raises(InputError, match="has begun"):
-        marks.read([*folders, folder / "none"], at)
+        marks.read([*folders, folder / "none"], [100])
 
 
 @pytest.mark.slow

@@ -39,7 +39,9 @@ class Newton:
         self.elimination = (Elimination if one else TeamElimination)(problem)
         self.search = (LineSearch if one else TeamLineSearch)(problem)
         self.coupling = Coupling if one else TeamCoupling
-        self.chord = Chord(problem) if problem.slotted and one else None
+        # A GPU's lanes wait for the one that needs most iterations, so that it gains nothing there.
+        vectors = one and problem.slotted and not problem.slotted[0].set.gathers
+        self.chord = Chord(problem) if vectors else None
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float

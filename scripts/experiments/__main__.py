@@ -7,7 +7,7 @@ python -m scripts.experiments 2d --out runs/big --gather           # then: resul
 python -m scripts.experiments 2d --out runs/small --size cpu       # minutes on a CPU
 python -m scripts.experiments 2d --parquet runs/2d.parquet         # every grasp, also afterwards
 python -m scripts.experiments types --videos docs/figures            # what the landscape's hands do
-python -m scripts.experiments figures --data docs/data/reproduction
+python -m scripts.experiments figures                                # of docs/data/experiments
 """
 
 import argparse
@@ -39,7 +39,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--scene",
         default="paper",
-        help="built-in scene or file; docs/data/reproduction has paper_spheres",
+        help="built-in scene or file",
     )
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
     parser.add_argument("--preset", dest="size", choices=list(plan.OVERRIDES), help="as --size")
@@ -71,13 +71,9 @@ def parse() -> argparse.Namespace:
         help="write every trial to this .npz",
     )
     parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument(
-        "--touching",
-        type=Path,
-        nargs="+",
-        default=[],
-        help="folders of the same with contact between fingers",
+        "--earlier", type=Path, nargs="+", default=[], help="folders of the same in earlier scenes"
     )
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--videos", type=Path, help="folder for a video of each grasp type")
@@ -246,7 +242,7 @@ def main() -> int:
         from scripts.experiments import report
     except ModuleNotFoundError as error:
         sys.exit(f"error: {error.name} is missing: pip install 'codesign-jax[study]'")
-    print(report.make(args.data, args.figures, args.page, args.touching))
+    print(report.make(args.data, args.figures, args.page, args.earlier))
     return 0
 
 

@@ -260,7 +260,7 @@ def merged(folder: Path) -> dict[str, Any]:
 def main() -> int:
     """Runs the command and returns the exit status."""
     parser = provenance.parser(__doc__)
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper_palm"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--out", type=Path, default=Path("runs/budget"), help="folder of the files")
     parser.add_argument("--designs", type=int, default=DESIGNS)
     parser.add_argument("--trials", type=int, default=TRIALS)

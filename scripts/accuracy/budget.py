@@ -277,7 +277,8 @@ def main() -> int:
     if args.report:
         from scripts.accuracy import budget_report
 
-        return budget_report.make(json.loads(args.merge.read_text()), args.page, args.figure)
+        found = budget_report.Budget(json.loads(args.merge.read_text()))
+        return budget_report.make(found, args.page, args.figure)
     if args.merge:
         output.write_json(args.merge, merged(args.out), indent=None)
         return 0

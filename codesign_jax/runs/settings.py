@@ -61,7 +61,7 @@ class Settings:
 # the optimisers that are compared with the paper's share; and those of the screened searches, by
 # docs/notes/search.md.
 _SIZES = {"2d": (10, 6, 64, 36), "": (60, 6, 128, 72)}
-_SCREENED_SIZES = {"2d": (13, 3, 21, 12), "": (25, 3, 28, 12)}
+_SCREENED_SIZES = {"2d": (13, 3, 22, 36), "": (25, 3, 30, 48)}
 
 _RANGES = {
     "particles": (1, MAX_PARTICLES),

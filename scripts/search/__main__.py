@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     chunk = args.chunk or (512 if jax.default_backend() == "cpu" else 16_384)
     args.out.mkdir(parents=True, exist_ok=True)
     for name in args.optimizers:
-        case = make_case(name, space, args.preset)
+        case = make_case(name, space, args.preset, len(scene.objects.object))
         stem = f"{args.preset}-{name.replace(':', '-').replace('=', '')}"
         how = {"seeds": args.seeds, "budget": args.budget, "tests": args.tests, "chunk": chunk}
         how |= {"marks": args.marks, "at": args.at, "first_seed": args.first_seed}

@@ -49,7 +49,14 @@ class Settings:
     @property
     def grasps(self) -> int:
         """Grasps of the episodes and the final test, without those that find the seed."""
-        return self.particles * (self.episodes * self.trials + self.test_rounds * self.trials)
+        episodes, test = self.episodes * self.particles, self.test_rounds * self.finalists
+        return self.trials * (episodes + test)
+
+    @property
+    def finalists(self) -> int:
+        """Particles that the final test simulates; see `optimize.Optimizer`."""
+        few = self.optimizer in optimize.SCREENED
+        return min(self.particles, optimize.FINALISTS) if few else self.particles
 
     @property
     def test_rounds(self) -> int:

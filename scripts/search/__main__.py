@@ -19,12 +19,9 @@ from codesign_jax import scene as scenes
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.progress import duration
 from codesign_jax.scene.parameters import design_space
-from scripts.search.study import Study, make_case
+from scripts.search.study import UNFINISHED, Study, make_case
 from scripts.shared import provenance
 from scripts.shared.output import write_json
-
-UNFINISHED = 3
-"""Exit status of a command that ran out of --minutes."""
 
 
 def main(arguments: list[str] | None = None) -> int:

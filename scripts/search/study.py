@@ -28,6 +28,8 @@ from scripts.shared.output import write_arrays
 CANDIDATES, ROUNDS = 25, 12
 """Most particles that are tested at a mark, and trials of each, but for whole turns of the objects;
 an optimiser with `finalists` has its runs' final test."""
+UNFINISHED = 3
+"""Exit status of a command that ran out of --minutes."""
 STREAM_JUDGE = 0x6A756467
 """Stream of the trials that judge a recommended design ("judg")."""
 
@@ -229,23 +231,37 @@ class Study:
         return jax.jit(init)(self.keys, drawn[jnp.arange(len(rows)), rows])
 
     def _mark(self) -> int:
-        """Chooses by fresh trials what is recommended now, and judges it by others."""
+        """Chooses what is recommended now, and judges it."""
         assert self.last is not None
-        chosen = self.state.particles
-        if not self.case.optimizer.keeps_best:
-            best = jnp.argsort(self.last[1], axis=1)[..., None]
-            chosen = jnp.take_along_axis(self.last[0], best, 1)
-        chosen = chosen[:, : self.case.finalists]
+        best_first = self.case.optimizer.keeps_best
+        return self.judge(self.done, *((self.state.particles,) if best_first else self.last))
+
+    def judge(self, mark: int, particles: jax.Array, costs: jax.Array | None = None) -> int:
+        """Chooses from particles by fresh trials, and judges the chosen one by others.
+
+        Args:
+          mark: Number of the mark.
+          particles: Particles of each seed, shape (seed, particle, parameter).
+          costs: Their costs, by which finalists are taken, shape (seed, particle); None if the
+            best stand first.
+
+        Returns:
+          The number of grasps.
+        """
+        if costs is not None:
+            order = jnp.argsort(jnp.asarray(costs), axis=1)[..., None]
+            particles = jnp.take_along_axis(jnp.asarray(particles), order, 1)
+        chosen = particles[:, : self.case.finalists]
         best, grasps = jnp.zeros(len(chosen), int), 0
         if self.rounds:
-            noise = self._noise(codesign.STREAM_TEST, self.done)
+            noise = self._noise(codesign.STREAM_TEST, mark)
             tested = self._costs(self._all(chosen, noise, self.rounds))
             best, grasps = tested.argmin(1), tested.size * self.rounds
         design = chosen[jnp.arange(len(chosen)), best][:, None]
         outcome = self._all(design, self._noise(STREAM_JUDGE, 0), self.tests)
         kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
-        self.kept[self.done] = kept[:, 0].mean(-1)
-        self.designs[self.done] = np.asarray(design[:, 0])
+        self.kept[mark] = kept[:, 0].mean(-1)
+        self.designs[mark] = np.asarray(design[:, 0])
         return grasps + kept.size
 
     def _noise(self, stream: int, index: int) -> jax.Array:

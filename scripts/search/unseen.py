@@ -27,13 +27,11 @@ from codesign_jax.engines import make_engine
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import failed
-from scripts.search.study import STREAM_JUDGE, Study, make_case
+from scripts.search.study import STREAM_JUDGE, UNFINISHED, Study, make_case
 from scripts.shared import provenance, tables
 from scripts.shared.output import write_json
 
 PAGE = Path("docs/notes/search.md")
-UNFINISHED = 3
-"""Exit status of a command that ran out of --minutes."""
 
 
 def folds(count: int) -> np.ndarray:

@@ -296,7 +296,11 @@ def main(arguments: list[str] | None = None) -> int:
         search.step()
         search.save()
         print(f"generation {search.done - 1}: {len(search.best)} cells", flush=True)
-    found = search.elites(args.turns)
+    elites = args.out.with_name(f"{args.out.stem}-elites.npz")
+    if not elites.exists():
+        write_arrays(elites, search.elites(args.turns))
+    with np.load(elites) as stored:
+        found = {name: stored[name] for name in stored}
     row: dict[str, Any] = {"preset": args.preset, "scene": args.scene, "seed": args.seed}
     row |= {"generations": args.generations, "grasps": search.grasps, "cells": len(search.best)}
     row |= {"turns": args.turns, "filled": search.filled, "ranges": RANGES}

@@ -33,7 +33,7 @@ from scripts.search.study import STREAM_JUDGE, UNFINISHED
 from scripts.shared import figures, provenance
 from scripts.shared.output import write_arrays, write_json
 
-RANGES = ((0.0, 0.16), (0.0, 4.0))
+RANGES = ((0.0, 0.08), (0.0, 4.5))
 """Of the distance [m] and of the bending [rad]."""
 CELLS = (16, 16)
 WORST = -4.0
@@ -219,28 +219,30 @@ def draw(
     length, palm = np.asarray(hands.length).mean(1), np.asarray(hands.arm)[:, 2]
     rows = apart(found["ways"], found["kept"], pictures)
     rows.sort(key=lambda row: found["ways"][row, 1])
-    figure = figures.new(11.0, 7.4)
-    grid = figure.add_gridspec(2, 2 * 6, height_ratios=[1.25, 1])
+    figure = figures.new(11.0, 7.0)
+    above, below = figure.subfigures(2, 1, height_ratios=[1.35, 1])
+    maps = above.subplots(1, 2)
     parts = ((found["kept"], "share of fresh grasps kept"), (1e3 * length, "finger length [mm]"))
     for place, (values, name) in enumerate(parts):
-        axes = figure.add_subplot(grid[0, 6 * place : 6 * place + 6])
+        axes = maps[place]
         image = np.full(np.prod(CELLS), np.nan)
         image[found["cell"]] = values
         extent = [1e3 * v for v in RANGES[0]] + [float(np.degrees(v)) for v in RANGES[1]]
         drawn = axes.imshow(image.reshape(CELLS).T, origin="lower", extent=extent, aspect="auto")
-        figure.colorbar(drawn, ax=axes, label=name)
+        above.colorbar(drawn, ax=axes, label=name)
         axes.set(xlabel="object to hand's centre [mm]", ylabel="bending of the fingers [deg]")
         for number, row in enumerate(rows):
             x, y = 1e3 * found["ways"][row, 0], np.degrees(found["ways"][row, 1])
-            axes.annotate("ABCDEFGH"[number], (x, y), color="w", weight="bold", ha="center")
-    time_s = np.array([scene.phases.lift])
+            style = {"weight": "bold", "ha": "center", "va": "center", "color": "k"}
+            axes.annotate("ABCDEFGH"[number], (x, y), **style, bbox={"fc": "w", "pad": 1, "lw": 0})
+    places, time_s = below.subplots(1, len(rows), squeeze=False)[0], np.array([scene.phases.lift])
     for number, row in enumerate(rows):
         params = space.params(jnp.asarray(found["design"][row]))
         trials = jax.tree.map(lambda v: jnp.asarray(v)[None], rollout.nominal_trial(scene, 0))
         [grasp] = animation.replay(scene, make_engine("structured", scene), params, trials)
-        width = 12 // len(rows)
-        axes = figure.add_subplot(grid[1, number * width : (number + 1) * width])
-        axes.imshow(animation.frames(scene, grasp, time_s, size=(360, 420))[0])
+        axes = places[number]
+        picture = animation.frames(scene, grasp, time_s, size=(480, 480))[0]
+        axes.imshow(picture[60:400, 80:400])
         axes.set_axis_off()
         kept, mm, arm = found["kept"][row], 1e3 * length[row], 1e3 * palm[row]
         axes.set_title(

@@ -66,12 +66,12 @@ def compare(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     (notes, first), rows = runs[args.counts[0]], {}
     for count, (other, record) in runs.items():
         differ = [k for k in first if first[k].tobytes() != record[k].tobytes()]
-        last = other["last_process"]
+        last = other["processes"][-1]
         rows[str(count)] = {
             "different_arrays": differ,
-            "grasps_per_s": last["grasps_per_s"],
+            "grasps_per_s": last["rate"],
             "compile_seconds": last["compile_seconds"],
-            "speedup": round(last["grasps_per_s"] / notes["last_process"]["grasps_per_s"], 3),
+            "speedup": round(last["rate"] / notes["processes"][-1]["rate"], 3),
         }
     kept = ("commit", "modified", "python", "versions", "platform", "device", "settings", "grasps")
     arrays = {"arrays": len(first), "bytes": sum(v.nbytes for v in first.values())}

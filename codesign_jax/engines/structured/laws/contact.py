@@ -278,6 +278,50 @@ def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, 
     return first, jnp.where(middle, bent, second)
 
 
+def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
+    """What a contact's jar has of the friction that its two bodies hold, shaped as jar.
+
+    With the effect `friction_memory` the tangential force of a contact that sticks is
+      f = -D_t (a + b v + g), with g = -f / D_t of the step before,
+    so that below the cone it grows until nothing moves (v = 0), where without g it has v in
+    proportion to f.  The cone bounds it as before: a spring of tangential stiffness D_t b / h with
+    a slider (Cundall and Strack 1979, doi 10.1680/geot.1979.29.1.47).
+
+    Args:
+      contacts: The contacts.
+      grip: g of the two bodies [m/s^2], world axes, shape (3, ...): see `hold`.
+    """
+    n = contacts.normal
+    tangent = grip - dot(n, grip) * n
+    if contacts.cone.spin is None:
+        return tangent
+    return jnp.concatenate([tangent, jnp.zeros_like(tangent)])
+
+
+def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
+    """What a contact adds to the friction that its two bodies hold, shape (4, ...).
+
+    Minus its tangential force with D_t times the normal part of g, and D_t: the sums' quotient is
+    the next g.  So two bodies at rest that touch with several normals keep g as it is; without the
+    normal part they would lose it as fast as their normals differ.
+
+    Args:
+      contacts: The contacts.
+      force: Their forces.
+      grip: As in `held`.
+    """
+    n, force = contacts.normal, force[:3]
+    stiff = jnp.where(contacts.active, contacts.grown.tangent, 0.0)
+    along = dot(n, force) + stiff * dot(n, grip)
+    return jnp.concatenate([along * n - force, (stiff + 0.0 * force[0])[None]])
+
+
+def grip(sums: jax.Array) -> jax.Array:
+    """Friction that two bodies hold, from the sums of `hold`; none where nothing touches."""
+    some = sums[3] > 0
+    return jnp.where(some, sums[:3] / jnp.where(some, sums[3], 1.0), 0.0)
+
+
 def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
     """X'KX with X = [-[r], 1]: a contact's Hessian in spatial accelerations, rows (6, 6, ...).
 

@@ -45,6 +45,7 @@ EVERYTHING = {
     "effects__finger_finger": True,
     "effects__neo_hookean": True,
     "effects__soft_touch": True,
+    "effects__friction_memory": True,
     "contact__touch_depth": 2.7e-3,  # within the depths of the state, and of none exactly
     "contact__finger_finger_friction": 0.6,  # not the object's
     "discretization__hull_rings": 2,

@@ -339,7 +339,7 @@ class Search:
         """Gives contacts a slot; places on either side, the sides' rows, and how they move."""
         pairs, contacts = self.pairs, self.pairs.set.contacts
 
-        def jar(one, other, cone, motion, vel, *held):
+        def jar(one, other, cone, held, motion, vel):
             a, b = (contacts(place, cone) for place in (one, other))
 
             def relative(m):
@@ -352,7 +352,7 @@ class Search:
 
         cone = pairs.of_row(row)
         held = grip.of_row(self.step, pairs, row)
-        mine, theirs, none = lanewise(jar, ends[0], ends[1], cone, moves[0], moves[1], *held)
+        mine, theirs, none = lanewise(jar, ends[0], ends[1], cone, held, moves[0], moves[1])
         kept = [
             dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
             for place, value in zip(ends, (mine, theirs), strict=True)

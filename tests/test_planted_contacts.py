@@ -222,9 +222,7 @@ HULL = {
     # state
     "fingers hold nothing": Fault({ENTER: without_grip}, later=True),
     "fingers hold the other way": Fault({KEEP: lambda f, sums: -f(sums)}, NEXT),
-    "fingers hold by one contact": Fault(
-        {HOLD: lambda f, sums, *rest: f(0 * sums, *rest)}, NEXT
-    ),
+    "fingers hold by one contact": Fault({HOLD: lambda f, sums, *rest: f(0 * sums, *rest)}, NEXT),
     # slots
     "a row has one slot": Fault({}, methods={(BoundSlots, "add"): first_only}),
     "a slot of the step before": Fault(

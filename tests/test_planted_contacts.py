@@ -43,7 +43,7 @@ RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>
 INSIDE, SUM, PRESSURE, BETWEEN = "inside", "add_vertex", "pressure", "between"
 ENTER, LOAD = "Search._enter.<locals>.jar", "BoundPairs.load.<locals>.wrench"
 ELIMINATE = "Elimination.backward.<locals>.eliminate"
-HOLD, KEEP = "sums.<locals>.add", "grip"
+HOLD, KEEP = "sums.<locals>.add", "quotient"
 NEXT = "next acceleration"
 """A check of the second step, of a fault in what the first one leaves."""
 TIMES, AGAIN, PALM_AGAIN = "_times", "_again", "Coupling._palm.<locals>.solve"

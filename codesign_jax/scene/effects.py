@@ -66,7 +66,7 @@ EFFECTS: Mapping[str, Effect] = {
         {"mujoco": {True: _IMPEDANCE}, "mjx": {True: _IMPEDANCE}},
     ),
     "friction_memory": Effect(
-        "fingers hold on one another without creep: the friction of the step before is kept",
+        "fingers hold on one another without creep: their friction is kept from step to step",
         {"mujoco": {True: _MEMORY}, "mjx": {True: _MEMORY}},
     ),
     "disturb": Effect("the arm is shaken after the lift"),

@@ -1,6 +1,6 @@
 """Friction that fingers hold on one another from step to step, in the kernel.
 
-Its law is `contact.held`.  The state has three numbers for each pairing of the fingers, "grip" of
+Its law is `holding.held`.  The state has three numbers for each pairing of the fingers, "grip" of
 both fingers' lanes, equal and opposite: all contacts of two fingers share it.  A step leaves what
 it ends with in "new_grip".
 """
@@ -18,7 +18,7 @@ from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.kernel.teams import team_sum
 from codesign_jax.engines.structured.lanes import sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact
+from codesign_jax.engines.structured.laws import contact, holding
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
@@ -53,13 +53,13 @@ def store(step: "Step", good: jax.Array) -> None:
 
 
 def sums(pairs: BoundPairs, row: Any, alpha: Lanes, grip: Lanes) -> Lanes:
-    """Sums of `contact.hold`, (4,), of a row's contacts where the last step has moved jar."""
+    """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar."""
     contacts = pairs.set.contacts
 
     def add(sums, place, cone, alpha, jar, step, grip):
         c = contacts(place, cone)
         force = contact.constraint_update(c, tree_add_scaled(alpha, jar, step)).force
-        return sums + sum_axis(contact.hold(c, force, grip[:, None]), 1)
+        return sums + sum_axis(holding.hold(c, force, grip[:, None]), 1)
 
     def one(item: Any, sums: Lanes) -> Lanes:
         jar, step = pairs.read("jar", item), pairs.read("step", item)
@@ -80,7 +80,7 @@ def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 
         def one(row: jax.Array, x: jax.Array) -> jax.Array:
             before, old = problem.read("grip", "new_grip", item=row - palm)
-            new = lanewise(contact.grip, sums(pairs, row, alpha, before))
+            new = lanewise(holding.quotient, sums(pairs, row, alpha, before))
             problem.write("new_grip", lanewise(jnp.where, mask, new, old), row - palm)
             return x
 

@@ -18,14 +18,14 @@ from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Problem
 from codesign_jax.engines.structured.kernel.pull import only_on, pull
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact
+from codesign_jax.engines.structured.laws import contact, holding
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.reverse import ReverseStep
 
 
 def reverse(step: "ReverseStep", pairs: BoundPairs, go: Lanes) -> None:
-    """Cotangents of the sums of `contact.hold`, of those of the state after the step.
+    """Cotangents of the sums of `holding.hold`, of those of the state after the step.
 
     Leaves them as "grip_bar", and the state's as those before a step of which contacts add their
     part (`leave`).  What a finger holds is the opposite of what its partner holds.
@@ -42,7 +42,7 @@ def reverse(step: "ReverseStep", pairs: BoundPairs, go: Lanes) -> None:
         mine = state.read(step.bars.finger_state, "grip", item)
         found = grip.sums(pairs, row, still, state.read(step.finger_state, "grip", item))
         both = only_on(go, lanewise(jnp.subtract, mine, pairs.pairing(row).swap(mine)))
-        (bars,) = pull(contact.grip, (found,), (), both)
+        (bars,) = pull(holding.quotient, (found,), (), both)
         step.p.scratch.write(step.scratch, "grip_bar", bars, item)
         rest = only_on(lanewise(jnp.logical_not, go), mine)
         state.write(step.bars.finger_state, "grip", rest, item)

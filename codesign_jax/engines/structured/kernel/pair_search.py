@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.teams import team_sum, where
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact, hull, sections
+from codesign_jax.engines.structured.laws import holding, hull, sections
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import first_on_palm
 
@@ -347,7 +347,7 @@ class Search:
 
             value = relative(motion) - a.reference(relative(vel))
             for g in held:
-                value = value + contact.held(a, g[:, None])
+                value = value + holding.held(a, g[:, None])
             return value, -value, jnp.zeros_like(value)
 
         cone = pairs.of_row(row)

@@ -17,7 +17,7 @@ from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.slots import HullSet
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
-from codesign_jax.engines.structured.laws import contact, hull, sections, shapes
+from codesign_jax.engines.structured.laws import contact, holding, hull, sections, shapes
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
@@ -234,8 +234,8 @@ def between_spheres(
       mine: Link, and centres and radii of its spheres, on the lane's own side.
       theirs: The same of the other finger.
       numbers: Numbers of the cone.
-      held: What the fingers hold, see `contact.held`, and cotangents of the sums of
-        `contact.hold`; nothing where they have no such state.
+      held: What the fingers hold, see `holding.held`, and cotangents of the sums of
+        `holding.hold`; nothing where they have no such state.
       which: Number of the sphere on either link.
     """
     balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
@@ -311,8 +311,8 @@ def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers, held: 
 
 
 def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:
-    """Cotangents of the sums of `contact.hold` times what contacts add to them."""
-    return sum_axis(dot(bars[:, None], contact.hold(contacts, force, grip[:, None])), 0)
+    """Cotangents of the sums of `holding.hold` times what contacts add to them."""
+    return sum_axis(dot(bars[:, None], holding.hold(contacts, force, grip[:, None])), 0)
 
 
 def _between(ends: list[Contacts], mine: Any, theirs: Any, held: tuple = ()) -> jax.Array:
@@ -326,7 +326,7 @@ def _between(ends: list[Contacts], mine: Any, theirs: Any, held: tuple = ()) -> 
         force = contact.constraint_update(one, jar).force
         return sum_axis(dot(force, along), 0)
     grip, bars = held
-    force = contact.constraint_update(one, jar + contact.held(one, grip[:, None])).force
+    force = contact.constraint_update(one, jar + holding.held(one, grip[:, None])).force
     return sum_axis(dot(force, along), 0) + held_work(one, force, grip, bars)
 
 

@@ -20,6 +20,7 @@ from codesign_jax.compiler import cache, gpu, launch
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
     adjoint,
+    grip_sweep,
     pair_sweep,
     pull,
     reverse,
@@ -45,6 +46,7 @@ EVERYTHING = {
     "effects__finger_finger": True,
     "effects__neo_hookean": True,
     "effects__soft_touch": True,
+    "effects__friction_memory": True,
     "contact__touch_depth": 2.7e-3,  # within the depths of the state, and of none exactly
     "contact__finger_finger_friction": 0.6,  # not the object's
     "discretization__hull_rings": 2,
@@ -124,6 +126,10 @@ FAULTS = {
     "sections of one size": Fault(names=("section_box",)),
     "rows push without their sums": Fault(results={"between_rows": without(0)}),
     "the other finger's row stands still": Fault(results={"vertex_sums": without(2)}),
+    "fingers held nothing in the step before": Fault(results={"between_rows": without(4)}),
+    "what fingers hold asks nothing of accelerations": Fault(
+        results={"push.<locals>.of_held": without(0)}
+    ),
     "both fingers own a contact": Fault(
         methods={(pair_sweep, "only_on"): lambda right, mask, tree: tree}
     ),
@@ -210,7 +216,7 @@ def planted(faults):
     """Kernels of derivatives that are made within have the faults."""
     fault = Planted(faults)
     with pytest.MonkeyPatch.context() as patch:
-        for module in (sweep, pair_sweep, reverse):
+        for module in (sweep, pair_sweep, grip_sweep, reverse):
             patch.setattr(module, "pull", fault.pull)
         for owner, name in {key for f in faults.values() for key in f.methods}:
             patch.setattr(owner, name, fault.method(owner, name))

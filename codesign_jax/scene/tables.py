@@ -29,6 +29,7 @@ class Effects:
     surface: str = choice("spheres", "hull", default="spheres")
     friction: str = choice("none", "coulomb", "full", default="coulomb")
     soft_touch: bool = False
+    friction_memory: bool = False
     disturb: bool = True
     ungrasp: bool = True
     neo_hookean: bool = False

@@ -114,7 +114,18 @@ class Dense:
         return total
 
     def _add(
-        self, scene, data, jac, normal, gap, friction, share, bodies, ratio=None, impedance=None
+        self,
+        scene,
+        data,
+        jac,
+        normal,
+        gap,
+        friction,
+        share,
+        bodies,
+        ratio=None,
+        impedance=None,
+        grip=None,
     ):
         c = scene.contact
         ratio = c.friction_ratio if ratio is None else ratio
@@ -124,6 +135,10 @@ class Dense:
         r = (1 - d) / d * model.contact_invweight(scene) * bodies / share
         reference = -2 / (d * c.time_constant) * (jac @ data.qvel)
         reference[0] -= gap * d / (d * c.time_constant) ** 2
+        if grip is not None:  # a share of the elastic normal force, which it is held by
+            elastic = -gap * d / (d * c.time_constant) ** 2 / r
+            reference[1:] -= elastic * r / ratio * (frame[1:] @ grip)
+            self.held.append((len(self.rows), frame, elastic, grip))
         self.rows.append((jac, reference, np.array([r, r / ratio]), friction))
         self.num_hull += 1
 
@@ -159,7 +174,15 @@ class Dense:
             _, grad, hess = parts(y)
             y = y - np.linalg.solve(hess, grad)
         assert np.linalg.norm(parts(y)[1]) < 1e-9 * (1 + np.linalg.norm(y))
-        return start + back @ y
+        self.acceleration = start + back @ y
+        return self.acceleration
+
+    def force(self, row):
+        """Force of a contact in its own frame at the solution."""
+        jac, reference, r, friction = self.rows[row]
+        root = np.sqrt([r[0], r[1], r[1]])
+        z = (reference - jac @ self.acceleration) / root
+        return project(z, friction * np.sqrt(r[1] / r[0]))[0] / root
 
 
 def project(z, slope):
@@ -181,8 +204,10 @@ def project(z, slope):
 class DensePairs(Dense):
     """A step's problem with the contacts of the hulls of different fingers, and of the palm."""
 
-    def __init__(self, scene, model, data, hand):
+    def __init__(self, scene, model, data, hand, grip=None):
+        """Grip: friction coefficient that the first of two fingers uses on the second one, (3,)."""
         super().__init__(scene, model, data, hand)
+        self.held, self.grip = [], grip
         self.pairs = self.merged = self.on_palm = 0
         if scene.effects.finger_palm:
             for f in range(scene.num_fingers):
@@ -210,7 +235,12 @@ class DensePairs(Dense):
             if found:
                 c = scene.contact
                 rest = c.finger_finger_friction, c.finger_finger_friction_ratio, c.impedance
-                self._add_resultant(scene, data, found, *rest)
+                sign = 1.0 if f < other else -1.0
+                if self.grip is None:
+                    self._add_resultant(scene, data, found, *rest)
+                else:
+                    self._add_resultant(scene, data, found, *rest, sign * self.grip)
+                    self.held[-1] += (sign,)
                 self.pairs += 1
                 self.merged = max(self.merged, len(found))
 
@@ -267,16 +297,26 @@ class DensePairs(Dense):
 
         return point, jac_at, -((1 - w) * turned[0] + w * turned[1])
 
-    def _add_resultant(self, scene, data, found, friction, ratio, impedance):
+    def _add_resultant(self, scene, data, found, friction, ratio, impedance, grip=None):
         """One contact of all vertices of a row in another row, weighted by their forces."""
         share, depth = (np.array([v[k] for v in found]) for k in (0, 1))
         force = share * depth / (share @ depth)
         normal, jac = (np.tensordot(force, [v[k] for v in found], 1) for k in (2, 3))
         length = np.linalg.norm(normal)
         gap = -length * (share @ depth) / share.sum()
-        self._add(
-            scene, data, jac, normal / length, gap, friction, share.sum(), 2, ratio, impedance
-        )
+        size = share.sum()
+        normal = normal / length
+        self._add(scene, data, jac, normal, gap, friction, size, 2, ratio, impedance, grip)
+
+    def next_grip(self):
+        """What the first finger uses in the solution: tangential over normal forces, or elastic."""
+        above = below = 0.0
+        for row, frame, elastic, grip, sign in self.held:
+            force = self.force(row)
+            weight = max(force[0], elastic)
+            held = weight * frame[0] * (frame[0] @ grip) - frame[1:].T @ force[1:]
+            above, below = above + sign * held, below + weight
+        return above / below
 
     @staticmethod
     def _section(scene, data, hand, f, row, point):

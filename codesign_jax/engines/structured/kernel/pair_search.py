@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import skin
+from codesign_jax.engines.structured.kernel import grip, skin
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.teams import team_sum, where
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import hull, sections
+from codesign_jax.engines.structured.laws import holding, hull, sections
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import first_on_palm
 
@@ -64,6 +64,7 @@ class Search:
         """Empties the slots; stores what belongs to the palm."""
         for row in range(self.pairs.set.rows):
             self.pairs.clear(row)
+        grip.clear(self.step)
         self._side(0, motion, vel, frame, base)
 
     def link(self, i: Any, motion: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
@@ -338,17 +339,20 @@ class Search:
         """Gives contacts a slot; places on either side, the sides' rows, and how they move."""
         pairs, contacts = self.pairs, self.pairs.set.contacts
 
-        def jar(one, other, cone, motion, vel):
+        def jar(one, other, cone, held, motion, vel):
             a, b = (contacts(place, cone) for place in (one, other))
 
             def relative(m):
                 return a.relative(m[0][:, None]) - b.relative(m[1][:, None])
 
             value = relative(motion) - a.reference(relative(vel))
+            for g in held:
+                value = value + holding.held(a, g[:, None])
             return value, -value, jnp.zeros_like(value)
 
         cone = pairs.of_row(row)
-        mine, theirs, none = lanewise(jar, ends[0], ends[1], cone, moves[0], moves[1])
+        held = grip.of_row(self.step, pairs, row)
+        mine, theirs, none = lanewise(jar, ends[0], ends[1], cone, held, moves[0], moves[1])
         kept = [
             dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
             for place, value in zip(ends, (mine, theirs), strict=True)

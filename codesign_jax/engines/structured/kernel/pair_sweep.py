@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import powers, skin
+from codesign_jax.engines.structured.kernel import grip_sweep, powers, skin
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
@@ -134,9 +134,11 @@ class PairSweep:
         link, which = self._sphere(item)
         mine = self._body(row), *(self.hand(n, link, self.lane) for n in ("sphere", "radius"))
         theirs, other = pairing.swap((mine, which))
-        args, fixed = (mine, theirs, self.sweep.step.constant(CONE)), ((which, other),)
+        held = grip_sweep.at(self.sweep.step, pairing)
+        args, fixed = (mine, theirs, self.sweep.step.constant(CONE), held), ((which, other),)
         run = partial(powers.between_spheres, self.p.scene)
-        own, swapped, numbers = only_on(live, pull(run, args, fixed, self.sweep.one))
+        own, swapped, numbers, kept = only_on(live, pull(run, args, fixed, self.sweep.one))
+        grip_sweep.leave(self.sweep.step, pairing, kept)
         place, *own = plus(own, pairing.swap(swapped))
         self.bars.add({CONE: numbers})
         self.bars.add(dict(zip(("sphere", "radius"), own, strict=True)), link, self.lane)
@@ -155,9 +157,11 @@ class PairSweep:
         def sums_of(k: Any) -> Lanes:
             return lanewise(powers.vertex_sums, vertex(k)[1], mine, theirs, last)
 
-        args = self._sums(count, sums_of), ends, other_ends, self.sweep.step.constant(CONE)
+        held = grip_sweep.at(self.sweep.step, pairing)
+        args = self._sums(count, sums_of), ends, other_ends, self.sweep.step.constant(CONE), held
         run = partial(powers.between_rows, p.scene)
-        bar, *moves, numbers = only_on(live, pull(run, args, (), self.sweep.one))
+        bar, *moves, numbers, kept = only_on(live, pull(run, args, (), self.sweep.one))
+        grip_sweep.leave(self.sweep.step, pairing, kept)
         self.bars.add({CONE: numbers})
 
         def one(number: Any, place: Lanes) -> tuple[Lanes, tuple]:

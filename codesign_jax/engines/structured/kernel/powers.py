@@ -17,7 +17,7 @@ from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.slots import HullSet
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
-from codesign_jax.engines.structured.laws import contact, hull, sections, shapes
+from codesign_jax.engines.structured.laws import contact, holding, hull, sections, shapes
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
@@ -224,6 +224,7 @@ def between_spheres(
     mine: tuple[Place, Any, Any],
     theirs: tuple[Place, Any, Any],
     numbers: Any,
+    held: tuple,
     which: tuple,
 ) -> jax.Array:
     """Power of two fingers' spheres on one another.
@@ -233,13 +234,15 @@ def between_spheres(
       mine: Link, and centres and radii of its spheres, on the lane's own side.
       theirs: The same of the other finger.
       numbers: Numbers of the cone.
+      held: What the fingers hold, see `holding.held`, and cotangents of the sums of
+        `holding.hold`; nothing where they have no such state.
       which: Number of the sphere on either link.
     """
     balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
     one, other = sections.between(*balls)
     cone = cone_of(scene, numbers)
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in (one, other)]
-    return _between(ends, mine[0][2:], theirs[0][2:])
+    return _between(ends, mine[0][2:], theirs[0][2:], held)
 
 
 def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, which) -> jax.Array:
@@ -287,25 +290,44 @@ def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
     return sections.add_vertex(none, *sections.inside(vertex, tuple(own), tuple(other), size, last))
 
 
-def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
-    """Power of a row on another finger's row; mine and theirs: sides before and behind."""
+def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers, held: tuple = ()):
+    """Power of a row on another finger's row, or the palm.
+
+    Args:
+      scene: The scene.
+      sums: See `sections.pressure`.
+      mine: Sides before and behind the row.
+      theirs: The same of the other row.
+      numbers: Numbers of the cone.
+      held: As in `between_spheres`.
+    """
     cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
     moves = [
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
         for before, after in (mine, theirs)
     ]
-    return _between(ends, *moves)
+    return _between(ends, *moves, held)
 
 
-def _between(ends: list[Contacts], mine: Any, theirs: Any) -> jax.Array:
+def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:
+    """Cotangents of the sums of `holding.hold` times what contacts add to them."""
+    return sum_axis(dot(bars[:, None], holding.hold(contacts, force, grip[:, None])), 0)
+
+
+def _between(ends: list[Contacts], mine: Any, theirs: Any, held: tuple = ()) -> jax.Array:
     one, other = ends
     vel, motion, along = (
         one.relative(a[:, None]) - other.relative(b[:, None])
         for a, b in zip(mine, theirs, strict=True)
     )
-    force = contact.constraint_update(one, motion - one.reference(vel)).force
-    return sum_axis(dot(force, along), 0)
+    jar = motion - one.reference(vel)
+    if not held:
+        force = contact.constraint_update(one, jar).force
+        return sum_axis(dot(force, along), 0)
+    grip, bars = held
+    force = contact.constraint_update(one, jar + holding.held(one, grip[:, None])).force
+    return sum_axis(dot(force, along), 0) + held_work(one, force, grip, bars)
 
 
 def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:

@@ -35,6 +35,8 @@ _SKIN = "its geoms are rigid parts of single bodies"
 
 _IMPEDANCE = "MuJoCo's impedance grows with depth in the elastic force as well"
 
+_NOW = "MuJoCo's contacts act by their depth at the beginning of a step"
+
 _SPRINGS = "the springs of its joints are constants of a rollout"
 
 EFFECTS: Mapping[str, Effect] = {
@@ -51,6 +53,10 @@ EFFECTS: Mapping[str, Effect] = {
     "object_table": Effect("the object rests on the table"),
     "finger_finger": Effect("fingers touch one another"),
     "finger_palm": Effect("fingers touch the palm's disc"),
+    "speculative_palm": Effect(
+        "fingers touch the palm already in the step that would carry them into it",
+        {"mujoco": {True: _NOW}, "mjx": {True: _NOW}},
+    ),
     "surface": Effect(
         "the fingers' contact points: spheres, or the vertices of the skinned hull",
         {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},

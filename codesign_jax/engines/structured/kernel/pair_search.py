@@ -46,6 +46,8 @@ class Search:
         self.moves, self.palm = (at["now"].palm_motion, at["vel"]), ()
         if pairs.set.palm:
             self.palm = at["place"], at["frame"], step.constant("palm_disc")
+        self.ahead = step.p.scene.effects.speculative_palm
+        self.timestep = step.p.scene.discretization.timestep
         self.scratch, self.ref, self.block = step.p.scratch, step.scratch, step.block
         self.like = jnp.zeros((step.p.size,), step.finger_state.dtype)
 
@@ -110,8 +112,10 @@ class Search:
         def one(j: Any) -> None:
             number, ball = j + first, self.read("sphere", j + first)
             mine, _ = lanewise(sections.ball_on_palm, ball, self.palm)
-            row = jax.lax.div(number, jnp.asarray(self.p.k, number.dtype)) + 1
-            self._enter_on_palm(mine, row, number)
+            row, seen = jax.lax.div(number, jnp.asarray(self.p.k, number.dtype)) + 1, None
+            if self.ahead:
+                mine, seen = lanewise(self._ahead, mine, self.pairs.side("vel", row))
+            self._enter_on_palm(mine, row, number, seen=seen)
 
         each(self.p.links * self.p.k - first, one)
 
@@ -120,31 +124,68 @@ class Search:
         first = first_on_palm(self.p.links)
 
         def one(i: Any) -> None:
-            row, ball = i + first, self.read("ball", i + first)
-            (_, _, near), _ = lanewise(sections.ball_on_palm, ball, self.palm)
-            any_of(near.lane < 0, lambda: self._row_on_palm(row, None))
+            row = i + first
+            any_of(self._near_palm(row), lambda: self._row_on_palm(row, None))
 
         each(self.p.links + 1 - first, one)
+
+    def _near_palm(self, row: Any) -> jax.Array:
+        """Lanes on which a vertex of a row may touch the palm, with `ahead` in this step."""
+        ball = self.read("ball", row)
+        (_, _, gap), _ = lanewise(sections.ball_on_palm, ball, self.palm)
+        if not self.ahead:
+            return gap.lane < 0
+        joint = self.read("joint", jnp.minimum(row + 1, self.p.links))
+        speed = lanewise(sections.fastest, ball, joint, self.pairs.side("vel", row))
+        return gap.lane < sections.REACH + self.timestep * speed.lane
+
+    def _ahead(self, mine: tuple, vel: Any) -> tuple:
+        return sections.ahead(mine, vel, self.timestep)
 
     def _row_on_palm(self, row: Any, there: jax.Array | None) -> None:
         """Enters one contact of all vertices of a row; there: lanes that have one to try."""
         d, links = self.p.scene.discretization, self._links(row)
         count, kind = d.hull_rings * d.hull_points, skin.kind_of(row, self.p.links)
 
+        vel = self.pairs.side("vel", row) if self.ahead else None
+
         def add(k: Any, sums: Lanes) -> Lanes:
             k, mine = self.block.dealt(count, k)
             vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
-            ends = lanewise(sections.on_palm, vertex, links, self.palm)
-            new = lanewise(sections.add_vertex, sums, *ends)
+            one, other = lanewise(sections.on_palm, vertex, links, self.palm)
+            if vel is None:
+                new = lanewise(sections.add_vertex, sums, one, other)
+            else:
+                one, seen = lanewise(self._ahead, one, vel)
+                new = lanewise(sections.add_ahead, sums, one, other, seen)
             return new if mine is None else where(mine, new, sums)
 
         start = zeros((sections.SUMS,), self.like)
+        if self.ahead:
+            start = lanewise(sections.none_ahead, lanes([self.like], (), wide=True))
         sums = loop(self.block.rounds(count), add, start, self.block.size)
-        place = lanewise(sections.pressure, team_sum(self.block, sums))[0]
-        self._enter_on_palm(place, row, there=there)
+        whole = sections.pressure_ahead if self.ahead else sections.pressure
+        place, _, *seen = lanewise(whole, self._team_sum(sums))
+        self._enter_on_palm(place, row, there=there, seen=seen[0] if seen else None)
+
+    def _team_sum(self, sums: Lanes) -> Lanes:
+        """Sums of a team's lanes; with `ahead` of those that have the lowest gap, or one below 0."""
+        if self.block.team == 1 or not self.ahead:
+            return team_sum(self.block, sums)
+        own = sums[0].lane
+        lowest = self.block.over_team(own, jnp.minimum)
+        counts = lanes([(own < 0) | (own == lowest)], (), wide=True)
+        parts = team_sum(self.block, lanewise(lambda c, s: jnp.where(c, s, 0.0), counts, sums[1:]))
+        first = lanes([lowest], (1,), wide=True)
+        return lanewise(lambda a, b: jnp.concatenate([a, b]), first, parts)
 
     def _enter_on_palm(
-        self, place: tuple, row: Any, sphere: Any = 0, there: jax.Array | None = None
+        self,
+        place: tuple,
+        row: Any,
+        sphere: Any = 0,
+        there: jax.Array | None = None,
+        seen: tuple | None = None,
     ) -> None:
         """Gives a slot to a contact with the palm, whose motion the sides' are relative to."""
         pairs = self.pairs
@@ -154,7 +195,7 @@ class Search:
         def enter() -> None:
             moves = [pairs.side(name, row) for name in ("motion", "vel")]
             with pairs.with_cone(0):
-                fields = pairs.begin(place, *moves)
+                fields = pairs.begin(place, *moves, seen)
             number = lanes([self.like + jnp.asarray(row, self.like.dtype)], (1, 1), wide=True)
             fields |= {"row": number} | pairs.remembered({"owner": 1.0, "sphere": sphere})
             pairs.add(0, which, fields, self.block.own)

@@ -12,7 +12,7 @@ direction flips.  Lane by lane, see `fingers`.
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import dot, total
+from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.laws import hull, shapes
 from codesign_jax.engines.structured.world_model import apply_columns, apply_rows
 
@@ -84,6 +84,49 @@ def on_palm(vertex, own: tuple, palm: tuple) -> tuple[tuple, tuple]:
     at, gap = (point[:, 0] + to_contact)[:, None], gap[None, None]
     mine = at, normal[:, None], gap, lever[:, None], share
     return mine, (at, -normal[:, None], gap, jnp.zeros_like(lever)[:, None], share)
+
+
+REACH = 0.010
+"""Gap at a step's end, at the velocity of its beginning, from which on a contact is a candidate [m].
+
+Fingers that come loose are accelerated by more than 100 m/s^2 and so move a centimetre in a step.
+"""
+
+
+def ahead(mine: tuple, vel: jax.Array, timestep: float) -> tuple[tuple, tuple]:
+    """A contact that acts in the step that would carry it into what it touches.
+
+    Args:
+      mine: Point, normal and gap, and of a vertex its lever and share, on the moving side.
+      vel: Motion of that side relative to the other, shape (6 or 9, ...).
+      timestep: Time step h [s].
+
+    Returns:
+      The same with the lower of the gap now and, at this velocity, at the step's end; and
+      `Contacts.ahead`, both of shape (1, 1, ...).
+    """
+    point, normal, gap, *rest = mine
+    moving = vel[3:6] + cross(vel[:3], point[:, 0])
+    if rest:
+        moving = moving + cross(vel[6:], rest[0][:, 0])
+    later = gap + timestep * dot(normal[:, 0], moving)
+    seen = jnp.minimum(gap, 0.0), jnp.maximum(gap, 0.0) / timestep
+    return (point, normal, jnp.minimum(gap, later), *rest), seen
+
+
+def fastest(ball: jax.Array, joint: jax.Array, vel: jax.Array) -> jax.Array:
+    """Bound of the speed of a row's vertices, which lie in a ball [m/s].
+
+    Args:
+      ball: Centre and radius, shape (4, ...).
+      joint: Place of the row's joint, shape (3, ...).
+      vel: Motion of the row, shape (9, ...).
+    """
+    away = ball[:3] - joint
+    moving = vel[3:6] + cross(vel[:3], ball[:3])
+    reach = ball[3] + jnp.sqrt(dot(away, away))
+    turning = ball[3] * jnp.sqrt(dot(vel[:3], vel[:3])) + reach * jnp.sqrt(dot(vel[6:], vel[6:]))
+    return jnp.sqrt(dot(moving, moving)) + turning
 
 
 def separated(own: tuple, own_size, theirs: tuple, size, last) -> jax.Array:
@@ -238,6 +281,45 @@ def add_vertex(sums: jax.Array, mine: tuple, other: tuple) -> jax.Array:
     force = share * depth
     vectors = [force * v[:, 0] for v in (normal, point, lever, other[3])]
     return sums + jnp.concatenate([share[None], force[None], *vectors])
+
+
+AHEAD = SUMS + 3
+"""Numbers of `add_ahead`: the lowest gap, both of `Contacts.ahead` x share, and `SUMS` others."""
+TOUCH = 1e-6
+"""Depth that the nearest vertex of a row counts with where none is in the palm [m]."""
+
+
+def none_ahead(like: jax.Array) -> jax.Array:
+    """Sums of no vertices, with the lowest gap that a candidate may have."""
+    zero = jnp.zeros_like(like)
+    return jnp.stack([zero + REACH, *[zero] * (AHEAD - 1)])
+
+
+def add_ahead(sums: jax.Array, mine: tuple, other: tuple, seen: tuple) -> jax.Array:
+    """As `add_vertex`, of a vertex of `ahead`; the nearest one alone while none is deeper than 0."""
+    lowest, gap = sums[0], mine[2][0, 0]
+    nearer = gap < lowest
+    depth = jnp.where(gap < 0, -gap, jnp.where(nearer, TOUCH, 0.0))
+    before = jnp.where(nearer & (lowest >= 0), 0.0, sums[1:])
+    share = jnp.where(depth > 0, mine[4][0, 0], 0.0)
+    more = jnp.stack([share * part[0, 0] for part in seen])
+    place = mine[:2] + (-depth[None, None],) + mine[3:]
+    added = [before[:2] + more, add_vertex(before[2:], place, other)]
+    return jnp.concatenate([jnp.minimum(lowest, gap)[None], *added])
+
+
+def pressure_ahead(sums: jax.Array) -> tuple[tuple, tuple, tuple]:
+    """As `pressure`, of the sums of `add_ahead`; and `Contacts.ahead`.
+
+    The row's is the mean of its vertices, less as far as they push in different directions.
+    """
+    share, force, normal = sums[3], sums[4], sums[5:8]
+    some = force > 0
+    square = dot(normal, normal)
+    pushes = some & (square > 0)
+    agree = jnp.sqrt(jnp.where(pushes, square, 1.0)) / jnp.where(some, force * share, 1.0)
+    seen = tuple((agree * part)[None, None] for part in sums[1:3])
+    return *pressure(sums[3:]), seen
 
 
 def pressure(sums: jax.Array) -> tuple[tuple, tuple]:

@@ -2,6 +2,8 @@
 
 python -m scripts.experiments 2d --out runs/reproduction           # on a GPU; again to resume
 timeout -s INT 500 python -m scripts.experiments 2d --out runs/reproduction    # stop after a time
+python -m scripts.experiments 2d --out runs/big --share 1/4        # beside 2/4, 3/4 and 4/4
+python -m scripts.experiments 2d --out runs/big --gather           # then: results of all shares
 python -m scripts.experiments 2d --out runs/small --size cpu       # minutes on a CPU
 python -m scripts.experiments 2d --parquet runs/2d.parquet         # every grasp, also afterwards
 python -m scripts.experiments types --videos docs/figures            # what the landscape's hands do
@@ -15,6 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from codesign_jax import runs, scene
@@ -54,6 +57,15 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--every", type=int, default=4, help="episodes between checkpoints")
     parser.add_argument("--fresh", action="store_true", help="delete what is there of it")
     parser.add_argument(
+        "--share",
+        default="1/1",
+        metavar="I/N",
+        help="every N-th run from the I-th on, beside other processes; --gather writes the results",
+    )
+    parser.add_argument(
+        "--gather", action="store_true", help="simulate nothing: write what the runs have"
+    )
+    parser.add_argument(
         "--trials",
         type=Path,
         help="write every trial to this .npz",
@@ -89,12 +101,17 @@ def simulate(args: argparse.Namespace) -> int:
     path = args.out / f"{args.experiment}.json"
     before = json.loads(path.read_text()) if path.exists() and not args.fresh else None
     settings = results.settings_of(the_plan, the_scene, args.engine, args.seed)
-    if before and before["settings"] != json.loads(json.dumps(settings)):
+    if before and _of_runs(before["settings"]) != _of_runs(json.loads(json.dumps(settings))):
         sys.exit(f"error: {path} belongs to another experiment; choose another --out, or --fresh")
     start = time.perf_counter()
     if isinstance(the_plan, plan.Landscape):
         return _landscape(args, the_plan, the_scene, before, start)
     return _strategies(args, the_plan, the_scene, before, start)
+
+
+def _of_runs(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of an experiment but the list of strategies: each has folders of its own."""
+    return settings | {"plan": {k: v for k, v in settings["plan"].items() if k != "strategies"}}
 
 
 def _strategies(
@@ -106,23 +123,26 @@ def _strategies(
 ) -> int:
     folder = args.out / args.experiment
     plans = strategies.plans(the_plan, the_scene, args.engine, folder, args.seed)
+    first, count = (int(n) for n in args.share.split("/"))
+    plans = dict([*plans.items()][first - 1 :: count]) if not args.gather else {}
     how = {"fresh": args.fresh, "every": args.every, "devices": args.devices, "chunk": args.chunk}
-    done = runs.optimize(plans, sys.argv, **how)
+    done = runs.optimize(plans, sys.argv, **how) if plans else runs.Results({}, runs.Timing())
     problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
     for place, error in problems.items():
         print(f"error: {place}: {error}", file=sys.stderr)
-    found = strategies.gather(the_plan, folder, args.seed)
     code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
+    timing, seconds = done.timing, time.perf_counter() - start
+    rate = timing.grasps / max(timing.seconds, 1e-9)
+    process = results.Process(timing.grasps, seconds, timing.compile_seconds, rate)
+    log = results.log(args.out / f"{args.experiment}.processes", process, args.commit, args.fresh)
+    found = strategies.gather(the_plan, folder, args.seed) if count == 1 else None
     if found is None or not found["cost"].shape[2]:
         return code
     space = parameters.design_space(the_scene.hand, the_plan.preset)
     kept = results.of_strategies(the_plan, the_scene, space, found)
-    timing, screened = done.timing, strategies.screened(the_plan, found)
-    grasps = found["status"].size + (the_plan.worlds * the_plan.rounds if not code else 0)
-    rate = timing.grasps / max(timing.seconds, 1e-9)
-    seconds = time.perf_counter() - start
-    process = results.Process(timing.grasps, seconds, timing.compile_seconds, rate)
-    notes = _write(args, kept, found, process, before, (the_plan, the_scene), (grasps, screened))
+    screened = strategies.screened(the_plan, found)
+    grasps = found["status"].size + found.get("test_status", np.zeros(0)).size
+    notes = _write(args, kept, found, log, before, (the_plan, the_scene), (grasps, screened))
     if args.parquet:
         print(parquet.write_strategies(args.parquet, the_plan, space, found, notes))
     return code
@@ -148,8 +168,9 @@ def _landscape(
     kept, seconds = results.of_landscape(the_scene, space, found), time.perf_counter() - start
     grasps = the_plan.grasps - earlier
     process = results.Process(grasps, seconds, 0.0, grasps / seconds)
+    log = results.log(args.out / f"{args.experiment}.processes", process, args.commit, args.fresh)
     sizes = the_plan.grasps, 0
-    notes = _write(args, kept, found, process, before, (the_plan, the_scene), sizes)
+    notes = _write(args, kept, found, log, before, (the_plan, the_scene), sizes)
     if args.parquet:
         print(parquet.write_landscape(args.parquet, the_plan.name, space, found, notes))
     return 0
@@ -159,17 +180,16 @@ def _write(
     args: argparse.Namespace,
     kept: strategies.Arrays,
     found: strategies.Arrays,
-    process: results.Process,
+    log: list[dict[str, Any]],
     before: dict[str, Any] | None,
     subject: tuple[Any, Scene],
     grasps: tuple[int, int],
 ) -> dict[str, Any]:
     """Writes the results; returns their provenance: that of who made them, if nothing is new."""
     notes = before or {}
-    if process.grasps or before is None:
+    if before is None or not log or before.get("processes") != log:
         settings = results.settings_of(*subject, args.engine, args.seed)
-        made = {"before": before, "commit": args.commit}
-        notes = results.describe(settings, process, *grasps, **made)
+        notes = results.describe(settings, log, *grasps, commit=args.commit)
         for path in results.write(args.out, args.experiment, kept, notes):
             print(path)
     if args.trials:

@@ -139,6 +139,14 @@ class Search:
         speed = lanewise(sections.fastest, ball, joint, self.pairs.side("vel", row))
         return gap.lane < sections.REACH + self.timestep * speed.lane
 
+    def _add_ahead(self, sums: tuple, vertex: Any, ends: tuple, vel: Any) -> tuple:
+        mine, seen = self._ahead(ends[0], vel)
+        halves = (sections.half_of_row(vertex, mine, side) for side in (-1, 1))
+        return tuple(
+            sections.add_ahead(s, half, ends[1], seen)
+            for s, half in zip(sums, halves, strict=True)
+        )
+
     def _ahead(self, mine: tuple, vel: Any) -> tuple:
         return sections.ahead(mine, vel, self.timestep)
 
@@ -149,24 +157,26 @@ class Search:
 
         vel = self.pairs.side("vel", row) if self.ahead else None
 
-        def add(k: Any, sums: Lanes) -> Lanes:
+        def add(k: Any, sums: Any) -> Any:
             k, mine = self.block.dealt(count, k)
             vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
-            one, other = lanewise(sections.on_palm, vertex, links, self.palm)
+            ends = lanewise(sections.on_palm, vertex, links, self.palm)
             if vel is None:
-                new = lanewise(sections.add_vertex, sums, one, other)
+                new = lanewise(sections.add_vertex, sums, *ends)
             else:
-                one, seen = lanewise(self._ahead, one, vel)
-                new = lanewise(sections.add_ahead, sums, one, other, seen)
+                new = lanewise(self._add_ahead, sums, vertex, ends, vel)
             return new if mine is None else where(mine, new, sums)
 
-        start = zeros((sections.SUMS,), self.like)
-        if self.ahead:
-            start = lanewise(sections.none_ahead, lanes([self.like], (), wide=True))
-        sums = loop(self.block.rounds(count), add, start, self.block.size)
-        whole = sections.pressure_ahead if self.ahead else sections.pressure
-        place, _, *seen = lanewise(whole, self._team_sum(sums))
-        self._enter_on_palm(place, row, there=there, seen=seen[0] if seen else None)
+        if vel is None:
+            start = zeros((sections.SUMS,), self.like)
+            sums = loop(self.block.rounds(count), add, start, self.block.size)
+            place = lanewise(sections.pressure, team_sum(self.block, sums))[0]
+            return self._enter_on_palm(place, row, there=there)
+        one = lanewise(sections.none_ahead, lanes([self.like], (), wide=True))
+        halves = loop(self.block.rounds(count), add, (one, one), self.block.size)
+        for number, sums in enumerate(halves):
+            place, _, seen = lanewise(sections.pressure_ahead, self._team_sum(sums))
+            self._enter_on_palm(place, row, number, there, seen)
 
     def _team_sum(self, sums: Lanes) -> Lanes:
         """Sums of a team's lanes; with `ahead` of those that have the lowest gap, or one below 0."""

@@ -289,6 +289,17 @@ TOUCH = 1e-6
 """Depth that the nearest vertex of a row counts with where none is in the palm [m]."""
 
 
+def half_of_row(vertex, mine: tuple, side: int) -> tuple:
+    """A vertex of `ahead` as one of the half of its row on one side of the finger, -1 or 1.
+
+    One contact a row would leave the finger free to roll, which the step after would see.
+    """
+    across = side * vertex[1]
+    part = jnp.where(across > TOUCH, 1.0, jnp.where(across < -TOUCH, 0.0, 0.5))
+    point, normal, gap, lever, share = mine
+    return point, normal, jnp.where(part > 0, gap, 1.0), lever, part * share
+
+
 def none_ahead(like: jax.Array) -> jax.Array:
     """Sums of no vertices, with the lowest gap that a candidate may have."""
     zero = jnp.zeros_like(like)

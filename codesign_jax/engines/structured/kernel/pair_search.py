@@ -143,8 +143,7 @@ class Search:
         mine, seen = self._ahead(ends[0], vel)
         halves = (sections.half_of_row(vertex, mine, side) for side in (-1, 1))
         return tuple(
-            sections.add_ahead(s, half, ends[1], seen)
-            for s, half in zip(sums, halves, strict=True)
+            sections.add_ahead(s, half, ends[1], seen) for s, half in zip(sums, halves, strict=True)
         )
 
     def _ahead(self, mine: tuple, vel: Any) -> tuple:
@@ -179,15 +178,14 @@ class Search:
             self._enter_on_palm(place, row, number, there, seen)
 
     def _team_sum(self, sums: Lanes) -> Lanes:
-        """Sums of a team's lanes; with `ahead` of those that have the lowest gap, or one below 0."""
+        """Sums of a team's lanes; with `ahead` of those with the lowest gap, or one below 0."""
         if self.block.team == 1 or not self.ahead:
             return team_sum(self.block, sums)
-        own = sums[0].lane
+        own = sums[-1].lane
         lowest = self.block.over_team(own, jnp.minimum)
         counts = lanes([(own < 0) | (own == lowest)], (), wide=True)
-        parts = team_sum(self.block, lanewise(lambda c, s: jnp.where(c, s, 0.0), counts, sums[1:]))
-        first = lanes([lowest], (1,), wide=True)
-        return lanewise(lambda a, b: jnp.concatenate([a, b]), first, parts)
+        parts = team_sum(self.block, lanewise(lambda c, s: jnp.where(c, s, 0.0), counts, sums[:-1]))
+        return lanewise(_appended, parts, lanes([lowest], (1,), wide=True))
 
     def _enter_on_palm(
         self,
@@ -414,6 +412,10 @@ class Search:
         if pairs.set.remembers:
             alike |= pairs.remembered({"owner": owner, "sphere": jnp.where(owner, *spheres)})
         pairs.enter(row, which, owner, kept[0], kept[1], alike)
+
+
+def _appended(one: jax.Array, other: jax.Array) -> jax.Array:
+    return jnp.concatenate([one, other])
 
 
 def each(count: int, body: Callable[[Any], None]) -> None:

@@ -255,9 +255,12 @@ def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, w
     """
     ball = sphere_ball(mine[0], mine[1], mine[2], which)
     cone = cone_of(scene, numbers)
-    found = sections.ball_on_palm(ball, (*palm[:2], size))
+    found, seen = list(sections.ball_on_palm(ball, (*palm[:2], size))), None
+    if scene.effects.speculative_palm:
+        vel = mine[0].vel - palm.vel
+        found[0], seen = sections.ahead(found[0], vel, scene.discretization.timestep)
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in found]
-    return _between(ends, mine[0][2:], palm[2:])
+    return _between([_with(ends[0], seen), ends[1]], mine[0][2:], palm[2:])
 
 
 def palm_sums(vertex, mine: tuple, palm: tuple) -> jax.Array:
@@ -270,6 +273,37 @@ def palm_sums(vertex, mine: tuple, palm: tuple) -> jax.Array:
     """
     none = jnp.zeros((sections.SUMS, *mine[0].shape[1:]), mine[0].dtype)
     return sections.add_vertex(none, *sections.on_palm(vertex, mine, palm))
+
+
+def ahead_gap(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side):
+    """The gap of a vertex of a half row as `sections.add_ahead` has it; see `ahead_sums`."""
+    return _half_ahead(timestep, vertex, mine, palm, vels, side)[0][2][0, 0]
+
+
+def ahead_sums(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side, lowest):
+    """What a vertex of a half row adds to `sections.pressure_ahead`.
+
+    Args:
+      timestep: Time step [s].
+      vertex: As in `palm_sums`.
+      mine: As in `palm_sums`.
+      palm: As in `palm_sums`.
+      vels: Velocities of the links before and behind its joint and of the palm.
+      side: Side of the half row, see `sections.half_of_row`.
+      lowest: The lowest gap of the half row.
+    """
+    half, other, seen = _half_ahead(timestep, vertex, mine, palm, vels, side)
+    return sections.part_ahead(half, other, seen, lowest + ROUNDING)
+
+
+ROUNDING = 0.1 * sections.TOUCH
+"""By how much the lowest gap may differ when it is computed again [m]."""
+
+
+def _half_ahead(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side) -> tuple:
+    own, other = sections.on_palm(vertex, mine, palm)
+    own, seen = sections.ahead(own, hull.across(*vels), timestep)
+    return sections.half_of_row(vertex, own, side), other, seen
 
 
 def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
@@ -291,11 +325,28 @@ def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
     """Power of a row on another finger's row; mine and theirs: sides before and behind."""
     cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
-    moves = [
+    return _between(ends, *_row_moves(mine, theirs))
+
+
+def row_on_palm(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
+    """As `between_rows`, of a half row on the palm ahead of touch."""
+    cone = cone_of(scene, numbers)
+    *places, seen = sections.pressure_ahead(sums)
+    ends = [HullSet.contacts(end, cone) for end in places]
+    return _between([_with(ends[0], seen), ends[1]], *_row_moves(mine, theirs))
+
+
+def _row_moves(mine: tuple, theirs: tuple) -> list[list]:
+    """Velocity, acceleration and virtual acceleration of two rows, of nine components each."""
+    return [
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
         for before, after in (mine, theirs)
     ]
-    return _between(ends, *moves)
+
+
+def _with(contacts: Contacts, seen: tuple | None) -> Contacts:
+    """Contacts that act ahead of touch, see `Contacts.ahead`."""
+    return contacts if seen is None else contacts._replace(ahead=tuple(s[0] for s in seen))
 
 
 def _between(ends: list[Contacts], mine: Any, theirs: Any) -> jax.Array:

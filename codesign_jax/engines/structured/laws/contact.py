@@ -70,7 +70,7 @@ class Contacts(NamedTuple):
         joint's angular velocity x lever, shape (3, ...).
       ends: Of contacts between fingers their links, see `finger_pairs`.
       ahead: Of contacts that act ahead of touch, see `sections.ahead`: the distance as far as it is
-        negative [m], and the speed that would close what is left of it in a step [m/s], shape (...).
+        negative [m], and the speed that would close in a step what is left of it [m/s], (...).
     """
 
     point: jax.Array

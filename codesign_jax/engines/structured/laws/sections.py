@@ -87,7 +87,7 @@ def on_palm(vertex, own: tuple, palm: tuple) -> tuple[tuple, tuple]:
 
 
 REACH = 0.010
-"""Gap at a step's end, at the velocity of its beginning, from which on a contact is a candidate [m].
+"""Gap at a step's end, at the velocity of its beginning, below which a contact may act [m].
 
 Fingers that come loose are accelerated by more than 100 m/s^2 and so move a centimetre in a step.
 """
@@ -284,12 +284,12 @@ def add_vertex(sums: jax.Array, mine: tuple, other: tuple) -> jax.Array:
 
 
 AHEAD = SUMS + 3
-"""Numbers of `add_ahead`: the lowest gap, both of `Contacts.ahead` x share, and `SUMS` others."""
+"""Numbers of `add_ahead`: `SUMS`, both of `Contacts.ahead` x share, and the lowest gap."""
 TOUCH = 1e-6
 """Depth that the nearest vertex of a row counts with where none is in the palm [m]."""
 
 
-def half_of_row(vertex, mine: tuple, side: int) -> tuple:
+def half_of_row(vertex, mine: tuple, side) -> tuple:
     """A vertex of `ahead` as one of the half of its row on one side of the finger, -1 or 1.
 
     One contact a row would leave the finger free to roll, which the step after would see.
@@ -301,22 +301,35 @@ def half_of_row(vertex, mine: tuple, side: int) -> tuple:
 
 
 def none_ahead(like: jax.Array) -> jax.Array:
-    """Sums of no vertices, with the lowest gap that a candidate may have."""
+    """Sums of no vertices, with the largest gap that a candidate may have."""
     zero = jnp.zeros_like(like)
-    return jnp.stack([zero + REACH, *[zero] * (AHEAD - 1)])
+    return jnp.stack([*[zero] * (AHEAD - 1), zero + REACH])
+
+
+def part_ahead(mine: tuple, other: tuple, seen: tuple, lowest: jax.Array) -> jax.Array:
+    """What a vertex of `ahead` adds to the sums: in the palm, or the nearest one where none is.
+
+    Args:
+      mine: The vertex on its own side.
+      other: On the palm's.
+      seen: `Contacts.ahead`.
+      lowest: The lowest gap of all vertices, shape (...).
+    """
+    gap, share = mine[2][0, 0], mine[4][0, 0]
+    depth = jnp.where(gap < 0, -gap, jnp.where(gap <= lowest, TOUCH, 0.0))
+    place = *mine[:2], -depth[None, None], *mine[3:]
+    none = jnp.zeros((SUMS, *gap.shape), gap.dtype)
+    share = jnp.where(depth > 0, share, 0.0)
+    more = jnp.stack([share * part[0, 0] for part in seen])
+    return jnp.concatenate([add_vertex(none, place, other), more])
 
 
 def add_ahead(sums: jax.Array, mine: tuple, other: tuple, seen: tuple) -> jax.Array:
-    """As `add_vertex`, of a vertex of `ahead`; the nearest one alone while none is deeper than 0."""
-    lowest, gap = sums[0], mine[2][0, 0]
-    nearer = gap < lowest
-    depth = jnp.where(gap < 0, -gap, jnp.where(nearer, TOUCH, 0.0))
-    before = jnp.where(nearer & (lowest >= 0), 0.0, sums[1:])
-    share = jnp.where(depth > 0, mine[4][0, 0], 0.0)
-    more = jnp.stack([share * part[0, 0] for part in seen])
-    place = mine[:2] + (-depth[None, None],) + mine[3:]
-    added = [before[:2] + more, add_vertex(before[2:], place, other)]
-    return jnp.concatenate([jnp.minimum(lowest, gap)[None], *added])
+    """As `add_vertex`, of a vertex of `ahead`."""
+    before, gap = sums[-1], mine[2][0, 0]
+    lowest = jnp.minimum(before, gap)
+    kept = jnp.where((gap < before) & (before >= 0), 0.0, sums[:-1])
+    return jnp.concatenate([kept + part_ahead(mine, other, seen, lowest), lowest[None]])
 
 
 def pressure_ahead(sums: jax.Array) -> tuple[tuple, tuple, tuple]:
@@ -324,13 +337,13 @@ def pressure_ahead(sums: jax.Array) -> tuple[tuple, tuple, tuple]:
 
     The row's is the mean of its vertices, less as far as they push in different directions.
     """
-    share, force, normal = sums[3], sums[4], sums[5:8]
+    share, force, normal = sums[0], sums[1], sums[2:5]
     some = force > 0
     square = dot(normal, normal)
     pushes = some & (square > 0)
     agree = jnp.sqrt(jnp.where(pushes, square, 1.0)) / jnp.where(some, force * share, 1.0)
-    seen = tuple((agree * part)[None, None] for part in sums[1:3])
-    return *pressure(sums[3:]), seen
+    seen = tuple((agree * part)[None, None] for part in sums[SUMS : SUMS + 2])
+    return *pressure(sums[:SUMS]), seen
 
 
 def pressure(sums: jax.Array) -> tuple[tuple, tuple]:

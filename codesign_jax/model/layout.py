@@ -164,6 +164,12 @@ def palm_touches(scene: Scene) -> bool:
     return scene.effects.palm_object or scene.effects.palm_table
 
 
+def palm_ahead(scene: Scene) -> bool:
+    """Whether fingers touch the palm ahead of their contact; spheres never do, as MuJoCo's."""
+    e = scene.effects
+    return e.finger_palm and e.speculative_palm and e.surface == "hull"
+
+
 PALM_FROM = 0.25
 """Share of a finger's length from its base that is not tested against the palm, to which it is
 fixed."""

@@ -35,8 +35,6 @@ _SKIN = "its geoms are rigid parts of single bodies"
 
 _IMPEDANCE = "MuJoCo's impedance grows with depth in the elastic force as well"
 
-_NOW = "MuJoCo's contacts act by their depth at the beginning of a step"
-
 _SPRINGS = "the springs of its joints are constants of a rollout"
 
 EFFECTS: Mapping[str, Effect] = {
@@ -54,8 +52,7 @@ EFFECTS: Mapping[str, Effect] = {
     "finger_finger": Effect("fingers touch one another"),
     "finger_palm": Effect("fingers touch the palm's disc"),
     "speculative_palm": Effect(
-        "fingers touch the palm already in the step that would carry them into it",
-        {"mujoco": {True: _NOW}, "mjx": {True: _NOW}},
+        "the hull touches the palm already in the step that would carry it in; spheres do not"
     ),
     "surface": Effect(
         "the fingers' contact points: spheres, or the vertices of the skinned hull",

@@ -23,7 +23,7 @@ from codesign_jax.engines.structured.kernel.teams import team_sum, where
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import hull, sections
 from codesign_jax.engines.structured.world_model import apply_columns
-from codesign_jax.model.layout import first_on_palm
+from codesign_jax.model.layout import first_on_palm, palm_ahead
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
@@ -46,7 +46,7 @@ class Search:
         self.moves, self.palm = (at["now"].palm_motion, at["vel"]), ()
         if pairs.set.palm:
             self.palm = at["place"], at["frame"], step.constant("palm_disc")
-        self.ahead = step.p.scene.effects.speculative_palm
+        self.ahead = palm_ahead(step.p.scene)
         self.timestep = step.p.scene.discretization.timestep
         self.scratch, self.ref, self.block = step.p.scratch, step.scratch, step.block
         self.like = jnp.zeros((step.p.size,), step.finger_state.dtype)
@@ -112,10 +112,8 @@ class Search:
         def one(j: Any) -> None:
             number, ball = j + first, self.read("sphere", j + first)
             mine, _ = lanewise(sections.ball_on_palm, ball, self.palm)
-            row, seen = jax.lax.div(number, jnp.asarray(self.p.k, number.dtype)) + 1, None
-            if self.ahead:
-                mine, seen = lanewise(self._ahead, mine, self.pairs.side("vel", row))
-            self._enter_on_palm(mine, row, number, seen=seen)
+            row = jax.lax.div(number, jnp.asarray(self.p.k, number.dtype)) + 1
+            self._enter_on_palm(mine, row, number)
 
         each(self.p.links * self.p.k - first, one)
 
@@ -140,14 +138,11 @@ class Search:
         return gap.lane < sections.REACH + self.timestep * speed.lane
 
     def _add_ahead(self, sums: tuple, vertex: Any, ends: tuple, vel: Any) -> tuple:
-        mine, seen = self._ahead(ends[0], vel)
+        mine, seen = sections.ahead(ends[0], vel, self.timestep)
         halves = (sections.half_of_row(vertex, mine, side) for side in (-1, 1))
         return tuple(
             sections.add_ahead(s, half, ends[1], seen) for s, half in zip(sums, halves, strict=True)
         )
-
-    def _ahead(self, mine: tuple, vel: Any) -> tuple:
-        return sections.ahead(mine, vel, self.timestep)
 
     def _row_on_palm(self, row: Any, there: jax.Array | None) -> None:
         """Enters one contact of all vertices of a row; there: lanes that have one to try."""

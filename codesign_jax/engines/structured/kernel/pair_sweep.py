@@ -22,6 +22,7 @@ from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import sections
+from codesign_jax.model.layout import palm_ahead
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.sweep import Sweep
@@ -110,7 +111,7 @@ class PairSweep:
         run, of_vertex = partial(powers.between_rows, self.p.scene), powers.palm_sums
         given, fixed, numbers = (mine, body), (), sections.SUMS
         empty: tuple = ((3,), (3, 3), (3, 3)), ((3,), (3, 3), (2,))
-        if self.p.scene.effects.speculative_palm:
+        if palm_ahead(self.p.scene):
             run, numbers = partial(powers.row_on_palm, self.p.scene), sections.AHEAD - 1
             of_vertex = partial(powers.ahead_sums, d.timestep)
             given = *given, (ends[0].vel, ends[1].vel, palm.vel)

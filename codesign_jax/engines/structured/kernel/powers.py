@@ -255,12 +255,9 @@ def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, w
     """
     ball = sphere_ball(mine[0], mine[1], mine[2], which)
     cone = cone_of(scene, numbers)
-    found, seen = list(sections.ball_on_palm(ball, (*palm[:2], size))), None
-    if scene.effects.speculative_palm:
-        vel = mine[0].vel - palm.vel
-        found[0], seen = sections.ahead(found[0], vel, scene.discretization.timestep)
+    found = sections.ball_on_palm(ball, (*palm[:2], size))
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in found]
-    return _between([_with(ends[0], seen), ends[1]], mine[0][2:], palm[2:])
+    return _between(ends, mine[0][2:], palm[2:])
 
 
 def palm_sums(vertex, mine: tuple, palm: tuple) -> jax.Array:
@@ -332,8 +329,9 @@ def row_on_palm(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
     """As `between_rows`, of a half row on the palm ahead of touch."""
     cone = cone_of(scene, numbers)
     *places, seen = sections.pressure_ahead(sums)
-    ends = [HullSet.contacts(end, cone) for end in places]
-    return _between([_with(ends[0], seen), ends[1]], *_row_moves(mine, theirs))
+    one, other = (HullSet.contacts(end, cone) for end in places)
+    one = one._replace(ahead=tuple(part[0] for part in seen))
+    return _between([one, other], *_row_moves(mine, theirs))
 
 
 def _row_moves(mine: tuple, theirs: tuple) -> list[list]:
@@ -342,11 +340,6 @@ def _row_moves(mine: tuple, theirs: tuple) -> list[list]:
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
         for before, after in (mine, theirs)
     ]
-
-
-def _with(contacts: Contacts, seen: tuple | None) -> Contacts:
-    """Contacts that act ahead of touch, see `Contacts.ahead`."""
-    return contacts if seen is None else contacts._replace(ahead=tuple(s[0] for s in seen))
 
 
 def _between(ends: list[Contacts], mine: Any, theirs: Any) -> jax.Array:

@@ -286,7 +286,7 @@ def add_vertex(sums: jax.Array, mine: tuple, other: tuple) -> jax.Array:
 AHEAD = SUMS + 3
 """Numbers of `add_ahead`: `SUMS`, both of `Contacts.ahead` x share, and the lowest gap."""
 TOUCH = 1e-6
-"""Depth that the nearest vertex of a row counts with where none is in the palm [m]."""
+"""Depth that a contact counts with which may act and does not reach the palm [m]."""
 
 
 def half_of_row(vertex, mine: tuple, side) -> tuple:

@@ -8,6 +8,7 @@ row of another finger are one contact, see `sections.pressure`; so are those in 
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -137,13 +138,6 @@ class Search:
         speed = lanewise(sections.fastest, ball, joint, self.pairs.side("vel", row))
         return gap.lane < sections.REACH + self.timestep * speed.lane
 
-    def _add_ahead(self, sums: tuple, vertex: Any, ends: tuple, vel: Any) -> tuple:
-        mine, seen = sections.ahead(ends[0], vel, self.timestep)
-        halves = (sections.half_of_row(vertex, mine, side) for side in (-1, 1))
-        return tuple(
-            sections.add_ahead(s, half, ends[1], seen) for s, half in zip(sums, halves, strict=True)
-        )
-
     def _row_on_palm(self, row: Any, there: jax.Array | None) -> None:
         """Enters one contact of all vertices of a row; there: lanes that have one to try."""
         d, links = self.p.scene.discretization, self._links(row)
@@ -154,11 +148,12 @@ class Search:
         def add(k: Any, sums: Any) -> Any:
             k, mine = self.block.dealt(count, k)
             vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
-            ends = lanewise(sections.on_palm, vertex, links, self.palm)
+            one, other = lanewise(sections.on_palm, vertex, links, self.palm)
             if vel is None:
-                new = lanewise(sections.add_vertex, sums, *ends)
+                new = lanewise(sections.add_vertex, sums, one, other)
             else:
-                new = lanewise(self._add_ahead, sums, vertex, ends, vel)
+                one, seen = lanewise(partial(sections.ahead, self.timestep), one, vel)
+                new = lanewise(sections.add_to_halves, sums, vertex, one, other, seen)
             return new if mine is None else where(mine, new, sums)
 
         if vel is None:

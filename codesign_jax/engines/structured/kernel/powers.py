@@ -299,7 +299,7 @@ ROUNDING = 0.1 * sections.TOUCH
 
 def _half_ahead(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side) -> tuple:
     own, other = sections.on_palm(vertex, mine, palm)
-    own, seen = sections.ahead(own, hull.across(*vels), timestep)
+    own, seen = sections.ahead(timestep, own, hull.across(*vels))
     return sections.half_of_row(vertex, own, side), other, seen
 
 

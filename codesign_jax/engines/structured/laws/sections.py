@@ -93,25 +93,23 @@ Fingers that come loose are accelerated by more than 100 m/s^2 and so move a cen
 """
 
 
-def ahead(mine: tuple, vel: jax.Array, timestep: float) -> tuple[tuple, tuple]:
+def ahead(timestep: float, mine: tuple, vel: jax.Array) -> tuple[tuple, tuple]:
     """A contact that acts in the step that would carry it into what it touches.
 
     Args:
-      mine: Point, normal and gap, and of a vertex its lever and share, on the moving side.
-      vel: Motion of that side relative to the other, shape (6 or 9, ...).
       timestep: Time step h [s].
+      mine: Point, normal, gap, lever and share of a vertex on the moving side.
+      vel: Motion of that side relative to the other, shape (9, ...).
 
     Returns:
       The same with the lower of the gap now and, at this velocity, at the step's end; and
       `Contacts.ahead`, both of shape (1, 1, ...).
     """
-    point, normal, gap, *rest = mine
-    moving = vel[3:6] + cross(vel[:3], point[:, 0])
-    if rest:
-        moving = moving + cross(vel[6:], rest[0][:, 0])
+    point, normal, gap, lever, share = mine
+    moving = vel[3:6] + cross(vel[:3], point[:, 0]) + cross(vel[6:], lever[:, 0])
     later = gap + timestep * dot(normal[:, 0], moving)
     seen = jnp.minimum(gap, 0.0), jnp.maximum(gap, 0.0) / timestep
-    return (point, normal, jnp.minimum(gap, later), *rest), seen
+    return (point, normal, jnp.minimum(gap, later), lever, share), seen
 
 
 def fastest(ball: jax.Array, joint: jax.Array, vel: jax.Array) -> jax.Array:
@@ -330,6 +328,12 @@ def add_ahead(sums: jax.Array, mine: tuple, other: tuple, seen: tuple) -> jax.Ar
     lowest = jnp.minimum(before, gap)
     kept = jnp.where((gap < before) & (before >= 0), 0.0, sums[:-1])
     return jnp.concatenate([kept + part_ahead(mine, other, seen, lowest), lowest[None]])
+
+
+def add_to_halves(sums: tuple, vertex, mine: tuple, other: tuple, seen: tuple) -> tuple:
+    """`add_ahead` of the two halves of a vertex's row, see `half_of_row`."""
+    halves = (half_of_row(vertex, mine, side) for side in (-1, 1))
+    return tuple(add_ahead(s, half, other, seen) for s, half in zip(sums, halves, strict=True))
 
 
 def pressure_ahead(sums: jax.Array) -> tuple[tuple, tuple, tuple]:

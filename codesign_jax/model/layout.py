@@ -172,6 +172,12 @@ def pairings_held(scene: Scene) -> int:
     return (1 << (fingers - 1).bit_length()) - 1
 
 
+def palm_ahead(scene: Scene) -> bool:
+    """Whether fingers touch the palm ahead of their contact; spheres never do, as MuJoCo's."""
+    e = scene.effects
+    return e.finger_palm and e.speculative_palm and e.surface == "hull"
+
+
 PALM_FROM = 0.25
 """Share of a finger's length from its base that is not tested against the palm, to which it is
 fixed."""

@@ -53,6 +53,9 @@ EFFECTS: Mapping[str, Effect] = {
     "object_table": Effect("the object rests on the table"),
     "finger_finger": Effect("fingers touch one another"),
     "finger_palm": Effect("fingers touch the palm's disc"),
+    "speculative_palm": Effect(
+        "the hull touches the palm already in the step that would carry it in; spheres do not"
+    ),
     "surface": Effect(
         "the fingers' contact points: spheres, or the vertices of the skinned hull",
         {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},

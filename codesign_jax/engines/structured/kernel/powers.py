@@ -275,6 +275,37 @@ def palm_sums(vertex, mine: tuple, palm: tuple) -> jax.Array:
     return sections.add_vertex(none, *sections.on_palm(vertex, mine, palm))
 
 
+def ahead_gap(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side):
+    """The gap of a vertex of a half row as `sections.add_ahead` has it; see `ahead_sums`."""
+    return _half_ahead(timestep, vertex, mine, palm, vels, side)[0][2][0, 0]
+
+
+def ahead_sums(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side, lowest):
+    """What a vertex of a half row adds to `sections.pressure_ahead`.
+
+    Args:
+      timestep: Time step [s].
+      vertex: As in `palm_sums`.
+      mine: As in `palm_sums`.
+      palm: As in `palm_sums`.
+      vels: Velocities of the links before and behind its joint and of the palm.
+      side: Side of the half row, see `sections.half_of_row`.
+      lowest: The lowest gap of the half row.
+    """
+    half, other, seen = _half_ahead(timestep, vertex, mine, palm, vels, side)
+    return sections.part_ahead(half, other, seen, lowest + ROUNDING)
+
+
+ROUNDING = 0.1 * sections.TOUCH
+"""By how much the lowest gap may differ when it is computed again [m]."""
+
+
+def _half_ahead(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side) -> tuple:
+    own, other = sections.on_palm(vertex, mine, palm)
+    own, seen = sections.ahead(timestep, own, hull.across(*vels))
+    return sections.half_of_row(vertex, own, side), other, seen
+
+
 def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
     """What a vertex of the own row adds to `sections.pressure` of another finger's row.
 
@@ -303,11 +334,24 @@ def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers, held: 
     """
     cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
-    moves = [
+    return _between(ends, *_row_moves(mine, theirs), held)
+
+
+def row_on_palm(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
+    """As `between_rows`, of a half row on the palm ahead of touch."""
+    cone = cone_of(scene, numbers)
+    *places, seen = sections.pressure_ahead(sums)
+    one, other = (HullSet.contacts(end, cone) for end in places)
+    one = one._replace(ahead=tuple(part[0] for part in seen))
+    return _between([one, other], *_row_moves(mine, theirs))
+
+
+def _row_moves(mine: tuple, theirs: tuple) -> list[list]:
+    """Velocity, acceleration and virtual acceleration of two rows, of nine components each."""
+    return [
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
         for before, after in (mine, theirs)
     ]
-    return _between(ends, *moves, held)
 
 
 def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:

@@ -303,11 +303,11 @@ def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers, held: 
     """
     cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
-    moves = [
+    one, other = (
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
         for before, after in (mine, theirs)
-    ]
-    return _between(ends, *moves, held)
+    )
+    return _between(ends, one, other, held)
 
 
 def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:

@@ -68,7 +68,7 @@ class Dense:
             rows = slice(c.efc_address, c.efc_address + 3)
             jac = data.efc_J.reshape(-1, oracle.nv)[rows]
             self.rows.append((jac, data.efc_aref[rows], 1 / data.efc_D[rows][:2], c.friction[0]))
-        self.num_hull = 0
+        self.num_hull, self.held = 0, []
         for f in range(scene.num_fingers):
             self._add_finger(scene, oracle, data, hand, f)
 
@@ -208,7 +208,7 @@ class DensePairs(Dense):
     def __init__(self, scene, model, data, hand, grip=None):
         """Grip: friction coefficient that the first of two fingers uses on the second one, (3,)."""
         super().__init__(scene, model, data, hand)
-        self.held, self.grip = [], grip
+        self.grip = grip
         self.pairs = self.merged = self.on_palm = self.ahead = 0
         if scene.effects.finger_palm:
             for f in range(scene.num_fingers):

@@ -333,7 +333,6 @@ for kind, turn in ROLLED.items():
     )(functools.partial(snaps, turn))
 
 half = "two crossed hull fingers that hold by friction_memory, half the friction limit"
-
 case(34, half, "way in 4.5 s under 5 and 15 N", unit="m", **loaded)(creeps)
 case(
     34,

@@ -346,12 +346,13 @@ def row_on_palm(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
     return _between([one, other], *_row_moves(mine, theirs))
 
 
-def _row_moves(mine: tuple, theirs: tuple) -> list[list]:
+def _row_moves(mine: tuple, theirs: tuple) -> tuple[list, list]:
     """Velocity, acceleration and virtual acceleration of two rows, of nine components each."""
-    return [
+    one, other = (
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
         for before, after in (mine, theirs)
-    ]
+    )
+    return one, other
 
 
 def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:

@@ -89,7 +89,7 @@ def on_palm(vertex, own: tuple, palm: tuple) -> tuple[tuple, tuple]:
 REACH = 0.006
 """Gap at a step's end, at the velocity of its beginning, below which a contact may act [m].
 
-Fingers that come loose are accelerated by more than 100 m/s^2 and so move half a centimetre and more in a step.
+Fingers that come loose from rest move by half a centimetre in a step of 10 ms.
 """
 
 

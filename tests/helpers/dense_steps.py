@@ -279,7 +279,7 @@ class DensePairs(Dense):
                     found.append((part * share, later[-1], normal, jac, depth))
             if max(later) <= 0:  # none will be inside: the nearest one may come in
                 near = np.argmax(later)
-                found = [(found[near][0], 1e-6, *found[near][2:])] if later[near] > -0.01 else []
+                found = [(found[near][0], 1e-6, *found[near][2:])] if later[near] > -0.006 else []
             found = [v for v in found if v[1] > 0]
             if found:
                 share, _, _, _, depth = (np.array([v[k] for v in found]) for k in range(5))

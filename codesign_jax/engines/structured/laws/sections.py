@@ -86,10 +86,10 @@ def on_palm(vertex, own: tuple, palm: tuple) -> tuple[tuple, tuple]:
     return mine, (at, -normal[:, None], gap, jnp.zeros_like(lever)[:, None], share)
 
 
-REACH = 0.010
+REACH = 0.006
 """Gap at a step's end, at the velocity of its beginning, below which a contact may act [m].
 
-Fingers that come loose are accelerated by more than 100 m/s^2 and so move a centimetre in a step.
+Fingers that come loose from rest move by half a centimetre in a step of 10 ms.
 """
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import solver
+from codesign_jax.engines.structured.kernel import grip, solver
 from codesign_jax.engines.structured.kernel.chord import LARGEST, Chord
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
@@ -79,6 +79,9 @@ class Newton:
                 found = now, alpha, residual
                 confirm = partial(self.confirm, *found, done, scale, likely, tolerance)
                 now, alpha, residual = choose(anywhere(likely), confirm, found, self.block.size)
+            if grip.kept(problem):
+                ends = busy & ((residual.lane <= tolerance) | (count + 1 >= iterations))
+                grip.settle(problem, alpha, ends)
             return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:

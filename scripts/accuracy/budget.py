@@ -102,6 +102,8 @@ VARIANTS: dict[str, Variant] = {
     "spheres": Variant(changes=("effects.surface=spheres",)),
     "fingers pass each other": Variant(changes=("effects.finger_finger=false",)),
     "fingers pass the palm": Variant(changes=("effects.finger_palm=false",)),
+    "fingers creep": Variant(changes=("effects.friction_memory=false",)),
+    "palm once inside": Variant(changes=("effects.speculative_palm=false",)),
     "constants": Variant(drawn=True),
     "4 iterations": Variant(changes=("newton.iterations=4",)),
     "1e-3": Variant(changes=LOOSE),

@@ -46,6 +46,8 @@ CHANGES = (
     Change("the material's damping alone", "standard", "least", NUMERICS),
     Change("step, links and skin at once: the truth", "standard", "truth", NUMERICS),
     Change("the truth refined again", "truth", "finer", NUMERICS),
+    Change("the palm acts once a finger is in it", "standard", "palm once inside", NUMERICS),
+    Change("fingers creep on one another", "standard", "fingers creep", MODELS),
     Change("soft touch", "standard", "soft touch", MODELS),
     Change("pressure resists sideways bending", "standard", "lateral threshold", MODELS),
     Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),

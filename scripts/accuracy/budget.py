@@ -29,7 +29,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.types import Status, Trial, failed
 from scripts.accuracy import decision, worlds
-from scripts.shared import output, provenance, work
+from scripts.shared import output, provenance, sets, work
 
 DESIGNS, TRIALS, FEW = 30, 40, 16
 """Designs, trials of each, and trials of the dearest variants: the first ones."""
@@ -199,10 +199,8 @@ def calibrated(the_scene: Scene, trials: int, designs: int) -> Any:
       trials: Trials of a design.
       designs: Designs, which meet the same sets.
     """
-    from scripts.calibration import score, sets
-
     with np.load(CALIBRATED) as file:
-        left = file["units"][score.plausible(file["distances"])]
+        left = file["units"][sets.plausible(file["distances"])]
     rows = np.random.default_rng(decision.SEED).permutation(len(left))[
         np.arange(trials) % len(left)
     ]

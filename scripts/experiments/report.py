@@ -230,7 +230,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     both = [statistics.median(study.convergence(r)[-1] * study.per_episode) for r in RULES]
     converged = (
         f"{name}: {paper} simulations to convergence (concurrent)",
-        f"median {_interval(both[0])}, mean {_interval(_mean(episodes[-1] * study.per_episode))}; "
+        f"median {_interval(both[0])}, mean {_interval(mean(episodes[-1] * study.per_episode))}; "
         f"failed trials at the maximum: median {_interval(both[1])}",
     )
     if len(study.strategies) < 3:  # a trend needs three
@@ -248,7 +248,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     ]
 
 
-def _mean(simulations: np.ndarray) -> Interval:
+def mean(simulations: np.ndarray) -> Interval:
     """Mean with its interval; without end where a run never converged."""
     if not np.isfinite(simulations).all():
         return Interval(np.inf, np.inf, np.inf)

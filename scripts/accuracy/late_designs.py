@@ -7,23 +7,21 @@ made before fingers touched the palm.  The table of the hard cases reads the fil
 """
 
 import argparse
-import functools
 import sys
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
-from codesign_jax import model, rollout
+from codesign_jax import rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import Scene, load, parameters
 from codesign_jax.types import Params, Status, Trial, failed
 from scripts.accuracy import decision
-from scripts.shared import output, provenance
+from scripts.shared import depths, output, provenance
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "h": {},
@@ -66,7 +64,7 @@ def simulated(
         )
         part = {"status": status, "cost": cost}
         if deep:
-            part["depth"] = depths(scene, worlds, each, qpos)
+            part["depth"] = deepest(scene, worlds, each, qpos)
         parts.append(part)
     return {
         name: np.concatenate([p[name] for p in parts]).reshape(len(designs), trials)
@@ -74,74 +72,14 @@ def simulated(
     }
 
 
-def depths(scene: Scene, params: Params, trials: Trial, qpos: np.ndarray) -> np.ndarray:
+def deepest(scene: Scene, params: Params, trials: Trial, qpos: np.ndarray) -> np.ndarray:
     """How deep the fingers of hands are in one another [m], shape (world,)."""
     found = []
     for world, q in enumerate(qpos):
         mine = jax.tree.map(lambda v, world=world: v[world], (params, trials))
-        found.append(depth(scene, _model(scene, *mine), mine[0], q))
+        at = depths.poses(depths.compiled(scene, *mine), q[None])
+        found.append(depths.in_fingers(scene, mine[0], at)[0][0])
     return np.array(found)
-
-
-def _model(scene: Scene, params: Params, trial: Trial) -> mujoco.MjModel:
-    """MuJoCo's model of a world, with which states are read."""
-    from codesign_jax.engines.mujoco import world_model
-
-    return world_model(scene, jax.tree.map(np.asarray, _fields(scene, params, trial)))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _fields(scene: Scene, params: Params, trial: Trial) -> Any:
-    return model.model_fields(scene, params, trial)
-
-
-def depth(scene: Scene, compiled: mujoco.MjModel, params: Params, qpos: np.ndarray) -> float:
-    """Largest depth of a point of a finger's outline in a link of another one [m].
-
-    A link reaches from its joint to the next one, the last to the tip, with the outline
-    |y/a|^4 + |z/b|^4 = 1, whose points stand at four places of each.
-
-    Args:
-      scene: The scene.
-      compiled: The model of the world.
-      params: The hand.
-      qpos: The state.
-    """
-    data, lay = mujoco.MjData(compiled), model.layout(scene)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(compiled, data)
-    around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    unit = np.stack([np.cos(around), np.sin(around)], 1)
-    unit /= ((unit**4).sum(1) ** 0.25)[:, None]
-    points, frames, halves = [], [], []
-    for f, bodies in enumerate(lay.bodies):
-        half = np.array([scene.hand.section.width, float(params.height[f])]) / 2
-        span = (
-            float(params.length[f])
-            / lay.links
-            * np.where(np.arange(lay.links) < lay.links - 1, 1, 0.5)
-        )
-        ring = np.c_[0 * unit[:, 0], unit * half + [0, half[1]]]
-        local = np.concatenate(
-            [ring + np.outer(part * span, [1, 0, 0])[:, None] for part in (0, 0.25, 0.5, 0.75)], 1
-        )
-        turn = data.xmat[bodies].reshape(-1, 3, 3)
-        points.append((data.xpos[bodies][:, None] + local @ turn.swapaxes(1, 2)).reshape(-1, 3))
-        frames.append((data.xpos[bodies], turn))
-        halves.append((span, *half))
-    worst = 0.0
-    for one, other in np.ndindex(len(points), len(points)):
-        if one == other:
-            continue
-        (place, turn), (span, a, b) = frames[other], halves[other]
-        x, y, z = np.moveaxis((points[one][:, None] - place)[..., None, :] @ turn, -1, 0)[..., 0]
-        units = np.abs([y / a, (z - b) / b])
-        phi = np.maximum((units**4).sum(0) ** 0.25, 1e-9)
-        slope = np.sqrt(((units / phi) ** 6 / np.array([a, b])[:, None, None] ** 2).sum(0))
-        inside = (x >= 0) & (x <= span) & (phi < 1)
-        if inside.any():
-            worst = max(worst, float(((1 - phi) / slope)[inside].max()))
-    return worst
 
 
 def told(scene: Scene, found: dict[str, np.ndarray]) -> dict[str, Any]:

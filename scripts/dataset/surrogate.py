@@ -100,15 +100,18 @@ class Model(NamedTuple):
       layers: Weights and biases.
       mean: Of the inputs.
       spread: Of the inputs.
+      range: Lowest and highest inputs that it learnt from, to which others are clipped.
     """
 
     layers: list
     mean: np.ndarray
     spread: np.ndarray
+    range: tuple[np.ndarray, np.ndarray]
 
     def logit(self, inputs: jax.Array) -> jax.Array:
         """Log odds that grasps are kept, shape (grasp,)."""
-        return _forward(self.layers, (inputs - self.mean) / self.spread)
+        seen = jnp.clip(inputs, *self.range)
+        return _forward(self.layers, (seen - self.mean) / self.spread)
 
 
 def _forward(layers: list, x: jax.Array) -> jax.Array:
@@ -138,7 +141,7 @@ def train(grasps: Grasps, told: np.ndarray, seed: int = 0) -> Model:
     draws = np.random.default_rng(seed)
     x, own = inputs(grasps, told), np.unique(grasps.design)
     out = np.isin(grasps.design, draws.choice(own, max(1, len(own) // 10), replace=False))
-    mean, spread = x.mean(0), x.std(0)
+    mean, spread, seen = x.mean(0), x.std(0), (x.min(0), x.max(0))
     spread = np.where(spread > 1e-6, spread, 1.0)
     x, sizes = (x - mean) / spread, (x.shape[1], *WIDTHS, 1)
     layers = [
@@ -160,7 +163,7 @@ def train(grasps: Grasps, told: np.ndarray, seed: int = 0) -> Model:
         layers, state = step(layers, state, x[rows], grasps.kept[rows])
         if number % 50 == 49 and (now := float(loss(layers, x[out], grasps.kept[out]))) < least:
             best, least = layers, now
-    return Model(best, mean, spread)
+    return Model(best, mean, spread, seen)
 
 
 def predicted(model: Model, grasps: Grasps, told: np.ndarray) -> np.ndarray:

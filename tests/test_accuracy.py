@@ -230,7 +230,7 @@ def test_tips_of_a_shorter_step_come_closer_to_the_reference():
 
 
 def test_populations_are_distinct_final_particles_of_every_quality():
-    data = ROOT / "docs" / "data" / "paper"
+    data = ROOT / "docs" / "data" / "paper_fingers_single"
     found = decision.populations(data, 60)
     with np.load(data / "23d.npz") as file:
         final, cost = file["final_particles"], file["test_exclude"].ravel()
@@ -239,7 +239,7 @@ def test_populations_are_distinct_final_particles_of_every_quality():
     assert cost[index].max() > 2.0 and cost[index].min() < 0.05
     assert len(np.unique(found["late"], axis=0)) == 60
     runs = [[(run == p).all(1).any() for run in final[-1]] for p in found["late"]]
-    assert np.all(np.sum(runs, 0) >= 2)  # two of each concurrent run
+    assert np.all(np.sum(runs, 0) >= 2)  # two of each run
     with pytest.raises(ValueError, match="distinct"):
         decision.populations(data, 10_000)
 
@@ -294,7 +294,7 @@ def test_a_case_that_kills_its_process_counts_as_failed_after_two_attempts(tmp_p
 
 
 def test_cases_have_names_of_their_own():
-    data = ROOT / "docs" / "data" / "paper"
+    data = ROOT / "docs" / "data" / "paper_fingers"
     for size in study.SIZES.values():
         every = study.cases(size, study.PARTS, ENGINES, data, gpu=True)
         assert len({c.key for c in every}) == len(every)

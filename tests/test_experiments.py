@@ -416,12 +416,3 @@ def test_the_script_simulates_and_draws(tmp_path):
     assert drawn.returncode == 0 and (tmp_path / "figures" / "fig7a_success.png").exists()
     refused = call(*run, "--seed", "7")
     assert refused.returncode == 1 and "belongs to another experiment" in refused.stderr
-
-
-@pytest.mark.slow
-def test_the_structured_engine_gives_the_same_bits_on_two_devices(tmp_path):
-    path, command = tmp_path / "devices.json", [sys.executable, "-m", "scripts.experiments.devices"]
-    subprocess.run([*command, "--json", str(path), "--size", "tiny"], cwd=ROOT, check=True)
-    found = json.loads(path.read_text())
-    assert found["compared"]["arrays"] == 10
-    assert [row["different_arrays"] for row in found["devices"].values()] == [[], []]

@@ -3,7 +3,6 @@
 python -m scripts.experiments 2d --out runs/reproduction           # on a GPU; again to resume
 timeout -s INT 500 python -m scripts.experiments 2d --out runs/reproduction    # stop after a time
 python -m scripts.experiments 2d --out runs/small --size cpu       # minutes on a CPU
-python -m scripts.experiments 2d --parquet runs/2d.parquet         # every grasp, also afterwards
 python -m scripts.experiments types --videos docs/figures            # what the landscape's hands do
 python -m scripts.experiments figures --data docs/data/reproduction
 """
@@ -21,10 +20,9 @@ from codesign_jax import runs, scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
-from codesign_jax.runs.parquet import library
 from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.scene.schema import InputError
-from scripts.experiments import landscape, parquet, plan, results, strategies
+from scripts.experiments import landscape, plan, results, strategies
 from scripts.shared import output, provenance
 
 
@@ -58,7 +56,6 @@ def parse() -> argparse.Namespace:
         type=Path,
         help="write every trial to this .npz",
     )
-    parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
     parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
     parser.add_argument(
         "--touching",
@@ -76,8 +73,6 @@ def parse() -> argparse.Namespace:
 def simulate(args: argparse.Namespace) -> int:
     """Runs or resumes an experiment; returns the exit status."""
     common.use_compilation_cache()
-    if args.parquet:
-        library(parquet.FLAG)  # refused before hours of simulation, not after
     the_plan = plan.experiment(args.experiment, args.size)
     try:
         the_plan = plan.narrowed(the_plan, args.strategies, args.runs)
@@ -122,9 +117,7 @@ def _strategies(
     rate = timing.grasps / max(timing.seconds, 1e-9)
     seconds = time.perf_counter() - start
     process = results.Process(timing.grasps, seconds, timing.compile_seconds, rate)
-    notes = _write(args, kept, found, process, before, (the_plan, the_scene), (grasps, screened))
-    if args.parquet:
-        print(parquet.write_strategies(args.parquet, the_plan, space, found, notes))
+    _write(args, kept, found, process, before, (the_plan, the_scene), (grasps, screened))
     return code
 
 
@@ -149,9 +142,7 @@ def _landscape(
     grasps = the_plan.grasps - earlier
     process = results.Process(grasps, seconds, 0.0, grasps / seconds)
     sizes = the_plan.grasps, 0
-    notes = _write(args, kept, found, process, before, (the_plan, the_scene), sizes)
-    if args.parquet:
-        print(parquet.write_landscape(args.parquet, the_plan.name, space, found, notes))
+    _write(args, kept, found, process, before, (the_plan, the_scene), sizes)
     return 0
 
 
@@ -163,9 +154,8 @@ def _write(
     before: dict[str, Any] | None,
     subject: tuple[Any, Scene],
     grasps: tuple[int, int],
-) -> dict[str, Any]:
-    """Writes the results; returns their provenance: that of who made them, if nothing is new."""
-    notes = before or {}
+) -> None:
+    """Writes the results; where nothing is new, who made them stays noted."""
     if process.grasps or before is None:
         settings = results.settings_of(*subject, args.engine, args.seed)
         made = {"before": before, "commit": args.commit}
@@ -174,7 +164,6 @@ def _write(
             print(path)
     if args.trials:
         print(output.write_arrays(args.trials, found))
-    return notes
 
 
 def find_types(args: argparse.Namespace) -> int:

@@ -32,9 +32,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     """
     problems, scene = [], None
     try:
-        problems += common.solver_problems(
-            [*chain.from_iterable(options.overrides)], options.engine or engines.DEFAULT
-        )
+        problems += common.engine_problems(options.engine or engines.DEFAULT, options.overrides)
         scene = common.load_scene(options)
     except InputError as error:
         problems += error.problems
@@ -94,13 +92,10 @@ def _flag_problems(options: "Optimize") -> list[str]:
     available = jax.local_device_count() if options.jobs is None else options.devices or 1
     if options.devices is not None and not 1 <= options.devices <= available:
         problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
-    for name, count, low, high in (
+    return problems + common.number_problems(
         ("--reference-trials", options.reference_trials, 0, 100_000),
         ("--chunk", options.chunk, 1, 10_000_000),
-    ):
-        problem = None if count is None else schema.range_problem(name, count, "", low, high)
-        problems += [problem] if problem else []
-    return problems
+    )
 
 
 def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:

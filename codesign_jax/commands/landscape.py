@@ -1,6 +1,5 @@
 """`codesign landscape`."""
 
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -112,17 +111,14 @@ def _refuse_other_scene(folder: Path, case: Case) -> None:
 
 
 def _check(options: "Options", case: Case) -> None:
-    ranges = (
+    problems = common.number_problems(
         ("--points", options.points, 2, 1000),
         ("--trials", options.trials, 1, 100_000),
         ("--seed", options.seed, 0, 2**31 - 1),
     )
-    found = [schema.range_problem(name, v, "", low, high) for name, v, low, high in ranges]
-    problems = [problem for problem in found if problem]
-    problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
+    problems += common.engine_problems(case.engine, options.overrides)
     if problems:
         raise InputError(problems)
-    common.check_engine(case.engine)
 
 
 def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import time
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset, parquet, rates
 from codesign_jax.runs.dataset import Question, Shards
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.scene import Scene, schema
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome
@@ -73,20 +72,17 @@ def main(options: "Sample") -> int:
 
 def _check(options: "Sample") -> None:
     """Refuses numbers out of range, and a place that cannot be written."""
-    ranges = (
+    problems = common.number_problems(
         ("--designs", options.designs, 1, MOST),
         ("--trials", options.trials, 1, 100_000),
         ("--seed", options.seed, 0, 2**31 - 1),
-        ("--chunk", 1 if options.chunk is None else options.chunk, 1, 10_000_000),
+        ("--chunk", options.chunk, 1, 10_000_000),
     )
-    found = [schema.range_problem(name, v, "", low, high) for name, v, low, high in ranges]
-    problems = [problem for problem in found if problem]
     if options.out.suffix != ".parquet":
         problems.append(f"--out {options.out} must end in .parquet")
-    problems += common.solver_problems([*chain.from_iterable(options.overrides)], options.engine)
+    problems += common.engine_problems(options.engine, options.overrides)
     if problems:
         raise InputError(problems)
-    common.check_engine(options.engine)
     if not options.outcomes:
         parquet.library("codesign sample")
     common.check_place("--out", options.out)

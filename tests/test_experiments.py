@@ -132,7 +132,7 @@ def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
     for e in range(PLAN.episodes):
         state, info = episode(state, mask[e])
         costs.append(info.selection.cost)
-    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.trials)
+    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.outcomes)
     test = codesign.final_test(
         scene, evaluate, state.particles, key, num_trials=PLAN.test_trials, previous=kept
     )
@@ -143,8 +143,8 @@ def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
     assert got["seed_candidates"][run] == drawn
     np.testing.assert_allclose(got["cost"][strategy, run], costs, **close)
     np.testing.assert_allclose(got["particles"][strategy, run], state.particles, **close)
-    np.testing.assert_allclose(got["test_cost"][strategy, run], test.trials.cost, **close)
-    np.testing.assert_array_equal(got["test_status"][strategy, run], test.trials.status)
+    np.testing.assert_allclose(got["test_cost"][strategy, run], test.outcomes.cost, **close)
+    np.testing.assert_array_equal(got["test_status"][strategy, run], test.outcomes.status)
 
 
 def test_one_program_serves_seeds_episodes_and_tests(toy, finished):

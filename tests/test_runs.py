@@ -67,7 +67,7 @@ def run():
         num_trials=s.test_trials,
         previous=record.last_outcomes(),
     )
-    record.test = test.trials
+    record.test = test.outcomes
     return the_scene, space, record, test
 
 
@@ -160,7 +160,7 @@ def test_a_record_of_an_older_version_tells_nothing_of_the_solver(run):
         del outcomes["capped"], outcomes["residual"]
     again = records.from_arrays(arrays)
     assert again.test is not None and np.isnan(again.test.capped).all()
-    np.testing.assert_array_equal(again.history.trials.cost, record.history.trials.cost)
+    np.testing.assert_array_equal(again.history.outcomes.cost, record.history.outcomes.cost)
     for row in tables._trials(again.history, the_scene, range(1)):
         assert row["steps_at_limit"] == row["residual"] == ""
 
@@ -181,7 +181,7 @@ def test_tables_hold_the_history_with_units(run, tmp_path):
     tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
     tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
     history, trials = record.history, read(tmp_path / "trials.csv")
-    assert [np.float32(r["cost"]) for r in trials] == history.trials.cost.ravel().tolist()
+    assert [np.float32(r["cost"]) for r in trials] == history.outcomes.cost.ravel().tolist()
     assert {r["object"] for r in trials} == {"sphere"}
     assert {r["status"] for r in trials} == {"OK"}
     lengths = [float(r["length_mm"]) for r in read(tmp_path / "particles.csv")]

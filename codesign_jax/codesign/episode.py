@@ -34,7 +34,7 @@ class EpisodeInfo(NamedTuple):
 
     Attributes:
       population: Particles as simulated [SI units], shape (particle, parameter).
-      trials: Cost, status, time of loss and first bad step, each of shape (particle, trial).
+      outcomes: Cost, status, time of loss and first bad step, each of shape (particle, trial).
       selection: Particle costs, and weights and ancestors of a resampling; see `optimize.Info`.
       last: States at which the worlds ended, failed ones frozen at their last good one, shape
         (particle, trial, nq + nv), or None if the engine does not report them.
@@ -42,7 +42,7 @@ class EpisodeInfo(NamedTuple):
     """
 
     population: jax.Array
-    trials: Outcome
+    outcomes: Outcome
     selection: Info
     last: jax.Array | None = None
     drawn: Trial | None = None
@@ -249,10 +249,10 @@ def _episode(
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
         worlds = scene, engine, hands, noise
-        trials, last = rollout.evaluate_to_end(*worlds, constants=constants, **how)
-        costs = particle_cost(scene.with_constants(constants), trials)
+        outcomes, last = rollout.evaluate_to_end(*worlds, constants=constants, **how)
+        costs = particle_cost(scene.with_constants(constants), outcomes)
         new, selection = optimizer.tell(state, population, costs, mask)
-        return new, EpisodeInfo(population, trials, selection, last)
+        return new, EpisodeInfo(population, outcomes, selection, last)
 
     return episode
 
@@ -313,7 +313,7 @@ def evaluate_by(episode: EpisodeFunction, optimizer: Optimizer) -> EvaluateFunct
     """
 
     def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
-        return episode(*closed(optimizer, population, key))[1].trials
+        return episode(*closed(optimizer, population, key))[1].outcomes
 
     return evaluate
 

@@ -33,12 +33,12 @@ class FinalTest(NamedTuple):
     """How particles did in the final test.
 
     Attributes:
-      trials: Outcomes, every array of shape (particle, trial).
+      outcomes: Arrays of shape (particle, trial).
       cost: Mean cost of each particle by the scene's failure rule, shape (particle,).
       success: Whether the cost is below `SUCCESS_COST`, bool, shape (particle,).
     """
 
-    trials: Outcome
+    outcomes: Outcome
     cost: jax.Array
     success: jax.Array
 
@@ -150,15 +150,15 @@ def testing(
     return summarize_test(scene, jax.tree.map(lambda *v: jnp.concatenate(v, axis=1), *parts))
 
 
-def summarize_test(scene: Scene, trials: Outcome) -> FinalTest:
+def summarize_test(scene: Scene, outcomes: Outcome) -> FinalTest:
     """Returns cost and success of particles from the outcomes of their test.
 
     Args:
       scene: The scene.
-      trials: Outcomes, every array of shape (particle, trial).
+      outcomes: Arrays of shape (particle, trial).
     """
-    cost = particle_cost(scene, trials)
-    return FinalTest(trials, cost, cost < SUCCESS_COST)
+    cost = particle_cost(scene, outcomes)
+    return FinalTest(outcomes, cost, cost < SUCCESS_COST)
 
 
 def verdicts(outcomes: Outcome) -> np.ndarray:

@@ -275,7 +275,7 @@ class Loop:
 
         def answer(reply: tuple[State, EpisodeInfo]) -> Outcome:
             told()
-            return reply[1].trials
+            return reply[1].outcomes
 
         return translated(
             asking,
@@ -321,7 +321,7 @@ class Loop:
 
     def _save_failures(self, e: int, info: EpisodeInfo) -> None:
         """Saves failed worlds with their last good states, for `codesign replay`."""
-        if not types.failed(np.asarray(info.trials.status)).any():
+        if not types.failed(np.asarray(info.outcomes.status)).any():
             return
         for path in failures.save(self.run_directory.path, e + 1, info):
             self.run_directory.log(f"failed world: codesign replay {path}")
@@ -344,7 +344,7 @@ class Loop:
         with self.progress.busy("testing the final particles") as watch:
             told = partial(self._tested_some, watch, batch)
             test = yield from self._evaluated(testing, told)
-        record.test = test.trials
+        record.test = test.outcomes
         self._save(settings.episodes + 1, record)
         self._write_tables(record, settings.episodes)
         self._refuse_all_failed(record)
@@ -352,7 +352,7 @@ class Loop:
         self._say(f"final test: {grasps} grasps in {watch.seconds:.1f} s")
 
     def _report(self, history: History, e: int, seconds: float) -> None:
-        status = history.trials.status[e]
+        status = history.outcomes.status[e]
         line = self.progress.episode(
             e + 1,
             mean=float(history.cost[e].mean()),

@@ -174,7 +174,7 @@ def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[Row
             "episode": e + 1,
             "mean_cost": _number(history.cost[e].mean()),
             "best_cost": _number(history.cost[e, best]),
-            "failed_trials": int(types.failed(history.trials.status[e]).sum()),
+            "failed_trials": int(types.failed(history.outcomes.status[e]).sum()),
             "effective_sample_size": _number(1 / (history.weight[e] ** 2).sum()),
             **_designs("episodes.csv", space, history.population[e, best : best + 1])[0],
         }
@@ -194,7 +194,7 @@ def _particles(history: History, space: DesignSpace, span: range) -> Iterator[Ro
 
 
 def _trials(history: History, scene: Scene, span: range) -> Iterator[Row]:
-    names, trials = [s.name for s in scene.objects.object], history.trials
+    names, trials = [s.name for s in scene.objects.object], history.outcomes
     for e in span:
         for i, t in np.ndindex(*trials.cost.shape[1:]):
             own = {"episode": e + 1, "particle": i, "trial": t, "object": names[t % len(names)]}
@@ -243,7 +243,7 @@ def _of_episodes(
 
 def _of_test(space: DesignSpace, particles: np.ndarray, test: FinalTest) -> Iterator[Row]:
     """Rows of the table of the final test."""
-    failed = types.failed(np.asarray(test.trials.status))
+    failed = types.failed(np.asarray(test.outcomes.status))
     for i, design in enumerate(_designs(TESTS, space, particles)):
         yield {
             "particle": i,

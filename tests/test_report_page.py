@@ -174,4 +174,4 @@ def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
 def test_axes_of_episodes_have_ticks_at_whole_ones(episodes, step):
     from codesign_jax.report import charts  # needs plotly
 
-    assert charts.failures(np.full((episodes, 2, 3), Status.STUCK)).layout.xaxis.dtick == step
+    assert charts.failure_chart(np.full((episodes, 2, 3), Status.STUCK)).layout.xaxis.dtick == step

@@ -58,7 +58,7 @@ def run():
     record = Record(state, records.empty_history(s, space.num_parameters))
     for e in range(s.episodes):
         record.state, info = episode(record.state, np.ones(2, bool))
-        records.report(record.history, e, info)
+        records.add_report(record.history, e, info)
     test = codesign.final_test(
         the_scene,
         codesign.evaluate_by(episode, optimizer),
@@ -278,10 +278,10 @@ def test_estimates_scale_the_most_similar_measurement(tmp_path, monkeypatch):
     shipped = rates.estimate(asked)
     assert "another machine" in shipped.basis and "scaled" in shipped.basis
     other = dataclasses.replace(asked, grasps=800, scene="another", structure="another")
-    rates.record(other, 10.0, 60.0)
+    rates.keep(other, 10.0, 60.0)
     busy = dataclasses.replace(other, grasps=801)
-    rates.record(busy, 10.0, 600.0)  # the computer was busy with something else
-    rates.record(asked, 50.0, 3.0)
+    rates.keep(busy, 10.0, 600.0)  # the computer was busy with something else
+    rates.keep(asked, 50.0, 3.0)
     found = rates.estimate(asked)
     assert (found.grasps_per_second, found.compile_seconds) == (50.0, 3.0)
     assert "50 grasps/s (measured on this machine" in found.basis and "scaled" not in found.basis
@@ -304,14 +304,14 @@ def test_a_damaged_file_of_rates_counts_as_none(content, tmp_path, monkeypatch):
     path.write_text(content)
     assert rates.measured() == []
     work = rates.work(tiny()[0], settings())
-    rates.record(work, 5.0, 1.0)
+    rates.keep(work, 5.0, 1.0)
     assert [r.work for r in rates.measured()] == [work]
 
 
 def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
     (tmp_path / "codesign-jax").write_text("a file, not a folder")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    rates.record(rates.work(tiny()[0], settings()), 5.0, 1.0)
+    rates.keep(rates.work(tiny()[0], settings()), 5.0, 1.0)
     assert rates.measured() == []
 
 

@@ -85,7 +85,7 @@ def _flag_problems(options: "Optimize") -> list[str]:
     if options.job_set and options.jobs is None:
         problems.append("--job-set needs --jobs: its parameters are those of jobs")
     try:
-        jobs.parameters([*chain.from_iterable(options.job_set)])
+        jobs.job_parameters([*chain.from_iterable(options.job_set)])
     except InputError as error:
         problems += error.problems
     # Jobs have the devices of their own hosts, and check there.

@@ -210,7 +210,7 @@ class Calls:
             first, *others = self._seconds
             each = sum(others) / len(others)
             rate = self._size * self._trials.count / each
-            rates.record(work(self._trials, self._size), rate, max(first - each, 0.0))
+            rates.keep(work(self._trials, self._size), rate, max(first - each, 0.0))
 
 
 def joined(parts: list[Outcome]) -> Outcome:

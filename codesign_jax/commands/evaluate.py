@@ -10,9 +10,9 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, rollout, runs, types
-from codesign_jax.commands import common, estimate
+from codesign_jax.commands import common, time_needed
 from codesign_jax.commands.case import Case, find_case
-from codesign_jax.commands.estimate import TimedPart
+from codesign_jax.commands.time_needed import TimedPart
 from codesign_jax.engines import make_engine
 from codesign_jax.report import verdicts
 from codesign_jax.runs import choice, rates, tables
@@ -100,7 +100,7 @@ def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
     if options.render:
         drawn = min(options.trials, len(case.scene.objects.object))
         parts.append(part("the grasps of the picture, without drawing it", drawn))
-    console.print(estimate.text(parts), markup=False)
+    console.print(time_needed.text(parts), markup=False)
 
 
 def simulate(

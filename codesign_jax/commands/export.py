@@ -122,7 +122,7 @@ def write_files(
     """Writes all that is asked for; tolerances if there is an engine to simulate them."""
     _models(case, params, folder, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
-    tables.write_commands(folder, case.scene, grasps.schedule(case.scene, params, nominal))
+    tables.write_commands(folder, case.scene, grasps.timed_controls(case.scene, params, nominal))
     if not options.no_parts:
         _parts(sizes, folder, options, console)
     if not options.no_sheet:
@@ -209,7 +209,7 @@ def _sheet(
 ) -> None:
     from codesign_jax.export import drawing, sheet  # needs the extra
 
-    content = sheet.sections(case.scene, params, sizes, found)
+    content = sheet.sheet_sections(case.scene, params, sizes, found)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
     code = provenance.git_state()

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import calls, common, estimate
+from codesign_jax.commands import calls, common, time_needed
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.cost import particle_cost
@@ -52,7 +52,7 @@ def main(options: "Options") -> int:
     case = find_case(options)
     _check(options, case)
     folder = _folder(options, case)
-    made = grid(case, _columns(case, options.parameters), options.points)
+    made = make_plane(case, _columns(case, options.parameters), options.points)
     console = Console(highlight=False, soft_wrap=True)
     others = [k for k in range(case.space.num_parameters) if k not in made.columns]
     if others:
@@ -143,7 +143,7 @@ def _meant(name: str, known: tuple[str, ...]) -> str:
     return schema.nearest(name, known)
 
 
-def grid(case: Case, columns: tuple[int, int], points: int) -> Plane:
+def make_plane(case: Case, columns: tuple[int, int], points: int) -> Plane:
     """A regular grid over the ranges of two parameters, ends included.
 
     Pressures are lowered under the limit that the walls set, as of every particle.
@@ -167,7 +167,7 @@ def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Conso
     size = calls.equal(len(designs), calls.most_designs(trials))
     grasps = len(designs) * trials.count
     console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
-    console.print(estimate.text([estimate.TimedPart("", calls.work(trials, size), grasps)]))
+    console.print(time_needed.text([time_needed.TimedPart("", calls.work(trials, size), grasps)]))
 
 
 def _trials(case: Case, options: "Options") -> Trials:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from codesign_jax import batch, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
-from codesign_jax.commands import calls, common, estimate
+from codesign_jax.commands import calls, common, time_needed
 from codesign_jax.commands.calls import Meter
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset, parquet, rates
@@ -84,7 +84,7 @@ def _check(options: "Sample") -> None:
     if problems:
         raise InputError(problems)
     if not options.outcomes:
-        parquet.library("codesign sample")
+        parquet.pyarrow_module("codesign sample")
     common.check_place("--out", options.out)
 
 
@@ -138,7 +138,9 @@ def _dry_run(options: "Sample", question: Question, console: Console) -> None:
     work = rates.batch_work(
         question.scene, options.engine, question.chunk * options.trials, devices=1
     )
-    console.print(estimate.text([estimate.TimedPart("", work, _grasps(options))]), markup=False)
+    console.print(
+        time_needed.text([time_needed.TimedPart("", work, _grasps(options))]), markup=False
+    )
     size = dataset.most_bytes(question, options.designs)
     console.print(f"size: at most about {size / 1e6:.1f} MB")
 
@@ -205,7 +207,7 @@ def _record_rate(question: Question, seconds: list[float]) -> None:
         first, *others = seconds
         each, grasps = sum(others) / len(others), question.chunk * question.trials
         work = rates.batch_work(question.scene, question.engine, grasps, devices=1)
-        rates.record(work, grasps / each, max(first - each, 0.0))
+        rates.keep(work, grasps / each, max(first - each, 0.0))
 
 
 def _report(path: Path, found: _Tally, console: Console) -> None:

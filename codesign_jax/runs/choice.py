@@ -169,7 +169,7 @@ def find_grasp(
     )
 
 
-def verdict(outcome: Outcome) -> str:
+def ending(outcome: Outcome) -> str:
     """How a trial ended, in words; its entries are numbers."""
     if failed(int(outcome.status)):
         return f"failed ({status_names(int(outcome.status))})"

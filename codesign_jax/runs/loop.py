@@ -304,7 +304,7 @@ class Loop:
         Raises:
           AllFailed: If every trial failed; the episode is saved.
         """
-        records.report(record.history, e, info)
+        records.add_report(record.history, e, info)
         self._save_failures(e, info)
         last = e + 1 == self.plan.settings.episodes or record.failed_status() is not None
         if last or (e + 1) % self._every == 0:

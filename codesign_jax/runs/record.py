@@ -77,7 +77,7 @@ def with_room(history: History, episodes: int) -> History:
     return jax.tree.map(lambda v: np.pad(v, [(0, more)] + [(0, 0)] * (v.ndim - 1)), history)
 
 
-def report(history: History, episode: int, info: EpisodeInfo) -> None:
+def add_report(history: History, episode: int, info: EpisodeInfo) -> None:
     """Writes the report of an episode into the history's arrays."""
     s = info.selection
     new = History(info.population, info.outcomes, s.cost, s.weight, s.ancestors)
@@ -140,7 +140,7 @@ def to_arrays(record: Record) -> dict:
 
 
 def from_arrays(arrays: dict) -> Record:
-    """Inverse of `to_arrays`; the history is copied, so that `report` may write to it.
+    """Inverse of `to_arrays`; the history is copied, so that `add_report` may write to it.
 
     Raises:
       RunError: If they are not the arrays of a record, such as those of another version.

@@ -106,7 +106,7 @@ def optimize(
     return Results(found, timing or Timing())
 
 
-def names(every: Mapping[Path, Settings]) -> dict[Path, str]:
+def run_names(every: Mapping[Path, Settings]) -> dict[Path, str]:
     """What to call each of several runs: by its seed, and by its schedule if these differ."""
     several = len({own.schedule for own in every.values()}) > 1
     return {
@@ -129,7 +129,7 @@ def _group(
     settings, many = plan.settings, len(plans) > 1
     batch = settings.particles * settings.trials
     ahead = {"test": batch * settings.test_rounds, "after": after}
-    called = names({folder: own.settings for folder, own in plans.items()})
+    called = run_names({folder: own.settings for folder, own in plans.items()})
     with contextlib.ExitStack() as stack:
         total = settings.episodes
         progress = GroupProgress(total, len(plans), **ahead) if many else Progress(total, **ahead)

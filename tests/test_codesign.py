@@ -15,6 +15,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.optimize import State, schedule
 from codesign_jax.optimize.schedule import NAMES
 from codesign_jax.types import Outcome
+from tests.helpers import episodes
 from tests.helpers.toy_engine import ToyEngine, tiny
 
 PARTICLES, TRIALS = 8, 3
@@ -49,13 +50,8 @@ def test_one_compile_serves_every_schedule_and_seed(setup):
         mask = schedule(name, np.array(space.is_morphology), 40)
         state, _ = episode(start(optimizer, seed), mask[0])
         episode(state, mask[-1])
-    codesign.find_seed(
-        the_scene,
-        codesign.evaluate_by(episode, optimizer),
-        optimizer,
-        jax.random.key(0),
-        batch=PARTICLES,
-    )
+    search = codesign.seed_search(the_scene, optimizer, jax.random.key(0), batch=PARTICLES)
+    episodes.answered(search, episodes.evaluate_by(episode, optimizer))
     assert engine.traced == traced > 0
 
 
@@ -113,10 +109,9 @@ def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     closed = np.zeros(2, bool)
     first, info = episode(start(optimizer), closed)
     seen = [info, episode(first, closed)[1], episode(start(optimizer, seed=1), closed)[1]]
-    evaluate = codesign.evaluate_by(episode, optimizer)
-    test = codesign.final_test(
-        the_scene, evaluate, first.particles, first.key, num_trials=2 * TRIALS
-    )
+    evaluate = episodes.evaluate_by(episode, optimizer)
+    testing = codesign.testing(the_scene, first.particles, first.key, num_trials=2 * TRIALS)
+    test = episodes.answered(testing, evaluate)
     rows = [i.outcomes.cost[0] for i in seen]
     rows += [test.outcomes.cost[0, :TRIALS], test.outcomes.cost[0, TRIALS:]]
     assert len(np.unique(np.asarray(rows), axis=0)) == 5
@@ -182,7 +177,7 @@ def test_evaluate_by_an_episode_equals_evaluate(setup):
     the_scene, space, engine, optimizer, episode = setup
     population = jnp.asarray(np.random.default_rng(0).uniform([0.03, -0.05], [0.17, 0.1], (8, 2)))
     key = jax.random.key(3)
-    by_episode = codesign.evaluate_by(episode, optimizer)(population, key)
+    by_episode = episodes.evaluate_by(episode, optimizer)(population, key)
     evaluate = codesign.Task(the_scene, space, TRIALS, engine).evaluate
     direct = evaluate(population, codesign.stream_key(key, codesign.STREAM_TRIAL))
     # Two programs round the noise differently, which may move a loss by one time step.
@@ -192,11 +187,12 @@ def test_evaluate_by_an_episode_equals_evaluate(setup):
 
 def test_seed_is_poor_and_reproducible(setup):
     the_scene, space, _, optimizer, episode = setup
-    evaluate = codesign.evaluate_by(episode, optimizer)
+    evaluate = episodes.evaluate_by(episode, optimizer)
 
     def find(seed):
         key = jax.random.key(seed)
-        return codesign.find_seed(the_scene, evaluate, optimizer, key, batch=PARTICLES)
+        search = codesign.seed_search(the_scene, optimizer, key, batch=PARTICLES)
+        return episodes.answered(search, evaluate)
 
     (a, cost, drawn), (b, *_), (c, *_) = find(0), find(0), find(1)
     assert cost > codesign.SEED_COST and drawn >= 1
@@ -209,10 +205,10 @@ def test_final_test_counts_the_last_episode(setup):
     the_scene, _, _, optimizer, episode = setup
     state, info = episode(start(optimizer), np.ones(2, bool))
     kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.outcomes)
-    evaluate = codesign.evaluate_by(episode, optimizer)
-    result = codesign.final_test(
-        the_scene, evaluate, state.particles, state.key, num_trials=4, previous=kept
-    )
+    evaluate = episodes.evaluate_by(episode, optimizer)
+    how = {"num_trials": 4, "previous": kept}
+    testing = codesign.testing(the_scene, state.particles, state.key, **how)
+    result = episodes.answered(testing, evaluate)
     # Four more trials take two rounds of three, and three were there.
     assert result.outcomes.cost.shape == (PARTICLES, 9)
     np.testing.assert_array_equal(result.outcomes.cost[:, :3], kept.cost)

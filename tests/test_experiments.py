@@ -24,6 +24,7 @@ from codesign_jax.types import Outcome
 from scripts.experiments import figures, landscape, plan, report, results, strategies, study
 from scripts.experiments.plan import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
+from tests.helpers import episodes
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
@@ -120,8 +121,9 @@ def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
     """As `codesign optimize --seed` does it: seed, episodes, final test."""
     _, got = finished
     (scene, space, optimizer, episode), key = single, jax.random.key(SEED + run)
-    evaluate = codesign.evaluate_by(episode, optimizer)
-    seed, cost, drawn = codesign.find_seed(scene, evaluate, optimizer, key, batch=PLAN.particles)
+    evaluate = episodes.evaluate_by(episode, optimizer)
+    search = codesign.seed_search(scene, optimizer, key, batch=PLAN.particles)
+    seed, cost, drawn = episodes.answered(search, evaluate)
     mask = schedule(
         PLAN.strategies[strategy],
         np.array(space.is_morphology),
@@ -133,9 +135,8 @@ def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
         state, info = episode(state, mask[e])
         costs.append(info.selection.cost)
     kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.outcomes)
-    test = codesign.final_test(
-        scene, evaluate, state.particles, key, num_trials=PLAN.test_trials, previous=kept
-    )
+    how = {"num_trials": PLAN.test_trials, "previous": kept}
+    test = episodes.answered(codesign.testing(scene, state.particles, key, **how), evaluate)
     # The same arithmetic in other programs, where the compiler fuses it: the last bit may differ.
     close = {"rtol": 1e-5, "atol": 1e-6}
     np.testing.assert_allclose(got["seeds"][run], seed, **close)

@@ -28,6 +28,7 @@ from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import library, parameters
 from codesign_jax.types import Status
+from tests.helpers import episodes
 from tests.helpers.toy_engine import tiny
 
 ROOT = Path(__file__).parent.parent
@@ -59,14 +60,10 @@ def run():
     for e in range(s.episodes):
         record.state, info = episode(record.state, np.ones(2, bool))
         records.add_report(record.history, e, info)
-    test = codesign.final_test(
-        the_scene,
-        codesign.evaluate_by(episode, optimizer),
-        record.state.particles,
-        record.state.key,
-        num_trials=s.test_trials,
-        previous=record.last_outcomes(),
-    )
+    particles, key = record.state.particles, record.state.key
+    how = {"num_trials": s.test_trials, "previous": record.last_outcomes()}
+    testing = codesign.testing(the_scene, particles, key, **how)
+    test = episodes.answered(testing, episodes.evaluate_by(episode, optimizer))
     record.test = test.outcomes
     return the_scene, space, record, test
 

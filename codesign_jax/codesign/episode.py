@@ -26,7 +26,6 @@ STREAM_TRIAL = 0x7472696C
 """Stream of the noise of an episode's trials ("tril")."""
 
 EpisodeFunction = Callable[..., tuple[State, "EpisodeInfo"]]
-EvaluateFunction = Callable[..., Outcome]
 
 
 class EpisodeInfo(NamedTuple):
@@ -299,23 +298,6 @@ def episode_trials(
     """Trials of an episode of the run with this root key, leading axis (trial,)."""
     own = stream_key(key, STREAM_TRIAL, episode)
     return rollout.sample_trials(scene, own, num_trials, constants=constants)
-
-
-def evaluate_by(episode: EpisodeFunction, optimizer: Optimizer) -> EvaluateFunction:
-    """Returns an evaluation (population, key) -> outcomes that uses an episode's own program.
-
-    With every parameter closed nothing moves, so that seeds and final particles are simulated
-    without a second compile, as long as they are as many as an episode's.
-
-    Args:
-      episode: Function (state, mask) of an episode, such as `partial(task.episode, optimizer)`.
-      optimizer: The episodes' optimiser.
-    """
-
-    def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
-        return episode(*closed(optimizer, population, key))[1].outcomes
-
-    return evaluate
 
 
 def closed(optimizer: Optimizer, population: jax.Array, key: jax.Array) -> tuple[State, np.ndarray]:

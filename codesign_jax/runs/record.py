@@ -34,7 +34,7 @@ class History(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The particle that a run starts from, as `codesign.find_seed` found it.
+    """The particle that a run starts from, as `codesign.seed_search` found it.
 
     Attributes:
       design: The particle [SI units], shape (parameter,).

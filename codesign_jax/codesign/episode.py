@@ -106,7 +106,10 @@ class Task:
         return self.scene, self.engine, self.space, self.trials, recording
 
     def evaluate(
-        self, population: jax.Array, key: jax.Array, constants: Constants | None = None
+        self,
+        population: jax.typing.ArrayLike,
+        key: jax.Array,
+        constants: Constants | None = None,
     ) -> Outcome:
         """Outcomes of particles in random trials, arrays of shape (particle, trial).
 

@@ -106,8 +106,8 @@ def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:
     Raises:
       InputError: If the runs differ in it.
     """
-    named = {"optimizer": optimize.DEFAULT, "cost": options.cost or runs.SCENE_COST}
-    usual = runs.make_settings(options.preset, "", "", "", 0, **named)
+    cost = options.cost or runs.SCENE_COST
+    usual = runs.make_settings(options.preset, "", "", "", 0, optimizer=optimize.DEFAULT, cost=cost)
     folders = runs_of(options, scene, usual)
     found = runs.setting_of(folders, "optimizer")
     return None if found is None or own.is_own(found) else found

@@ -42,22 +42,24 @@ SCENE = "paper"
 """Scene where none is named."""
 
 
-class SceneFlags(Protocol):
-    """Flags that say which scene; `flags.Subject` has their meaning."""
-
-    scene: str | None
-    hand: str | None
-    objects: str | None
-    accuracy: str | None
-    overrides: tuple[tuple[str, ...], ...]
-    robust: bool
-
-
 class Overriding(Protocol):
     """Flags that replace values of a scene; `flags.Subject` has their meaning."""
 
     overrides: tuple[tuple[str, ...], ...]
     robust: bool
+
+
+class SceneFlags(Overriding, Protocol):
+    """Flags that say which scene; `flags.Subject` has their meaning."""
+
+    @property
+    def scene(self) -> str | None:
+        """The scene; of some commands it has a default."""
+        ...
+
+    hand: str | None
+    objects: str | None
+    accuracy: str | None
 
 
 def changes(options: Overriding) -> dict[keypaths.Path, Any]:
@@ -211,9 +213,8 @@ def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[st
     Args:
       *numbers: Flag, value, smallest and largest one; None is a flag that was not given.
     """
-    given = (number for number in numbers if number[1] is not None)
-    found = (schema.range_problem(flag, v, "", low, high) for flag, v, low, high in given)
-    return [problem for problem in found if problem]
+    given = [(flag, v, "", low, high) for flag, v, low, high in numbers if v is not None]
+    return [problem for number in given if (problem := schema.range_problem(*number))]
 
 
 def check_engine(name: str) -> None:

@@ -161,7 +161,7 @@ def _landscape(run: Run) -> str:
 
 
 def _failures(run: Run) -> str:
-    status = run.history.outcomes.status
+    status = np.asarray(run.history.outcomes.status)
     failed, total = int(types.failed(status).sum()), status.size
     rule = (
         "are left out of a particle's mean"

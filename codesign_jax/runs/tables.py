@@ -152,18 +152,19 @@ def status_names(status: int) -> str:
     return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
 
 
-def failure_counts(status: np.ndarray) -> str:
+def failure_counts(status: jax.typing.ArrayLike) -> str:
     """How often each cause of failure occurs, e.g. "SPEED 1, STUCK 3"; empty if none does."""
     return _counts(status, [bit for bit in Status if bit not in WARNINGS])
 
 
-def warning_counts(status: np.ndarray) -> str:
+def warning_counts(status: jax.typing.ArrayLike) -> str:
     """How often each warning occurs, which does not fail a trial, e.g. "SOLVER_CAP 3"."""
     return _counts(status, [*WARNINGS])
 
 
-def _counts(status: np.ndarray, bits: Iterable[Status]) -> str:
-    counts = {bit.name: int(((status & bit) != 0).sum()) for bit in bits}
+def _counts(status: jax.typing.ArrayLike, bits: Iterable[Status]) -> str:
+    every = np.asarray(status)
+    counts = {bit.name: int(((every & bit) != 0).sum()) for bit in bits}
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
 
 

@@ -141,8 +141,8 @@ class Batch:
           a program wait its turn while 32 are under way on a GPU (`max_inflight_computations` of
           XLA's GPU client), and each run is judged by a program of its own.
         """
-        size = self._group(requests[0]) if requests else 1
-        groups = [requests[k : k + size] for k in range(0, len(requests), size)]
+        places = self._groups(requests)
+        groups = [[requests[i] for i in group] for group in places]
         first = [self._launched(group) for group in groups[:1]]
 
         def finish() -> list[tuple[State, EpisodeInfo]]:
@@ -151,9 +151,21 @@ class Batch:
                 # A group begins when the one before it has been judged and its arrays have left
                 # the memory, so no name here may hold on to them.
                 found += self._judged(group, first.pop() if first else self._launched(group))
-            return found
+            by_place = dict(zip(itertools.chain(*places), found, strict=True))
+            return [by_place[i] for i in range(len(requests))]
 
         return finish
+
+    def _groups(self, requests: Sequence[Request]) -> list[list[int]]:
+        """Indices of the requests of each call: of as many particles, as a test may have fewer."""
+        by_size: dict[int, list[int]] = {}
+        for i, request in enumerate(requests):
+            by_size.setdefault(len(request.state.particles), []).append(i)
+        groups = []
+        for alike in by_size.values():
+            size = self._group(requests[alike[0]])
+            groups += [alike[k : k + size] for k in range(0, len(alike), size)]
+        return groups
 
     def _group(self, request: Request) -> int:
         """Runs that are simulated in one call."""

@@ -103,6 +103,24 @@ def test_shares_of_joined_runs_are_those_of_one_run(tmp_path, monkeypatch):
         assert stored(tmp_path / "many" / seed) == stored(tmp_path / "calls" / seed)
 
 
+def test_a_test_of_few_particles_runs_beside_episodes():
+    """Requests of two sizes in one call: each has the answer that it has alone, in its place."""
+    the_scene, space, engine = tiny()
+    optimizer = codesign.make_optimizer("screened-es", space)
+    task = codesign.Task(the_scene, space, 2, engine)
+    keys = jax.random.split(jax.random.key(5), 3)
+    requests = [
+        Request(*codesign.closed(optimizer, space.sample(key, count), key))
+        for key, count in zip(keys, (3, 6, 3), strict=True)
+    ]
+    together = Batch(task, optimizer)
+    together.compile(requests[0], 3)
+    for request, (_, info) in zip(requests, together(requests), strict=True):
+        [(_, alone)] = Batch(task, optimizer)([request])
+        np.testing.assert_array_equal(info.population, request.state.particles)
+        np.testing.assert_array_equal(info.outcomes.cost, alone.trials.cost)
+
+
 def test_devices_that_there_are_not_and_calls_without_grasps(tmp_path, capsys):
     assert cli.main([*RUN, "--devices", "99", "--out", str(tmp_path / "no")]) == 2
     assert "--devices = 99 is not valid; this process has" in capsys.readouterr().err

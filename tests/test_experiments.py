@@ -21,7 +21,8 @@ from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import InputError
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
-from scripts.experiments import figures, landscape, plan, report, results, strategies, study
+from scripts.experiments import __main__ as experiments
+from scripts.experiments import figures, landscape, marks, plan, report, results, strategies, study
 from scripts.experiments.plan import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
 from tests.helpers import episodes
@@ -345,18 +346,17 @@ def test_figures_and_page_are_made_from_files_alone(finished, tmp_path):
     assert filled.startswith("before") and filled.endswith("after\n")
     assert json.loads((tmp_path / "2d.json").read_text())["grasps"] == PLAN.grasps
 
-    # Another landscape, in the place of that with contact between fingers, which was stopped.
-    other, moved = tmp_path / "fingers", dict(study.load(tmp_path, "landscape")[0])
+    # Another landscape, in the place of an earlier scene's, which was stopped.
+    other, moved = tmp_path / "earlier", dict(study.load(tmp_path, "landscape")[0])
     moved["exclude"] = np.cumsum(moved["exclude"]).reshape(moved["exclude"].shape)
     notes = {"grasps": 2 * moved["exclude"].size, "wall_seconds": 1.0, "commit": "4567def"}
     results.write(other, "landscape", moved, notes)
-    both = report.make(tmp_path, tmp_path / "figures", touching=[other, tmp_path])
-    assert "with it" in both.split(text)[1]
+    both = report.make(tmp_path, tmp_path / "figures", earlier=[other, tmp_path])
+    assert "the earlier scene by commit" in both and "Wilcoxon): s.d. = 1.000" in both
     plain = study.load(tmp_path, "landscape")[0]["exclude"]
     expected = scipy.stats.pearsonr(plain.ravel(), moved["exclude"].ravel()).statistic
     row = next(line for line in both.splitlines() if "4567def" in line).split(" | ")
     assert row[1] == "2" and float(row[-1].strip(" |")) == pytest.approx(expected, abs=6e-4)
-    assert (tmp_path / "figures" / "fig8_landscape_fingers.png").stat().st_size > 1000
 
 
 def test_strategies_of_the_same_runs_are_joined(finished):
@@ -388,6 +388,60 @@ def test_what_was_not_run_is_said(tmp_path):
     assert figures.label("switch-16") == "16"
 
 
+def test_shares_of_several_processes_make_the_whole(toy, finished, tmp_path, monkeypatch):
+    """Each takes every second run; the list of strategies may grow, and all processes are noted."""
+    monkeypatch.setitem(plan.SMALL["tiny"], "2d", PLAN)
+    monkeypatch.setitem(plan.OVERRIDES, "tiny", ())
+    base = [
+        "scripts.experiments",
+        "2d",
+        "--size",
+        "tiny",
+        "--scene",
+        str(TINY),
+        "--out",
+        str(tmp_path),
+    ]
+    base += ["--seed", str(SEED)]
+
+    def call(*more):
+        monkeypatch.setattr(sys, "argv", [*base, *more])
+        code = experiments.main()
+        path = tmp_path / "2d.json"
+        return code, json.loads(path.read_text()) if path.exists() else None
+
+    some = ["--strategies", "single,switch-2"]
+    assert call(*some, "--share", "1/2", "--commit", "abc") == (0, None)
+    assert call(*some, "--gather") == (0, None), "some runs have not begun"
+    call(*some, "--share", "2/2", "--commit", "abc")
+    code, notes = call(*some, "--gather", "--commit", "xyz")
+    assert code == 0 and (notes["commit"], notes["grasps"]) == ("abc", 2 * 2 * 18 * 7)
+    assert [p["grasps"] for p in notes["processes"]] == [2 * 18 * 8] * 2, "and its seeds"
+    assert notes["settings"]["plan"]["strategies"] == ["single", "switch-2"]
+    _, notes = call("--commit", "def")
+    assert (notes["commit"], notes["grasps"]) == ("abc, def", PLAN.grasps)
+    arrays, _ = study.load(tmp_path, "2d")
+    space = design_space(scenes.load(TINY).hand, "2d")
+    whole = results.of_strategies(PLAN, scenes.load(TINY), space, finished[1])
+    assert all(np.array_equal(arrays[name], value) for name, value in whole.items())
+    times = [{"ended": 10.0, "seconds": 4.0}, {"ended": 12.0, "seconds": 5.0}]
+    assert results.wall_seconds([*times, {"ended": 20.0, "seconds": 1.0}]) == 7.0
+
+
+def test_particles_on_the_way_are_those_of_their_episodes(finished):
+    """Episodes that the grasps allow, with what finds the seed and what chooses counted."""
+    folder, got = finished
+    folders = strategies.folders(PLAN, folder, SEED)["concurrent"]
+    other = 18 + PLAN.particles * marks.ROUNDS
+    found = marks.read(folders, [other + 18 * e + 5 for e in (1, 3, 9)])
+    assert sorted(found) == ["cost36", "cost72", "particles36", "particles72", "seeds"]
+    assert found["seeds"].tolist() == [SEED, SEED + 1]
+    for name, episode in (("cost36", 0), ("cost72", 2)):
+        np.testing.assert_array_equal(found[name], got["cost"][-1][:, episode])
+    with pytest.raises(InputError, match="has begun"):
+        marks.read([*folders, folder / "none"], [100])
+
+
 @pytest.mark.slow
 def test_the_script_simulates_and_draws(tmp_path):
     def call(*arguments):
@@ -408,7 +462,7 @@ def test_the_script_simulates_and_draws(tmp_path):
     done = call(*run, "--trials", str(tmp_path / "trials.npz"), "--commit", "abc")
     assert done.returncode == 0, done.stderr
     notes = json.loads((tmp_path / "2d.json").read_text())
-    assert (notes["commit"], notes["grasps"], notes["processes"]) == ("abc", 72, 1)
+    assert (notes["commit"], notes["grasps"], len(notes["processes"])) == ("abc", 72, 1)
     assert call(*run, "--commit", "def").returncode == 0
     assert json.loads((tmp_path / "2d.json").read_text()) == notes, "who made them stays"
     with np.load(tmp_path / "trials.npz") as trials:

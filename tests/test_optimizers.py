@@ -184,15 +184,16 @@ def test_screened_searches_average_the_means_of_evosax(name):
 
 
 def test_the_particles_of_the_default_are_what_was_simulated_as_particle_0():
-    """The newest average and the one after a third of them: designs that the run can show."""
+    """The newest average and those after one and two thirds: designs that the run can show."""
     made = Screened(SPACE)
     state, populations, infos = run(made, start(made), OPEN[:14])
-    np.testing.assert_array_equal(state.particles[1], populations[5 + 9 // 3 - 1, 0])
+    for row in (1, 2):
+        np.testing.assert_array_equal(state.particles[row], populations[5 + 3 * row - 1, 0])
     np.testing.assert_array_equal(state.particles[0], populations[-1, 0])
-    newest = np.tile(populations[-1, 0], (PARTICLES - 2, 1))
-    np.testing.assert_array_equal(state.particles[2:], newest)
-    np.testing.assert_array_equal(infos[-1].ancestors, [0, -1, *[0] * (PARTICLES - 2)])
-    assert not (state.particles[0] == state.particles[1]).all()
+    newest = np.tile(populations[-1, 0], (PARTICLES - 3, 1))
+    np.testing.assert_array_equal(state.particles[3:], newest)
+    np.testing.assert_array_equal(infos[-1].ancestors, [0, -1, -1, *[0] * (PARTICLES - 3)])
+    assert len(np.unique(state.particles, axis=0)) == made.finalists == 3
     with_random, *_ = run(made, start(made), OPEN[:5])
     random = populations[:3].reshape(-1, WIDTH)
     order = np.argsort([info.cost for info in infos[:3]], axis=None)

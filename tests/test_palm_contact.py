@@ -45,7 +45,19 @@ def moving(right, mine, self, motion, palm):
     return lanewise(lambda m, a, b: jnp.where(m, a, b), lanes([mine], (), wide=True), motion, found)
 
 
-ON_PALM = {"hull": "on_palm", "spheres": "ball_on_palm"}
+def seen_late(right, timestep, mine, vel):
+    """A contact ahead of touch sees the gap that is there."""
+    (point, normal, _, *rest), seen = right(timestep, mine, vel)
+    return (point, normal, mine[2], *rest), seen
+
+
+def not_closing(right, sums):
+    """A contact ahead of touch stops a finger where it is."""
+    one, other, (inside, closing) = right(sums)
+    return one, other, (inside, 0.0 * closing)
+
+
+ON_PALM = {"hull": "on_palm", "ahead": "on_palm", "spheres": "ball_on_palm"}
 FAULTS = {
     surface: {
         "the palm pulls": Fault({stage: flipped}),
@@ -57,12 +69,19 @@ FAULTS = {
     }
     for surface, stage in ON_PALM.items()
 }
+FAULTS["ahead"] |= {
+    "contacts ahead see the gap that is there": Fault({"ahead": seen_late}),
+    "contacts ahead stop a finger where it is": Fault({"pressure_ahead": not_closing}),
+}
 
 
 def scene_of(surface):
-    density = {"discretization__hull_rings": 2, "discretization__hull_points": 4}
-    density = density if surface == "hull" else {"discretization__spheres_per_link": 2}
-    return grasps.pinch("sphere", links=2, effects__surface=surface, **SETTINGS, **density)
+    """Spheres, the hull, or the hull that touches the palm ahead."""
+    density = {"discretization__spheres_per_link": 2}
+    if surface != "spheres":
+        density = {"discretization__hull_rings": 2, "discretization__hull_points": 8}
+        density |= {"effects__surface": "hull", "effects__speculative_palm": surface == "ahead"}
+    return grasps.pinch("sphere", links=2, **SETTINGS, **density)
 
 
 def accelerations(scene, model, data):
@@ -72,6 +91,7 @@ def accelerations(scene, model, data):
         with jax.enable_x64(True):
             hand, _ = grasps.hand_world(scene, length=0.1)
         dense = dense_steps.DensePairs(scene, model, data, hand)
+        print(dense.on_palm, dense.ahead, dense.pairs, dense.num_hull)
         assert dense.on_palm > 2 and dense.pairs > 3 and dense.num_hull > 20
         return dense.solve()
     assert on_palm(model, data) > 0

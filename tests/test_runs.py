@@ -128,8 +128,13 @@ def test_sizes_default_to_the_papers():
     )
     assert two.grasps == 64 * 60 + 360
     # The default optimiser's: each of its trials is one with another object.
-    assert sizes("23d", optimize.DEFAULT) == (25, 3, 28, 12)
-    assert sizes("full", optimize.DEFAULT, objects=8) == (25, 8, 28, 12)
+    assert sizes("23d", optimize.DEFAULT) == (25, 3, 30, 48)
+    assert sizes("full", optimize.DEFAULT, objects=8) == (25, 8, 30, 48)
+    # Its final test simulates three averages, and no copies of them.
+    made = settings_module.make_settings(
+        "23d", "concurrent", "control", "mujoco", 0, optimizer=optimize.DEFAULT
+    )
+    assert made.grasps == 30 * 75 + 3 * 48
 
 
 def test_settings_report_every_problem():

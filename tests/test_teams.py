@@ -35,7 +35,7 @@ def rollouts(scene, fields, ctrl, widths):
 def test_teams_follow_the_same_path_in_contact():
     """The default scene from curled fingers on: hull, table, palm, and fingers on one another."""
     with jax.enable_x64(True):
-        scene = scenes.load("paper")
+        scene = scenes.load("paper", overrides={"effects": {"friction_memory": True}})
         plain = scenes.load("paper", overrides={"effects": {"surface": "spheres"}})
         starts, ctrl = work.window(plain, 8, 20, distinct=8)
         made, _ = work.inputs(scene, work.make_worlds(scene, 8))

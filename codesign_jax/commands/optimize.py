@@ -203,8 +203,8 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     print(f"grasps: {settings.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
     if tested := settings.test_rounds * settings.trials:
         whole = f", in whole rounds of {settings.trials}" if tested != settings.test_trials else ""
-        many = settings.particles * tested
-        print(f"final test: {many} of these grasps, {tested} trials of each particle{whole}")
+        many, few = settings.finalists * tested, settings.finalists
+        print(f"final test: {many} of these grasps, {tested} trials of {few} particles{whole}")
     if count > 1:
         how = f"{options.jobs} at a time" if options.jobs else "in one batch"
         print(f"runs: {count}, {how}; grasps and disk are those of each")
@@ -251,7 +251,9 @@ def _judge(
     """Prints the verdict: on fresh trials, or on those of the final test if there are no others."""
     assert result.test is not None
     test = seeds.of_test(plan.scene, result)
-    chosen = f"chosen as the best of {len(result.test.cost)} final particles"
+    assert result.record is not None
+    count = len(np.unique(np.asarray(result.record.state.particles), axis=0))
+    chosen = f"chosen as the best of {count} final particles"
     if fresh is None:
         lines = [f"verdict: {test}", f"{chosen} by these very trials, which flatters it"]
     else:

@@ -34,6 +34,7 @@ _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 _OBSTACLES = {
     "neo_hookean": "its moments follow the angles by a law that MuJoCo's joints do not have",
     "lateral_threshold": "the stiffness of its joints follows pressure and angles",
+    "friction_memory": "MuJoCo's contacts keep nothing from step to step",
     "soft_touch": "in MuJoCo the elastic force grows with the impedance",
 }
 """Effects that plain MuJoCo does not have, and why."""

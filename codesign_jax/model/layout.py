@@ -164,6 +164,20 @@ def palm_touches(scene: Scene) -> bool:
     return scene.effects.palm_object or scene.effects.palm_table
 
 
+def pairings_held(scene: Scene) -> int:
+    """Pairings of fingers whose friction is kept from step to step; see the kernel's `pairing`."""
+    e, fingers = scene.effects, len(layout(scene).dofs)
+    if not (e.friction_memory and e.finger_finger) or e.friction == "none":
+        return 0
+    return (1 << (fingers - 1).bit_length()) - 1
+
+
+def palm_ahead(scene: Scene) -> bool:
+    """Whether fingers touch the palm ahead of their contact; spheres never do, as MuJoCo's."""
+    e = scene.effects
+    return e.finger_palm and e.speculative_palm and e.surface == "hull"
+
+
 PALM_FROM = 0.25
 """Share of a finger's length from its base that is not tested against the palm, to which it is
 fixed."""

@@ -88,6 +88,8 @@ class Optimizer(Protocol):
 
     # An attribute `screens` that is True says that the optimiser finds its start by itself: a run
     # then simulates nothing before its first episode, and the seed particle is any random one.
+    # An attribute `finalists` says how many of a run's final particles differ, if it went on long
+    # enough: the final test then simulates so many, and not their copies.
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0.

@@ -4,7 +4,7 @@ Grasps are noisy: a design that loses none of three objects may lose one in ten.
 particle is believed.  The mean of an evolution strategy moves where particles keep their objects on
 the whole; the average of these means over the episodes, recent ones weighing more, has less noise
 still, and no trial chose it.  Each average is simulated as particle 0 of the next episode, and the
-final test takes the newest one and an early one.
+final test takes the newest one and two earlier ones.
 
 The strategy is OpenAI's.  Its draws come in mirrored pairs and designs of equal cost have equal
 weight, so that its mean stays where it is while all particles keep all of their objects; that of
@@ -46,6 +46,8 @@ STREAM_TELL = 0x636D6174
 """Stream of its draws in `tell` ("cmat")."""
 LEAST = 3
 """Fewest particles: the average, and two for the strategy to rank."""
+FINALISTS = 3
+"""Averages that the final test takes."""
 STRATEGIES = {"open-es": OPEN_SIGMA, "cma-es": 0.2}
 """The strategies, and the first standard deviation of each as a fraction of the parameter range."""
 
@@ -58,18 +60,20 @@ class Screened:
     The first episodes simulate random designs, uniform in the parameters that the schedule opens,
     and the next ones the best of these again, in other trials: a start in the wrong place costs
     more than they do.  Later ones simulate the average so far, as particle 0, and draws of the
-    strategy.  Particle 1 of the state is the average after a third of these, at most as many ago as
-    there are particles: a guard against a mean that has left a good place.  All others are the
-    newest average; more finalists would only have one of them chosen by luck.  When a schedule
-    opens other parameters, strategy and average start anew at particle 0.
+    strategy.  Particles 1 and 2 of the state are the averages after a third and two thirds of
+    these, at most as many ago as there are particles: a guard against a mean that has left a good
+    place.  All others are the newest average, and the final test takes the first three alone: so
+    few are compared in many trials.  When a schedule opens other parameters, strategy and average
+    start anew at particle 0.
 
     Attributes:
       keeps_best: True: the final test counts new trials only; see `Optimizer.keeps_best`.
       screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
+      finalists: Particles of the state that the final test takes.
       space: Bounds and constraint of the parameters.
       strategy: One of `STRATEGIES`. With "open-es", whose draws come in pairs, the last one of
         an even number of particles is the strategy's mean.
-      screening: Episodes of random designs.
+      screening: Episodes of random designs; without any it starts at the seed particle.
       retests: Episodes that simulate the best of them again.
       sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
         that of `STRATEGIES`.
@@ -79,6 +83,7 @@ class Screened:
 
     keeps_best = True
     screens = True
+    finalists = FINALISTS
 
     space: Space
     strategy: str = dataclasses.field(default="open-es", metadata={"static": True})
@@ -95,8 +100,8 @@ class Screened:
         """
         if self.strategy not in STRATEGIES:
             raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
-        if not (min(self.screening, self.retests + 1, self.recency) >= 1 and self.sigma >= 0):
-            raise ValueError(f"need screening, recency >= 1, retests >= 0 and sigma >= 0: {self}")
+        if not (min(self.screening, self.retests, self.sigma) >= 0 and self.recency >= 1):
+            raise ValueError(f"need recency >= 1, screening, retests and sigma >= 0: {self}")
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0; see `Optimizer.init`.
@@ -161,15 +166,16 @@ class Screened:
         now = {"average": average, "averaged": memory["averaged"] + 1, "strategy": arrays(new)}
         # The averages that were simulated, newest first, and which of them the final test takes.
         way = jnp.concatenate([population[:1], state.memory["way"][:-1]])
-        rows, third = jnp.arange(len(cost)), 2 * now["averaged"] // 3
-        finalists = way[jnp.where(rows == 1, jnp.minimum(third, len(cost) - 1), 0)]
+        rows, third = jnp.arange(len(cost)), now["averaged"] // 3
+        ago = jnp.where(rows < FINALISTS, jnp.array([0, 2, 1])[rows % FINALISTS] * third, 0)
+        finalists = way[jnp.minimum(ago, len(cost) - 1)]
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
             "way": jnp.where(screens, state.memory["way"], way),
             "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
             "cost": jnp.where(screens, costs[best], state.memory["cost"]),
         }
         copied = jnp.where(
-            screens, jnp.where(best < len(cost), best, -1), jnp.where(rows == 1, -1, 0)
+            screens, jnp.where(best < len(cost), best, -1), jnp.where(ago > 0, -1, 0)
         )
         particles = jnp.where(screens, screened, finalists)
         next_state = State(particles, state.episode + 1, state.key, following)

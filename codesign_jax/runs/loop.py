@@ -333,18 +333,19 @@ class Loop:
             return
         # Outcomes by which the best particles so far were chosen are too good to count.
         previous = None if plan.optimizer.keeps_best else record.last_outcomes()
+        particles, same = _finalists(plan, np.asarray(record.state.particles))
         testing = codesign.testing(
             plan.scene,
-            record.state.particles,
+            jnp.asarray(particles),
             plan.key,
             num_trials=settings.test_trials,
             previous=previous,
         )
-        batch = settings.particles * settings.trials
+        batch = len(particles) * settings.trials
         with self.progress.busy("testing the final particles") as watch:
             told = partial(self._tested_some, watch, batch)
             test = yield from self._evaluated(testing, told)
-        record.test = test.outcomes
+        record.test = jax.tree.map(lambda v: np.asarray(v)[same], test.outcomes)
         self._save(settings.episodes + 1, record)
         self._write_tables(record, settings.episodes)
         self._refuse_all_failed(record)
@@ -387,6 +388,18 @@ class Loop:
     def _say(self, message: str) -> None:
         self.progress.message(message)
         self.run_directory.log(message)
+
+
+def _finalists(plan: Plan, particles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Particles that the final test simulates, and for each final particle its place among them.
+
+    They are all of them, unless the optimiser says that few differ, and so few do.
+    """
+    every, most = len(particles), getattr(plan.optimizer, "finalists", len(particles))
+    _, first, same = np.unique(particles, axis=0, return_index=True, return_inverse=True)
+    if most >= every or len(first) > most:
+        return particles, np.arange(every)
+    return particles[np.resize(first, most)], same.ravel()
 
 
 def _final_test(plan: Plan, record: Record) -> FinalTest | None:

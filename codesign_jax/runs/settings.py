@@ -49,7 +49,14 @@ class Settings:
     @property
     def grasps(self) -> int:
         """Grasps of the episodes and the final test, without those that find the seed."""
-        return self.particles * (self.episodes * self.trials + self.test_rounds * self.trials)
+        episodes, test = self.episodes * self.particles, self.test_rounds * self.finalists
+        return self.trials * (episodes + test)
+
+    @property
+    def finalists(self) -> int:
+        """Particles that the final test simulates; see `optimize.Optimizer`."""
+        few = self.optimizer in optimize.SCREENED
+        return min(self.particles, optimize.FINALISTS) if few else self.particles
 
     @property
     def test_rounds(self) -> int:
@@ -61,7 +68,7 @@ class Settings:
 # the optimisers that are compared with the paper's share; and those of the screened searches, by
 # docs/notes/search.md.
 _SIZES = {"2d": (10, 6, 64, 36), "": (60, 6, 128, 72)}
-_SCREENED_SIZES = {"2d": (13, 3, 21, 12), "": (25, 3, 28, 12)}
+_SCREENED_SIZES = {"2d": (13, 3, 22, 36), "": (25, 3, 30, 48)}
 
 _RANGES = {
     "particles": (1, MAX_PARTICLES),

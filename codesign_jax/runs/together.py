@@ -11,6 +11,7 @@ from pathlib import Path
 from traceback import format_exception
 from typing import Any, NamedTuple
 
+from codesign_jax import codesign
 from codesign_jax.batch import LIMIT, Batch, Request
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.errors import RunError
@@ -127,8 +128,8 @@ def _group(
     """`optimize` of as many runs as fit into one process; `begun` is how to open the folders."""
     plan = next(iter(plans.values()))
     settings, many = plan.settings, len(plans) > 1
-    batch = settings.particles * settings.trials
-    ahead = {"test": batch * settings.test_rounds, "after": after}
+    test = settings.finalists * settings.trials * settings.test_rounds
+    ahead = {"test": test, "after": after}
     called = run_names({folder: own.settings for folder, own in plans.items()})
     with contextlib.ExitStack() as stack:
         total = settings.episodes
@@ -205,6 +206,8 @@ class _Together:
         request = next(iter(self.waiting.values()))[1]
         with self.progress.busy("compiling") as watch:
             self.interrupts.call(self.batch.compile, request, len(self.waiting))
+            if test := self._test(request):
+                self.interrupts.call(self.batch.compile, test, len(self.waiting))
         count, engine = len(self.batch.devices), self.plan.task.engine.name
         where = f", {count} devices" if count > 1 else ""
         message = f"compiled in {watch.seconds:.1f} s (engine {engine}{where})"
@@ -213,6 +216,14 @@ class _Together:
         for folder in self.waiting:
             self.loops[folder].run_directory.log(message)
         self.timing = Timing(watch.seconds, runs=len(self.waiting))
+
+    def _test(self, request: Request) -> Request | None:
+        """What the final test will ask for, if that is another program than an episode's."""
+        settings, optimizer = self.plan.settings, self.plan.optimizer
+        few = settings.finalists
+        if settings.test_trials == 0 or few == len(request.state.particles):
+            return None
+        return Request(*codesign.closed(optimizer, request.state.particles[:few], self.plan.key))
 
     def _round(self) -> None:
         """One episode of every run that wants one; the episodes before are saved meanwhile."""
@@ -227,7 +238,8 @@ class _Together:
             if folder in self.waiting:
                 self._go_on(folder, self.waiting.pop(folder)[0], reply)
         self.seconds = time.perf_counter() - start
-        grasps = self.plan.settings.particles * self.plan.settings.trials * len(asked)
+        trials = self.plan.settings.trials
+        grasps = sum(len(request.state.particles) * trials for request in asked.values())
         self.timing = self.timing._replace(
             seconds=self.timing.seconds + self.seconds, grasps=self.timing.grasps + grasps
         )

@@ -35,6 +35,8 @@ _SKIN = "its geoms are rigid parts of single bodies"
 
 _IMPEDANCE = "MuJoCo's impedance grows with depth in the elastic force as well"
 
+_MEMORY = "its contacts have no state"
+
 _SPRINGS = "the springs of its joints are constants of a rollout"
 
 EFFECTS: Mapping[str, Effect] = {
@@ -51,6 +53,9 @@ EFFECTS: Mapping[str, Effect] = {
     "object_table": Effect("the object rests on the table"),
     "finger_finger": Effect("fingers touch one another"),
     "finger_palm": Effect("fingers touch the palm's disc"),
+    "speculative_palm": Effect(
+        "the hull touches the palm already in the step that would carry it in; spheres do not"
+    ),
     "surface": Effect(
         "the fingers' contact points: spheres, or the vertices of the skinned hull",
         {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},
@@ -62,6 +67,10 @@ EFFECTS: Mapping[str, Effect] = {
     "soft_touch": Effect(
         "damping and friction of a contact grow with its depth, from none at first touch",
         {"mujoco": {True: _IMPEDANCE}, "mjx": {True: _IMPEDANCE}},
+    ),
+    "friction_memory": Effect(
+        "fingers hold on one another without creep: their friction is kept from step to step",
+        {"mujoco": {True: _MEMORY}, "mjx": {True: _MEMORY}},
     ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),

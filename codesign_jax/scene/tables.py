@@ -26,9 +26,11 @@ class Effects:
     object_table: bool = True
     finger_finger: bool = False
     finger_palm: bool = False
+    speculative_palm: bool = False
     surface: str = choice("spheres", "hull", default="spheres")
     friction: str = choice("none", "coulomb", "full", default="coulomb")
     soft_touch: bool = False
+    friction_memory: bool = False
     disturb: bool = True
     ungrasp: bool = True
     neo_hookean: bool = False

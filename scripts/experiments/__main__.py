@@ -2,9 +2,11 @@
 
 python -m scripts.experiments 2d --out runs/reproduction           # on a GPU; again to resume
 timeout -s INT 500 python -m scripts.experiments 2d --out runs/reproduction    # stop after a time
+python -m scripts.experiments 2d --out runs/big --share 1/4        # beside 2/4, 3/4 and 4/4
+python -m scripts.experiments 2d --out runs/big --gather           # then: results of all shares
 python -m scripts.experiments 2d --out runs/small --size cpu       # minutes on a CPU
 python -m scripts.experiments types --videos docs/figures            # what the landscape's hands do
-python -m scripts.experiments figures --data docs/data/reproduction
+python -m scripts.experiments figures                                # of docs/data/experiments
 """
 
 import argparse
@@ -20,6 +22,7 @@ from codesign_jax import runs, scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
+from codesign_jax.runs.together import Timing
 from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.scene.schema import InputError
 from scripts.experiments import landscape, plan, results, strategies
@@ -34,7 +37,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--scene",
         default="paper",
-        help="built-in scene or file; docs/data/reproduction has paper_spheres",
+        help="built-in scene or file",
     )
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
     parser.add_argument("--preset", dest="size", choices=list(plan.OVERRIDES), help="as --size")
@@ -52,17 +55,22 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--every", type=int, default=4, help="episodes between checkpoints")
     parser.add_argument("--fresh", action="store_true", help="delete what is there of it")
     parser.add_argument(
+        "--share",
+        default="1/1",
+        metavar="I/N",
+        help="every N-th run from the I-th on, beside other processes; --gather writes the results",
+    )
+    parser.add_argument(
+        "--gather", action="store_true", help="simulate nothing: write what the runs have"
+    )
+    parser.add_argument(
         "--trials",
         type=Path,
         help="write every trial to this .npz",
     )
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument(
-        "--touching",
-        type=Path,
-        nargs="+",
-        default=[],
-        help="folders of the same with contact between fingers",
+        "--earlier", type=Path, nargs="+", default=[], help="folders of the same in earlier scenes"
     )
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--videos", type=Path, help="folder for a video of each grasp type")
@@ -84,12 +92,19 @@ def simulate(args: argparse.Namespace) -> int:
     path = args.out / f"{args.experiment}.json"
     before = json.loads(path.read_text()) if path.exists() and not args.fresh else None
     settings = results.settings_of(the_plan, the_scene, args.engine, args.seed)
-    if before and before["settings"] != json.loads(json.dumps(settings)):
+    if before and _of_runs(before["settings"]) != _of_runs(json.loads(json.dumps(settings))):
         sys.exit(f"error: {path} belongs to another experiment; choose another --out, or --fresh")
+    if args.fresh:
+        (args.out / f"{args.experiment}.processes").unlink(missing_ok=True)
     start = time.perf_counter()
     if isinstance(the_plan, plan.Landscape):
         return _landscape(args, the_plan, the_scene, before, start)
     return _strategies(args, the_plan, the_scene, before, start)
+
+
+def _of_runs(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of an experiment but the list of strategies: each has folders of its own."""
+    return settings | {"plan": {k: v for k, v in settings["plan"].items() if k != "strategies"}}
 
 
 def _strategies(
@@ -101,23 +116,27 @@ def _strategies(
 ) -> int:
     folder = args.out / args.experiment
     plans = strategies.plans(the_plan, the_scene, args.engine, folder, args.seed)
+    first, count = (int(n) for n in args.share.split("/"))
+    plans = dict([*plans.items()][first - 1 :: count]) if not args.gather else {}
     how = {"fresh": args.fresh, "every": args.every, "devices": args.devices, "chunk": args.chunk}
-    done = runs.optimize(plans, sys.argv, **how)
+    done = runs.optimize(plans, sys.argv, **how) if plans else runs.Results({}, Timing())
     problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
     for place, error in problems.items():
         print(f"error: {place}: {error}", file=sys.stderr)
-    found = strategies.gather(the_plan, folder, args.seed)
     code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
+    timing, seconds = done.timing, time.perf_counter() - start
+    rate = timing.grasps / max(timing.seconds, 1e-9)
+    process = results.Process(timing.grasps, seconds, timing.compile_seconds, rate)
+    log = results.log(args.out / f"{args.experiment}.processes", process, args.commit)
+    found = strategies.gather(the_plan, folder, args.seed) if count == 1 else None
     if found is None or not found["cost"].shape[2]:
         return code
     space = parameters.design_space(the_scene.hand, the_plan.preset)
     kept = results.of_strategies(the_plan, the_scene, space, found)
-    timing, screened = done.timing, strategies.screened(the_plan, found)
-    grasps = found["status"].size + (the_plan.worlds * the_plan.rounds if not code else 0)
-    rate = timing.grasps / max(timing.seconds, 1e-9)
-    seconds = time.perf_counter() - start
-    process = results.Process(timing.grasps, seconds, timing.compile_seconds, rate)
-    _write(args, kept, found, process, before, (the_plan, the_scene), (grasps, screened))
+    screened = strategies.screened(the_plan, found)
+    grasps = found["status"].size
+    grasps += the_plan.worlds * the_plan.rounds if "test_status" in found else 0
+    _write(args, kept, found, log, before, (the_plan, the_scene), (grasps, screened))
     return code
 
 
@@ -141,8 +160,9 @@ def _landscape(
     kept, seconds = results.of_landscape(the_scene, space, found), time.perf_counter() - start
     grasps = the_plan.grasps - earlier
     process = results.Process(grasps, seconds, 0.0, grasps / seconds)
+    log = results.log(args.out / f"{args.experiment}.processes", process, args.commit)
     sizes = the_plan.grasps, 0
-    _write(args, kept, found, process, before, (the_plan, the_scene), sizes)
+    _write(args, kept, found, log, before, (the_plan, the_scene), sizes)
     return 0
 
 
@@ -150,16 +170,17 @@ def _write(
     args: argparse.Namespace,
     kept: strategies.Arrays,
     found: strategies.Arrays,
-    process: results.Process,
+    log: list[dict[str, Any]],
     before: dict[str, Any] | None,
     subject: tuple[Any, Scene],
     grasps: tuple[int, int],
 ) -> None:
     """Writes the results; where nothing is new, who made them stays noted."""
-    if process.grasps or before is None:
-        settings = results.settings_of(*subject, args.engine, args.seed)
-        made = {"before": before, "commit": args.commit}
-        notes = results.describe(settings, process, *grasps, **made)
+    notes = before or {}
+    settings = json.loads(json.dumps(results.settings_of(*subject, args.engine, args.seed)))
+    new = log and notes.get("processes") != log
+    if before is None or new or before["settings"] != settings:
+        notes = results.describe(settings, log, *grasps, commit=args.commit)
         for path in results.write(args.out, args.experiment, kept, notes):
             print(path)
     if args.trials:
@@ -211,7 +232,7 @@ def main() -> int:
         from scripts.experiments import report
     except ModuleNotFoundError as error:
         sys.exit(f"error: {error.name} is missing: pip install 'codesign-jax[study]'")
-    print(report.make(args.data, args.figures, args.page, args.touching))
+    print(report.make(args.data, args.figures, args.page, args.earlier))
     return 0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.types import WARNINGS
 from scripts.experiments import figures, grasp_types
-from scripts.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
+from scripts.experiments.plan import PAPER, PAPER_GRASPS, TOTAL_GRASPS
 from scripts.experiments.results import BITS
 from scripts.experiments.study import RULES, Study, joined, load, load_study, regions
 from scripts.shared import statistics
@@ -22,52 +22,42 @@ _THRESHOLDS = (0.1, 0.5, 1.0)
 _HEAD = "| the paper | here |\n|---|---|"
 
 
-def make(
-    data: Path, pictures: Path, page: Path | None = None, touching: Sequence[Path] = ()
-) -> str:
+def make(data: Path, pictures: Path, page: Path | None = None, earlier: Sequence[Path] = ()) -> str:
     """Draws the figures of whatever results there are and writes the table.
 
     Args:
       data: Folder of the results.
       pictures: Folder of the figures.
       page: Markdown page whose text between the marks is replaced; None for none.
-      touching: Folders of the experiments with contact between fingers. Those that are complete
-        have figures of their own, as has the landscape of the first folder; the first grasp types
-        of them go before those of `data`.
+      earlier: Folders of the same with an earlier scene; strategies of the same runs are joined.
+        Those with more strategies than `data` has are drawn, with a suffix.
 
     Returns:
       The table in Markdown.
     """
     studies = {name: load_study(data, name) for name in ("2d", "23d")}
-    grids = {folder: load(folder, "landscape") for folder in (data, *touching)}
-    types = {folder: load(folder, "types") for folder in grids}
-    grid = grids[data]
-    others = [found for folder in touching if (found := grids[folder])]
+    grid, types = load(data, "landscape"), load(data, "types")
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
     for name, study in studies.items():
-        found = [load_study(folder, name) for folder in touching]
-        if study:
+        before = [s for folder in earlier if (s := load_study(folder, name))]
+        whole = [str(s) for s in PAPER[name].strategies]  # type: ignore[union-attr]
+        if study and len(study.strategies) > 1:
             _draw(name, study, pictures, "")
-            for other in joined([s for s in found if s], study.strategies):
-                text += f"\n\n{with_fingers(study, other)}"
-                if other.tested and other.strategies == study.strategies:
-                    _draw(name, other, pictures, "_fingers")
+        for other in joined(before, whole) if study else []:
+            text += f"\n\n{beside(study, other)}"  # type: ignore[arg-type]
+            if len(other.strategies) > len(study.strategies):  # type: ignore[union-attr]
+                _draw(name, other, pictures, "_earlier")
+    others = [found for folder in earlier if (found := load(folder, "landscape"))]
     if grid and others:
         text += f"\n\n{landscapes(grid, others)}"
-    _draw_landscape(grid, types[data], pictures / "fig8_landscape.png")
-    for folder in touching[:1]:
-        _draw_landscape(grids[folder], types[folder], pictures / "fig8_landscape_fingers.png")
+    _draw_landscape(grid, types, pictures / "fig8_landscape.png")
     if page:
         fill(page, text, "results")
-    for folder in (*touching, data):
-        shown, found = grids[folder], types[folder]
-        if not (shown and found):
-            continue
-        table = grasp_types.describe(shown[0], found[0])
+    if grid and types:
+        table = grasp_types.describe(grid[0], types[0])
         if page:
             fill(page, table, "types")
         text += f"\n\n{table}"
-        break
     return text
 
 
@@ -76,7 +66,8 @@ def _draw(name: str, study: Study, pictures: Path, suffix: str) -> None:
     if name == "2d":
         figures.evolution(study, pictures / f"fig6_cost_evolution{suffix}.png")
     number = {"2d": 7, "23d": 9}[name]
-    figures.success(study, pictures / f"fig{number}a_success{suffix}.png")
+    if study.tested:
+        figures.success(study, pictures / f"fig{number}a_success{suffix}.png")
     figures.convergence(study, pictures / f"fig{number}b_convergence{suffix}.png")
 
 
@@ -86,19 +77,18 @@ def _draw_landscape(grid: Loaded | None, types: Loaded | None, path: Path) -> No
         figures.landscape(grid[0], path, types=types[0]["type"] if types else None)
 
 
-def landscapes(plain: Loaded, touching: Sequence[Loaded]) -> str:
-    """The landscape without contact between fingers beside those with it, as a Markdown table."""
+def landscapes(now: Loaded, earlier: Sequence[Loaded]) -> str:
+    """The landscape beside those of earlier scenes, as a Markdown table."""
     lines = [
         "| landscape | trials a design | regions | correlation with the first |",
         "|---|---|---|---|",
     ]
-    for k, grid in enumerate((plain, *touching)):
+    for k, grid in enumerate((now, *earlier)):
         data, notes = grid
-        how = "with contact between fingers" if k else "without contact between fingers"
         trials = notes["grasps"] // data["exclude"].size  # fewer than planned if it was stopped
-        alike = np.corrcoef(data["exclude"].ravel(), plain[0]["exclude"].ravel())[0, 1]
-        cells = f"{how}, commit {notes['commit']}", str(trials), _regions(grid), f"{alike:.3f}"
-        lines.append(f"| {' | '.join(cells)} |")
+        alike = np.corrcoef(data["exclude"].ravel(), now[0]["exclude"].ravel())[0, 1]
+        words = f"{'earlier scene' if k else 'default scene'}, commit {notes['commit']}"
+        lines.append(f"| {words} | {trials} | {_regions(grid)} | {alike:.3f} |")
     return "\n".join(lines)
 
 
@@ -117,7 +107,8 @@ def details(study: Study) -> str:
     """One line a strategy: success by both rules, convergence by both readings, failed trials."""
     name = study.plan["name"]
     lines = [
-        f"{name}: {study.plan['runs']} runs a strategy; intervals of 95 %",
+        f"{name}: {study.plan['runs']} runs a strategy, {study.episodes} of "
+        f"{study.plan['episodes']} episodes; intervals of 95 %",
         "",
         "| strategy | success | failed trials at the maximum | mean cost stays below 1 "
         "| simulations until then: median [quartiles] | until it first is below 1 | failed trials "
@@ -133,7 +124,10 @@ def details(study: Study) -> str:
     for s, strategy in enumerate(study.strategies):
         cells = [
             figures.label(strategy),
-            *(_percent(wilson(int(v[s].sum()), v[s].size)) for v in (good, strict)),
+            *(
+                _percent(wilson(int(v[s].sum()), v[s].size)) if study.tested else "not tested"
+                for v in (good, strict)
+            ),
             f"{int(np.isfinite(episodes[s]).sum())}/{episodes.shape[1]}",
             *(_quartiles(v[s] * study.per_episode) for v in (episodes, first)),
             f"{100 * failed[s] / trials:.2f} %",
@@ -173,38 +167,43 @@ def _against_last(study: Study) -> list[str]:
     return lines
 
 
-def with_fingers(plain: Study, touching: Study) -> str:
-    """Experiments without and with contact between fingers, over the episodes that both have.
+def beside(now: Study, earlier: Study) -> str:
+    """An experiment beside the same in an earlier scene, over the episodes that both have.
 
     Of one that is complete also what `details` tells.
     """
-    count = min(plain.episodes, touching.episodes)
+    count = min(now.episodes, earlier.episodes)
     lines = [
-        f"{plain.plan['name']}, the first {count} episodes "
-        f"({count * plain.per_episode:,} simulations), contact between fingers by commit "
-        f"{touching.notes.get('commit')}: mean cost stays below 1",
+        f"{now.plan['name']}, the first {count} episodes ({count * now.per_episode:,} "
+        f"simulations), the earlier scene by commit {earlier.notes.get('commit')}: "
+        "mean cost stays below 1",
         "",
-        "| strategy | without contact between fingers | median simulations [quartiles] "
-        "| with it | median simulations [quartiles] |",
+        "| strategy | default scene | median simulations [quartiles] "
+        "| earlier scene | median simulations [quartiles] |",
         "|---|---|---|---|---|",
     ]
     both = [
         (v.per_episode, dict(zip(v.strategies, v.convergence(episodes=count), strict=True)))
-        for v in (plain, touching)
+        for v in (now, earlier)
     ]
-    for strategy in touching.strategies:
+    for strategy in earlier.strategies:
         cells = [figures.label(strategy)]
         for per_episode, episodes in both:
-            each = episodes[strategy]
-            cells += [f"{int(np.isfinite(each).sum())}/{each.size}"]
-            cells += [_quartiles(each * per_episode)]
+            each = episodes.get(strategy)
+            known = each is not None
+            cells += [f"{int(np.isfinite(each).sum())}/{each.size}" if known else "not run"]
+            cells += [_quartiles(each * per_episode) if known else "–"]
         lines.append(f"| {' | '.join(cells)} |")
-    if not touching.tested:
+    common = [s for s in earlier.strategies if s in both[0][1]]
+    pairs = [statistics.wilcoxon(both[0][1][s], both[1][1][s], count) for s in common]
+    each = ", ".join(f"{figures.label(s)} {_p(p)}" for s, p in zip(common, pairs, strict=True))
+    lines += ["", f"p of a difference between the scenes, paired (Wilcoxon): {each}."]
+    if not earlier.tested:
         return "\n".join(lines)
-    if touching.strategies[-1] == plain.strategies[-1]:  # the paper's statements are of that one
-        rows = [f"| {a} | {b} |" for a, b in _rows(plain.plan["name"], touching)]
-        lines += ["", _HEAD.replace("here", "here, with contact between fingers"), *rows]
-    return "\n".join([*lines, "", f"With contact between fingers, {details(touching)}"])
+    if len(earlier.strategies) > 2:
+        rows = [f"| {a} | {b} |" for a, b in _rows(earlier.plan["name"], earlier)]
+        lines += ["", _HEAD.replace("here", "here, in the earlier scene"), *rows]
+    return "\n".join([*lines, "", f"Earlier scene, {details(earlier)}"])
 
 
 def _quartiles(values: np.ndarray) -> str:
@@ -219,6 +218,10 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
         f"{figures.label(s)} {100 * r.mean():.0f} %"
         for s, r in zip(study.strategies, success, strict=True)
     )
+    ratios += f"; Page's trend test p {_p(statistics.trend(1.0 * success))}"
+    if len(success) > 4:
+        ratios += f", from two switches on p {_p(statistics.trend(1.0 * success[2:]))}"
+    ratios = ratios if study.tested else "not tested: the runs have not ended"
     finite = np.minimum(episodes, study.plan["episodes"] + 1)
     medians = ", ".join(
         f"{figures.label(s)} {_number(float(statistics.quantile(e, 0.5)))}"
@@ -227,14 +230,15 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     both = [statistics.median(study.convergence(r)[-1] * study.per_episode) for r in RULES]
     converged = (
         f"{name}: {paper} simulations to convergence (concurrent)",
-        f"{_interval(both[0])}; failed trials at the maximum: {_interval(both[1])}",
+        f"median {_interval(both[0])}, mean {_interval(_mean(episodes[-1] * study.per_episode))}; "
+        f"failed trials at the maximum: median {_interval(both[1])}",
     )
     if len(study.strategies) < 3:  # a trend needs three
         return [converged]
     return [
         (
             f"{name}: success grows with more switching, concurrent best",
-            f"{ratios}; Page's trend test p {_p(statistics.trend(1.0 * success))}",
+            ratios,
         ),
         (
             f"{name}: convergence quickens with more switching, concurrent fastest",
@@ -244,15 +248,28 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     ]
 
 
+def _mean(simulations: np.ndarray) -> Interval:
+    """Mean with its interval; without end where a run never converged."""
+    if not np.isfinite(simulations).all():
+        return Interval(np.inf, np.inf, np.inf)
+    found = statistics.bootstrap(lambda k: simulations[k].mean(-1), len(simulations))
+    return Interval(*(round(v) for v in found))
+
+
 def _growth_row(two: Study, many: Study) -> tuple[str, str]:
     parameters = len(many.data["parameters"]) / len(two.data["parameters"])
-    growth = statistics.ratio_of_medians(
-        many.convergence()[-1] * many.per_episode, two.convergence()[-1] * two.per_episode
-    )
-    text = "not defined" if np.isnan(growth.value) else _interval(growth, 3)
+    a, b = (s.convergence()[-1] * s.per_episode for s in (many, two))
+    growth = statistics.ratio_of_medians(a, b)
+    text = "not defined" if np.isnan(growth.value) else f"{_interval(growth, 3)} times by medians"
+    if np.isfinite(a).all() and np.isfinite(b).all():
+        # Of all pairs of resamples, as the runs of the two experiments are independent.
+        rng = np.random.default_rng(0)
+        drawn = [v[rng.integers(0, len(v), (2000, len(v)))].mean(1) for v in (a, b)]
+        low, high = np.quantile(drawn[0] / drawn[1], [0.025, 0.975])
+        text += f", {_interval(Interval(a.mean() / b.mean(), low, high), 3)} by means"
     return (
         "2 to 23 parameters: 11.5 times the parameters, 14.6 times the simulations",
-        f"{parameters:.1f} times the parameters, {text} times the simulations",
+        f"{parameters:.1f} times the parameters, the simulations {text}",
     )
 
 

@@ -2,6 +2,9 @@
 
 import dataclasses
 import datetime
+import json
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,39 +102,65 @@ class Process(NamedTuple):
     rate: float
 
 
+def log(path: Path, process: Process, commit: str | None) -> list[dict[str, Any]]:
+    """Notes a process that simulated something; several at once may do so.
+
+    Args:
+      path: File with a line of JSON for each process.
+      process: What this one did.
+      commit: Commit of the code, for a machine without git.
+
+    Returns:
+      Every process that the file has.
+    """
+    if process.grasps:
+        made = provenance.results(commit)
+        line = {name: made[name] for name in ("command", "commit", "device", "num_devices")}
+        line |= {"ended": round(time.time(), 1)}
+        line |= {name: round(value, 1) for name, value in process._asdict().items()}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:  # a line at once: others append as well
+            file.write(json.dumps(line) + "\n")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return [json.loads(line) for line in lines]
+
+
+def wall_seconds(processes: Sequence[Mapping[str, Any]]) -> float:
+    """Time in which at least one of the processes ran [s]."""
+    total, until = 0.0, -np.inf
+    for start, end in sorted((p["ended"] - p["seconds"], p["ended"]) for p in processes):
+        total += max(0.0, end - max(start, until))
+        until = max(until, end)
+    return round(total, 1)
+
+
 def describe(
     settings: dict[str, object],
-    process: Process,
+    processes: list[dict[str, Any]],
     grasps: int,
     screened: int,
     *,
-    before: dict[str, Any] | None = None,
     commit: str | None = None,
 ) -> dict[str, object]:
     """Returns what a result depends on, and what it took.
 
     Args:
       settings: See `settings_of`.
-      process: What this process did.
+      processes: Those that simulated it, see `log`; its commit is theirs.
       grasps: Grasps of the experiment so far.
       screened: Grasps that screened the seeds.
-      before: What an earlier process wrote of the same experiment.
       commit: Commit of the code, for a machine without git.
     """
-    earlier = before or {}
+    notes = provenance.results(commit)
+    commits = dict.fromkeys(str(p["commit"]) for p in processes)
     return {
-        **provenance.results(commit),
+        **notes,
+        "commit": ", ".join(commits) or notes["commit"],
         "settings": settings,
         "grasps": grasps,
         "grasps_that_screened_seeds": screened,
-        "wall_seconds": round(earlier.get("wall_seconds", 0.0) + process.seconds, 1),
-        "processes": earlier.get("processes", 0) + 1,
-        "last_process": {
-            "grasps": process.grasps,
-            "seconds": round(process.seconds, 1),
-            "compile_seconds": round(process.compile_seconds, 1),
-            "grasps_per_s": round(process.rate, 1),
-        },
+        "wall_seconds": wall_seconds(processes),
+        "processes": processes,
     }
 
 

@@ -19,12 +19,9 @@ from codesign_jax import scene as scenes
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.progress import duration
 from codesign_jax.scene.parameters import design_space
-from scripts.search.study import Study, make_case
+from scripts.search.study import UNFINISHED, Study, make_case
 from scripts.shared import provenance
 from scripts.shared.output import write_json
-
-UNFINISHED = 3
-"""Exit status of a command that ran out of --minutes."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -57,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     chunk = args.chunk or (512 if jax.default_backend() == "cpu" else 16_384)
     args.out.mkdir(parents=True, exist_ok=True)
     for name in args.optimizers:
-        case = make_case(name, space, args.preset)
+        case = make_case(name, space, args.preset, len(scene.objects.object))
         stem = f"{args.preset}-{name.replace(':', '-').replace('=', '')}"
         how = {"seeds": args.seeds, "budget": args.budget, "tests": args.tests, "chunk": chunk}
         how |= {"marks": args.marks, "at": args.at, "first_seed": args.first_seed}

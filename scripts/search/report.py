@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from codesign_jax.optimize import NAMES
 from codesign_jax.report.statistics import wilson
 from codesign_jax.report.verdicts import RELIABLE
 from scripts.shared import figures, tables
@@ -49,12 +50,14 @@ def table(rows: list[dict[str, Any]]) -> str:
     head = [
         "optimiser",
         "preset",
+        "objects",
         "seeds",
         "grasps of a seed",
         "median kept",
         "5 % of the seeds below",
     ]
     head += ["share of seeds that keep 95 % (95 % interval)", "grasps until 90 % of the seeds do"]
+    head += ["commit"]
     found = [head]
     for row in rows:
         kept = np.array(row["kept"][-1])
@@ -64,30 +67,50 @@ def table(rows: list[dict[str, Any]]) -> str:
             [
                 f"`{row['optimizer']}`",
                 row["preset"],
+                row.get("objects") or "three",
                 str(kept.size),
                 f"{row['grasps'][-1]:,}",
                 f"{np.median(kept):.3f}",
                 f"{np.quantile(kept, 0.05):.3f}",
                 f"{good / kept.size:.2f} ({share.low:.2f} to {share.high:.2f})",
                 reached(row, 0.9),
+                str(row.get("provenance", {}).get("commit", ""))[:7],
             ]
         )
     return tables.markdown(found)
 
 
+def variant(name: str) -> bool:
+    """Whether a case's name changes more than an optimiser's sizes."""
+    changes = {pair.split("=")[0] for pair in name.partition(":")[2].split(",") if pair}
+    return not changes <= {"particles", "trials"}
+
+
 def draw(rows: list[dict[str, Any]], path: Path) -> Path:
-    """Kept share of the recommended design against grasps: medians and 25 to 75 % of the seeds."""
-    presets = sorted({row["preset"] for row in rows})
-    figure = figures.new(4.6 * len(presets), 3.4)
-    for place, preset in enumerate(presets):
-        axes = figure.add_subplot(1, len(presets), place + 1)
-        for row in (r for r in rows if r["preset"] == preset):
+    """Kept share of the recommended design against grasps: medians and 25 to 75 % of the seeds.
+
+    Variants of an optimiser, but for its sizes, are in the table alone.
+    """
+    rows = [row for row in rows if not variant(row["optimizer"])]
+    kinds = sorted({(row["preset"], row.get("objects") or "three objects") for row in rows})
+    figure = figures.new(4.6 * len(kinds), 3.6)
+    for place, kind in enumerate(kinds):
+        axes = figure.add_subplot(1, len(kinds), place + 1)
+        for row in rows:
+            if (row["preset"], row.get("objects") or "three objects") != kind:
+                continue
+            name, at = row["optimizer"].split(":")[0], row["grasps"]
             low, middle, high = np.quantile(np.array(row["kept"]), [0.25, 0.5, 0.75], axis=1)
-            (line,) = axes.plot(row["grasps"], middle, ".-", label=row["optimizer"])
-            axes.fill_between(row["grasps"], low, high, alpha=0.15, color=line.get_color(), lw=0)
+            color = f"C{NAMES.index(name)}" if name in NAMES else None
+            (line,) = axes.plot(at, middle, "o-", ms=4, color=color, label=name)
+            away = [middle - low, high - middle]
+            axes.errorbar(at, middle, away, color=line.get_color(), lw=1, capsize=3)
         axes.axhline(RELIABLE, color="0.6", lw=0.8)
-        axes.set(xscale="log", xlabel="grasps of a seed, all counted", title=preset, ylim=(0, 1.01))
+        title = f"{kind[0]}, {kind[1]}"
+        axes.set(xscale="log", xlabel="grasps of a seed, all counted", title=title, ylim=(0, 1.01))
         axes.set_ylabel("share of fresh grasps kept")
+        ticks = sorted({g for row in rows for g in row["grasps"]})
+        axes.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
         axes.legend(fontsize=7, loc="lower right")
     return figures.save(figure, path)
 

@@ -1,8 +1,9 @@
 """One optimiser over many seeds at once, and how its recommended designs do on fresh trials.
 
-At every mark the optimiser's best particles meet fresh trials, the same number of them whatever the
-optimiser, and the one that costs least in these is what it recommends there.  These trials count as
-the search's; those by which the recommended design is judged do not.
+At every mark the optimiser's best particles meet fresh trials, and the one that costs least in
+these is what it recommends there: 25 particles in 12 trials each, or the final test of an optimiser
+that says how many finalists it has.  These trials count as the search's; those by which the
+recommended design is judged do not.
 """
 
 import dataclasses
@@ -25,22 +26,25 @@ from codesign_jax.types import Outcome, Trial, failed
 from scripts.shared.output import write_arrays
 
 CANDIDATES, ROUNDS = 25, 12
-"""Most particles that are tested at a mark, and most trials of each, but for whole turns of the
-objects; an optimiser whose runs have a shorter final test has that."""
+"""Most particles that are tested at a mark, and trials of each, but for whole turns of the objects;
+an optimiser with `finalists` has its runs' final test."""
+UNFINISHED = 3
+"""Exit status of a command that ran out of --minutes."""
 STREAM_JUDGE = 0x6A756467
 """Stream of the trials that judge a recommended design ("judg")."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """An optimiser with its sizes, by a name such as `screened-es:sigma=0.2,particles=12`.
+    """An optimiser with its sizes, by a name such as `screened-es:sigma=0.2,particles=12,tests=0`.
 
     Attributes:
       name: The name.
       optimizer: The optimiser.
       particles: Its particles.
       trials: Trials of each in an episode.
-      tests: Trials of each that choose at a mark.
+      tests: Trials of each finalist that choose at a mark; 0 recommends the state's first particle.
+      finalists: Particles that these choose from.
     """
 
     name: str
@@ -48,6 +52,7 @@ class Case:
     particles: int
     trials: int
     tests: int = ROUNDS
+    finalists: int = CANDIDATES
 
     @property
     def worlds(self) -> int:
@@ -55,24 +60,37 @@ class Case:
         return self.particles * self.trials
 
 
-def make_case(name: str, space: DesignSpace, preset: str) -> Case:
+def make_case(name: str, space: DesignSpace, preset: str, objects: int = 3) -> Case:
     """A case by its name; what the name does not change has the command's defaults.
 
     Args:
-      name: Name of an optimiser, and after a colon its fields, `particles` or `trials`.
+      name: Name of an optimiser, and after a colon its fields, `particles`, `trials` or `tests`.
       space: The design space.
       preset: Its name.
+      objects: Number of objects, each of which a particle of a screened search meets in an episode.
     """
     kind, _, changes = name.partition(":")
     given = dict(pair.split("=") for pair in changes.split(",") if pair)
     sizes = {n: int(given.pop(n)) for n in ("particles", "trials") if n in given}
     usual = runs.make_settings(
-        preset, "concurrent", "morphology", "structured", 0, optimizer=kind, **sizes
+        preset,
+        "concurrent",
+        "morphology",
+        "structured",
+        0,
+        optimizer=kind,
+        objects=objects,
+        **sizes,
     )
     made: Any = codesign.make_optimizer(kind, space)
+    own_test = getattr(made, "finalists", None)
+    tests = int(given.pop("tests", usual.test_trials if own_test else ROUNDS))
+    finalists = min(own_test or CANDIDATES, usual.particles)
+    if tests == 0 and not made.keeps_best:
+        raise ValueError(f"{name}: tests=0 is for optimisers whose first particle is the best")
     own = {n: _as(type(getattr(made, n)), v) for n, v in given.items()}
-    tests = min(ROUNDS, usual.test_trials)
-    return Case(name, dataclasses.replace(made, **own), usual.particles, usual.trials, tests)
+    optimizer = dataclasses.replace(made, **own)
+    return Case(name, optimizer, usual.particles, usual.trials, tests, finalists)
 
 
 def _as(kind: type, text: str) -> Any:
@@ -126,7 +144,8 @@ class Study:
         every = np.tile(np.arange(len(scene.objects.object)), (seeds, 1))
         self.shapes = every if shapes is None else np.asarray(shapes)
         self.rounds = -(-case.tests // self.shapes.shape[1]) * self.shapes.shape[1]
-        self.simulate = jax.jit(jax.vmap(self._simulate))
+        self.batch = min(chunk, seeds * case.worlds)
+        self.simulate = jax.jit(self._simulate)
         self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
         self.tell = jax.jit(
             jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
@@ -153,7 +172,7 @@ class Study:
     @property
     def tested(self) -> int:
         """Grasps by which a mark chooses."""
-        return min(CANDIDATES, self.case.particles) * self.rounds
+        return self.case.finalists * self.rounds
 
     @property
     def done(self) -> int:
@@ -212,22 +231,38 @@ class Study:
         return jax.jit(init)(self.keys, drawn[jnp.arange(len(rows)), rows])
 
     def _mark(self) -> int:
-        """Chooses by fresh trials what is recommended now, and judges it by others."""
+        """Chooses what is recommended now, and judges it."""
         assert self.last is not None
-        chosen = self.state.particles
-        if not self.case.optimizer.keeps_best:
-            best = jnp.argsort(self.last[1], axis=1)[..., None]
-            chosen = jnp.take_along_axis(self.last[0], best, 1)
-        chosen = chosen[:, :CANDIDATES]
-        tested = self._costs(
-            self._all(chosen, self._noise(codesign.STREAM_TEST, self.done), self.rounds)
-        )
-        design = chosen[jnp.arange(len(chosen)), tested.argmin(1)][:, None]
+        best_first = self.case.optimizer.keeps_best
+        return self.judge(self.done, *((self.state.particles,) if best_first else self.last))
+
+    def judge(self, mark: int, particles: jax.Array, costs: jax.Array | None = None) -> int:
+        """Chooses from particles by fresh trials, and judges the chosen one by others.
+
+        Args:
+          mark: Number of the mark.
+          particles: Particles of each seed, shape (seed, particle, parameter).
+          costs: Their costs, by which finalists are taken, shape (seed, particle); None if the
+            best stand first.
+
+        Returns:
+          The number of grasps.
+        """
+        if costs is not None:
+            order = jnp.argsort(jnp.asarray(costs), axis=1)[..., None]
+            particles = jnp.take_along_axis(jnp.asarray(particles), order, 1)
+        chosen = particles[:, : self.case.finalists]
+        best, grasps = jnp.zeros(len(chosen), int), 0
+        if self.rounds:
+            noise = self._noise(codesign.STREAM_TEST, mark)
+            tested = self._costs(self._all(chosen, noise, self.rounds))
+            best, grasps = tested.argmin(1), tested.size * self.rounds
+        design = chosen[jnp.arange(len(chosen)), best][:, None]
         outcome = self._all(design, self._noise(STREAM_JUDGE, 0), self.tests)
         kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
-        self.kept[self.done] = kept[:, 0].mean(-1)
-        self.designs[self.done] = np.asarray(design[:, 0])
-        return tested.size * self.rounds + kept.size
+        self.kept[mark] = kept[:, 0].mean(-1)
+        self.designs[mark] = np.asarray(design[:, 0])
+        return grasps + kept.size
 
     def _noise(self, stream: int, index: int) -> jax.Array:
         return jax.vmap(lambda key: codesign.stream_key(key, stream, index))(self.keys)
@@ -240,19 +275,22 @@ class Study:
         return self.outcomes(populations, self.drawn(keys, trials, self.shapes, self.scene))
 
     def outcomes(self, populations: jax.Array, trials: Trial) -> Outcome:
-        """Outcomes of shape (seed, particle, trial), simulated in calls of equal size.
+        """Outcomes of shape (seed, particle, trial), by one program whatever the shape.
 
         Args:
           populations: Particles of each seed, shape (seed, particle, parameter).
           trials: Trials that these meet, leading axes (seed, trial).
         """
-        count, worlds = len(populations), populations.shape[1] * trials.yaw.shape[1]
-        size, parts = min(max(1, self.chunk // worlds), count), []
-        for start in range(0, count, size):
-            rows = jnp.minimum(jnp.arange(start, start + size), count - 1)
-            own = jax.tree.map(lambda v, rows=rows: v[rows], trials)
-            parts.append(self.simulate(populations[rows], own))
-        return jax.tree.map(lambda *v: jnp.concatenate(v)[:count], *parts)
+        shape = (*populations.shape[:2], trials.yaw.shape[1])
+        seed, particle, trial = np.indices(shape).reshape(3, -1)
+        designs, trials = np.asarray(populations), jax.tree.map(np.asarray, trials)
+        parts = []
+        for start in range(0, len(seed), self.batch):
+            rows = np.minimum(np.arange(start, start + self.batch), len(seed) - 1)
+            own = jax.tree.map(lambda v, at=(seed[rows], trial[rows]): v[at], trials)
+            parts.append(self.simulate(designs[seed[rows], particle[rows]], own))
+        found = jax.tree.map(lambda *v: np.concatenate(v)[: len(seed)], *parts)
+        return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), found)
 
     def drawn(self, keys: jax.Array, trials: int, shapes: np.ndarray, scene: Scene) -> Trial:
         """Trials of each key with a scene's noise, of objects that take turns.
@@ -270,9 +308,9 @@ class Study:
         turns = shapes[:, np.arange(trials) % shapes.shape[1]]
         return drawn._replace(shape=jnp.asarray(turns, drawn.shape.dtype))
 
-    def _simulate(self, population: jax.Array, trials: Trial) -> Outcome:
-        hands = jax.vmap(self.space.params)(population)
-        return rollout.evaluate(self.scene, self.engine, hands, trials)
+    def _simulate(self, designs: jax.Array, trials: Trial) -> Outcome:
+        hands = jax.vmap(self.space.params)(designs)
+        return rollout.simulate(self.scene, self.engine, hands, trials)[0]
 
     def _leaves(self) -> list[jax.Array]:
         state = self.state._replace(key=jax.vmap(jax.random.key_data)(self.state.key))

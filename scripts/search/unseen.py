@@ -27,13 +27,11 @@ from codesign_jax.engines import make_engine
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import failed
-from scripts.search.study import STREAM_JUDGE, Study, make_case
+from scripts.search.study import STREAM_JUDGE, UNFINISHED, Study, make_case
 from scripts.shared import provenance, tables
 from scripts.shared.output import write_json
 
 PAGE = Path("docs/notes/search.md")
-UNFINISHED = 3
-"""Exit status of a command that ran out of --minutes."""
 
 
 def folds(count: int) -> np.ndarray:
@@ -139,9 +137,8 @@ def main(arguments: list[str] | None = None) -> int:
     scene = scenes.load("paper", object_set=args.objects, overrides=noise)
     count, space = len(scene.objects.object), design_space(scene.hand, args.preset)
     shapes = np.repeat(folds(count), args.seeds, axis=0)
-    changes = "" if "trials=" in args.optimizer else f"trials={count - 1}"
-    name = args.optimizer + (":" if ":" not in args.optimizer else ",") * bool(changes) + changes
-    case, engine = make_case(name, space, args.preset), make_engine("structured", scene)
+    case = make_case(args.optimizer, space, args.preset, count - 1)
+    engine = make_engine("structured", scene)
     chunk = args.chunk or (512 if jax.default_backend() == "cpu" else 16_384)
     how = {"seeds": len(shapes), "tests": count - 1, "marks": 1, "chunk": chunk, "shapes": shapes}
     study = Study(case, scene, engine, space, budget=args.budget, **how, path=args.out)
@@ -161,7 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
         with np.load(path) as stored:
             last = max(int(n.removeprefix("designs")) for n in stored if n.startswith("designs"))
             others[other] = stored[f"designs{last}"][: args.most]
-    row = {"optimizer": name, "objects": [s.name for s in scene.objects.object]}
+    row = {"optimizer": case.name, "objects": [s.name for s in scene.objects.object]}
     row |= {"grasps": study.row()["grasps"][-1], "seeds": args.seeds, "trials": args.trials}
     row |= judged(study, usual, others, args.trials)
     write_json(result, row | {"provenance": provenance.results(args.commit)})

@@ -68,7 +68,7 @@ class Dense:
             rows = slice(c.efc_address, c.efc_address + 3)
             jac = data.efc_J.reshape(-1, oracle.nv)[rows]
             self.rows.append((jac, data.efc_aref[rows], 1 / data.efc_D[rows][:2], c.friction[0]))
-        self.num_hull = 0
+        self.num_hull, self.held = 0, []
         for f in range(scene.num_fingers):
             self._add_finger(scene, oracle, data, hand, f)
 
@@ -114,7 +114,19 @@ class Dense:
         return total
 
     def _add(
-        self, scene, data, jac, normal, gap, friction, share, bodies, ratio=None, impedance=None
+        self,
+        scene,
+        data,
+        jac,
+        normal,
+        gap,
+        friction,
+        share,
+        bodies,
+        ratio=None,
+        impedance=None,
+        grip=None,
+        closing=0.0,
     ):
         c = scene.contact
         ratio = c.friction_ratio if ratio is None else ratio
@@ -122,8 +134,12 @@ class Dense:
         frame[0] = normal
         jac, d = frame @ jac, c.impedance if impedance is None else impedance
         r = (1 - d) / d * model.contact_invweight(scene) * bodies / share
-        reference = -2 / (d * c.time_constant) * (jac @ data.qvel)
+        reference = -2 / (d * c.time_constant) * (jac @ data.qvel + [closing, 0, 0])
         reference[0] -= gap * d / (d * c.time_constant) ** 2
+        if grip is not None:  # a share of the elastic normal force, which it is held by
+            elastic = -gap * d / (d * c.time_constant) ** 2 / r
+            reference[1:] -= elastic * r / ratio * (frame[1:] @ grip)
+            self.held.append((len(self.rows), frame, elastic, grip))
         self.rows.append((jac, reference, np.array([r, r / ratio]), friction))
         self.num_hull += 1
 
@@ -159,7 +175,15 @@ class Dense:
             _, grad, hess = parts(y)
             y = y - np.linalg.solve(hess, grad)
         assert np.linalg.norm(parts(y)[1]) < 1e-9 * (1 + np.linalg.norm(y))
-        return start + back @ y
+        self.acceleration = start + back @ y
+        return self.acceleration
+
+    def force(self, row):
+        """Force of a contact in its own frame at the solution."""
+        jac, reference, r, friction = self.rows[row]
+        root = np.sqrt([r[0], r[1], r[1]])
+        z = (reference - jac @ self.acceleration) / root
+        return project(z, friction * np.sqrt(r[1] / r[0]))[0] / root
 
 
 def project(z, slope):
@@ -181,9 +205,11 @@ def project(z, slope):
 class DensePairs(Dense):
     """A step's problem with the contacts of the hulls of different fingers, and of the palm."""
 
-    def __init__(self, scene, model, data, hand):
+    def __init__(self, scene, model, data, hand, grip=None):
+        """Grip: friction coefficient that the first of two fingers uses on the second one, (3,)."""
         super().__init__(scene, model, data, hand)
-        self.pairs = self.merged = self.on_palm = 0
+        self.grip = grip
+        self.pairs = self.merged = self.on_palm = self.ahead = 0
         if scene.effects.finger_palm:
             for f in range(scene.num_fingers):
                 self._add_palm(scene, model, data, hand, f)
@@ -210,35 +236,58 @@ class DensePairs(Dense):
             if found:
                 c = scene.contact
                 rest = c.finger_finger_friction, c.finger_finger_friction_ratio, c.impedance
-                self._add_resultant(scene, data, found, *rest)
+                sign = 1.0 if f < other else -1.0
+                if self.grip is None:
+                    self._add_resultant(scene, data, found, *rest)
+                else:
+                    self._add_resultant(scene, data, found, *rest, sign * self.grip)
+                    self.held[-1] += (sign,)
                 self.pairs += 1
                 self.merged = max(self.merged, len(found))
 
     def _add_palm(self, scene, model, data, hand, f):
         """Resultants of the vertices of a finger's rows in the palm's disc, from a quarter on."""
         c, links, palm = scene.contact, scene.discretization.links, data.body("palm")
-        frame, disc = palm.xmat.reshape(3, 3), scene.hand.palm
+        frame = palm.xmat.reshape(3, 3)
         stiffer = c.finger_palm_stiffness / c.normal_stiffness
         impedance = 1 - (1 - c.impedance) / stiffer
         for row in range(int(np.ceil(links / 4)), links + 1):
-            found = []
+            vertices = []
             for k in range(hull.slots(scene).along.shape[1]):
                 point, jac_at, share = self._vertex(scene, model, data, hand, f, row, k)
-                x, y, z = (point - palm.xpos) @ frame
-                depth, normal = min(
-                    (disc.radius - np.hypot(x, y), (*np.array([x, y]) / np.hypot(x, y), 0)),
-                    (z, (0, 0, -1)),
-                    (disc.thickness - z, (0, 0, 1)),
-                )
-                if depth > 0:
-                    normal = frame @ normal
-                    arm = normal * depth / 2
-                    jac = jac_at(arm) - self._jac(model, data, [point + arm], (palm.id,), 1.0)
-                    found.append((2 * share, depth, normal, jac))
-            if found:
-                rest = c.finger_palm_friction, c.finger_finger_friction_ratio, impedance
+                gap, normal = from_disc(scene.hand.palm, (point - palm.xpos) @ frame)
+                normal = frame @ normal
+                arm = -normal * gap / 2
+                jac = jac_at(arm) - self._jac(model, data, [point + arm], (palm.id,), 1.0)
+                vertices.append((2 * share, -gap, normal, jac))
+            rest = c.finger_palm_friction, c.finger_finger_friction_ratio, impedance
+            if scene.effects.speculative_palm:
+                self._add_ahead(scene, data, row, vertices, rest)
+            elif found := [v for v in vertices if v[1] > 0]:
                 self._add_resultant(scene, data, found, *rest)
                 self.on_palm += 1
+
+    def _add_ahead(self, scene, data, row, vertices, rest):
+        """Contacts of a row's halves with the palm that act in the step that carries them in."""
+        h, across = scene.discretization.timestep, hull.slots(scene).across[row]
+        for side in (-1, 1):
+            found, later = [], []
+            for (share, depth, normal, jac), place in zip(vertices, across, strict=True):
+                part = 0.5 if abs(place) < 1e-9 else float(np.sign(place) == side)
+                if part:
+                    later.append(max(depth, depth - h * normal @ jac @ data.qvel))
+                    found.append((part * share, later[-1], normal, jac, depth))
+            if max(later) <= 0:  # none will be inside: the nearest one may come in
+                near = np.argmax(later)
+                found = [(found[near][0], 1e-6, *found[near][2:])] if later[near] > -0.006 else []
+            found = [v for v in found if v[1] > 0]
+            if found:
+                share, _, _, _, depth = (np.array([v[k] for v in found]) for k in range(5))
+                share = share / share.sum()
+                gaps = share @ np.minimum(-depth, 0), share @ np.maximum(-depth, 0) / h
+                self._add_resultant(scene, data, found, *rest, gaps=gaps)
+                self.on_palm += 1
+                self.ahead += gaps[0] == 0
 
     def _vertex(self, scene, model, data, hand, f, row, k):
         """Place of a vertex, its Jacobian as a function of an offset, and half its share."""
@@ -267,16 +316,29 @@ class DensePairs(Dense):
 
         return point, jac_at, -((1 - w) * turned[0] + w * turned[1])
 
-    def _add_resultant(self, scene, data, found, friction, ratio, impedance):
-        """One contact of all vertices of a row in another row, weighted by their forces."""
+    def _add_resultant(self, scene, data, found, friction, ratio, impedance, grip=None, gaps=None):
+        """One contact of all vertices of a row in another row, weighted by their forces.
+
+        gaps: Of a contact ahead of touch the mean of the gaps below zero, and the speed that
+        closes the mean of those above it in a step.
+        """
         share, depth = (np.array([v[k] for v in found]) for k in (0, 1))
         force = share * depth / (share @ depth)
         normal, jac = (np.tensordot(force, [v[k] for v in found], 1) for k in (2, 3))
         length = np.linalg.norm(normal)
-        gap = -length * (share @ depth) / share.sum()
-        self._add(
-            scene, data, jac, normal / length, gap, friction, share.sum(), 2, ratio, impedance
-        )
+        gap, closing = gaps or (-(share @ depth) / share.sum(), 0.0)
+        cone = friction, share.sum(), 2, ratio, impedance, grip
+        self._add(scene, data, jac, normal / length, length * gap, *cone, closing=length * closing)
+
+    def next_grip(self):
+        """What the first finger uses in the solution: tangential over normal forces, or elastic."""
+        above = below = 0.0
+        for row, frame, elastic, grip, sign in self.held:
+            force = self.force(row)
+            weight = max(force[0], elastic)
+            held = weight * frame[0] * (frame[0] @ grip) - frame[1:].T @ force[1:]
+            above, below = above + sign * held, below + weight
+        return above / below
 
     @staticmethod
     def _section(scene, data, hand, f, row, point):
@@ -302,6 +364,20 @@ class DensePairs(Dense):
         if phi >= 1:
             return None
         return (phi - 1) / slope, joint + frames[1] @ local, w
+
+
+def from_disc(palm, point):
+    """Signed distance of a point from the palm's disc and its gradient, in the palm's frame."""
+    beside = np.hypot(*point[:2])
+    out = np.array([*point[:2] / beside, 0.0])
+    up = np.array([0.0, 0.0, np.sign(point[2] - palm.thickness / 2)])
+    excess = np.array(
+        [beside - palm.radius, abs(point[2] - palm.thickness / 2) - palm.thickness / 2]
+    )
+    if (excess > 0).all():
+        gap = np.hypot(*excess)
+        return gap, (excess[0] * out + excess[1] * up) / gap
+    return (excess[0], out) if excess[0] > excess[1] else (excess[1], up)
 
 
 def outline(scene, hand, f, row):

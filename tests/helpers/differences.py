@@ -77,6 +77,9 @@ class Case:
         self.start, (hand, state) = start, self._lanes(scene, engine, start)
         ctrl = jnp.asarray(start.ctrl)[None]
         self.tables = [np.array(x) for x in jax.jit(self.program.inputs)(hand, state, ctrl)]
+        if self.program.held:  # fingers hold on one another from the start
+            grip = 0.3 * np.random.default_rng(1).normal(size=self.world(self.tables[2]).shape)
+            self._move(self.tables[2], 0, self._opposite(grip))
         layouts = [getattr(self.program, name) for name in TABLES[:4]]
         self.groups = [
             (k, name)
@@ -121,6 +124,15 @@ class Case:
         count, first = layout.groups[name][0] * layout.stride[name], layout.offset[name]
         return slice(first, first + count)
 
+    def _opposite(self, values):
+        """The rows of "grip" of values (row, finger), equal and opposite for two fingers."""
+        found, fingers = np.zeros_like(values), np.arange(values.shape[1])
+        for item, row in enumerate(np.arange(values.shape[0])[self.rows(2, "grip")][::3]):
+            other = fingers ^ (item + 1)
+            mine = values[row : row + 3] * (fingers < other)
+            found[row : row + 3] = mine - mine[:, other]
+        return found
+
     def directions(self):
         """A random direction for each group, as large as its numbers."""
         random, found = np.random.default_rng(0), []
@@ -129,6 +141,8 @@ class Case:
             along, noise = np.zeros_like(here), random.normal(size=here.shape)
             size = {2: 0.1, 3: 0.1, 4: 0.01, 5: np.abs(here).max()}.get(k)
             along[rows] = noise[rows] * (np.abs(here[rows]) if size is None else size)
+            if name == "grip":
+                along = self._opposite(along)
             if name == "quat":  # it stays one
                 along[rows] -= here[rows] * (here[rows] * along[rows]).sum()
             found.append(along)

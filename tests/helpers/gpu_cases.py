@@ -31,7 +31,11 @@ EFFECTS = {
     },
     "hull": {"effects__surface": "hull"},
     "fingers": {"effects__finger_finger": True},
-    "hull and fingers": {"effects__surface": "hull", "effects__finger_finger": True},
+    "hull and fingers": {
+        "effects__surface": "hull",
+        "effects__finger_finger": True,
+        "effects__friction_memory": True,
+    },
 }
 """Effects of the scenes that are compared, by name."""
 

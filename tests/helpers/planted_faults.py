@@ -23,6 +23,7 @@ from codesign_jax.engines.structured.kernel import (
     advance,
     contact_sets,
     coupling,
+    grip,
     linear_system,
     newton,
     pair_search,
@@ -43,6 +44,7 @@ DEEP = 1e6
 MODULES = (
     contact_sets,
     coupling,
+    grip,
     linear_system,
     pair_search,
     skin,

@@ -22,14 +22,24 @@ ROLLED = {"flat on flat": 0.0, "edge on flat": np.pi / 4}
 
 
 @functools.cache
-def crossed(links=10, rings=2, points=8):
-    """The default scene's contact between two opposed fingers, and no other."""
+def crossed(links=10, rings=2, points=8, memory=False):
+    """The default scene's contact between two opposed fingers, and no other.
+
+    Args:
+      links: Links of a finger.
+      rings: Rings of vertices a link.
+      points: Vertices a ring.
+      memory: `effects.friction_memory`.
+    """
     others = ("finger_object", "palm_object", "finger_table", "palm_table", "finger_palm")
     size = {"links": links, "hull_rings": rings, "hull_points": points}
     base = scene.load(
         "paper",
         hand_name=grasps.DATA / "pinch.toml",
-        overrides={"effects": dict.fromkeys(others, False), "discretization": size},
+        overrides={
+            "effects": dict.fromkeys(others, False) | {"friction_memory": memory},
+            "discretization": size,
+        },
     )
     return dataclasses.replace(base, gravity=0.0)
 
@@ -193,11 +203,7 @@ def pressed(roll, step, precision):
     """
     b, start = exact(step, precision), -0.3e-3  # they do not touch yet
     worlds, lay = len(PLACED), model.layout(b.scene)
-    fields = straight(b, PLACED, np.full(worlds, start), roll)
-    hinge = lay.dofs[1, 0, 0]
-    fields.dof_armature[:, : int(lay.dofs.max()) + 1] = HEAVY
-    fields.dof_damping[:, hinge], fields.jnt_stiffness[:, hinge] = HINGE, 0.0
-    fields.dof_armature[:, hinge] = b.h * HINGE  # implicit, as everywhere
+    fields, (hinge,) = hinged(b, PLACED, start, roll, (1,))
     arm = LENGTH * (PLACED[:, 1] - 0.5 / lay.links)
     each = round(HOLD / b.h)
     ctrl = b.hold(HOLD * len(LOADS), *np.c_[fields.start[:, :6], np.zeros((worlds, 2))])
@@ -205,6 +211,18 @@ def pressed(roll, step, precision):
     ctrl[:, :, 7] = torque / fields.actuator_gainprm[:, -1:, 0]
     turned = b.run(fields, ctrl).qpos[:, each - 1 :: each, hinge]
     return start + np.tan(turned) * arm[:, None]
+
+
+def hinged(b, places, depth, roll, fingers):
+    """Fields of rigid fingers, some of which turn about their first joints; and these joints."""
+    lay = model.layout(b.scene)
+    fields = straight(b, places, np.full(len(places), depth), roll)
+    fields.dof_armature[:, : int(lay.dofs.max()) + 1] = HEAVY
+    hinges = [lay.dofs[f, 0, 0] for f in fingers]
+    for hinge in hinges:
+        fields.dof_damping[:, hinge], fields.jnt_stiffness[:, hinge] = HINGE, 0.0
+        fields.dof_armature[:, hinge] = b.h * HINGE  # implicit, as everywhere
+    return fields, hinges
 
 
 def sinks(roll, engine, step, precision):
@@ -224,6 +242,58 @@ def snaps(roll, engine, step, precision):
     # A snap is of millimetres: 3.5 mm by the law before this one.  A mesh with points 5 mm apart
     # slides from one to the next over a few tenths.
     return Found(change.max(), 5e-4, f"at {1 + change.max(0).argmax()} N")
+
+
+# --- friction below and above its limit ----------------------------------------------------------
+
+PRESSED = np.array([5.0, 15.0])
+"""Forces that press the fingers together [N]."""
+PRESS, PULL, REST = 0.7, 0.1, 1.0
+"""Times in which the load and then the pull grow, and until the pull begins [s]."""
+CREEPS = 4.5
+"""Time from the pull on [s]: that of a grasp from lift to release."""
+
+
+def pulled(share, seconds, step, precision, *, memory=True):
+    """Way [m] of a finger that is pulled along the other one by a share of the friction limit.
+
+    The upper finger presses on the edge of the lower one, which lies on its side, so that it bends
+    in the plane of contact.  Both are rigid and turn about their first joints, by their pressures.
+
+    Returns:
+      Ways from the pull on, shape (world, time); worlds are `PLACED` times `PRESSED`.
+    """
+    b = bench(crossed(memory=memory), "structured", step, precision)
+    places = np.repeat(PLACED, len(PRESSED), 0)
+    load = np.tile(PRESSED, len(PLACED))
+    fields, hinges = hinged(b, places, -0.3e-3, np.pi / 2, (0, 1))
+    first = round(REST / b.h)
+    start = np.c_[fields.start[:, :6], np.zeros((len(load), 2))]
+    ctrl = b.hold(first * b.h + seconds, *start)
+    arms = LENGTH * (places - 0.5 / model.layout(b.scene).links)
+    time = np.arange(ctrl.shape[1]) * b.h
+    pull = share * b.scene.contact.finger_finger_friction * load
+    loads = (pull, np.clip((time - REST) / PULL, 0, 1)), (load, np.clip(time / PRESS, 0, 1))
+    for f, (force, ramp) in enumerate(loads):
+        moment = fields.actuator_gainprm[:, f - 2, 0]
+        ctrl[:, :, 6 + f] = (force * arms[:, f] / moment)[:, None] * ramp
+    turned = b.run(fields, ctrl).qpos[:, :, hinges[0]]
+    way = np.tan(turned) * arms[:, :1]
+    return way[:, first:] - way[:, first - 1 : first]
+
+
+def creeps(engine, step, precision):
+    """Half the limit holds; above it the finger slides off and turns away."""
+    way = pulled(0.5, CREEPS, step, precision)
+    assert np.abs(pulled(1.3, 0.5, step, precision)).max(1).min() > 5e-3, "it holds above its limit"
+    last = np.abs(way[:, -1] - way[:, round(-way.shape[1] / CREEPS)]).max()
+    note = f"in the last second {1e3 * last:.2g} mm; at 1.3 of the limit it slides off"
+    return Found(np.abs(way).max(), 1e-3, note)
+
+
+def creeps_without(engine, step, precision):
+    """A damper: 12 to 21 mm/s; after a second the finger turns away."""
+    return Found(pulled(0.5, 1.0, step, precision, memory=False)[:, -1].min(), 5e-3)
 
 
 once = {"steps": (1.0,), "precisions": ("float64",)}  # a force at rest does not know the step
@@ -261,3 +331,14 @@ for kind, turn in ROLLED.items():
         unit="m",
         **loaded,
     )(functools.partial(snaps, turn))
+
+half = "two crossed hull fingers that hold by friction_memory, half the friction limit"
+case(34, half, "way in 4.5 s under 5 and 15 N", unit="m", **loaded)(creeps)
+case(
+    34,
+    half,
+    "way in a second without that effect",
+    unit="m",
+    lower=True,
+    **once,
+)(creeps_without)

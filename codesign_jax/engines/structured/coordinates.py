@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.model import ModelFields, layout
+from codesign_jax.model.layout import pairings_held
 from codesign_jax.scene import Scene
 
 
@@ -24,7 +25,7 @@ def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> Stat
       acc: Accelerations, the solver's warm start, in the order of qvel, the object's as in
         `kinematics.Acc`, shape (world, nv).
     """
-    lay = layout(scene)
+    lay, held = layout(scene), pairings_held(scene)
     end = 6 + lay.dofs.size
     q, v, a = (x.T[:, None] for x in (qpos, qvel, acc))
 
@@ -41,6 +42,7 @@ def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> Stat
         linear_vel=v[end : end + 3],
         angular_vel=v[end + 3 :],
         acc=Acc(a[:6], finger(a), a[end:]),
+        grip=jnp.zeros((held, 3, len(lay.dofs), len(qpos)), q.dtype) if held else None,
     )
 
 

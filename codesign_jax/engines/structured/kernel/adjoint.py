@@ -82,6 +82,8 @@ class AdjointProgram(Program):
         n, a = self.links, self.axes
         more = {f"chain.{k}": (n + 1, shape) for k, shape in SHAPES._asdict().items()}
         more |= {"acc_bar": (n, (a,)), "virtual": (n, (a,))}
+        if self.held:
+            more |= {"grip_bar": (self.held, (4,))}
         more |= {f"bar.{k}": (1, shape) for k, shape in STEP.items()}
         if any(isinstance(s, PairSet) for s in self.sets):
             more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in Place._fields}

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import grip
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.problem import Iterate
@@ -57,6 +58,7 @@ def advance(step: "Step", state: dict, at: dict, now: Iterate, goes_on: Any, spe
         return x
 
     jax.lax.fori_loop(0, p.links, store, jnp.int32(0))
+    grip.store(step, good)
     return jnp.where(goes_on, largest, speed), good
 
 

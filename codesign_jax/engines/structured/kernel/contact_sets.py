@@ -149,16 +149,26 @@ class BoundContacts:
 
         jax.lax.cond(self.touching(item), store, lambda: None)
 
-    def begin(self, place: tuple, motion: Lanes, velocity: Lanes) -> dict[str, Lanes]:
-        """What is kept of new contacts, by field, for relative motions of their bodies."""
+    def begin(
+        self, place: tuple, motion: Lanes, velocity: Lanes, ahead: tuple | None = None
+    ) -> dict[str, Lanes]:
+        """What is kept of new contacts, by field, for relative motions of their bodies.
+
+        Args:
+          place: Where they are, see `ContactSet.places`.
+          motion: Relative acceleration.
+          velocity: Relative velocity.
+          ahead: See `sections.ahead`; None for contacts that act from touch on.
+        """
         contacts = self.set.contacts
 
-        def jar(place, cone, motion, velocity):
+        def jar(place, cone, motion, velocity, *ahead):
             c = contacts(place, cone)
+            c = c._replace(ahead=tuple(part[0] for part in ahead) or None)
             reference = c.reference(c.relative(velocity[:, None]))
             return c.relative(motion[:, None]) - reference
 
-        value = lanewise(jar, place, self.cone, motion, velocity)
+        value = lanewise(jar, place, self.cone, motion, velocity, *(ahead or ()))
         fields = dict(zip(self.set.places, place, strict=True))
         return {**fields, "jar": value, "step": lanewise(jnp.zeros_like, value)}
 

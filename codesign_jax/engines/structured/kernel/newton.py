@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import solver
+from codesign_jax.engines.structured.kernel import grip, solver
 from codesign_jax.engines.structured.kernel.chord import LARGEST, Chord
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
@@ -39,7 +39,9 @@ class Newton:
         self.elimination = (Elimination if one else TeamElimination)(problem)
         self.search = (LineSearch if one else TeamLineSearch)(problem)
         self.coupling = Coupling if one else TeamCoupling
-        self.chord = Chord(problem) if problem.slotted and one else None
+        # A GPU's lanes wait for the one that needs most iterations, so that it gains nothing there.
+        vectors = one and problem.slotted and not problem.slotted[0].set.gathers
+        self.chord = Chord(problem) if vectors else None
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -77,6 +79,9 @@ class Newton:
                 found = now, alpha, residual
                 confirm = partial(self.confirm, *found, done, scale, likely, tolerance)
                 now, alpha, residual = choose(anywhere(likely), confirm, found, self.block.size)
+            if grip.kept(problem):
+                ends = busy & ((residual.lane <= tolerance) | (count + 1 >= iterations))
+                grip.settle(problem, alpha, ends)
             return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:

@@ -86,6 +86,8 @@ class Packing(Tables):
             "finger_vel": state.finger_vel,
             "acc": state.acc.finger,
         }
+        if self.held:
+            finger_state["grip"] = state.grip
         wide = {k: self._widen(v) for k, v in finger_state.items()}
         narrow = {k: arrays[k] for k in self.world_state.groups}
         return self.finger_state.pack(self.fingers, self.block, **wide), self.world_state.pack(

@@ -8,12 +8,13 @@ row of another finger are one contact, see `sections.pressure`; so are those in 
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import skin
+from codesign_jax.engines.structured.kernel import grip, skin
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
@@ -21,9 +22,9 @@ from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.teams import team_sum, where
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import hull, sections
+from codesign_jax.engines.structured.laws import holding, hull, sections
 from codesign_jax.engines.structured.world_model import apply_columns
-from codesign_jax.model.layout import first_on_palm
+from codesign_jax.model.layout import first_on_palm, palm_ahead
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
@@ -46,6 +47,8 @@ class Search:
         self.moves, self.palm = (at["now"].palm_motion, at["vel"]), ()
         if pairs.set.palm:
             self.palm = at["place"], at["frame"], step.constant("palm_disc")
+        self.ahead = palm_ahead(step.p.scene)
+        self.timestep = step.p.scene.discretization.timestep
         self.scratch, self.ref, self.block = step.p.scratch, step.scratch, step.block
         self.like = jnp.zeros((step.p.size,), step.finger_state.dtype)
 
@@ -64,6 +67,7 @@ class Search:
         """Empties the slots; stores what belongs to the palm."""
         for row in range(self.pairs.set.rows):
             self.pairs.clear(row)
+        grip.clear(self.step)
         self._side(0, motion, vel, frame, base)
 
     def link(self, i: Any, motion: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
@@ -120,31 +124,67 @@ class Search:
         first = first_on_palm(self.p.links)
 
         def one(i: Any) -> None:
-            row, ball = i + first, self.read("ball", i + first)
-            (_, _, near), _ = lanewise(sections.ball_on_palm, ball, self.palm)
-            any_of(near.lane < 0, lambda: self._row_on_palm(row, None))
+            row = i + first
+            any_of(self._near_palm(row), lambda: self._row_on_palm(row, None))
 
         each(self.p.links + 1 - first, one)
+
+    def _near_palm(self, row: Any) -> jax.Array:
+        """Lanes on which a vertex of a row may touch the palm, with `ahead` in this step."""
+        ball = self.read("ball", row)
+        (_, _, gap), _ = lanewise(sections.ball_on_palm, ball, self.palm)
+        if not self.ahead:
+            return gap.lane < 0
+        joint = self.read("joint", jnp.minimum(row + 1, self.p.links))
+        speed = lanewise(sections.fastest, ball, joint, self.pairs.side("vel", row))
+        return gap.lane < sections.REACH + self.timestep * speed.lane
 
     def _row_on_palm(self, row: Any, there: jax.Array | None) -> None:
         """Enters one contact of all vertices of a row; there: lanes that have one to try."""
         d, links = self.p.scene.discretization, self._links(row)
         count, kind = d.hull_rings * d.hull_points, skin.kind_of(row, self.p.links)
 
-        def add(k: Any, sums: Lanes) -> Lanes:
+        vel = self.pairs.side("vel", row) if self.ahead else None
+
+        def add(k: Any, sums: Any) -> Any:
             k, mine = self.block.dealt(count, k)
             vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
-            ends = lanewise(sections.on_palm, vertex, links, self.palm)
-            new = lanewise(sections.add_vertex, sums, *ends)
+            one, other = lanewise(sections.on_palm, vertex, links, self.palm)
+            if vel is None:
+                new = lanewise(sections.add_vertex, sums, one, other)
+            else:
+                one, seen = lanewise(partial(sections.ahead, self.timestep), one, vel)
+                new = lanewise(sections.add_to_halves, sums, vertex, one, other, seen)
             return new if mine is None else where(mine, new, sums)
 
-        start = zeros((sections.SUMS,), self.like)
-        sums = loop(self.block.rounds(count), add, start, self.block.size)
-        place = lanewise(sections.pressure, team_sum(self.block, sums))[0]
-        self._enter_on_palm(place, row, there=there)
+        if vel is None:
+            start = zeros((sections.SUMS,), self.like)
+            sums = loop(self.block.rounds(count), add, start, self.block.size)
+            place = lanewise(sections.pressure, team_sum(self.block, sums))[0]
+            return self._enter_on_palm(place, row, there=there)
+        one = lanewise(sections.none_ahead, lanes([self.like], (), wide=True))
+        halves = loop(self.block.rounds(count), add, (one, one), self.block.size)
+        for number, sums in enumerate(halves):
+            place, _, seen = lanewise(sections.pressure_ahead, self._team_sum(sums))
+            self._enter_on_palm(place, row, number, there, seen)
+
+    def _team_sum(self, sums: Lanes) -> Lanes:
+        """Sums of a team's lanes; with `ahead` of those with the lowest gap, or one below 0."""
+        if self.block.team == 1 or not self.ahead:
+            return team_sum(self.block, sums)
+        own = sums[-1].lane
+        lowest = self.block.over_team(own, jnp.minimum)
+        counts = lanes([(own < 0) | (own == lowest)], (), wide=True)
+        parts = team_sum(self.block, lanewise(lambda c, s: jnp.where(c, s, 0.0), counts, sums[:-1]))
+        return lanewise(_appended, parts, lanes([lowest], (1,), wide=True))
 
     def _enter_on_palm(
-        self, place: tuple, row: Any, sphere: Any = 0, there: jax.Array | None = None
+        self,
+        place: tuple,
+        row: Any,
+        sphere: Any = 0,
+        there: jax.Array | None = None,
+        seen: tuple | None = None,
     ) -> None:
         """Gives a slot to a contact with the palm, whose motion the sides' are relative to."""
         pairs = self.pairs
@@ -154,7 +194,7 @@ class Search:
         def enter() -> None:
             moves = [pairs.side(name, row) for name in ("motion", "vel")]
             with pairs.with_cone(0):
-                fields = pairs.begin(place, *moves)
+                fields = pairs.begin(place, *moves, seen)
             number = lanes([self.like + jnp.asarray(row, self.like.dtype)], (1, 1), wide=True)
             fields |= {"row": number} | pairs.remembered({"owner": 1.0, "sphere": sphere})
             pairs.add(0, which, fields, self.block.own)
@@ -338,17 +378,20 @@ class Search:
         """Gives contacts a slot; places on either side, the sides' rows, and how they move."""
         pairs, contacts = self.pairs, self.pairs.set.contacts
 
-        def jar(one, other, cone, motion, vel):
+        def jar(one, other, cone, held, motion, vel):
             a, b = (contacts(place, cone) for place in (one, other))
 
             def relative(m):
                 return a.relative(m[0][:, None]) - b.relative(m[1][:, None])
 
             value = relative(motion) - a.reference(relative(vel))
+            for g in held:
+                value = value + holding.held(a, g[:, None])
             return value, -value, jnp.zeros_like(value)
 
         cone = pairs.of_row(row)
-        mine, theirs, none = lanewise(jar, ends[0], ends[1], cone, moves[0], moves[1])
+        held = grip.of_row(self.step, pairs, row)
+        mine, theirs, none = lanewise(jar, ends[0], ends[1], cone, held, moves[0], moves[1])
         kept = [
             dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
             for place, value in zip(ends, (mine, theirs), strict=True)
@@ -363,6 +406,10 @@ class Search:
         if pairs.set.remembers:
             alike |= pairs.remembered({"owner": owner, "sphere": jnp.where(owner, *spheres)})
         pairs.enter(row, which, owner, kept[0], kept[1], alike)
+
+
+def _appended(one: jax.Array, other: jax.Array) -> jax.Array:
+    return jnp.concatenate([one, other])
 
 
 def each(count: int, body: Callable[[Any], None]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import powers, skin
+from codesign_jax.engines.structured.kernel import grip_sweep, powers, skin
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
@@ -22,6 +22,7 @@ from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import sections
+from codesign_jax.model.layout import palm_ahead
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.sweep import Sweep
@@ -107,36 +108,62 @@ class PairSweep:
         palm, disc = self._palm()
         body = (palm.origin, palm.frame, disc)
 
-        def sums_of(k: Any) -> Lanes:
-            return lanewise(powers.palm_sums, vertex(k)[1], mine, body)
+        run, of_vertex = partial(powers.between_rows, self.p.scene), powers.palm_sums
+        given, fixed, numbers = (mine, body), (), sections.SUMS
+        empty: tuple = ((3,), (3, 3), (3, 3)), ((3,), (3, 3), (2,))
+        if palm_ahead(self.p.scene):
+            run, numbers = partial(powers.row_on_palm, self.p.scene), sections.AHEAD - 1
+            of_vertex = partial(powers.ahead_sums, d.timestep)
+            given = *given, (ends[0].vel, ends[1].vel, palm.vel)
+            fixed, empty = self._half(item, vertex, count, given), (*empty, ((6,), (6,), (6,)))
 
-        side = RowSide(palm.frame, *palm[2:])
-        args = self._sums(count, sums_of), ends, (side, side), self.sweep.step.constant(ON_PALM)
-        run = partial(powers.between_rows, self.p.scene)
-        bar, moves, (first, second), numbers = only_on(live, pull(run, args, (), self.sweep.one))
-        self.bars.add({ON_PALM: numbers})
+        def sums_of(k: Any) -> Lanes:
+            return lanewise(of_vertex, vertex(k)[1], *given, *fixed)
+
+        side, cone = RowSide(palm.frame, *palm[2:]), self.sweep.step.constant(ON_PALM)
+        args = self._sums(count, sums_of, numbers), ends, (side, side), cone
+        bar, moves, (first, second), cone = only_on(live, pull(run, args, (), self.sweep.one))
+        self.bars.add({ON_PALM: cone})
 
         def one(number: Any, place: Lanes) -> tuple[Lanes, tuple]:
-            own, *bodies = only_on(live, pull(powers.palm_sums, (place, mine, body), (), bar))
+            own, *bodies = only_on(live, pull(of_vertex, (place, *given), fixed, bar))
             return own, tuple(bodies)
 
-        empty = ((3,), (3, 3), (3, 3)), ((3,), (3, 3), (2,))
-        own, theirs = self._back(count, "vertex", vertex, live, sums_of, one, empty)
-        (joint, *frames), (origin, frame, size) = own, theirs
+        found = self._back(count, "vertex", vertex, live, sums_of, one, empty)
+        (joint, *frames), (origin, frame, size), *vels = found
         self.bars.add({"palm_disc": size})
         moved = plus(first, second)
+        if vels:
+            *both, other = vels[0]
+            moves = [m._replace(vel=plus(m.vel, v)) for m, v in zip(moves, both, strict=True)]
+            moved = moved._replace(vel=plus(moved.vel, other))
         self._leave_palm(Place(origin, frame, *moved[1:]))
         self._leave_row(row, behind, joint, frames, moves)
 
+    def _half(self, item: Any, vertex: Callable, count: int, given: tuple) -> tuple[Lanes, Lanes]:
+        """Side of the half row of a slot, and the lowest gap of its vertices."""
+        number = self.pairs.read("sphere", item).lane
+        side = lanes([2.0 * number - 1.0], (), wide=True)
+        gap = partial(powers.ahead_gap, self.p.scene.discretization.timestep)
+
+        def lower(k: Any, lowest: Lanes) -> Lanes:
+            return lanewise(jnp.minimum, lowest, lanewise(gap, vertex(k)[1], *given, side))
+
+        far = lanes([self.like + sections.REACH], (), wide=True)
+        return side, loop(count, lower, far, self.p.size)
+
     # Fingers
+
     def _spheres(self, item: Any, pairing: Pairing, row: jax.Array, live: Lanes) -> None:
         """Adds the cotangents of spheres of two links."""
         link, which = self._sphere(item)
         mine = self._body(row), *(self.hand(n, link, self.lane) for n in ("sphere", "radius"))
         theirs, other = pairing.swap((mine, which))
-        args, fixed = (mine, theirs, self.sweep.step.constant(CONE)), ((which, other),)
+        held = grip_sweep.at(self.sweep.step, pairing)
+        args, fixed = (mine, theirs, self.sweep.step.constant(CONE), held), ((which, other),)
         run = partial(powers.between_spheres, self.p.scene)
-        own, swapped, numbers = only_on(live, pull(run, args, fixed, self.sweep.one))
+        own, swapped, numbers, kept = only_on(live, pull(run, args, fixed, self.sweep.one))
+        grip_sweep.leave(self.sweep.step, pairing, kept)
         place, *own = plus(own, pairing.swap(swapped))
         self.bars.add({CONE: numbers})
         self.bars.add(dict(zip(("sphere", "radius"), own, strict=True)), link, self.lane)
@@ -155,9 +182,11 @@ class PairSweep:
         def sums_of(k: Any) -> Lanes:
             return lanewise(powers.vertex_sums, vertex(k)[1], mine, theirs, last)
 
-        args = self._sums(count, sums_of), ends, other_ends, self.sweep.step.constant(CONE)
+        held = grip_sweep.at(self.sweep.step, pairing)
+        args = self._sums(count, sums_of), ends, other_ends, self.sweep.step.constant(CONE), held
         run = partial(powers.between_rows, p.scene)
-        bar, *moves, numbers = only_on(live, pull(run, args, (), self.sweep.one))
+        bar, *moves, numbers, kept = only_on(live, pull(run, args, (), self.sweep.one))
+        grip_sweep.leave(self.sweep.step, pairing, kept)
         self.bars.add({CONE: numbers})
 
         def one(number: Any, place: Lanes) -> tuple[Lanes, tuple]:
@@ -199,9 +228,9 @@ class PairSweep:
         one, other = (RowSide(*(self._chain(n, r) for n in RowSide._fields)) for r in (row, behind))
         return vertex, behind, (one, other)
 
-    def _sums(self, count: int, sums_of: Callable) -> Lanes:
+    def _sums(self, count: int, sums_of: Callable, numbers: int = sections.SUMS) -> Lanes:
         """What all vertices of a row add to `sections.pressure`."""
-        none = zeros((sections.SUMS,), self.like)
+        none = zeros((numbers,), self.like)
         return loop(count, lambda k, s: plus(s, sums_of(k)), none, self.p.size)
 
     def _back(

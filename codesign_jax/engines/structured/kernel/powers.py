@@ -17,7 +17,7 @@ from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.slots import HullSet
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
-from codesign_jax.engines.structured.laws import contact, hull, sections, shapes
+from codesign_jax.engines.structured.laws import contact, holding, hull, sections, shapes
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
@@ -224,6 +224,7 @@ def between_spheres(
     mine: tuple[Place, Any, Any],
     theirs: tuple[Place, Any, Any],
     numbers: Any,
+    held: tuple,
     which: tuple,
 ) -> jax.Array:
     """Power of two fingers' spheres on one another.
@@ -233,13 +234,15 @@ def between_spheres(
       mine: Link, and centres and radii of its spheres, on the lane's own side.
       theirs: The same of the other finger.
       numbers: Numbers of the cone.
+      held: What the fingers hold, see `holding.held`, and cotangents of the sums of
+        `holding.hold`; nothing where they have no such state.
       which: Number of the sphere on either link.
     """
     balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
     one, other = sections.between(*balls)
     cone = cone_of(scene, numbers)
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in (one, other)]
-    return _between(ends, mine[0][2:], theirs[0][2:])
+    return _between(ends, mine[0][2:], theirs[0][2:], held)
 
 
 def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, which) -> jax.Array:
@@ -272,6 +275,37 @@ def palm_sums(vertex, mine: tuple, palm: tuple) -> jax.Array:
     return sections.add_vertex(none, *sections.on_palm(vertex, mine, palm))
 
 
+def ahead_gap(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side):
+    """The gap of a vertex of a half row as `sections.add_ahead` has it; see `ahead_sums`."""
+    return _half_ahead(timestep, vertex, mine, palm, vels, side)[0][2][0, 0]
+
+
+def ahead_sums(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side, lowest):
+    """What a vertex of a half row adds to `sections.pressure_ahead`.
+
+    Args:
+      timestep: Time step [s].
+      vertex: As in `palm_sums`.
+      mine: As in `palm_sums`.
+      palm: As in `palm_sums`.
+      vels: Velocities of the links before and behind its joint and of the palm.
+      side: Side of the half row, see `sections.half_of_row`.
+      lowest: The lowest gap of the half row.
+    """
+    half, other, seen = _half_ahead(timestep, vertex, mine, palm, vels, side)
+    return sections.part_ahead(half, other, seen, lowest + ROUNDING)
+
+
+ROUNDING = 0.1 * sections.TOUCH
+"""By how much the lowest gap may differ when it is computed again [m]."""
+
+
+def _half_ahead(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side) -> tuple:
+    own, other = sections.on_palm(vertex, mine, palm)
+    own, seen = sections.ahead(timestep, own, hull.across(*vels))
+    return sections.half_of_row(vertex, own, side), other, seen
+
+
 def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
     """What a vertex of the own row adds to `sections.pressure` of another finger's row.
 
@@ -287,25 +321,58 @@ def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
     return sections.add_vertex(none, *sections.inside(vertex, tuple(own), tuple(other), size, last))
 
 
-def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
-    """Power of a row on another finger's row; mine and theirs: sides before and behind."""
+def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers, held: tuple = ()):
+    """Power of a row on another finger's row, or the palm.
+
+    Args:
+      scene: The scene.
+      sums: See `sections.pressure`.
+      mine: Sides before and behind the row.
+      theirs: The same of the other row.
+      numbers: Numbers of the cone.
+      held: As in `between_spheres`.
+    """
     cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
-    moves = [
+    return _between(ends, *_row_moves(mine, theirs), held)
+
+
+def row_on_palm(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
+    """As `between_rows`, of a half row on the palm ahead of touch."""
+    cone = cone_of(scene, numbers)
+    *places, seen = sections.pressure_ahead(sums)
+    one, other = (HullSet.contacts(end, cone) for end in places)
+    one = one._replace(ahead=tuple(part[0] for part in seen))
+    return _between([one, other], *_row_moves(mine, theirs))
+
+
+def _row_moves(mine: tuple, theirs: tuple) -> tuple[list, list]:
+    """Velocity, acceleration and virtual acceleration of two rows, of nine components each."""
+    one, other = (
         [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
         for before, after in (mine, theirs)
-    ]
-    return _between(ends, *moves)
+    )
+    return one, other
 
 
-def _between(ends: list[Contacts], mine: Any, theirs: Any) -> jax.Array:
+def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:
+    """Cotangents of the sums of `holding.hold` times what contacts add to them."""
+    return sum_axis(dot(bars[:, None], holding.hold(contacts, force, grip[:, None])), 0)
+
+
+def _between(ends: list[Contacts], mine: Any, theirs: Any, held: tuple = ()) -> jax.Array:
     one, other = ends
     vel, motion, along = (
         one.relative(a[:, None]) - other.relative(b[:, None])
         for a, b in zip(mine, theirs, strict=True)
     )
-    force = contact.constraint_update(one, motion - one.reference(vel)).force
-    return sum_axis(dot(force, along), 0)
+    jar = motion - one.reference(vel)
+    if not held:
+        force = contact.constraint_update(one, jar).force
+        return sum_axis(dot(force, along), 0)
+    grip, bars = held
+    force = contact.constraint_update(one, jar + holding.held(one, grip[:, None])).force
+    return sum_axis(dot(force, along), 0) + held_work(one, force, grip, bars)
 
 
 def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import advance, powers, speed
+from codesign_jax.engines.structured.kernel import advance, grip_sweep, powers, speed
 from codesign_jax.engines.structured.kernel.bars import Bars
 from codesign_jax.engines.structured.kernel.memory import Block
 from codesign_jax.engines.structured.kernel.pair_sweep import PairSweep
@@ -73,6 +73,8 @@ class ReverseStep(Step):
         state, at, thing, m, now, centre = self.assemble(arm, pressure)
         go = lanes([moved], (), wide=False)
         before, acc_bar = self._integration(state, at, now, go)
+        if p.held:
+            grip_sweep.reverse(self, m.contacts["finger_finger"], go)
         forces = palm_problem(at["palm"], *acc_bar)
         problem = Problem(p.links, block, m, forces, rigid=not p.scene.effects.wrist)
         virtual = Virtual(problem).solve()

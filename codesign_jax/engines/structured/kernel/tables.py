@@ -11,7 +11,7 @@ from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_
 from codesign_jax.engines.structured.kernel.team_slots import TeamHullSet, TeamPairSet
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.model import layout
-from codesign_jax.model.layout import palm_touches
+from codesign_jax.model.layout import pairings_held, palm_touches
 from codesign_jax.scene import Scene
 
 GATHERING = ("gpu",)
@@ -52,6 +52,7 @@ class Tables:
         self.palm_groups = -(-self.lay.palm.size // self.fingers)
         self.meshes = bool(shapes.mesh_indices(scene))
         self.sets = self._sets()
+        self.held = pairings_held(scene)
         self.slotted = any(isinstance(s, SlotSet) for s in self.sets)
         self._tables()
 
@@ -150,9 +151,9 @@ class Tables:
             **dict.fromkeys(verdict.Bounds._fields, (1, one)),
             **some,
         )
-        self.finger_state = MemoryLayout(
-            True, finger=(n, (a,)), finger_vel=(n, (a,)), acc=(n, (a,))
-        )
+        held = {"grip": (self.held, (3,))} if self.held else {}
+        joint = n, (a,)
+        self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **held, acc=joint)
         world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
         world_state |= dict(acc_wrist=6, acc_object=6)
         self.world_state = MemoryLayout(
@@ -175,6 +176,8 @@ class Tables:
         }
         if self.scene.effects.lateral_threshold:
             fields |= {"armature_now": (n, (a,))}
+        if self.held:
+            fields |= {"new_grip": (self.held, (3,))}
         for contacts in self.sets:
             fields |= contacts.groups()
         if self.slotted:

@@ -47,9 +47,7 @@ class TeamSearch(Search):
         first = first_on_palm(self.p.links)
 
         def near(item: jax.Array) -> jax.Array:
-            ball = self.read("ball", item + first)
-            (_, _, gap), _ = lanewise(sections.ball_on_palm, ball, self.palm)
-            return gap.lane < 0
+            return self._near_palm(item + first)
 
         def process(item: jax.Array, some: jax.Array) -> None:
             self._row_on_palm(item + first, some)

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import grip, grip_sweep
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
@@ -46,6 +47,8 @@ class Virtual(Elimination):
         """See `Elimination`."""
         pairs.update_constraints(alpha)
         pairs.clear_wrenches()
+        if grip.kept(self.problem):
+            grip_sweep.push(self.problem, pairs)
 
     def solve(self) -> Iterate:
         """Solves the system; leaves the joints' part in the scratch table.

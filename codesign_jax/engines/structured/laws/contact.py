@@ -69,6 +69,8 @@ class Contacts(NamedTuple):
       lever: Of points that follow a joint's rotation in part, see `hull`: their velocity is the
         joint's angular velocity x lever, shape (3, ...).
       ends: Of contacts between fingers their links, see `finger_pairs`.
+      ahead: Of contacts that act ahead of touch, see `sections.ahead`: the distance as far as it is
+        negative [m], and the speed that would close in a step what is left of it [m/s], (...).
     """
 
     point: jax.Array
@@ -77,6 +79,7 @@ class Contacts(NamedTuple):
     cone: Cone
     lever: jax.Array | None = None
     ends: "Ends | None" = None
+    ahead: tuple[jax.Array, jax.Array] | None = None
 
     @property
     def active(self) -> jax.Array:
@@ -137,9 +140,17 @@ class Contacts(NamedTuple):
         return cone._replace(normal=cone.normal * share, tangent=tangent, spring=spring)
 
     def reference(self, velocity: jax.Array) -> jax.Array:
-        """Reference acceleration aref from the relative point velocity, shaped as that."""
-        cone = self.grown
-        return -cone.damper * velocity - cone.spring * self.distance * self.direction
+        """Reference acceleration aref from the relative point velocity, shaped as that.
+
+        MuJoCo's is -b v - k r.  A contact that acts ahead of touch, at a distance r > 0, has
+        -b (v + r/h) in the step h: it takes from the velocity what would carry it below the
+        surface (speculative contact).  At r = 0 both are one.
+        """
+        cone, distance = self.grown, self.distance
+        if self.ahead is not None:
+            distance, closing = self.ahead
+            velocity = velocity + closing * self.direction
+        return -cone.damper * velocity - cone.spring * distance * self.direction
 
 
 class Response(NamedTuple):

@@ -46,6 +46,8 @@ class State(NamedTuple):
       linear_vel: Object velocity, world frame, shape (3, 1, world).
       angular_vel: Object angular velocity, body frame as in MuJoCo, shape (3, 1, world).
       acc: Accelerations of the last step, the solver's warm start.
+      grip: Friction that fingers hold on one another, see `holding.held`, of each pairing of the
+        kernel, shape (pairing, 3, finger, world); None without `effects.friction_memory`.
     """
 
     wrist: jax.Array
@@ -57,6 +59,7 @@ class State(NamedTuple):
     linear_vel: jax.Array
     angular_vel: jax.Array
     acc: "Acc"
+    grip: jax.Array | None = None
 
 
 class Acc(NamedTuple):

@@ -12,7 +12,7 @@ direction flips.  Lane by lane, see `fingers`.
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import dot, total
+from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.laws import hull, shapes
 from codesign_jax.engines.structured.world_model import apply_columns, apply_rows
 
@@ -84,6 +84,47 @@ def on_palm(vertex, own: tuple, palm: tuple) -> tuple[tuple, tuple]:
     at, gap = (point[:, 0] + to_contact)[:, None], gap[None, None]
     mine = at, normal[:, None], gap, lever[:, None], share
     return mine, (at, -normal[:, None], gap, jnp.zeros_like(lever)[:, None], share)
+
+
+REACH = 0.006
+"""Gap at a step's end, at the velocity of its beginning, below which a contact may act [m].
+
+Fingers that come loose from rest move by half a centimetre in a step of 10 ms.
+"""
+
+
+def ahead(timestep: float, mine: tuple, vel: jax.Array) -> tuple[tuple, tuple]:
+    """A contact that acts in the step that would carry it into what it touches.
+
+    Args:
+      timestep: Time step h [s].
+      mine: Point, normal, gap, lever and share of a vertex on the moving side.
+      vel: Motion of that side relative to the other, shape (9, ...).
+
+    Returns:
+      The same with the lower of the gap now and, at this velocity, at the step's end; and
+      `Contacts.ahead`, both of shape (1, 1, ...).
+    """
+    point, normal, gap, lever, share = mine
+    moving = vel[3:6] + cross(vel[:3], point[:, 0]) + cross(vel[6:], lever[:, 0])
+    later = gap + timestep * dot(normal[:, 0], moving)
+    seen = jnp.minimum(gap, 0.0), jnp.maximum(gap, 0.0) / timestep
+    return (point, normal, jnp.minimum(gap, later), lever, share), seen
+
+
+def fastest(ball: jax.Array, joint: jax.Array, vel: jax.Array) -> jax.Array:
+    """Bound of the speed of a row's vertices, which lie in a ball [m/s].
+
+    Args:
+      ball: Centre and radius, shape (4, ...).
+      joint: Place of the row's joint, shape (3, ...).
+      vel: Motion of the row, shape (9, ...).
+    """
+    away = ball[:3] - joint
+    moving = vel[3:6] + cross(vel[:3], ball[:3])
+    reach = ball[3] + jnp.sqrt(dot(away, away))
+    turning = ball[3] * jnp.sqrt(dot(vel[:3], vel[:3])) + reach * jnp.sqrt(dot(vel[6:], vel[6:]))
+    return jnp.sqrt(dot(moving, moving)) + turning
 
 
 def separated(own: tuple, own_size, theirs: tuple, size, last) -> jax.Array:
@@ -238,6 +279,75 @@ def add_vertex(sums: jax.Array, mine: tuple, other: tuple) -> jax.Array:
     force = share * depth
     vectors = [force * v[:, 0] for v in (normal, point, lever, other[3])]
     return sums + jnp.concatenate([share[None], force[None], *vectors])
+
+
+AHEAD = SUMS + 3
+"""Numbers of `add_ahead`: `SUMS`, both of `Contacts.ahead` x share, and the lowest gap."""
+TOUCH = 1e-6
+"""Depth that a contact counts with which may act and does not reach the palm [m]."""
+
+
+def half_of_row(vertex, mine: tuple, side) -> tuple:
+    """A vertex of `ahead` as one of the half of its row on one side of the finger, -1 or 1.
+
+    One contact a row would leave the finger free to roll, which the step after would see.
+    """
+    across = side * vertex[1]
+    part = jnp.where(across > TOUCH, 1.0, jnp.where(across < -TOUCH, 0.0, 0.5))
+    point, normal, gap, lever, share = mine
+    return point, normal, jnp.where(part > 0, gap, 1.0), lever, part * share
+
+
+def none_ahead(like: jax.Array) -> jax.Array:
+    """Sums of no vertices, with the largest gap that a candidate may have."""
+    zero = jnp.zeros_like(like)
+    return jnp.stack([*[zero] * (AHEAD - 1), zero + REACH])
+
+
+def part_ahead(mine: tuple, other: tuple, seen: tuple, lowest: jax.Array) -> jax.Array:
+    """What a vertex of `ahead` adds to the sums: in the palm, or the nearest one where none is.
+
+    Args:
+      mine: The vertex on its own side.
+      other: On the palm's.
+      seen: `Contacts.ahead`.
+      lowest: The lowest gap of all vertices, shape (...).
+    """
+    gap, share = mine[2][0, 0], mine[4][0, 0]
+    depth = jnp.where(gap < 0, -gap, jnp.where(gap <= lowest, TOUCH, 0.0))
+    place = *mine[:2], -depth[None, None], *mine[3:]
+    none = jnp.zeros((SUMS, *gap.shape), gap.dtype)
+    share = jnp.where(depth > 0, share, 0.0)
+    more = jnp.stack([share * part[0, 0] for part in seen])
+    return jnp.concatenate([add_vertex(none, place, other), more])
+
+
+def add_ahead(sums: jax.Array, mine: tuple, other: tuple, seen: tuple) -> jax.Array:
+    """As `add_vertex`, of a vertex of `ahead`."""
+    before, gap = sums[-1], mine[2][0, 0]
+    lowest = jnp.minimum(before, gap)
+    kept = jnp.where((gap < before) & (before >= 0), 0.0, sums[:-1])
+    return jnp.concatenate([kept + part_ahead(mine, other, seen, lowest), lowest[None]])
+
+
+def add_to_halves(sums: tuple, vertex, mine: tuple, other: tuple, seen: tuple) -> tuple:
+    """`add_ahead` of the two halves of a vertex's row, see `half_of_row`."""
+    halves = (half_of_row(vertex, mine, side) for side in (-1, 1))
+    return tuple(add_ahead(s, half, other, seen) for s, half in zip(sums, halves, strict=True))
+
+
+def pressure_ahead(sums: jax.Array) -> tuple[tuple, tuple, tuple]:
+    """As `pressure`, of the sums of `add_ahead`; and `Contacts.ahead`.
+
+    The row's is the mean of its vertices, less as far as they push in different directions.
+    """
+    share, force, normal = sums[0], sums[1], sums[2:5]
+    some = force > 0
+    square = dot(normal, normal)
+    pushes = some & (square > 0)
+    agree = jnp.sqrt(jnp.where(pushes, square, 1.0)) / jnp.where(some, force * share, 1.0)
+    seen = tuple((agree * part)[None, None] for part in sums[SUMS : SUMS + 2])
+    return *pressure(sums[:SUMS]), seen
 
 
 def pressure(sums: jax.Array) -> tuple[tuple, tuple]:

@@ -1,0 +1,62 @@
+"""Friction that two bodies hold on one another from step to step, the effect `friction_memory`."""
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.lanes import dot
+from codesign_jax.engines.structured.laws.contact import Contacts
+
+
+def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
+    """What a contact's jar has of the friction that its two bodies hold, shaped as jar.
+
+    With the effect `friction_memory` the tangential force of a contact that sticks is
+      f = -D_t (a + b v) - E g,
+    with its elastic normal force E = D k |r| and g the friction coefficient that the two bodies
+    used in the step before, see `hold`.  Below the cone the force so grows until nothing moves,
+    where without g it keeps v in proportion to f.  The cone bounds it as before: a spring of
+    tangential stiffness D_t b / h with a slider (Cundall and Strack 1979, Geotechnique 29, 47).
+
+    Args:
+      contacts: The contacts.
+      grip: g, world axes, shape (3, ...).
+    """
+    cone, n = contacts.grown, contacts.normal
+    # A slot in which a lane has no contact may have no stiffness either.
+    some = contacts.active & (cone.tangent > 0)
+    share = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangent, 1.0), 0.0)
+    tangent = share * (grip - dot(n, grip) * n)
+    if cone.spin is None:
+        return tangent
+    return jnp.concatenate([tangent, jnp.zeros_like(tangent)])
+
+
+def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
+    """What a contact adds to the friction that its two bodies hold, shape (4, ...).
+
+    The quotient of the sums over their contacts is the next g: minus the tangential forces over
+    the normal ones.  Where E is the larger one it counts in their place, so that g is at most mu.
+    A contact leaves the part of g along its own normal as it is: without it bodies at rest that
+    touch with several normals would lose g as fast as those differ.
+
+    Args:
+      contacts: The contacts.
+      force: Their forces.
+      grip: As in `held`.
+    """
+    n, force = contacts.normal, force[:3]
+    normal = dot(n, force)
+    weight = jnp.where(contacts.active, jnp.maximum(normal, _elastic(contacts)), 0.0)
+    return jnp.concatenate([(normal + weight * dot(n, grip)) * n - force, weight[None]])
+
+
+def _elastic(contacts: Contacts) -> jax.Array:
+    """Normal force of a contact at rest."""
+    cone = contacts.grown
+    return cone.normal * cone.spring * jnp.maximum(-contacts.distance, 0.0)
+
+
+def quotient(sums: jax.Array) -> jax.Array:
+    """Friction that two bodies hold, from the sums of `hold`; none where nothing touches."""
+    some = sums[3] > 0
+    return jnp.where(some, sums[:3] / jnp.where(some, sums[3], 1.0), 0.0)

@@ -1,0 +1,155 @@
+"""The tables and the figure of `scripts.accuracy.budget`, from its file alone."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.patches import Patch
+
+from codesign_jax.scene import load
+from scripts.accuracy import analysis, decision
+from scripts.accuracy.tables import interval
+from scripts.shared import figures, tables
+
+PRESETS = ("fast", "standard", "fine", "reference")
+CANDIDATES = {
+    "least": "`standard` with the material's damping",
+    "least, 1e-3": "the same, a tolerance of 1e-3",
+    "4 x 16, least, 1e-3": "the same, a skin of 4 × 16 points a link",
+    "5 ms, least, 1e-3": "`fine` with a tolerance of 1e-3 and 24 iterations",
+    "5 ms, 3 x 12, least, 1e-3": "the same, a skin of 3 × 12 points a link",
+}
+
+
+class Change(NamedTuple):
+    """A row of the budget: what is changed, from which variant to which, and of what kind."""
+
+    words: str
+    of: str
+    to: str
+    kind: str
+
+
+CHANCE, NUMERICS, MODELS = "chance", "numerics", "models"
+COLORS = {CHANCE: "tab:gray", NUMERICS: "tab:blue", MODELS: "tab:orange"}
+CHANGES = (
+    Change("object moved by a micrometre, `standard`", "standard", "standard, moved", CHANCE),
+    Change("the same, `fast`", "fast", "fast, moved", CHANCE),
+    Change("the same, `fine`", "fine", "fine, moved", CHANCE),
+    Change("the same, the truth", "truth", "truth, moved", CHANCE),
+    Change("time step of 5 ms", "standard", "5 ms", NUMERICS),
+    Change("time step of 2 ms", "standard", "2 ms", NUMERICS),
+    Change("20 links", "standard", "20 links", NUMERICS),
+    Change("skin of 4 × 16 points a link", "standard", "4 x 16", NUMERICS),
+    Change("four Newton iterations", "standard", "4 iterations", NUMERICS),
+    Change("tolerance of 1e-3", "standard", "1e-3", NUMERICS),
+    Change("the material's damping alone", "standard", "least", NUMERICS),
+    Change("step, links and skin at once: the truth", "standard", "truth", NUMERICS),
+    Change("the truth refined again", "truth", "finer", NUMERICS),
+    Change("soft touch", "standard", "soft touch", MODELS),
+    Change("pressure resists sideways bending", "standard", "lateral threshold", MODELS),
+    Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
+    Change("spheres in place of the skin", "standard", "spheres", MODELS),
+    Change("fingers pass one another", "standard", "fingers pass each other", MODELS),
+    Change("fingers pass the palm", "standard", "fingers pass the palm", MODELS),
+    Change("constants drawn from their calibrated range", "standard", "constants", MODELS),
+)
+
+
+class Budget:
+    """Costs of all variants that a file has, and their comparisons."""
+
+    def __init__(self, found: dict[str, Any]):
+        """Decodes the file."""
+        scene = load("paper")
+        records = {n: r for n, r in found["variants"].items() if "lost" in r}
+        self.costs = {n: decision.costs(scene, r) for n, r in records.items()}
+        self.rates = {n: r["rates"] for n, r in found.get("rates", {}).items()}
+
+    def compared(self, of: str, to: str) -> dict[str, Any] | None:
+        """`analysis.compare` of a variant with another one, None if either was not run."""
+        if of not in self.costs or to not in self.costs:
+            return None
+        return analysis.compare(self.costs[of], self.costs[to])
+
+    def row(self, name: str, words: str) -> list[str]:
+        """A setting beside the truth."""
+        beside, moved = self.compared(name, "truth"), self.compared(name, f"{name}, moved")
+        cells = [words, *["–"] * 5]
+        if beside:
+            cells[1] = points(beside["success_difference"])
+            cells[2], cells[3] = interval(beside["flipped"]), interval(beside["rank"], ".2f")
+        if moved:
+            cells[4] = f"{moved['flipped'].value:.1%}"
+        if rate := self.rates.get("gpu", {}).get(name):
+            cells[5] = f"{float(format(rate['grasps_per_s'], '.2g')):,.0f}"
+        return cells
+
+
+def points(value: Any) -> str:
+    """A difference of success in points, with its interval."""
+    middle, low, high = (100 * v for v in value)
+    return f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def presets_table(budget: Budget) -> list[list[str]]:
+    """Presets and candidates beside the truth."""
+    head = ["setting", "success, points from the truth", "verdicts that flip", "rank correlation"]
+    rows = [[*head, "flips by a micrometre", "grasps/s, one H100"]]
+    rows += [budget.row(name, f"`{name}`") for name in PRESETS]
+    return rows + [budget.row(n, words) for n, words in CANDIDATES.items() if n in budget.costs]
+
+
+def budget_table(budget: Budget) -> list[list[str]]:
+    """What each change moves."""
+    rows = [["change", "verdicts that flip", "success, points", "rank correlation", "of"]]
+    for change in CHANGES:
+        if found := budget.compared(change.to, change.of):
+            cells = interval(found["flipped"]), points(found["success_difference"])
+            rows.append([change.words, *cells, f"{found['rank'].value:.2f}", change.kind])
+    return rows
+
+
+def luck(budget: Budget) -> str:
+    """What six trials tell of a design: a sentence."""
+    cost = budget.costs["truth" if "truth" in budget.costs else "standard"]
+    kept = (cost < 0.01).astype(float)
+    six = np.sqrt((kept.mean(1) * (1 - kept.mean(1))).mean() / 6)
+    rank = analysis.trial_noise(cost)
+    told = "none" if rank is None else f"{rank:.2f}"
+    return (
+        f"Luck of six trials: a design's success has a standard error of {100 * six:.0f} points; "
+        f"ranks by six trials and by six others correlate by {told}."
+    )
+
+
+def draw(budget: Budget, path: Path) -> Path:
+    """The budget as bars with their intervals, by kind."""
+    found = [(c, r) for c in CHANGES if (r := budget.compared(c.to, c.of))]
+    figure = figures.new(7.5, 0.28 * len(found) + 1.0)
+    axes = figure.subplots()
+    for place, (change, result) in enumerate(found):
+        middle, low, high = (100 * v for v in result["flipped"])
+        axes.barh(-place, middle, color=COLORS[change.kind], alpha=0.8)
+        error = [[middle - low], [high - middle]]
+        axes.errorbar(middle, -place, xerr=error, fmt="none", color="black", capsize=2)
+    words = [c.words.replace("`", "") for c, _ in found]
+    axes.set_yticks([-k for k in range(len(found))], words, fontsize=8)
+    handles = [Patch(color=color, alpha=0.8) for color in COLORS.values()]
+    axes.legend(handles, list(COLORS), frameon=False, fontsize=8, loc="lower right")
+    axes.set(xlabel="verdicts of late designs that flip [%]", xlim=(0, None))
+    return figures.save(figure, path)
+
+
+def make(found: dict[str, Any], page: Path | None, figure: Path | None) -> int:
+    """Prints the tables, fills them into a page, draws the figure; returns the exit status."""
+    budget = Budget(found)
+    parts = {"presets": tables.markdown(presets_table(budget))}
+    parts["budget"] = f"{tables.markdown(budget_table(budget))}\n\n{luck(budget)}"
+    for mark, text in parts.items():
+        print(f"{text}\n")
+        if page:
+            tables.fill(page, text, mark)
+    if figure:
+        print(draw(budget, figure))
+    return 0

@@ -165,9 +165,13 @@ def palm_touches(scene: Scene) -> bool:
 
 
 def pairings_held(scene: Scene) -> int:
-    """Pairings of fingers whose friction is kept from step to step; see the kernel's `pairing`."""
+    """Pairings of fingers whose friction is kept from step to step; see the kernel's `pairing`.
+
+    Spheres keep none: their contact is MuJoCo's, which has no state.
+    """
     e, fingers = scene.effects, len(layout(scene).dofs)
-    if not (e.friction_memory and e.finger_finger) or e.friction == "none":
+    kept = e.friction_memory and e.finger_finger and e.surface == "hull"
+    if not kept or e.friction == "none":
         return 0
     return (1 << (fingers - 1).bit_length()) - 1
 

@@ -35,8 +35,6 @@ _SKIN = "its geoms are rigid parts of single bodies"
 
 _IMPEDANCE = "MuJoCo's impedance grows with depth in the elastic force as well"
 
-_MEMORY = "its contacts have no state"
-
 _SPRINGS = "the springs of its joints are constants of a rollout"
 
 EFFECTS: Mapping[str, Effect] = {
@@ -69,8 +67,7 @@ EFFECTS: Mapping[str, Effect] = {
         {"mujoco": {True: _IMPEDANCE}, "mjx": {True: _IMPEDANCE}},
     ),
     "friction_memory": Effect(
-        "fingers hold on one another without creep: their friction is kept from step to step",
-        {"mujoco": {True: _MEMORY}, "mjx": {True: _MEMORY}},
+        "skinned fingers hold on one another without creep: their friction is kept from step to step"
     ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),

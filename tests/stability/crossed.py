@@ -287,8 +287,7 @@ def creeps(engine, step, precision):
     way = pulled(0.5, CREEPS, step, precision)
     assert np.abs(pulled(1.3, 0.5, step, precision)).max(1).min() > 5e-3, "it holds above its limit"
     last = np.abs(way[:, -1] - way[:, round(-way.shape[1] / CREEPS)]).max()
-    note = f"in the last second {1e3 * last:.2g} mm; at 1.3 of the limit it slides off"
-    return Found(np.abs(way).max(), 1e-3, note)
+    return Found(np.abs(way).max(), 1e-3, f"{1e9 * last:.2g} nm in the last second")
 
 
 def creeps_without(engine, step, precision):

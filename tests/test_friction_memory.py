@@ -1,0 +1,78 @@
+"""Friction that fingers hold from step to step: its law on contacts alone, and who refuses it.
+
+The kernel's steps are compared with a dense solve in `test_planted_contacts`, its derivatives with
+differences in `test_reverse`; hard case 34 has the creep of two crossed fingers.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from codesign_jax import scene
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.structured.laws import holding
+from codesign_jax.engines.structured.laws.contact import Cone, Contacts, constraint_update
+from codesign_jax.scene import InputError
+
+MU = 0.8
+
+
+def touching(normals, depths, full=False):
+    """Contacts with the default scene's numbers between fingers and unequal stiffnesses."""
+    share = jnp.array([0.3, 1.0, 0.6])
+    more = {"spin": 0.003, "roll": 0.0005} if full else {}
+    cone = Cone(1.44 * share, 1.44 * share, MU, MU, 2778.0, 111.0, **more)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return Contacts(jnp.zeros((3, 3)), jnp.asarray(normals.T), -jnp.asarray(depths), cone)
+
+
+def next_grip(contacts, jar, grip):
+    """The next g of contacts whose jar without friction that is held is given."""
+    g = jnp.broadcast_to(jnp.asarray(grip)[:, None], (3, 3))
+    force = constraint_update(contacts, jar + holding.held(contacts, g)).force
+    return np.asarray(holding.quotient(holding.hold(contacts, force, g).sum(1))), force
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_bodies_at_rest_keep_what_they_hold(full):
+    """Three contacts with normals up to 50 degrees apart, none of which moves."""
+    with jax.enable_x64(True):
+        normals = np.array([[0, 0, 1.0], [0.6, 0, 1], [0, -0.9, 1]])
+        contacts = touching(normals, np.array([1e-3, 3e-3, 2e-4]), full)
+        grip = np.array([0.3, -0.2, 0.1])
+        resting = -contacts.reference(jnp.zeros((6 if full else 3, 3)))
+        found, force = next_grip(contacts, resting, grip)
+    np.testing.assert_allclose(found, grip, rtol=1e-12)
+    # Each pushes as deep as it is, 4 kN/m times its share, and rubs in proportion.
+    share = np.array([0.3, 1.0, 0.6]) * 1.44 * 2778.0 * np.array([1e-3, 3e-3, 2e-4])
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    wanted = share[:, None] * (unit - grip + unit * (unit @ grip)[:, None])
+    np.testing.assert_allclose(np.asarray(force)[:3].T, wanted, rtol=1e-12)
+
+
+def test_sliding_bodies_hold_coulomb_s_coefficient():
+    """Contacts of one normal that slide and close: |g| is mu, against the motion."""
+    with jax.enable_x64(True):
+        contacts = touching(np.array([[0, 0, 1.0]] * 3), np.array([1e-3, 3e-3, 2e-4]))
+        velocity = jnp.array([[2.0], [0.0], [-0.1]]) * jnp.ones((1, 3))
+        grip, _ = next_grip(contacts, -contacts.reference(velocity), np.zeros(3))
+        assert grip[0] > 0 and np.hypot(*grip[:2]) == pytest.approx(MU, rel=1e-12)
+        # Bodies that part at once push less than their skin would, and hold less.
+        away = -contacts.reference(velocity * jnp.array([[1.0], [1.0], [-0.5]]))
+        less, _ = next_grip(contacts, away, np.zeros(3))
+        assert 0 < np.linalg.norm(less) < MU
+
+
+def test_bodies_apart_hold_nothing():
+    with jax.enable_x64(True):
+        contacts = touching(np.array([[0, 0, 1.0]] * 3), np.array([-1e-3, -1e-6, 0.0]))
+        grip, force = next_grip(contacts, jnp.full((3, 3), -5.0), np.array([0.5, 0.0, 0.0]))
+    assert not grip.any() and not np.asarray(force).any()
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "mjx"])
+def test_engines_without_it_say_so(engine):
+    chosen = scene.load("paper_spheres", overrides={"effects.friction_memory": True})
+    with pytest.raises(InputError, match="effects.friction_memory = true .*no state"):
+        make_engine(engine, chosen)

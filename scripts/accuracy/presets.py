@@ -10,8 +10,6 @@ from scripts.accuracy.results import ERRORS, Study
 from scripts.accuracy.settings import PRESETS, Setting
 from scripts.accuracy.tables import COST, cost_cells
 
-JUDGED = ("tip", "impulse", "decision")
-"""Errors by which discretizations are compared; that of a step is the solver's own."""
 _COMMENT = "# measured: "
 
 
@@ -36,10 +34,10 @@ WITHOUT = "without contact between fingers"
 
 def standing(study: Study) -> list[list[str]]:
     """Whether the presets are on the Pareto fronts, and what beats those that are not."""
-    rows = [["preset", *(ERRORS[p][0] for p in JUDGED), "in all three at once"]]
+    rows = [["preset", *(ERRORS[p][0] for p in ERRORS), "in all three at once"]]
     for name, setting in PRESETS.items():
-        cells = [_standing(study, setting, part) for part in JUDGED]
-        every = study.beaten_by(setting, *JUDGED)
+        cells = [_standing(study, setting, part) for part in ERRORS]
+        every = study.beaten_by(setting, *ERRORS)
         cells.append(", ".join(s.label for s in every) or "nothing is cheaper and better")
         rows.append([f"`{name}`", *cells])
     return rows

@@ -10,8 +10,6 @@ from scripts.accuracy.results import ERRORS, Study
 from scripts.accuracy.settings import PRESETS, Setting
 from scripts.accuracy.tables import COST, cost_cells
 
-JUDGED = ("tip", "impulse", "decision")
-"""Errors by which discretizations are compared; that of a step is the solver's own."""
 FINEST_MESH = Setting(timestep=2.0, links=20, surface="hull 4 x 16", damping="least")
 _COMMENT = "# measured: "
 
@@ -38,13 +36,13 @@ WITHOUT = "without contact between fingers"
 def in_short(studies: dict[str, Study]) -> list[list[str]]:
     """The presets for a user: three errors and grasps a second; the heads say what is left out."""
     full = next(iter(studies.values()))
-    heads = [ERRORS[part][0] for part in JUDGED]
+    heads = [ERRORS[part][0] for part in ERRORS]
     heads[-1] += f", {WITHOUT}, against 0.5 ms and 20 links"
     heads.append("against 2 ms, 20 links and a skin of 4 x 16 points")
     rates = (f"grasps/s in contact, {WITHOUT}, {name}" for name in studies)
     rows = [["preset", "setting", *heads, *rates]]
     for name, setting in PRESETS.items():
-        errors = [full.error(part, setting) for part in JUDGED]
+        errors = [full.error(part, setting) for part in ERRORS]
         cells = ["–" if e is None else f"{e:.2g}" for e in [*errors, _flips(full, setting)]]
         cells += [cost_cells(s.cost("structured", setting))[1] for s in studies.values()]
         rows.append([f"`{name}`", setting.label, *cells])
@@ -63,10 +61,10 @@ def _flips(study: Study, setting: Setting) -> float | None:
 
 def standing(study: Study) -> list[list[str]]:
     """Whether the presets are on the Pareto fronts, and what beats those that are not."""
-    rows = [["preset", *(ERRORS[p][0] for p in JUDGED), "in all three at once"]]
+    rows = [["preset", *(ERRORS[p][0] for p in ERRORS), "in all three at once"]]
     for name, setting in PRESETS.items():
-        cells = [_standing(study, setting, part) for part in JUDGED]
-        every = study.beaten_by(setting, *JUDGED)
+        cells = [_standing(study, setting, part) for part in ERRORS]
+        every = study.beaten_by(setting, *ERRORS)
         cells.append(", ".join(s.label for s in every) or "nothing is cheaper and better")
         rows.append([f"`{name}`", *cells])
     return rows

@@ -75,7 +75,7 @@ def _section(study: Study, name: str, docs: Path) -> str:
         figures.convergence(lines, docs / "figures" / f"convergence_{name}.png")
         parts.append(f"![Orders of convergence](../figures/convergence_{name}.png)")
         add("The reference and the orders", tables.confirmed(study.records))
-    for part in ("tip", "impulse", "step"):
+    for part in ("tip", "impulse"):
         add(ERRORS[part][0], tables.errors_table(study, part))
     for population, words in tables.POPULATIONS.items():
         add(f"Decisions: {words}", tables.decisions_table(study, population))

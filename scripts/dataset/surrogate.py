@@ -71,7 +71,7 @@ def read(path: Path, space: DesignSpace, names: list[str], most: int | None = No
       names: Names of the objects.
       most: Most grasps, from the first one on.
     """
-    pa = parquet.library("scripts.dataset.surrogate")
+    pa = parquet.pyarrow_module("scripts.dataset.surrogate")
     table = pa.parquet.read_table(path)[: most or None]
     own = [f.name for f in table.schema if b"parameter" in (f.metadata or {})]
     values = np.stack([table[n].to_numpy() for n in own], 1) * np.array(space.scale)
@@ -100,15 +100,18 @@ class Model(NamedTuple):
       layers: Weights and biases.
       mean: Of the inputs.
       spread: Of the inputs.
+      range: Lowest and highest inputs that it learnt from, to which others are clipped.
     """
 
     layers: list
     mean: np.ndarray
     spread: np.ndarray
+    range: tuple[np.ndarray, np.ndarray]
 
     def logit(self, inputs: jax.Array) -> jax.Array:
         """Log odds that grasps are kept, shape (grasp,)."""
-        return _forward(self.layers, (inputs - self.mean) / self.spread)
+        seen = jnp.clip(inputs, *self.range)
+        return _forward(self.layers, (seen - self.mean) / self.spread)
 
 
 def _forward(layers: list, x: jax.Array) -> jax.Array:
@@ -138,7 +141,7 @@ def train(grasps: Grasps, told: np.ndarray, seed: int = 0) -> Model:
     draws = np.random.default_rng(seed)
     x, own = inputs(grasps, told), np.unique(grasps.design)
     out = np.isin(grasps.design, draws.choice(own, max(1, len(own) // 10), replace=False))
-    mean, spread = x.mean(0), x.std(0)
+    mean, spread, seen = x.mean(0), x.std(0), (x.min(0), x.max(0))
     spread = np.where(spread > 1e-6, spread, 1.0)
     x, sizes = (x - mean) / spread, (x.shape[1], *WIDTHS, 1)
     layers = [
@@ -149,7 +152,7 @@ def train(grasps: Grasps, told: np.ndarray, seed: int = 0) -> Model:
     state = descent.init(layers)
 
     @jax.jit
-    def step(layers: list, state: Any, x: jax.Array, kept: jax.Array) -> tuple[list, Any]:
+    def step(layers: list, state: Any, x: jax.Array, kept: jax.Array) -> tuple[Any, Any]:
         updates, state = descent.update(jax.grad(_loss)(layers, x, kept), state, layers)
         return optax.apply_updates(layers, updates), state
 
@@ -160,7 +163,7 @@ def train(grasps: Grasps, told: np.ndarray, seed: int = 0) -> Model:
         layers, state = step(layers, state, x[rows], grasps.kept[rows])
         if number % 50 == 49 and (now := float(loss(layers, x[out], grasps.kept[out]))) < least:
             best, least = layers, now
-    return Model(best, mean, spread)
+    return Model(best, mean, spread, seen)
 
 
 def predicted(model: Model, grasps: Grasps, told: np.ndarray) -> np.ndarray:
@@ -252,7 +255,8 @@ def climbed(
         unit, state = carry
         slope = jax.grad(lambda u: -liking(model, u, told, noise).sum())(unit)
         updates, state = descent.update(slope, state)
-        return (jnp.clip(optax.apply_updates(unit, updates), 0, 1), state), None
+        moved: Any = optax.apply_updates(unit, updates)
+        return (jnp.clip(moved, 0, 1), state), None
 
     (unit, _), _ = jax.lax.scan(step, (unit, descent.init(unit)), length=200)
     designs = jax.vmap(space.project)(space.low + unit * (space.high - space.low))
@@ -278,7 +282,9 @@ def study(grasps: Grasps, told: np.ndarray, each: bool) -> tuple[dict[str, Any],
     train_on, rest = grasps.rows(~out), grasps.rows(out)
     base = shares(train_on, len(told))
     model = train(train_on, told)
-    found = {"designs": scores(predicted(model, rest, told), rest.kept, base[rest.object])}
+    found: dict[str, Any] = {
+        "designs": scores(predicted(model, rest, told), rest.kept, base[rest.object])
+    }
     if each:
         found["objects"] = {}
         for k in np.unique(grasps.object):
@@ -321,6 +327,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--most", type=int, help="grasps of the file that are used")
     parser.add_argument("--objects", action="store_true", help="hold out each object in turn")
     parser.add_argument("--counts", type=int, nargs="*", default=[600, 2400, 9600, 38_400])
+    parser.add_argument("--repeats", type=int, default=6, help="searches by other grasps of it")
     parser.add_argument("--simulate", type=int, default=0, help="fresh trials of climbed designs")
     args = parser.parse_args(arguments)
     use_compilation_cache()
@@ -331,15 +338,20 @@ def main(arguments: list[str] | None = None) -> int:
     found, out = study(grasps, told, args.objects)
     found["screened"] = screened(grasps, told, out, args.counts)
     if args.simulate:
-        rows = [c for c in args.counts if c <= (~out).sum()]
-        designs = []
-        for number, count in enumerate(rows):
-            model = train(grasps.rows(~out).rows(np.arange(count)), told)
-            designs.append(climbed(model, space, told, grasps.noise[:16], number))
+        learnt, rows, designs = grasps.rows(~out), [], []
+        for count in args.counts:
+            for block in range(min(args.repeats, len(learnt.kept) // count)):
+                own = learnt.rows(np.arange(block * count, (block + 1) * count))
+                designs.append(climbed(train(own, told), space, told, own.noise[:16], block))
+                rows.append(count)
         kept = simulated(the_scene, space, np.stack(designs), args.simulate)
         found["climbed"] = [
-            {"grasps": c, "kept": float(k), "trials": args.simulate}
-            for c, k in zip(rows, kept, strict=True)
+            {
+                "grasps": c,
+                "trials": args.simulate,
+                "kept": np.round(kept[np.array(rows) == c], 4).tolist(),
+            }
+            for c in dict.fromkeys(rows)
         ]
     row = {"file": args.file.name, "scene": args.scene, "object_set": args.object_set}
     write_json(args.json, row | found | {"provenance": provenance.results(args.commit)})

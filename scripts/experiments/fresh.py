@@ -94,7 +94,9 @@ def run(args: argparse.Namespace) -> None:
     """Simulates at the accuracies that the file does not have yet."""
     path = args.data / "fresh.npz"
     arrays = dict(np.load(path)) if path.exists() else {}
-    notes = json.loads(path.with_suffix(".json").read_text()) if path.exists() else {"runs": []}
+    notes: dict[str, Any] = {"runs": []}
+    if path.exists():
+        notes = json.loads(path.with_suffix(".json").read_text())
     found = {name: winners(args.data, name) for name in args.experiments}
     arrays |= {f"{name}|strategies": np.array(names) for name, (names, _) in found.items()}
     every = {name: particles for name, (_, particles) in found.items()}

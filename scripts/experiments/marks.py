@@ -37,7 +37,7 @@ def read(folders: list[Path], at: list[int]) -> dict[str, np.ndarray]:
     if not records or None in records:
         raise InputError(["not all of the folders hold a run that has begun"])
     known = [record for record in records if record is not None]
-    _, particles, trials = known[0].history.trials.cost.shape
+    _, particles, trials = known[0].history.outcomes.cost.shape
     worlds, tested = particles * trials, min(CANDIDATES, particles) * ROUNDS
     seeds = [read_provenance(folder)["settings"]["seed"] for folder in folders]
     found = {"seeds": np.array(seeds)}

@@ -90,7 +90,7 @@ def _standing(study: Study, setting: Setting, part: str) -> str:
 def comment(name: str, studies: dict[str, Study]) -> str:
     """What was measured of a preset, as comment lines of its file."""
     setting, full = PRESETS[name], next(iter(studies.values()))
-    form = {"tip": "finger tip {:.3g} mm", "step": "acceleration of a step {:.0e}"}
+    form = {"tip": "finger tip {:.3g} mm"}
     form |= {"impulse": "contact impulse {:.1%}", "decision": "verdicts that flip {:.1%}"}
     errors = {part: full.error(part, setting) for part in form}
     words = [form[part].format(e) for part, e in errors.items() if e is not None]

@@ -152,11 +152,10 @@ class Store(Parts):
 
 
 def _packed(arrays: Mapping[str, Any], compressed: bool) -> bytes:
-    arrays = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
+    found: dict[str, Any] = {n: np.asarray(v) for n, v in arrays.items() if v is not None}
+    found[DIGEST] = np.array(_digest(found))
     buffer = io.BytesIO()
-    (np.savez_compressed if compressed else np.savez)(
-        buffer, **arrays, **{DIGEST: np.array(_digest(arrays))}
-    )
+    (np.savez_compressed if compressed else np.savez)(buffer, **found)
     return buffer.getvalue()
 
 

@@ -11,7 +11,7 @@ from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trial
 
-_TRIAL = Trial((), (2,), (), (2,), (), (), (), (), ())
+_TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), ()])
 """Shapes of one trial."""
 
 
@@ -28,7 +28,7 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
       InputError: With every array of another shape.
     """
     fingers = (scene.num_fingers,)
-    one = Params(fingers, fingers, fingers, (), (6,), fingers)
+    one = Params._make([fingers, fingers, fingers, (), (6,), fingers])
     problems = _problems("params", params, one, axes[0])
     problems += _problems("trials", trials, _TRIAL, axes[1])
     if not problems and axes[0] == axes[1]:

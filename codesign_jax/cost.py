@@ -62,7 +62,7 @@ def outcome(
     return Outcome(cost, status, lost_time, jnp.where(bad, bad_step, -1), capped, residual)
 
 
-def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
+def particle_cost(scene: Scene, outcomes: Outcome) -> jax.Array:
     """Mean cost over a particle's trials by the scene's rule for failed ones.
 
     "exclude" (the paper's) averages the trials that did not fail, the maximum if all did; "worst"
@@ -70,16 +70,16 @@ def particle_cost(scene: Scene, trials: Outcome) -> jax.Array:
 
     Args:
       scene: The scene.
-      trials: Outcomes with the trial as the last axis.
+      outcomes: Arrays with the trial as the last axis.
 
     Returns:
       Costs without the trial axis.
     """
-    good = ~failed(trials.status)
+    good = ~failed(outcomes.status)
     if _failures_count(scene):
-        return jnp.where(good, trials.cost, scene.cost.maximum).mean(-1)
+        return jnp.where(good, outcomes.cost, scene.cost.maximum).mean(-1)
     count = good.sum(-1)
-    mean = jnp.where(good, trials.cost, 0.0).sum(-1) / jnp.maximum(count, 1)
+    mean = jnp.where(good, outcomes.cost, 0.0).sum(-1) / jnp.maximum(count, 1)
     return jnp.where(count > 0, mean, scene.cost.maximum)
 
 

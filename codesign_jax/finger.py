@@ -113,7 +113,7 @@ def of_design(scene: Scene, params: Params, index: int) -> Finger:
       index: Which finger.
     """
     hand, links = scene.hand, scene.discretization.links
-    params = Params(*(np.asarray(v, float) for v in params))
+    params = Params._make(np.asarray(v, float) for v in params)
     beams = morphology.finger_beams(hand, params)
     springs, _ = morphology.joint_springs(hand, params, beams, links, ("bend",))
     return Finger(

@@ -88,9 +88,10 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     one = jax.tree.map(lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene)))
     fields, _, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t, constants), *one)
     dtype = jnp.result_type(float)
-    series = jax.ShapeDtypeStruct((1, scene.num_steps), dtype)
-    qpos = (1, scene.num_steps, fields.start.shape[-1] if not stops else 0)
-    trace = Trace(series, series, series, jax.ShapeDtypeStruct(qpos, dtype))
+    series: Any = jax.ShapeDtypeStruct((1, scene.num_steps), dtype)
+    size = (1, scene.num_steps, fields.start.shape[-1] if not stops else 0)
+    qpos: Any = jax.ShapeDtypeStruct(size, dtype)
+    trace = Trace(series, series, series, qpos)
     _tried(flag, cost, lambda: jax.eval_shape(judge, trace, *one))
     return cost, stops
 

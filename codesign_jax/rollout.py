@@ -428,6 +428,6 @@ def crossed(params: Params, trials: Trial) -> tuple[Params, Trial]:
     return every_p, every_t
 
 
-def grid(tree: Any, shape: tuple[int, int]) -> Any:
+def grid(tree: Any, shape: tuple[int, ...]) -> Any:
     """Arrays whose leading axis (particle * trial,) becomes two, (particle, trial)."""
     return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), tree)

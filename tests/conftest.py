@@ -43,7 +43,7 @@ test_many_runs test_compose test_resume test_effects test_engines test_kernel te
 test_mesh_grasps test_calibration test_constants test_codesign test_planted_contacts test_winners
 test_docs test_experiments test_accuracy test_hard_cases test_rollout test_model
 test_particle_filter test_grasp test_batch test_export_sheet test_report test_showing
-test_effects_physics test_optimizers test_parquet test_accuracy_report
+test_effects_physics test_optimizers test_accuracy_report
 """.split()
 
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from codesign_jax.engines.structured.kernel import Limits
 from codesign_jax.types import Trace
-from scripts.benchmark import cases, compare, grasps, report
+from scripts.benchmark import cases, grasps, report
 from scripts.shared import statistics, work
 
 
@@ -122,23 +121,11 @@ def test_a_second_process_finds_the_program(tmp_path):
 
 
 def test_a_micrometre_moves_the_objects_and_nothing_else():
-    worlds = compare.grid_worlds(work.variant(links=2), 2400)
+    worlds = work.make_worlds(work.variant(links=2), 60)
     moved = work.nudged(worlds.trials)
     difference = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(), moved, worlds.trials)
     assert float(difference.position) == pytest.approx(1e-6, rel=0.02)  # float32 of centimetres
     assert not any(np.any(d) for d in difference._replace(position=0.0))
-    designs = np.stack([worlds.params.length[:, 0], worlds.params.arm[:, 2]], -1)
-    assert len(np.unique(designs, axis=0)) == 400
-
-
-def test_limits_of_the_kernel_s_solver_are_read():
-    assert compare.limits("24/14/1e-6") == (24, 14, 1e-6)
-    with pytest.raises(ValueError):
-        compare.limits("24/14")
-    found = compare.engines(work.variant(links=2), [(4, 6, 1e-5)], mjx=False)
-    assert list(found) == ["mujoco", "mujoco, perturbed", "structured", "structured, 4/6/1e-05"]
-    engine = found["structured, 4/6/1e-05"]()
-    assert engine.limits == Limits(4, 6, 1e-5)
 
 
 def test_a_case_that_is_measured_again_keeps_its_calls_and_counts_the_shortest():

@@ -43,7 +43,7 @@ def test_biases_and_flips_are_those_that_were_planted(found, tmp_path):
     page, figure = tmp_path / "page.md", tmp_path / "figure.png"
     marks = "".join(f"<!-- {m}:begin -->\n<!-- {m}:end -->\n" for m in ("presets", "budget"))
     page.write_text(marks)
-    assert budget_report.make(found, page, figure) == 0
+    assert budget_report.make(made, page, figure) == 0
     assert "`standard`" in page.read_text() and figure.stat().st_size > 5000
 
 

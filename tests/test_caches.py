@@ -70,7 +70,7 @@ def use_all(monkeypatch):
     monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
     grid.cached("cube", *cube(), 1e-3)
     work = rates.Work("structured", "cpu x2", "hull", 1, 1, 1)
-    rates.record(work, 1.0, 1.0)
+    rates.keep(work, 1.0, 1.0)
     return [r.work for r in rates.measured()] == [work]
 
 

@@ -19,9 +19,10 @@ from codesign_jax.optimize import State, candidates, schedule
 from codesign_jax.scene import parameters, schema
 from codesign_jax.types import Status
 from scripts.calibration import __main__ as calibrate
-from scripts.calibration import files, report, score, sets, summary, surrogate
+from scripts.calibration import files, report, score, summary, surrogate
 from scripts.calibration.wave import Size, Wave, keep, trial_costs
 from scripts.experiments.landscape import STREAM_GRID
+from scripts.shared import sets
 from tests.helpers.toy_engine import ToyEngine, tiny
 
 AXIS = np.arange(12.0)

@@ -15,6 +15,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.optimize import State, schedule
 from codesign_jax.optimize.schedule import NAMES
 from codesign_jax.types import Outcome
+from tests.helpers import episodes
 from tests.helpers.toy_engine import ToyEngine, tiny
 
 PARTICLES, TRIALS = 8, 3
@@ -49,13 +50,8 @@ def test_one_compile_serves_every_schedule_and_seed(setup):
         mask = schedule(name, np.array(space.is_morphology), 40)
         state, _ = episode(start(optimizer, seed), mask[0])
         episode(state, mask[-1])
-    codesign.find_seed(
-        the_scene,
-        codesign.evaluate_by(episode, optimizer),
-        optimizer,
-        jax.random.key(0),
-        batch=PARTICLES,
-    )
+    search = codesign.seed_search(the_scene, optimizer, jax.random.key(0), batch=PARTICLES)
+    episodes.answered(search, episodes.evaluate_by(episode, optimizer))
     assert engine.traced == traced > 0
 
 
@@ -84,8 +80,8 @@ def test_episode_is_move_evaluate_weigh_and_resample(setup):
     new, info = episode(state, mask)
     # The same arithmetic in another program, where the compiler fuses it: the last bit may differ.
     np.testing.assert_allclose(info.population, optimizer.ask(state, mask), rtol=1e-6, atol=1e-8)
-    assert info.trials.cost.shape == info.trials.status.shape == (PARTICLES, TRIALS)
-    np.testing.assert_allclose(info.selection.cost, info.trials.cost.mean(1), rtol=1e-6)
+    assert info.outcomes.cost.shape == info.outcomes.status.shape == (PARTICLES, TRIALS)
+    np.testing.assert_allclose(info.selection.cost, info.outcomes.cost.mean(1), rtol=1e-6)
     np.testing.assert_array_equal(new.particles, info.population[info.selection.ancestors])
     assert int(new.episode) == 1
 
@@ -103,7 +99,7 @@ def test_particles_share_their_trials(setup):
     _, _, _, optimizer, episode = setup
     closed = np.zeros(2, bool)
     _, info = episode(start(optimizer), closed)  # nothing moves: all particles are the same
-    cost = np.asarray(info.trials.cost)
+    cost = np.asarray(info.outcomes.cost)
     np.testing.assert_array_equal(cost, np.broadcast_to(cost[0], cost.shape))
     assert len(np.unique(cost[0])) > 1, "trials of one particle have noise of their own"
 
@@ -113,12 +109,11 @@ def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     closed = np.zeros(2, bool)
     first, info = episode(start(optimizer), closed)
     seen = [info, episode(first, closed)[1], episode(start(optimizer, seed=1), closed)[1]]
-    evaluate = codesign.evaluate_by(episode, optimizer)
-    test = codesign.final_test(
-        the_scene, evaluate, first.particles, first.key, num_trials=2 * TRIALS
-    )
-    rows = [i.trials.cost[0] for i in seen]
-    rows += [test.trials.cost[0, :TRIALS], test.trials.cost[0, TRIALS:]]
+    evaluate = episodes.evaluate_by(episode, optimizer)
+    testing = codesign.testing(the_scene, first.particles, first.key, num_trials=2 * TRIALS)
+    test = episodes.answered(testing, evaluate)
+    rows = [i.outcomes.cost[0] for i in seen]
+    rows += [test.outcomes.cost[0, :TRIALS], test.outcomes.cost[0, TRIALS:]]
     assert len(np.unique(np.asarray(rows), axis=0)) == 5
 
 
@@ -147,15 +142,15 @@ def failing():
 
 def test_failed_trials_are_left_out_of_the_mean(failing):
     the_scene, info = failing
-    np.testing.assert_array_equal((info.trials.status != 0).sum(1), [1, 3, 0])
-    np.testing.assert_allclose(info.selection.cost[0], info.trials.cost[0, 1:].mean(), rtol=1e-6)
+    np.testing.assert_array_equal((info.outcomes.status != 0).sum(1), [1, 3, 0])
+    np.testing.assert_allclose(info.selection.cost[0], info.outcomes.cost[0, 1:].mean(), rtol=1e-6)
     assert float(info.selection.cost[1]) == the_scene.cost.maximum
 
 
 def test_noise_does_not_depend_on_the_number_of_particles(setup, failing):
     *_, optimizer, episode = setup
-    few = failing[1].trials.cost[2]  # which does not fail
-    many = episode(start(optimizer), np.zeros(2, bool))[1].trials.cost
+    few = failing[1].outcomes.cost[2]  # which does not fail
+    many = episode(start(optimizer), np.zeros(2, bool))[1].outcomes.cost
     np.testing.assert_array_equal(few, many[0])
 
 
@@ -173,16 +168,16 @@ def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):
     for k, state in enumerate(starts):
         for e in range(3):
             state, want = episode(state, masks[k, e])
-            np.testing.assert_allclose(infos.trials.cost[k, e], want.trials.cost, atol=3 * step)
+            np.testing.assert_allclose(infos.outcomes.cost[k, e], want.outcomes.cost, atol=3 * step)
         np.testing.assert_allclose(ends.particles[k], state.particles, rtol=1e-5)
-    assert np.ptp(infos.trials.cost) > 0.1
+    assert np.ptp(infos.outcomes.cost) > 0.1
 
 
 def test_evaluate_by_an_episode_equals_evaluate(setup):
     the_scene, space, engine, optimizer, episode = setup
     population = jnp.asarray(np.random.default_rng(0).uniform([0.03, -0.05], [0.17, 0.1], (8, 2)))
     key = jax.random.key(3)
-    by_episode = codesign.evaluate_by(episode, optimizer)(population, key)
+    by_episode = episodes.evaluate_by(episode, optimizer)(population, key)
     evaluate = codesign.Task(the_scene, space, TRIALS, engine).evaluate
     direct = evaluate(population, codesign.stream_key(key, codesign.STREAM_TRIAL))
     # Two programs round the noise differently, which may move a loss by one time step.
@@ -192,11 +187,12 @@ def test_evaluate_by_an_episode_equals_evaluate(setup):
 
 def test_seed_is_poor_and_reproducible(setup):
     the_scene, space, _, optimizer, episode = setup
-    evaluate = codesign.evaluate_by(episode, optimizer)
+    evaluate = episodes.evaluate_by(episode, optimizer)
 
     def find(seed):
         key = jax.random.key(seed)
-        return codesign.find_seed(the_scene, evaluate, optimizer, key, batch=PARTICLES)
+        search = codesign.seed_search(the_scene, optimizer, key, batch=PARTICLES)
+        return episodes.answered(search, evaluate)
 
     (a, cost, drawn), (b, *_), (c, *_) = find(0), find(0), find(1)
     assert cost > codesign.SEED_COST and drawn >= 1
@@ -208,15 +204,15 @@ def test_seed_is_poor_and_reproducible(setup):
 def test_final_test_counts_the_last_episode(setup):
     the_scene, _, _, optimizer, episode = setup
     state, info = episode(start(optimizer), np.ones(2, bool))
-    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.trials)
-    evaluate = codesign.evaluate_by(episode, optimizer)
-    result = codesign.final_test(
-        the_scene, evaluate, state.particles, state.key, num_trials=4, previous=kept
-    )
+    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.outcomes)
+    evaluate = episodes.evaluate_by(episode, optimizer)
+    how = {"num_trials": 4, "previous": kept}
+    testing = codesign.testing(the_scene, state.particles, state.key, **how)
+    result = episodes.answered(testing, evaluate)
     # Four more trials take two rounds of three, and three were there.
-    assert result.trials.cost.shape == (PARTICLES, 9)
-    np.testing.assert_array_equal(result.trials.cost[:, :3], kept.cost)
-    np.testing.assert_allclose(result.cost, result.trials.cost.mean(1), rtol=1e-6)
+    assert result.outcomes.cost.shape == (PARTICLES, 9)
+    np.testing.assert_array_equal(result.outcomes.cost[:, :3], kept.cost)
+    np.testing.assert_allclose(result.cost, result.outcomes.cost.mean(1), rtol=1e-6)
 
 
 def test_success_needs_a_mean_below_a_hundredth():
@@ -258,8 +254,8 @@ def test_episode_on_real_physics_is_repeatable():
     for a, b in zip(jax.tree.leaves(info), jax.tree.leaves(repeated), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(once.particles, again.particles)
-    assert (np.asarray(info.trials.status) == 0).all()
-    assert ((np.asarray(info.trials.cost) >= 0) & (np.asarray(info.trials.cost) <= 3)).all()
+    assert (np.asarray(info.outcomes.status) == 0).all()
+    assert ((np.asarray(info.outcomes.cost) >= 0) & (np.asarray(info.outcomes.cost) <= 3)).all()
 
 
 @pytest.mark.parametrize(("costs", "own"), [([-0.1, 2.0], True), ([0.0, 2.0], True), ([-1], False)])

@@ -186,7 +186,7 @@ def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes():
             for a, b in zip(jax.tree.leaves(infos), jax.tree.leaves(want), strict=True):
                 close(a[k, e], b)
         close(ends.particles[k], state.particles)
-    assert np.ptp(infos.trials.cost) > 0.1 and (infos.trials.status & ~int(WARNINGS) == 0).any()
+    assert np.ptp(infos.outcomes.cost) > 0.1 and (infos.outcomes.status & ~int(WARNINGS) == 0).any()
 
 
 @pytest.mark.slow
@@ -205,9 +205,9 @@ def test_a_run_vmaps_over_constants():
     for k in range(2):
         end, info = run(start, masks, grasps.nth(both, k))
         # Two programs round fields differently, which may move a loss by a step of 10 ms.
-        np.testing.assert_allclose(infos.trials.cost[k], info.trials.cost, atol=0.05)
+        np.testing.assert_allclose(infos.outcomes.cost[k], info.outcomes.cost, atol=0.05)
         np.testing.assert_allclose(ends.particles[k], end.particles, rtol=1e-5)
-    assert np.abs(infos.trials.cost[0] - infos.trials.cost[1]).max() > 0.1
+    assert np.abs(infos.outcomes.cost[0] - infos.outcomes.cost[1]).max() > 0.1
 
 
 # --- a cost of one's own -------------------------------------------------------------------------

@@ -344,7 +344,7 @@ def test_the_end_of_a_stuck_world_has_its_hull_and_its_controls_in_mujoco():
     data.qpos[-7:-4] = data.xpos[model.layout(hull).bodies[0, 1]]  # the object in a finger's place
     state = np.concatenate([data.qpos, data.qvel])
     world = runs.failures.Failure(design, trial, state, int(Status.STUCK), -1, (1, 0, 0))
-    controls = grasps.schedule(hull, params, trial)[:, 1:]
+    controls = grasps.timed_controls(hull, params, trial)[:, 1:]
     data = failure._last_state(hull, space, world)
     np.testing.assert_array_equal(data.ctrl, controls[-1])
     assert re.match(r"contacts: \d+ of hand and object, ", failure._contacts(data))

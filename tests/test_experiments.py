@@ -25,6 +25,7 @@ from scripts.experiments import __main__ as experiments
 from scripts.experiments import figures, landscape, marks, plan, report, results, strategies, study
 from scripts.experiments.plan import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
+from tests.helpers import episodes
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
@@ -121,8 +122,9 @@ def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
     """As `codesign optimize --seed` does it: seed, episodes, final test."""
     _, got = finished
     (scene, space, optimizer, episode), key = single, jax.random.key(SEED + run)
-    evaluate = codesign.evaluate_by(episode, optimizer)
-    seed, cost, drawn = codesign.find_seed(scene, evaluate, optimizer, key, batch=PLAN.particles)
+    evaluate = episodes.evaluate_by(episode, optimizer)
+    search = codesign.seed_search(scene, optimizer, key, batch=PLAN.particles)
+    seed, cost, drawn = episodes.answered(search, evaluate)
     mask = schedule(
         PLAN.strategies[strategy],
         np.array(space.is_morphology),
@@ -133,10 +135,9 @@ def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
     for e in range(PLAN.episodes):
         state, info = episode(state, mask[e])
         costs.append(info.selection.cost)
-    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.trials)
-    test = codesign.final_test(
-        scene, evaluate, state.particles, key, num_trials=PLAN.test_trials, previous=kept
-    )
+    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.outcomes)
+    how = {"num_trials": PLAN.test_trials, "previous": kept}
+    test = episodes.answered(codesign.testing(scene, state.particles, key, **how), evaluate)
     # The same arithmetic in other programs, where the compiler fuses it: the last bit may differ.
     close = {"rtol": 1e-5, "atol": 1e-6}
     np.testing.assert_allclose(got["seeds"][run], seed, **close)
@@ -144,8 +145,8 @@ def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
     assert got["seed_candidates"][run] == drawn
     np.testing.assert_allclose(got["cost"][strategy, run], costs, **close)
     np.testing.assert_allclose(got["particles"][strategy, run], state.particles, **close)
-    np.testing.assert_allclose(got["test_cost"][strategy, run], test.trials.cost, **close)
-    np.testing.assert_array_equal(got["test_status"][strategy, run], test.trials.status)
+    np.testing.assert_allclose(got["test_cost"][strategy, run], test.outcomes.cost, **close)
+    np.testing.assert_array_equal(got["test_status"][strategy, run], test.outcomes.status)
 
 
 def test_one_program_serves_seeds_episodes_and_tests(toy, finished):
@@ -470,12 +471,3 @@ def test_the_script_simulates_and_draws(tmp_path):
     assert drawn.returncode == 0 and (tmp_path / "figures" / "fig7a_success.png").exists()
     refused = call(*run, "--seed", "7")
     assert refused.returncode == 1 and "belongs to another experiment" in refused.stderr
-
-
-@pytest.mark.slow
-def test_the_structured_engine_gives_the_same_bits_on_two_devices(tmp_path):
-    path, command = tmp_path / "devices.json", [sys.executable, "-m", "scripts.experiments.devices"]
-    subprocess.run([*command, "--json", str(path), "--size", "tiny"], cwd=ROOT, check=True)
-    found = json.loads(path.read_text())
-    assert found["compared"]["arrays"] == 10
-    assert [row["different_arrays"] for row in found["devices"].values()] == [[], []]

@@ -302,7 +302,7 @@ def test_commands_are_the_key_frames(tmp_path):
     space = parameters.design_space(the_scene.hand, "2d")
     with jax.enable_x64(True):
         design = nth(space.params(space.default()), ...)
-    schedule = grasps.schedule(the_scene, design, rollout.nominal_trial(the_scene))
+    schedule = grasps.timed_controls(the_scene, design, rollout.nominal_trial(the_scene))
     tables.write_commands(tmp_path, the_scene, schedule)
     rows = read(tmp_path / tables.COMMANDS)
     head = [*tables.COMMAND_COLUMNS, *(f"pressure_{i}_kPa" for i in (1, 2, 3))]

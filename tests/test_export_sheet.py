@@ -151,7 +151,7 @@ def page():
 
 
 def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
-    content = sheet.sections(*page)
+    content = sheet.sheet_sections(*page)
     text = sheet.write(tmp_path, "Build sheet", ["Design: x"], content).read_text()
     fingers = "| 0 | 110.0 | 20.0 | 20.0 | 5.0 | 100.0 x 10.0 x 10.0 | 34.0 | 36.4 | 120.0 (200) |"
     assert fingers in text  # 110 x 20 x 20 - 100 x 10 x 10 = 34 cm^3 of 1.07 g
@@ -179,7 +179,7 @@ def test_a_design_that_fails_has_no_tolerance(page):
 
 def test_drawing_is_one_page(page, tmp_path):
     the_scene, params, sizes, drift = page
-    content = sheet.sections(*page)
+    content = sheet.sheet_sections(*page)
     path = drawing.write(
         *(tmp_path, "Build sheet", ["Design: x"], content),
         **{"scene": the_scene, "params": params, "sizes": sizes, "drift": drift},

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -140,23 +141,27 @@ def built_library(tmp_path_factory):
     return shim.build(tmp_path_factory.mktemp("library"))
 
 
-def test_the_page_has_a_row_for_each_campaign_and_the_committed_counts():
-    data = {"starts": [], "campaigns": {}}
-    rows = page.table(data)[1:]
-    assert len(rows) == len(cases.CAMPAIGNS) and all(row[3] == "not run" for row in rows)
+def test_the_page_has_a_row_for_each_campaign_and_the_committed_counts(tmp_path):
+    rows = page.table({"starts": [], "campaigns": {}})[1:]
+    assert len(rows) == len(cases.CAMPAIGNS) and all(row[page.SEEN] == "not run" for row in rows)
     bad = {"cases": 3, "counts": {"same": 2, "lost": 1}, "tallies": {"kills": 5}, "most": {}}
     row = page.table({"starts": [], "campaigns": {"kills": bad}})[1]
-    assert row[1] == "5" and "2 same, 1 lost (**broken**) of 3" in row[3]
-    docs = Path(__file__).parents[1] / "docs"
-    if (docs / "data" / "faults.json").exists():
-        committed = page.table(json.loads((docs / "data" / "faults.json").read_text()))
-        text = (docs / "faults.md").read_text()
-        assert all(" | ".join(row) in text for row in committed), "python -m scripts.faults --page"
+    assert row[page.TRIES] == "5" and "2 same, 1 lost (**broken**) of 3" in row[page.SEEN]
+    committed = json.loads((page.PAGE.parent / "data" / "faults.json").read_text())
+    text = page.PAGE.read_text()
+    again = "python -m scripts.faults --page"
+    assert all(" | ".join(row) in text for row in page.table(committed)), again
+    other = tmp_path / "page.md"
+    other.write_text(text.replace("| `kills` |", "| `killed` |"))
+    with pytest.raises(ValueError, match="differ in killed, kills"):
+        page.rows(other)
 
 
 def test_the_quick_tests_that_the_page_names_are_there():
     text = "".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
-    named = {name for campaign in cases.CAMPAIGNS.values() for name in campaign.tests}
+    named = {
+        name for row in page.rows().values() for name in re.findall("`(.*?)`", row[page.TESTS])
+    }
     assert len(named) > 20 and not [name for name in named if f"def {name}(" not in text]
 
 

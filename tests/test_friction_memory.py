@@ -58,10 +58,17 @@ def test_sliding_bodies_hold_coulomb_s_coefficient():
         velocity = jnp.array([[2.0], [0.0], [-0.1]]) * jnp.ones((1, 3))
         grip, _ = next_grip(contacts, -contacts.reference(velocity), np.zeros(3))
         assert grip[0] > 0 and np.hypot(*grip[:2]) == pytest.approx(MU, rel=1e-12)
-        # Bodies that part at once push less than their skin would, and hold less.
-        away = -contacts.reference(velocity * jnp.array([[1.0], [1.0], [-0.5]]))
-        less, _ = next_grip(contacts, away, np.zeros(3))
-        assert 0 < np.linalg.norm(less) < MU
+
+
+def test_bodies_that_part_hold_by_their_elastic_force():
+    """Sticking at 10 mm/s while they part by 5 mm/s: D b v over E, which is more than they push."""
+    with jax.enable_x64(True):
+        contacts = touching(np.array([[0, 0, 1.0]] * 3), np.full(3, 1e-3))
+        velocity = jnp.array([[0.01], [0.0], [0.005]]) * jnp.ones((1, 3))
+        grip, force = next_grip(contacts, -contacts.reference(velocity), np.zeros(3))
+        share = np.array([0.3, 1.0, 0.6]) * 1.44
+    np.testing.assert_allclose(np.asarray(force)[2], share * (2.778 - 111 * 0.005), rtol=1e-12)
+    np.testing.assert_allclose(grip, [111 * 0.01 / 2.778, 0, 0], rtol=1e-12, atol=1e-15)
 
 
 def test_bodies_apart_hold_nothing():

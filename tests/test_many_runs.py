@@ -226,7 +226,7 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     monkeypatch.setattr(Checkpoints, "save", save)
     assert command(*run) == 0
     assert "of 3 runs found a design" in capsys.readouterr().out
-    events, fetch, report = [], runs.loop.fetch, runs.loop.records.report
+    events, fetch, report = [], runs.loop.fetch, runs.loop.records.add_report
 
     def noted_fetch(tree):
         events.append("fetch")
@@ -245,7 +245,7 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
         return simulate(batch, requests)
 
     monkeypatch.setattr(runs.loop, "fetch", noted_fetch)
-    monkeypatch.setattr(runs.loop.records, "report", noted_report)
+    monkeypatch.setattr(runs.loop.records, "add_report", noted_report)
     monkeypatch.setattr(Checkpoints, "save", noted_save)
     monkeypatch.setattr(Batch, "begin", noted_simulation)
     for seed in ("3", "5"):

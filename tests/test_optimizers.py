@@ -28,6 +28,7 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import make_settings
+from tests.helpers import episodes
 from tests.helpers.toy_engine import tiny
 
 # As many parameters as in the paper, of different ranges.  Each optimiser has two programs for all
@@ -235,7 +236,7 @@ def test_closed_parameters_keep_their_bits(optimizer):
 
 
 def test_with_all_closed_the_particles_come_back(optimizer):
-    """How `codesign.evaluate_by` tests particles; every row is its own."""
+    """How `episodes.evaluate_by` tests particles; every row is its own."""
     rows = np.linspace(LOW, SEED, PARTICLES).astype(np.float32)
     rows[:, LIMITED] = LOW[LIMITED]
     state = start(optimizer)._replace(particles=jnp.asarray(rows))
@@ -309,7 +310,7 @@ def test_a_whole_run_is_its_episodes_with_one_compile(name):
         costs.append(info.selection.cost)
         traced.append(engine.traced)
     assert len(set(traced)) == 1
-    by_episode = codesign.evaluate_by(episode, made)(state.particles, jax.random.key(5))
+    by_episode = episodes.evaluate_by(episode, made)(state.particles, jax.random.key(5))
     assert engine.traced == traced[0] and np.asarray(by_episode.cost).shape == (8, 3)
     run = partial(task.run, made)
     batch = jax.tree.map(lambda *v: jnp.stack(v), *states)

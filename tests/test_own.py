@@ -161,7 +161,7 @@ def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
     noise = codesign.stream_key(jax.random.key(3), codesign.STREAM_TRIAL, 1)
     again = evaluate(jnp.asarray(record.history.population[1]), noise)
     # Two programs round model fields differently, and 0.3 s of contact let that grow.
-    np.testing.assert_allclose(again.cost, record.history.trials.cost[1], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(again.cost, record.history.outcomes.cost[1], rtol=1e-3, atol=1e-5)
     assert np.ptp(again.cost) > 0.01
 
 

@@ -11,9 +11,10 @@ from codesign_jax.optimize import (
     ParticleFilter,
     Space,
     State,
+    answer,
     candidates,
     reflect,
-    rejection_sample,
+    rejection,
     schedule,
     strictly_below,
 )
@@ -357,7 +358,7 @@ def test_candidates_fill_the_box_and_satisfy_the_constraint():
 def test_seeds_do_not_depend_on_the_batch_size():
     key, space = jax.random.key(9), FILTER.space
     results = [
-        rejection_sample(key, space, quadratic, 5, threshold=0.6, batch=batch, max_batches=500)
+        answer(rejection(key, space, 5, threshold=0.6, batch=batch, max_batches=500), quadratic)
         for batch in (8, 64)
     ]
     seeds, costs, drawn = results[0]
@@ -375,13 +376,12 @@ def test_too_few_seeds_are_an_error_with_the_counts():
     def costs(population):
         return jnp.where(jnp.arange(len(population)) == 0, jnp.nan, 1.5)
 
+    key, space = jax.random.key(0), FILTER.space
     with pytest.raises(RuntimeError, match=r"accepted 0 of 2 .* from 12 candidates; .* was 1\.5"):
-        rejection_sample(jax.random.key(0), FILTER.space, costs, 2, batch=4, max_batches=3)
+        answer(rejection(key, space, 2, batch=4, max_batches=3), costs)
     with pytest.raises(RuntimeError, match="was -inf"):
-        rejection_sample(
-            jax.random.key(0), FILTER.space, lambda x: jnp.inf * x[:, 1], 2, max_batches=1
-        )
+        answer(rejection(key, space, 2, max_batches=1), lambda x: jnp.inf * x[:, 1])
     with pytest.raises(ValueError, match="shape"):
-        rejection_sample(jax.random.key(0), FILTER.space, lambda x: x, 2)
+        answer(rejection(key, space, 2), lambda x: x)
     with pytest.raises(ValueError, match="at least 1"):
-        rejection_sample(jax.random.key(0), FILTER.space, quadratic, 0)
+        answer(rejection(key, space, 0), quadratic)

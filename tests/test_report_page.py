@@ -33,7 +33,7 @@ def test_report_shows_the_best_tested_particle_with_its_interval(run, text):
     best = min(rows, key=lambda row: float(row["test_cost"]))  # the first of equal ones
     the_scene, _ = runs.read_run(run)
     chosen = choice.choose(the_scene, choice.read_record(run))
-    kept = int(((chosen.trials.cost < 0.01) & ~failed(chosen.trials.status)).sum())
+    kept = int(((chosen.outcomes.cost < 0.01) & ~failed(chosen.outcomes.status)).sum())
     low, high = stats.binomtest(kept, int(best["trials"])).proportion_ci(0.95, method="wilson")
     share = f"{100 * low:.0f} to {100 * high:.0f} % of grasps (95 % interval"
     assert f"kept {kept} of {best['trials']}, " in text and share in text
@@ -79,7 +79,7 @@ def test_grasp_is_the_one_of_the_table(run):
     # The best one is the chosen particle's ancestor in the last episode.
     best, chosen = choice.find_grasp(the_scene, record), choice.choose(the_scene, record)
     np.testing.assert_array_equal(best.design, chosen.design)
-    assert float(best.outcome.cost) == record.history.trials.cost[-1, chosen.row].min()
+    assert float(best.outcome.cost) == record.history.outcomes.cost[-1, chosen.row].min()
     with pytest.raises(InputError) as error:
         choice.find_grasp(the_scene, record, episode=4, trial=3)
     assert len(error.value.problems) == 2 and "--episode = 4 is outside [1, 3]" in str(error.value)
@@ -174,4 +174,4 @@ def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
 def test_axes_of_episodes_have_ticks_at_whole_ones(episodes, step):
     from codesign_jax.report import charts  # needs plotly
 
-    assert charts.failures(np.full((episodes, 2, 3), Status.STUCK)).layout.xaxis.dtick == step
+    assert charts.failure_chart(np.full((episodes, 2, 3), Status.STUCK)).layout.xaxis.dtick == step

@@ -288,7 +288,7 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
     np.testing.assert_array_equal(grasp.design, chosen.design)
     assert grasp.place[:2] == (chosen.episode + 1, chosen.row)
     # Four trials of the test; the last episode's two are the particle filter's only.
-    assert chosen.trials.cost.shape == ((6,) if optimizer == "particle-filter" else (4,))
+    assert chosen.outcomes.cost.shape == ((6,) if optimizer == "particle-filter" else (4,))
     before = snapshot(grown)
     assert command(*run, "--episodes", "4", "--out", grown) == 2
     error = capsys.readouterr().err

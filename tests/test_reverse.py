@@ -336,14 +336,18 @@ def test_derivatives_do_not_depend_on_company():
 
 SCENES = {
     "spheres": {"discretization__spheres_per_link": 2, "effects__finger_finger": True},
-    "full friction": {"effects__friction": "full", "effects__finger_finger": True},
+    "full friction": {
+        "effects__friction": "full",
+        "effects__finger_finger": True,
+        "effects__friction_memory": True,
+    },
     "no friction": {"effects__friction": "none", "effects__surface": "hull"},
     "rigid wrist": {"effects__wrist": False},
     "bending alone": {"effects__twist": False, "effects__lateral_bending": False},
     "no gravity, no table": {"effects__gravity": False, "effects__object_table": False},
     "mesh": {},
     "mesh and hull": {"effects__surface": "hull"},
-    "three fingers": {"effects__finger_finger": True},
+    "three fingers": {"effects__finger_finger": True, "effects__friction_memory": True},
     "capsule": {},
 }
 

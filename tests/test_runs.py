@@ -28,6 +28,7 @@ from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import library, parameters
 from codesign_jax.types import Status
+from tests.helpers import episodes
 from tests.helpers.toy_engine import tiny
 
 ROOT = Path(__file__).parent.parent
@@ -58,16 +59,12 @@ def run():
     record = Record(state, records.empty_history(s, space.num_parameters))
     for e in range(s.episodes):
         record.state, info = episode(record.state, np.ones(2, bool))
-        records.report(record.history, e, info)
-    test = codesign.final_test(
-        the_scene,
-        codesign.evaluate_by(episode, optimizer),
-        record.state.particles,
-        record.state.key,
-        num_trials=s.test_trials,
-        previous=record.last_outcomes(),
-    )
-    record.test = test.trials
+        records.add_report(record.history, e, info)
+    particles, key = record.state.particles, record.state.key
+    how = {"num_trials": s.test_trials, "previous": record.last_outcomes()}
+    testing = codesign.testing(the_scene, particles, key, **how)
+    test = episodes.answered(testing, episodes.evaluate_by(episode, optimizer))
+    record.test = test.outcomes
     return the_scene, space, record, test
 
 
@@ -165,7 +162,7 @@ def test_a_record_of_an_older_version_tells_nothing_of_the_solver(run):
         del outcomes["capped"], outcomes["residual"]
     again = records.from_arrays(arrays)
     assert again.test is not None and np.isnan(again.test.capped).all()
-    np.testing.assert_array_equal(again.history.trials.cost, record.history.trials.cost)
+    np.testing.assert_array_equal(again.history.outcomes.cost, record.history.outcomes.cost)
     for row in tables._trials(again.history, the_scene, range(1)):
         assert row["steps_at_limit"] == row["residual"] == ""
 
@@ -186,7 +183,7 @@ def test_tables_hold_the_history_with_units(run, tmp_path):
     tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
     tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
     history, trials = record.history, read(tmp_path / "trials.csv")
-    assert [np.float32(r["cost"]) for r in trials] == history.trials.cost.ravel().tolist()
+    assert [np.float32(r["cost"]) for r in trials] == history.outcomes.cost.ravel().tolist()
     assert {r["object"] for r in trials} == {"sphere"}
     assert {r["status"] for r in trials} == {"OK"}
     lengths = [float(r["length_mm"]) for r in read(tmp_path / "particles.csv")]
@@ -283,10 +280,10 @@ def test_estimates_scale_the_most_similar_measurement(tmp_path, monkeypatch):
     shipped = rates.estimate(asked)
     assert "another machine" in shipped.basis and "scaled" in shipped.basis
     other = dataclasses.replace(asked, grasps=800, scene="another", structure="another")
-    rates.record(other, 10.0, 60.0)
+    rates.keep(other, 10.0, 60.0)
     busy = dataclasses.replace(other, grasps=801)
-    rates.record(busy, 10.0, 600.0)  # the computer was busy with something else
-    rates.record(asked, 50.0, 3.0)
+    rates.keep(busy, 10.0, 600.0)  # the computer was busy with something else
+    rates.keep(asked, 50.0, 3.0)
     found = rates.estimate(asked)
     assert (found.grasps_per_second, found.compile_seconds) == (50.0, 3.0)
     assert "50 grasps/s (measured on this machine" in found.basis and "scaled" not in found.basis
@@ -309,14 +306,14 @@ def test_a_damaged_file_of_rates_counts_as_none(content, tmp_path, monkeypatch):
     path.write_text(content)
     assert rates.measured() == []
     work = rates.work(tiny()[0], settings())
-    rates.record(work, 5.0, 1.0)
+    rates.keep(work, 5.0, 1.0)
     assert [r.work for r in rates.measured()] == [work]
 
 
 def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
     (tmp_path / "codesign-jax").write_text("a file, not a folder")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    rates.record(rates.work(tiny()[0], settings()), 5.0, 1.0)
+    rates.keep(rates.work(tiny()[0], settings()), 5.0, 1.0)
     assert rates.measured() == []
 
 

@@ -87,16 +87,16 @@ def test_parameters_are_what_submitit_and_slurm_want():
     pairs = ["timeout_min=30", "mem_gb=1.5", "cpus_per_task=8", "slurm_account=007"]
     pairs += ["slurm_setup=module load cuda; nvidia-smi", "slurm_srun_args=--mpi=none --quiet"]
     pairs += ["slurm_additional_parameters=reservation=course,spread-job", "slurm_use_srun=false"]
-    given = jobs.parameters(pairs)
+    given = jobs.job_parameters(pairs)
     assert given["timeout_min"] == 30 and given["mem_gb"] == 1.5
     assert given["slurm_account"] == "007" and given["slurm_use_srun"] is False
-    found = slurm.parameters(given)
+    found = slurm.submitit_parameters(given)
     assert found["slurm_setup"] == ["module load cuda; nvidia-smi"]
     assert found["slurm_srun_args"] == ["--cpus-per-task=8", "--mpi=none", "--quiet"]
     further = {"requeue": True, "reservation": "course", "spread-job": True}
     assert found["slurm_additional_parameters"] == further
     with pytest.raises(InputError, match="tasks_per_node: a run is one process"):
-        slurm.parameters({"tasks_per_node": 2})
+        slurm.submitit_parameters({"tasks_per_node": 2})
 
 
 def test_what_the_queue_says_is_counted_and_reasons_that_matter_are_named():

@@ -39,8 +39,9 @@ def test_teams_follow_the_same_path_in_contact():
         plain = scenes.load("paper", overrides={"effects": {"surface": "spheres"}})
         starts, ctrl = work.window(plain, 8, 20, distinct=8)
         made, _ = work.inputs(scene, work.make_worlds(scene, 8))
-        fields = jax.tree.map(np.asarray, made._replace(start=starts.start))
-        got, want = rollouts(scene, fields, np.asarray(ctrl), (64, 16))
+        made = made._replace(start=starts.start)
+        fields, ctrl = jax.tree.map(lambda x: np.asarray(x, np.float64), (made, ctrl))
+        got, want = rollouts(scene, fields, ctrl, (64, 16))
     assert (want["iterations"] > 6).any() and (want["distance"][:, -1] < 0.2).any()
     # Sums round differently by 1e-16, and contact multiplies it by up to seven in a step.
     assert np.abs(got["qpos"] - want["qpos"]).max() < 1e-10

@@ -26,7 +26,6 @@ STREAM_TRIAL = 0x7472696C
 """Stream of the noise of an episode's trials ("tril")."""
 
 EpisodeFunction = Callable[..., tuple[State, "EpisodeInfo"]]
-EvaluateFunction = Callable[..., Outcome]
 
 
 class EpisodeInfo(NamedTuple):
@@ -34,7 +33,7 @@ class EpisodeInfo(NamedTuple):
 
     Attributes:
       population: Particles as simulated [SI units], shape (particle, parameter).
-      trials: Cost, status, time of loss and first bad step, each of shape (particle, trial).
+      outcomes: Cost, status, time of loss and first bad step, each of shape (particle, trial).
       selection: Particle costs, and weights and ancestors of a resampling; see `optimize.Info`.
       last: States at which the worlds ended, failed ones frozen at their last good one, shape
         (particle, trial, nq + nv), or None if the engine does not report them.
@@ -42,7 +41,7 @@ class EpisodeInfo(NamedTuple):
     """
 
     population: jax.Array
-    trials: Outcome
+    outcomes: Outcome
     selection: Info
     last: jax.Array | None = None
     drawn: Trial | None = None
@@ -107,7 +106,10 @@ class Task:
         return self.scene, self.engine, self.space, self.trials, recording
 
     def evaluate(
-        self, population: jax.Array, key: jax.Array, constants: Constants | None = None
+        self,
+        population: jax.typing.ArrayLike,
+        key: jax.Array,
+        constants: Constants | None = None,
     ) -> Outcome:
         """Outcomes of particles in random trials, arrays of shape (particle, trial).
 
@@ -249,10 +251,10 @@ def _episode(
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         hands = jax.vmap(space.params)(population)
         worlds = scene, engine, hands, noise
-        trials, last = rollout.evaluate_to_end(*worlds, constants=constants, **how)
-        costs = particle_cost(scene.with_constants(constants), trials)
+        outcomes, last = rollout.evaluate_to_end(*worlds, constants=constants, **how)
+        costs = particle_cost(scene.with_constants(constants), outcomes)
         new, selection = optimizer.tell(state, population, costs, mask)
-        return new, EpisodeInfo(population, trials, selection, last)
+        return new, EpisodeInfo(population, outcomes, selection, last)
 
     return episode
 
@@ -299,23 +301,6 @@ def episode_trials(
     """Trials of an episode of the run with this root key, leading axis (trial,)."""
     own = stream_key(key, STREAM_TRIAL, episode)
     return rollout.sample_trials(scene, own, num_trials, constants=constants)
-
-
-def evaluate_by(episode: EpisodeFunction, optimizer: Optimizer) -> EvaluateFunction:
-    """Returns an evaluation (population, key) -> outcomes that uses an episode's own program.
-
-    With every parameter closed nothing moves, so that seeds and final particles are simulated
-    without a second compile, as long as they are as many as an episode's.
-
-    Args:
-      episode: Function (state, mask) of an episode, such as `partial(task.episode, optimizer)`.
-      optimizer: The episodes' optimiser.
-    """
-
-    def evaluate(population: jax.Array, key: jax.Array) -> Outcome:
-        return episode(*closed(optimizer, population, key))[1].trials
-
-    return evaluate
 
 
 def closed(optimizer: Optimizer, population: jax.Array, key: jax.Array) -> tuple[State, np.ndarray]:

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.codesign.episode import EvaluateFunction, stream_key
+from codesign_jax.codesign.episode import stream_key
 from codesign_jax.cost import particle_cost
-from codesign_jax.optimize import Optimizer, answer, rejection, translated
+from codesign_jax.optimize import Optimizer, rejection, translated
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Status, failed
 
@@ -33,43 +33,14 @@ class FinalTest(NamedTuple):
     """How particles did in the final test.
 
     Attributes:
-      trials: Outcomes, every array of shape (particle, trial).
+      outcomes: Arrays of shape (particle, trial).
       cost: Mean cost of each particle by the scene's failure rule, shape (particle,).
       success: Whether the cost is below `SUCCESS_COST`, bool, shape (particle,).
     """
 
-    trials: Outcome
+    outcomes: Outcome
     cost: jax.Array
     success: jax.Array
-
-
-def find_seed(
-    scene: Scene,
-    evaluate: EvaluateFunction,
-    optimizer: Optimizer,
-    key: jax.Array,
-    *,
-    batch: int,
-    threshold: float = SEED_COST,
-) -> tuple[jax.Array, float, int]:
-    """Draws the particle that a run starts from by rejection sampling (section VI.4).
-
-    Args:
-      scene: The scene.
-      evaluate: Function (population, key) -> outcomes, such as `Task.evaluate`.
-      optimizer: Optimiser whose space is sampled.
-      key: Root key of the run.
-      batch: Candidates simulated at once.
-      threshold: Cost above which a candidate is poor enough.
-
-    Returns:
-      The seed particle [SI units], shape (parameter,), its cost and the number of candidates drawn.
-
-    Raises:
-      RuntimeError: If no candidate is poor enough.
-    """
-    search = seed_search(scene, optimizer, key, batch=batch, threshold=threshold)
-    return answer(search, lambda asked: evaluate(*asked))
 
 
 def seed_search(
@@ -80,7 +51,9 @@ def seed_search(
     batch: int,
     threshold: float = SEED_COST,
 ) -> Generator[tuple[jax.Array, jax.Array], Outcome, tuple[jax.Array, float, int]]:
-    """`find_seed` as a generator: yields (population, key), and is sent their outcomes.
+    """Draws the particle that a run starts from by rejection sampling (section VI.4).
+
+    A generator: it yields (population, key), and is sent their outcomes; see `optimize.answer`.
 
     Args:
       scene: The scene.
@@ -88,6 +61,12 @@ def seed_search(
       key: Root key of the run.
       batch: Candidates of one request.
       threshold: Cost above which a candidate is poor enough.
+
+    Returns:
+      The seed particle [SI units], shape (parameter,), its cost and the number of candidates drawn.
+
+    Raises:
+      NoSeed: If no candidate is poor enough.
     """
     noise = stream_key(key, STREAM_SCREEN)
     seeds, costs, drawn = yield from translated(
@@ -98,33 +77,6 @@ def seed_search(
     return seeds[0], float(costs[0]), drawn
 
 
-def final_test(
-    scene: Scene,
-    evaluate: EvaluateFunction,
-    particles: jax.Array,
-    key: jax.Array,
-    *,
-    num_trials: int,
-    previous: Outcome | None = None,
-) -> FinalTest:
-    """Tests final particles on new trials, together with the trials they had already.
-
-    The paper's test: 36 more trials in 2D, which makes 42 with the last episode's 6, and 72 more
-    in 23D, which makes 78.
-
-    Args:
-      scene: The scene.
-      evaluate: As of `find_seed`; called until there are at least `num_trials` more trials, so
-        that a multiple of its own number of trials gives exactly that many.
-      particles: Particles [SI units], shape (particle, parameter).
-      key: Root key of the run.
-      num_trials: Further trials of each particle.
-      previous: Outcomes that count as well, shape (particle, trial), such as the last episode's.
-    """
-    asked = testing(scene, particles, key, num_trials=num_trials, previous=previous)
-    return answer(asked, lambda request: evaluate(*request))
-
-
 def testing(
     scene: Scene,
     particles: jax.Array,
@@ -133,14 +85,18 @@ def testing(
     num_trials: int,
     previous: Outcome | None = None,
 ) -> Generator[tuple[jax.Array, jax.Array], Outcome, FinalTest]:
-    """`final_test` as a generator: yields (population, key), and is sent their outcomes.
+    """Tests final particles on new trials, together with the trials they had already.
+
+    The paper's test: 36 more trials in 2D, which makes 42 with the last episode's 6, and 72 more
+    in 23D, which makes 78.  A generator: it yields (population, key), and is sent their outcomes.
 
     Args:
-      scene: See `final_test`, as the others.
+      scene: The scene.
       particles: Particles [SI units], shape (particle, parameter).
       key: Root key of the run.
-      num_trials: Further trials of each particle.
-      previous: Outcomes that count as well.
+      num_trials: Further trials of each particle; requests go on until there are as many, so that a
+        multiple of an answer's trials gives exactly that many.
+      previous: Outcomes that count as well, shape (particle, trial), such as the last episode's.
     """
     parts = [] if previous is None else [previous]
     done, chunk = 0, 0
@@ -150,15 +106,15 @@ def testing(
     return summarize_test(scene, jax.tree.map(lambda *v: jnp.concatenate(v, axis=1), *parts))
 
 
-def summarize_test(scene: Scene, trials: Outcome) -> FinalTest:
+def summarize_test(scene: Scene, outcomes: Outcome) -> FinalTest:
     """Returns cost and success of particles from the outcomes of their test.
 
     Args:
       scene: The scene.
-      trials: Outcomes, every array of shape (particle, trial).
+      outcomes: Arrays of shape (particle, trial).
     """
-    cost = particle_cost(scene, trials)
-    return FinalTest(trials, cost, cost < SUCCESS_COST)
+    cost = particle_cost(scene, outcomes)
+    return FinalTest(outcomes, cost, cost < SUCCESS_COST)
 
 
 def verdicts(outcomes: Outcome) -> np.ndarray:

@@ -32,9 +32,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     """
     problems, scene = [], None
     try:
-        problems += common.solver_problems(
-            [*chain.from_iterable(options.overrides)], options.engine or engines.DEFAULT
-        )
+        problems += common.engine_problems(options.engine or engines.DEFAULT, options.overrides)
         scene = common.load_scene(options)
     except InputError as error:
         problems += error.problems
@@ -87,20 +85,17 @@ def _flag_problems(options: "Optimize") -> list[str]:
     if options.job_set and options.jobs is None:
         problems.append("--job-set needs --jobs: its parameters are those of jobs")
     try:
-        jobs.parameters([*chain.from_iterable(options.job_set)])
+        jobs.job_parameters([*chain.from_iterable(options.job_set)])
     except InputError as error:
         problems += error.problems
     # Jobs have the devices of their own hosts, and check there.
     available = jax.local_device_count() if options.jobs is None else options.devices or 1
     if options.devices is not None and not 1 <= options.devices <= available:
         problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
-    for name, count, low, high in (
+    return problems + common.number_problems(
         ("--reference-trials", options.reference_trials, 0, 100_000),
         ("--chunk", options.chunk, 1, 10_000_000),
-    ):
-        problem = None if count is None else schema.range_problem(name, count, "", low, high)
-        problems += [problem] if problem else []
-    return problems
+    )
 
 
 def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:
@@ -111,8 +106,8 @@ def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:
     Raises:
       InputError: If the runs differ in it.
     """
-    named = {"optimizer": optimize.DEFAULT, "cost": options.cost or runs.SCENE_COST}
-    usual = runs.make_settings(options.preset, "", "", "", 0, **named)
+    cost = options.cost or runs.SCENE_COST
+    usual = runs.make_settings(options.preset, "", "", "", 0, optimizer=optimize.DEFAULT, cost=cost)
     folders = runs_of(options, scene, usual)
     found = runs.setting_of(folders, "optimizer")
     return None if found is None or own.is_own(found) else found

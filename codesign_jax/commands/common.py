@@ -26,11 +26,12 @@ __all__ = [
     "check_engine",
     "check_place",
     "counted",
+    "engine_problems",
     "load_scene",
     "mesh_notes",
+    "number_problems",
     "parse_design",
     "preflight_warnings",
-    "solver_problems",
     "source_files",
     "use_compilation_cache",
     "warn",
@@ -41,22 +42,24 @@ SCENE = "paper"
 """Scene where none is named."""
 
 
-class SceneFlags(Protocol):
-    """Flags that say which scene; `flags.Subject` has their meaning."""
-
-    scene: str | None
-    hand: str | None
-    objects: str | None
-    accuracy: str | None
-    overrides: tuple[tuple[str, ...], ...]
-    robust: bool
-
-
 class Overriding(Protocol):
     """Flags that replace values of a scene; `flags.Subject` has their meaning."""
 
     overrides: tuple[tuple[str, ...], ...]
     robust: bool
+
+
+class SceneFlags(Overriding, Protocol):
+    """Flags that say which scene; `flags.Subject` has their meaning."""
+
+    @property
+    def scene(self) -> str | None:
+        """The scene; of some commands it has a default."""
+        ...
+
+    hand: str | None
+    objects: str | None
+    accuracy: str | None
 
 
 def changes(options: Overriding) -> dict[keypaths.Path, Any]:
@@ -204,33 +207,43 @@ def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
         raise InputError([problem]) from error
 
 
+def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[str]:
+    """What is wrong with numbers of a command line.
+
+    Args:
+      *numbers: Flag, value, smallest and largest one; None is a flag that was not given.
+    """
+    given = [(flag, v, "", low, high) for flag, v, low, high in numbers if v is not None]
+    return [problem for number in given if (problem := schema.range_problem(*number))]
+
+
 def check_engine(name: str) -> None:
     """Refuses an engine that there is not.
 
     Raises:
       InputError: With the nearest name.
     """
-    if name not in engines.NAMES:
-        hint = schema.nearest(name, engines.NAMES)
-        raise InputError([f"--engine {name!r} is not valid; {hint}"])
+    if problems := engine_problems(name):
+        raise InputError(problems)
 
 
-def solver_problems(pairs: Sequence[str], engine: str) -> list[str]:
-    """Refuses values of the [solver] table given to an engine that does not read it.
+def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[str]:
+    """An engine that there is not, or values of the [solver] table for one that does not read them.
 
     Args:
-      pairs: Values as KEY=VALUE.
-      engine: The engine's name.
+      name: The engine's name.
+      overrides: Values as KEY=VALUE, as of --set.
 
     Raises:
       InputError: If a pair is not KEY=VALUE.
     """
-    if engine != "structured":
-        return []
-    given = {path: value for path, value in keypaths.parse(pairs).items() if path[0] == "solver"}
+    if name not in engines.NAMES:
+        return [f"--engine = {name!r} is not valid; {schema.nearest(name, engines.NAMES)}"]
+    given = keypaths.parse(chain.from_iterable(overrides)) if name == "structured" else {}
     return [
         engines.solver_problem(f"--set {'.'.join(path)}={value}", path[1] if path[1:] else "")
         for path, value in given.items()
+        if path[0] == "solver"
     ]
 
 

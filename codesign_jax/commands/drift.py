@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from codesign_jax.commands import calls, common, estimate
+from codesign_jax.commands import calls, common, time_needed
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case
 from codesign_jax.engines import Engine
@@ -72,4 +72,4 @@ def _announce(
         f"(--tolerance {others[options.tolerance]}, off none)",
         markup=False,
     )
-    console.print(estimate.text([estimate.TimedPart("", calls.work(trials, size), most)]))
+    console.print(time_needed.text([time_needed.TimedPart("", calls.work(trials, size), most)]))

@@ -10,9 +10,9 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, rollout, runs, types
-from codesign_jax.commands import common, estimate
+from codesign_jax.commands import common, time_needed
 from codesign_jax.commands.case import Case, find_case
-from codesign_jax.commands.estimate import TimedPart
+from codesign_jax.commands.time_needed import TimedPart
 from codesign_jax.engines import make_engine
 from codesign_jax.report import verdicts
 from codesign_jax.runs import choice, rates, tables
@@ -76,23 +76,14 @@ def _of_particle(case: Case, options: "Evaluate") -> Case:
 
 
 def _check(options: "Evaluate", engine: str) -> None:
-    problems = []
-    for name, value, high in (
-        ("trials", options.trials, 100_000),
-        ("seed", options.seed, 2**31 - 1),
-    ):
-        low = 1 if name == "trials" else 0
-        problem = schema.range_problem(f"--{name}", value, "", low, high)
-        problems += [problem] if problem else []
-    if engine not in engines.NAMES:
-        problems.append(
-            f"--engine {engine!r} is not valid; {schema.nearest(engine, engines.NAMES)}"
-        )
+    problems = common.number_problems(
+        ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
+    )
     if options.render and options.render.suffix not in (".gif", ".png"):
         problems.append(f"--render {options.render} must end in .gif or .png")
     if options.out and options.out.suffix != ".csv":
         problems.append(f"--out {options.out} must end in .csv")
-    problems += common.solver_problems([*chain.from_iterable(options.overrides)], engine)
+    problems += common.engine_problems(engine, options.overrides)
     if problems:
         raise InputError(problems)
     for flag, path in (("--render", options.render), ("--out", options.out)):
@@ -109,7 +100,7 @@ def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
     if options.render:
         drawn = min(options.trials, len(case.scene.objects.object))
         parts.append(part("the grasps of the picture, without drawing it", drawn))
-    console.print(estimate.text(parts), markup=False)
+    console.print(time_needed.text(parts), markup=False)
 
 
 def simulate(

@@ -3,7 +3,6 @@
 import dataclasses
 import importlib.util
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.progress import Busy
-from codesign_jax.scene import schema
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trial
 
@@ -80,26 +78,19 @@ def _sizes(case: Case, params: Params, options: "Export") -> list[Size]:
 
 
 def _check(options: "Export", case: Case) -> None:
-    problems = []
-    for name, value, high in (
-        ("trials", options.trials, 10_000),
-        ("seed", options.seed, 2**31 - 1),
-        ("tolerance-steps", options.tolerance_steps, 100),
-        ("tolerance-trials", options.tolerance_trials, 100_000),
-    ):
-        low = 1 if name.startswith("tolerance") else 0
-        problem = schema.range_problem(f"--{name}", value, "", low, high)
-        problems += [problem] if problem else []
+    problems = common.number_problems(
+        ("--trials", options.trials, 0, 10_000),
+        ("--seed", options.seed, 0, 2**31 - 1),
+        ("--tolerance-steps", options.tolerance_steps, 1, 100),
+        ("--tolerance-trials", options.tolerance_trials, 1, 100_000),
+    )
     out = options.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not options.overwrite:
         problems.append(f"--out {out} exists; choose another folder, or give --overwrite")
     elif out.exists() and not out.is_dir():
         problems.append(f"--out {out} is a file")
     problems += process.problems(_process(options)) + _missing(options)
-    if case.engine not in engines.NAMES:
-        hint = schema.nearest(case.engine, engines.NAMES)
-        problems.append(f"--engine {case.engine!r} is not valid; {hint}")
-    problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
+    problems += common.engine_problems(case.engine, options.overrides)
     if problems:
         raise InputError(problems)
 
@@ -131,7 +122,7 @@ def write_files(
     """Writes all that is asked for; tolerances if there is an engine to simulate them."""
     _models(case, params, folder, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
-    tables.write_commands(folder, case.scene, grasps.schedule(case.scene, params, nominal))
+    tables.write_commands(folder, case.scene, grasps.timed_controls(case.scene, params, nominal))
     if not options.no_parts:
         _parts(sizes, folder, options, console)
     if not options.no_sheet:
@@ -218,7 +209,7 @@ def _sheet(
 ) -> None:
     from codesign_jax.export import drawing, sheet  # needs the extra
 
-    content = sheet.sections(case.scene, params, sizes, found)
+    content = sheet.sheet_sections(case.scene, params, sizes, found)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
     code = provenance.git_state()

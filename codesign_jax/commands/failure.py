@@ -125,7 +125,7 @@ def _last_state(scene: Scene, space: DesignSpace, failure: Failure) -> mujoco.Mj
     data = mujoco.MjData(grasps.world(scene, params, trial))
     nq = data.model.nq
     data.qpos[:], data.qvel[:] = failure.state[:nq], failure.state[nq:]
-    controls = grasps.schedule(scene, params, trial)[:, 1:]
+    controls = grasps.timed_controls(scene, params, trial)[:, 1:]
     # Entry k of a trace is the state before step k, so that step k - 1 led to a bad state k.
     step = failure.bad_step - 1 if failure.bad_step >= 0 else len(controls) - 1
     data.ctrl[:] = controls[np.clip(step, 0, len(controls) - 1)]

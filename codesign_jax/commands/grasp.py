@@ -69,7 +69,7 @@ def _of_run(case: Case, options: "Shown", folder: Path) -> Asked:
     name = case.scene.objects.object[int(found.trial.shape)].name
     episode, particle, trial = found.place
     text = f"episode {episode}, particle {particle}, trial {trial}: object {name}"
-    return Asked(case, found.trial, text, choice.verdict(found.outcome))
+    return Asked(case, found.trial, text, choice.ending(found.outcome))
 
 
 def _nominal(case: Case, shape: int | str) -> Asked:
@@ -97,7 +97,7 @@ def simulate(asked: Asked) -> "Replay":
 
 def description(asked: Asked, shown: "Replay") -> list[str]:
     """Lines that say which grasp it is and how it ended."""
-    again = choice.verdict(shown.outcome)
+    again = choice.ending(shown.outcome)
     ending = f"in the run: {asked.recorded}; here: {again}" if asked.recorded else again
     design = runs.describe(asked.case.space, asked.case.design)
     lines = [f"design: {design}", f"{asked.text}; {ending}"]

@@ -53,8 +53,8 @@ def executor(options: "Optimize", folder: Path) -> Any:
       InputError: If submitit is missing, or a parameter is none of its own.
     """
     submitit = _submitit()
-    given = parameters([*chain.from_iterable(options.job_set)])
-    kind, asked = given.pop("cluster", None), slurm.parameters(given)
+    given = job_parameters([*chain.from_iterable(options.job_set)])
+    kind, asked = given.pop("cluster", None), slurm.submitit_parameters(given)
     try:
         made = submitit.AutoExecutor(folder=folder, cluster=kind)  # type: ignore[arg-type]
         ours = {"name": "codesign", "slurm_array_parallelism": options.jobs}
@@ -69,7 +69,7 @@ def executor(options: "Optimize", folder: Path) -> Any:
 
 def where(made: Any, options: "Optimize") -> str:
     """Where an executor starts the runs, and which parameters are of no use there, in words."""
-    given = parameters([*chain.from_iterable(options.job_set)])
+    given = job_parameters([*chain.from_iterable(options.job_set)])
     idle = [name for name in given if name.startswith("slurm_") and made.cluster != "slurm"]
     reason = "there is no SLURM here" if "cluster" not in given else "that is not SLURM"
     return made.cluster + (f"; not used, as {reason}: {', '.join(idle)}" if idle else "")
@@ -129,7 +129,7 @@ def _submitit() -> Any:
     return submitit
 
 
-def parameters(pairs: Sequence[str]) -> dict[str, bool | int | float | str]:
+def job_parameters(pairs: Sequence[str]) -> dict[str, bool | int | float | str]:
     """Reads KEY=VALUE pairs; numbers, true and false become what submitit wants them to be.
 
     Raises:
@@ -200,7 +200,7 @@ def run(
         folder: (one, options, settings, folder.absolute(), sys.argv)
         for folder, settings in every.items()
     }
-    called = runs.names(every)
+    called = runs.run_names(every)
     with private_folder(options.out or Path("runs")) as own:
         made = executor(options, own)
         console.print(

@@ -1,6 +1,5 @@
 """`codesign landscape`."""
 
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -9,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import calls, common, estimate
+from codesign_jax.commands import calls, common, time_needed
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.cost import particle_cost
@@ -53,7 +52,7 @@ def main(options: "Options") -> int:
     case = find_case(options)
     _check(options, case)
     folder = _folder(options, case)
-    made = grid(case, _columns(case, options.parameters), options.points)
+    made = make_plane(case, _columns(case, options.parameters), options.points)
     console = Console(highlight=False, soft_wrap=True)
     others = [k for k in range(case.space.num_parameters) if k not in made.columns]
     if others:
@@ -112,17 +111,14 @@ def _refuse_other_scene(folder: Path, case: Case) -> None:
 
 
 def _check(options: "Options", case: Case) -> None:
-    ranges = (
+    problems = common.number_problems(
         ("--points", options.points, 2, 1000),
         ("--trials", options.trials, 1, 100_000),
         ("--seed", options.seed, 0, 2**31 - 1),
     )
-    found = [schema.range_problem(name, v, "", low, high) for name, v, low, high in ranges]
-    problems = [problem for problem in found if problem]
-    problems += common.solver_problems([*chain.from_iterable(options.overrides)], case.engine)
+    problems += common.engine_problems(case.engine, options.overrides)
     if problems:
         raise InputError(problems)
-    common.check_engine(case.engine)
 
 
 def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
@@ -147,7 +143,7 @@ def _meant(name: str, known: tuple[str, ...]) -> str:
     return schema.nearest(name, known)
 
 
-def grid(case: Case, columns: tuple[int, int], points: int) -> Plane:
+def make_plane(case: Case, columns: tuple[int, int], points: int) -> Plane:
     """A regular grid over the ranges of two parameters, ends included.
 
     Pressures are lowered under the limit that the walls set, as of every particle.
@@ -171,7 +167,7 @@ def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Conso
     size = calls.equal(len(designs), calls.most_designs(trials))
     grasps = len(designs) * trials.count
     console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
-    console.print(estimate.text([estimate.TimedPart("", calls.work(trials, size), grasps)]))
+    console.print(time_needed.text([time_needed.TimedPart("", calls.work(trials, size), grasps)]))
 
 
 def _trials(case: Case, options: "Options") -> Trials:

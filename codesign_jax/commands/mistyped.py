@@ -42,11 +42,11 @@ def problems(arguments: Sequence[str], commands: Any) -> list[str]:
         return [f"{name!r} is not a command; {_near(name, known)}"]
     if {"-h", "--help"} & {*arguments}:
         return []
-    found = next(_wrong(name, arguments[1:], flags(known[name])), None)
+    found = next(_wrong(name, arguments[1:], known_flags(known[name])), None)
     return [] if found is None else [f"{found} (codesign {name} --help has all flags)"]
 
 
-def flags(command: Any) -> dict[str, Taken]:
+def known_flags(command: Any) -> dict[str, Taken]:
     """The flags of a command by name, such as "--trials"."""
     found = {}
     hints = get_type_hints(command, include_extras=True)

@@ -14,8 +14,8 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import asked, common, estimate, hosts, jobs, reference, seeds, status
-from codesign_jax.commands.estimate import TimedPart
+from codesign_jax.commands import asked, common, hosts, jobs, reference, seeds, status, time_needed
+from codesign_jax.commands.time_needed import TimedPart
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, rates
@@ -63,7 +63,7 @@ def main(options: "Optimize") -> int:
     found = runs.optimize(plans, sys.argv, **opened, devices=devices, chunk=chunk)
     _record_rate(plan, found, devices)
     results: dict[Path, RunResult | None] = {}
-    called = runs.names(every) if asked.several(options) else {}
+    called = runs.run_names(every) if asked.several(options) else {}
     for folder, result in found.runs.items():
         results[folder] = result if isinstance(result, RunResult) else None
         if isinstance(result, Exception):
@@ -159,7 +159,7 @@ def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
     timing = found.timing
     if timing.grasps and timing.compile_seconds and plan.task.cost is None:
         work = rates.work(plan.scene, plan.settings, runs=timing.runs, devices=devices)
-        rates.record(work, timing.grasps / timing.seconds, timing.compile_seconds)
+        rates.keep(work, timing.grasps / timing.seconds, timing.compile_seconds)
 
 
 def _jobs(options: "Optimize", scene: Scene, every: dict[Path, Settings]) -> int:
@@ -219,7 +219,7 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
         parts.append(reference.part(scene, settings, trials, count))
-    print(estimate.text(parts))
+    print(time_needed.text(parts))
 
 
 def _summarize(plan: Plan, result: RunResult, console: Console) -> None:

@@ -38,7 +38,7 @@ def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Find
       designs: Parameters with leading axis (design,).
       names: What to call the designs; by default "design 0" and so on.
     """
-    designs = Params(*(np.asarray(v, float) for v in designs))
+    designs = Params._make(np.asarray(v, float) for v in designs)
     count = designs.length.shape[0]
     names = names or [f"design {i}" for i in range(count)]
     report = Findings([], _scene_warnings(scene))

@@ -15,8 +15,8 @@ from rich.console import Console
 from codesign_jax import codesign, engines, rollout
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.common import counted
-from codesign_jax.commands.estimate import TimedPart
 from codesign_jax.commands.flags import Subject
+from codesign_jax.commands.time_needed import TimedPart
 from codesign_jax.engines import make_engine
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns, outcomes, rates, read_run, tables

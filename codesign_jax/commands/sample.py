@@ -2,7 +2,6 @@
 
 import dataclasses
 import time
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,13 +11,13 @@ from rich.console import Console
 
 from codesign_jax import batch, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
-from codesign_jax.commands import calls, common, estimate
+from codesign_jax.commands import calls, common, time_needed
 from codesign_jax.commands.calls import Meter
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset, parquet, rates
 from codesign_jax.runs.dataset import Question, Shards
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.scene import Scene, schema
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome
@@ -73,22 +72,19 @@ def main(options: "Sample") -> int:
 
 def _check(options: "Sample") -> None:
     """Refuses numbers out of range, and a place that cannot be written."""
-    ranges = (
+    problems = common.number_problems(
         ("--designs", options.designs, 1, MOST),
         ("--trials", options.trials, 1, 100_000),
         ("--seed", options.seed, 0, 2**31 - 1),
-        ("--chunk", 1 if options.chunk is None else options.chunk, 1, 10_000_000),
+        ("--chunk", options.chunk, 1, 10_000_000),
     )
-    found = [schema.range_problem(name, v, "", low, high) for name, v, low, high in ranges]
-    problems = [problem for problem in found if problem]
     if options.out.suffix != ".parquet":
         problems.append(f"--out {options.out} must end in .parquet")
-    problems += common.solver_problems([*chain.from_iterable(options.overrides)], options.engine)
+    problems += common.engine_problems(options.engine, options.overrides)
     if problems:
         raise InputError(problems)
-    common.check_engine(options.engine)
     if not options.outcomes:
-        parquet.library("codesign sample")
+        parquet.pyarrow_module("codesign sample")
     common.check_place("--out", options.out)
 
 
@@ -142,7 +138,9 @@ def _dry_run(options: "Sample", question: Question, console: Console) -> None:
     work = rates.batch_work(
         question.scene, options.engine, question.chunk * options.trials, devices=1
     )
-    console.print(estimate.text([estimate.TimedPart("", work, _grasps(options))]), markup=False)
+    console.print(
+        time_needed.text([time_needed.TimedPart("", work, _grasps(options))]), markup=False
+    )
     size = dataset.most_bytes(question, options.designs)
     console.print(f"size: at most about {size / 1e6:.1f} MB")
 
@@ -209,7 +207,7 @@ def _record_rate(question: Question, seconds: list[float]) -> None:
         first, *others = seconds
         each, grasps = sum(others) / len(others), question.chunk * question.trials
         work = rates.batch_work(question.scene, question.engine, grasps, devices=1)
-        rates.record(work, grasps / each, max(first - each, 0.0))
+        rates.keep(work, grasps / each, max(first - each, 0.0))
 
 
 def _report(path: Path, found: _Tally, console: Console) -> None:

@@ -78,7 +78,7 @@ def of_test(scene: Scene, result: RunResult) -> Judged:
     """
     assert result.test is not None
     best = int(np.asarray(result.test.cost).argmin())
-    trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.trials)
+    trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.outcomes)
     return Judged(scene, trials)
 
 
@@ -191,7 +191,7 @@ def _values(scene: Scene, run: Compared) -> dict[str, object]:
     test = run.result.test
     costs = np.asarray(test.cost)
     best = int(costs.argmin())
-    own = jax.tree.map(lambda v: np.asarray(v)[best], test.trials)
+    own = jax.tree.map(lambda v: np.asarray(v)[best], test.outcomes)
     counted = cost.counts(scene, own.status)
     return found | {
         "best_test_cost": f"{costs[best]:.9g}",

@@ -41,7 +41,7 @@ class JobState(NamedTuple):
     reason: str = "None"
 
 
-def parameters(given: Mapping[str, Any]) -> dict[str, Any]:
+def submitit_parameters(given: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters of submitit from those of `--job-set`, in the types that it wants.
 
     Args:

@@ -36,7 +36,7 @@ def write(
       folder: An existing folder.
       title: Its title.
       lines: What it is about, below the title.
-      content: The sections, see `sheet.sections`.
+      content: The sections, see `sheet.sheet_sections`.
       scene: The scene.
       params: Parameters of the design as concrete arrays.
       sizes: Dimensions of the fingers.

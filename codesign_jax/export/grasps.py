@@ -49,7 +49,7 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
     """
     scene, trial = plain.single_object(scene, trial)
     wide = _wide(params), _wide(trial)
-    start, controls = _float64(_start, scene, *wide), schedule(scene, params, trial)
+    start, controls = _float64(_start, scene, *wide), timed_controls(scene, params, trial)
     spec, shares = _spec(scene, *wide)
     limits = verdict.bounds(scene)
     spec.add_numeric(name="hand_centre", data=model.layout(scene).centre_weights)
@@ -87,7 +87,7 @@ def _spec(scene: Scene, params: Params, trial: Trial) -> tuple[mujoco.MjSpec, Ma
     return spec, skin.add(scene, spec, params) if skinned else plain.NONE
 
 
-def schedule(scene: Scene, params: Params, trial: Trial) -> np.ndarray:
+def timed_controls(scene: Scene, params: Params, trial: Trial) -> np.ndarray:
     """Time [s] and controls of each step of a grasp in float64, shape (time, 1 + nu).
 
     Args:

@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 from codesign_jax.scene.schema import InputError, quantity, range_problem
 
@@ -64,7 +65,11 @@ class Size(NamedTuple):
 
 
 def sizes(
-    lengths: list[float], width: float, heights: list[float], walls: list[float], process: Process
+    lengths: Iterable[Any],
+    width: float,
+    heights: Iterable[Any],
+    walls: Iterable[Any],
+    process: Process,
 ) -> list[Size]:
     """Dimensions of a hand's fingers.
 

@@ -46,7 +46,7 @@ class Drift(NamedTuple):
     fixed: int = 0
 
 
-def sections(
+def sheet_sections(
     scene: Scene, params: Params, sizes: Sequence[Size], drift: Drift | None
 ) -> list[SheetSection]:
     """The sheet's content.

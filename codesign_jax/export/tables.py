@@ -59,7 +59,7 @@ def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
     Args:
       folder: An existing folder.
       scene: The scene.
-      schedule: Time and controls, see `grasps.schedule`.
+      schedule: Time and controls, see `grasps.timed_controls`.
 
     Returns:
       The file's path.

@@ -209,9 +209,7 @@ def threshold_moments(numbers: tuple, pressure: Any, bend: Any, lateral: Any) ->
     return moment * taut / length, loss * (length - angle) * taut
 
 
-def softening(
-    curvature: jax.Array, height: jax.Array, wall: jax.Array, *, width: float
-) -> jax.Array:
+def softening(curvature: Any, height: Any, wall: Any, *, width: Any) -> Any:
     """Share of the linear bending moment that a neo-Hookean section lacks at large curvature.
 
     With the stretch lambda = 1 + kappa y of a fibre at height y above the inextensible layer, held
@@ -224,7 +222,7 @@ def softening(
     the rubber stiffens; there the linear law stays [ours].
 
     Args:
-      curvature: Curvature kappa [1/m], any shape.
+      curvature: Curvature kappa [1/m], any shape; a JAX or NumPy array, as the others.
       height: Outer height h [m], broadcasting to it.
       wall: Wall thickness d [m], likewise.
       width: Outer width w [m].
@@ -232,7 +230,7 @@ def softening(
     kappa, inner = curvature * (curvature > 0), height - wall
     chamber = width - 2 * wall
 
-    def missing(y: jax.Array) -> jax.Array:
+    def missing(y: Any) -> Any:
         e = kappa * y
         return y**3 * e * (3 + 2 * e) / (2 * (1 + e) ** 2)
 

@@ -31,7 +31,6 @@ from codesign_jax.optimize.seeding import (
     answer,
     candidates,
     rejection,
-    rejection_sample,
     translated,
 )
 
@@ -57,7 +56,6 @@ __all__ = [
     "problem",
     "reflect",
     "rejection",
-    "rejection_sample",
     "schedule",
     "stochastic_universal",
     "translated",

@@ -41,46 +41,6 @@ def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
     return space.constrain(jnp.clip(low + unit * (high - low), low, high))
 
 
-def rejection_sample(
-    key: jax.Array,
-    space: Space,
-    evaluate: Callable[[jax.Array], jax.Array],
-    num_seeds: int,
-    *,
-    threshold: float = 2.0,
-    batch: int = 64,
-    max_batches: int = 100,
-) -> tuple[jax.Array, jax.Array, int]:
-    """Draw seed particles that are not solutions yet.
-
-    Deimel et al. (2017), section VI.4: seeds are drawn with cost > 2.0 to avoid runs whose initial
-    particles already contain a solution. Candidates are accepted in the order of their number, so
-    the result is the same for every `batch` as far as `evaluate` treats particles alone.
-
-    Args:
-      key: Typed key from `jax.random.key`.
-      space: Bounds and constraint of the parameters.
-      evaluate: Costs of particles, (particle, parameter) -> (particle,). Always called with
-        `batch` particles. A cost that is not finite is never accepted.
-      num_seeds: Number of seed particles to find.
-      threshold: Cost above which a candidate is accepted.
-      batch: Candidates evaluated at once.
-      max_batches: Evaluations after which to give up.
-
-    Returns:
-      Seeds, shape (seed, parameter), their costs, shape (seed,), and the number of candidates
-      drawn up to and with the last seed.
-
-    Raises:
-      ValueError: If a count is below 1 or `evaluate` returns another shape.
-      NoSeed: If `max_batches` did not hold enough seeds.
-    """
-    asked = rejection(
-        key, space, num_seeds, threshold=threshold, batch=batch, max_batches=max_batches
-    )
-    return answer(asked, evaluate)
-
-
 def rejection(
     key: jax.Array,
     space: Space,
@@ -90,25 +50,31 @@ def rejection(
     batch: int = 64,
     max_batches: int = 100,
 ) -> Generator[jax.Array, ArrayLike, tuple[jax.Array, jax.Array, int]]:
-    """`rejection_sample` as a generator, for whoever evaluates several searches at once.
+    """Draws seed particles that are not solutions yet.
+
+    Deimel et al. (2017), section VI.4: seeds are drawn with cost > 2.0 to avoid runs whose initial
+    particles already contain a solution. Candidates are accepted in the order of their number, so
+    the result is the same for every `batch` as far as costs are those of particles alone.
 
     Args:
-      key: See `rejection_sample`, as the others.
-      space: Box of the candidates.
+      key: Typed key from `jax.random.key`.
+      space: Bounds and constraint of the parameters.
       num_seeds: Number of seed particles to find.
       threshold: Cost above which a candidate is accepted.
       batch: Candidates of one request.
       max_batches: Requests after which to give up.
 
     Yields:
-      Candidates, shape (particle, parameter); it is sent their costs, shape (particle,).
+      Candidates, shape (particle, parameter); it is sent their costs, shape (particle,). A cost
+      that is not finite is never accepted.
 
     Returns:
-      See `rejection_sample`.
+      Seeds, shape (seed, parameter), their costs, shape (seed,), and the number of candidates
+      drawn up to and with the last seed.
 
     Raises:
-      ValueError: See `rejection_sample`.
-      NoSeed: See `rejection_sample`.
+      ValueError: If a count is below 1 or the costs have another shape.
+      NoSeed: If `max_batches` did not hold enough seeds.
     """
     if min(num_seeds, batch, max_batches) < 1:
         raise ValueError(f"counts must be at least 1: {num_seeds=}, {batch=}, {max_batches=}")
@@ -118,7 +84,7 @@ def rejection(
         drawn.append(candidates(key, space, np.arange(start, start + batch)))
         cost = np.asarray((yield drawn[-1]))
         if cost.shape != (batch,):
-            raise ValueError(f"evaluate returned shape {cost.shape} for {batch} particles")
+            raise ValueError(f"costs have shape {cost.shape} for {batch} particles")
         costs = np.concatenate([costs, cost])
         accepted = np.flatnonzero(np.isfinite(costs) & (costs > threshold))[:num_seeds]
         if accepted.size == num_seeds:

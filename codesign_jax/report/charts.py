@@ -33,7 +33,7 @@ def html(figure: go.Figure, name: str) -> str:
     )
 
 
-def library() -> str:
+def plotly_source() -> str:
     """The source of plotly.js, for a page that needs no network."""
     import plotly.offline
 
@@ -67,7 +67,7 @@ def cost_evolution(history: History) -> go.Figure:
     return figure
 
 
-def parameters(history: History, space: DesignSpace, chosen: np.ndarray) -> go.Figure:
+def parameter_chart(history: History, space: DesignSpace, chosen: np.ndarray) -> go.Figure:
     """Distribution of every parameter over the episodes: range, quartiles and median.
 
     Args:
@@ -184,7 +184,7 @@ def _heatmap(found: Landscape) -> go.Heatmap:
     return go.Heatmap(x=x, y=y, z=z, colorscale="Greys", colorbar=bar, **limits)
 
 
-def failures(status: np.ndarray) -> go.Figure:
+def failure_chart(status: np.ndarray) -> go.Figure:
     """How often each cause of failure occurs in each episode.
 
     Args:

@@ -13,10 +13,10 @@ def design(run: Run) -> str:
     """The verdict on the design, its parameters within their ranges, and its trials by object."""
     chosen, judged = run.chosen, run.judged
     source = "the final test" if chosen.tested else "its last episode (there was no final test)"
-    tested = Judged(run.scene, chosen.trials)
+    tested = Judged(run.scene, chosen.outcomes)
     note = (
         f"Particle {chosen.particle}, chosen as the best by {source}, which flatters it: "
-        f"{verdicts.tally(chosen.trials)}; {verdicts.mean_cost(run.scene, chosen.trials)}. "
+        f"{verdicts.tally(chosen.outcomes)}; {verdicts.mean_cost(run.scene, chosen.outcomes)}. "
     )
     if run.reference is None:
         trials = f"Verdict, in the trials of {source}: {tested}."

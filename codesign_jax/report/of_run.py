@@ -39,7 +39,7 @@ class Run(NamedTuple):
     @property
     def judged(self) -> Judged:
         """The trials that judge the design: the fresh ones, or else those that chose it."""
-        return self.reference or Judged(self.scene, self.chosen.trials)
+        return self.reference or Judged(self.scene, self.chosen.outcomes)
 
     @property
     def space(self) -> DesignSpace:
@@ -50,5 +50,5 @@ class Run(NamedTuple):
     def history(self) -> History:
         """Reports of the finished episodes."""
         h, done = self.record.history, self.record.done
-        trials = jax.tree.map(lambda v: v[:done], h.trials)
+        trials = jax.tree.map(lambda v: v[:done], h.outcomes)
         return History(h.population[:done], trials, *(v[:done] for v in h[2:]))

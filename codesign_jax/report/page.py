@@ -48,7 +48,7 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
     head = f"<h1>{markup.text(title)}</h1>\n<p class='note'>codesign-jax, report of {now}</p>\n"
     with files.atomically(path) as part:
         body = head + "\n".join(sections)
-        part.write_text(viewer.page(title, body, charts.library()), encoding="utf-8")
+        part.write_text(viewer.page(title, body, charts.plotly_source()), encoding="utf-8")
     return path
 
 
@@ -104,7 +104,7 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
     planned, shown = grasp
     episode, particle, trial = planned.place
     name = run.scene.objects.object[int(planned.trial.shape)].name
-    before, again = (choice.verdict(o) for o in (planned.outcome, shown.outcome))
+    before, again = (choice.ending(o) for o in (planned.outcome, shown.outcome))
     note = (
         f"The chosen design with the object {name}: trial {trial} of particle {particle} in "
         f"episode {episode}, simulated again. In the run: {before}; here: {again}."
@@ -132,7 +132,7 @@ def _parameters(run: Run) -> str:
         "Distribution of the particles over the episodes; an axis spans the parameter's range. "
         "A band that stays wide says that selection did not narrow the parameter."
     )
-    figure = charts.parameters(run.history, run.space, run.chosen.design)
+    figure = charts.parameter_chart(run.history, run.space, run.chosen.design)
     return markup.section("Parameters", markup.paragraph(note), charts.html(figure, "parameters"))
 
 
@@ -161,7 +161,7 @@ def _landscape(run: Run) -> str:
 
 
 def _failures(run: Run) -> str:
-    status = run.history.trials.status
+    status = np.asarray(run.history.outcomes.status)
     failed, total = int(types.failed(status).sum()), status.size
     rule = (
         "are left out of a particle's mean"
@@ -179,7 +179,7 @@ def _failures(run: Run) -> str:
     if not rows:
         return markup.section("Failures by cause", markup.paragraph(note))
     table = markup.table(("status", "trials", "share", "meaning"), rows, (1, 2))
-    figure = charts.html(charts.failures(status), "failures")
+    figure = charts.html(charts.failure_chart(status), "failures")
     return markup.section("Failures by cause", markup.paragraph(note), table, figure)
 
 

@@ -15,7 +15,7 @@ from codesign_jax.runs.reading import load_record, read_run
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.settings import SCENE_COST, Settings, check, make_settings
 from codesign_jax.runs.tables import describe, failure_counts, status_names, warning_counts
-from codesign_jax.runs.together import FAILURES, Results, names, optimize
+from codesign_jax.runs.together import FAILURES, Results, optimize, run_names
 
 __all__ = [
     "FAILURES",
@@ -34,11 +34,11 @@ __all__ = [
     "failure_counts",
     "load_record",
     "make_settings",
-    "names",
     "needs_poor_seed",
     "optimize",
     "prepare",
     "read_run",
+    "run_names",
     "setting_of",
     "status_names",
     "variant",

@@ -39,7 +39,7 @@ class Chosen(NamedTuple):
       design: The design [SI units], shape (parameter,).
       particle: Its index among the final particles, or in its episode without a test.
       cost: Its mean cost by the scene's rule for failed trials.
-      trials: Outcomes of its trials, every array of shape (trial,).
+      outcomes: Of its trials, arrays of shape (trial,).
       tested: Whether they are those of the final test, or its episode's.
       row: Its index in its episode's population.
       episode: Index of an episode that simulated it: the last, where that did.
@@ -48,7 +48,7 @@ class Chosen(NamedTuple):
     design: np.ndarray
     particle: int
     cost: float
-    trials: Outcome
+    outcomes: Outcome
     tested: bool
     row: int
     episode: int
@@ -84,7 +84,7 @@ def choose(scene: Scene, record: Record) -> Chosen:
         episode, row = record.done - 1, int(history.cost[record.done - 1].argmin())
         if (history.ancestors[: record.done] < 0).any():
             episode, row = _place(record, 0)
-        trials = jax.tree.map(lambda v: v[episode, row], history.trials)
+        trials = jax.tree.map(lambda v: v[episode, row], history.outcomes)
         cost = float(history.cost[episode, row])
         return Chosen(history.population[episode, row], row, cost, trials, False, row, episode)
     cost = np.asarray(particle_cost(scene, record.test))
@@ -97,7 +97,7 @@ def choose(scene: Scene, record: Record) -> Chosen:
 
 def doubt(chosen: Chosen) -> str:
     """Why the design should not be called the best of its run, in words; nothing if it may be."""
-    status = np.asarray(chosen.trials.status)
+    status = np.asarray(chosen.outcomes.status)
     if not failed(status).all():
         return ""
     return (
@@ -142,7 +142,7 @@ def find_grasp(
       InputError: If the run has no such episode, particle or trial.
     """
     history = record.history
-    _, particles, trials = history.trials.cost.shape
+    _, particles, trials = history.outcomes.cost.shape
     asked = (
         ("--episode", episode, 1, record.done),
         ("--particle", particle, 0, particles - 1),
@@ -156,7 +156,7 @@ def find_grasp(
     e = last if episode is None else episode - 1
     if particle is None:
         particle = chosen.row if e == chosen.episode else int(history.cost[e].argmin())
-    of_particle = jax.tree.map(lambda v: v[e, particle], history.trials)
+    of_particle = jax.tree.map(lambda v: v[e, particle], history.outcomes)
     if trial is None:
         trial = int(np.where(failed(of_particle.status), np.inf, of_particle.cost).argmin())
     # One program, not one an operation.
@@ -169,7 +169,7 @@ def find_grasp(
     )
 
 
-def verdict(outcome: Outcome) -> str:
+def ending(outcome: Outcome) -> str:
     """How a trial ended, in words; its entries are numbers."""
     if failed(int(outcome.status)):
         return f"failed ({status_names(int(outcome.status))})"

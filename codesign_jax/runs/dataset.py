@@ -181,7 +181,7 @@ def finished(path: Path) -> tuple[dict[str, Any], int] | None:
     """
     if not path.exists():
         return None
-    pa = parquet.library("--out")
+    pa = parquet.pyarrow_module("--out")
     try:
         metadata = pa.parquet.read_schema(path).metadata or {}
         return json.loads(metadata[b"question"]), json.loads(metadata[b"designs"])
@@ -290,10 +290,10 @@ def write(path: Path, question: Question, designs: int, shards: Shards) -> None:
     Raises:
       RunError: If a shard cannot be read any more.
     """
-    pa = parquet.library("--out")
+    pa = parquet.pyarrow_module("--out")
     notes = {"question": question.described, "designs": designs, "environment": environment()}
     notes |= {"status_bits": parquet.STATUS_BITS}
-    schema = parquet.schema(pa, columns(question.space), notes)
+    schema = parquet.arrow_schema(pa, columns(question.space), notes)
     shape, left, group = (question.chunk, question.trials), designs * question.trials, []
     with files.naming(path), parquet.writing(pa, path, schema) as writer:
         for shard in range(question.shards(designs)):

@@ -184,11 +184,11 @@ def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
     """Notes a resumption or extension; returns what the user should know about it."""
     stored = manifest.read_provenance(path)
     notes = _differences(stored["environment"], environment())
-    stored["resumed"] = [*stored.get("resumed", []), manifest.start(command)]
+    stored["resumed"] = [*stored.get("resumed", []), manifest.start_note(command)]
     before = stored["settings"]["episodes"]
     if before != settings.episodes:
         step = {"from": before, "to": settings.episodes}
-        stored["extended"] = [*stored.get("extended", []), manifest.start(command) | step]
+        stored["extended"] = [*stored.get("extended", []), manifest.start_note(command) | step]
         stored["settings"]["episodes"] = settings.episodes
         notes.append(f"extended from {before} to {settings.episodes} episodes")
     manifest.write(path, stored)

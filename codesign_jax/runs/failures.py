@@ -47,7 +47,7 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
     """
     # From the device as a whole: to index there would be a program for each number.
     info = jax.tree.map(np.asarray, info)
-    status, trials, files = info.trials.status, info.drawn, []
+    status, trials, files = info.outcomes.status, info.drawn, []
     for p, t in np.argwhere(types.failed(status))[:MOST]:
         trial = jax.tree.map(lambda v, t=t: v[t], trials)
         state = np.zeros(0) if info.last is None else info.last[p, t]
@@ -56,7 +56,7 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
             "design": info.population[p],
             "state": state,
             "status": status[p, t],
-            "bad_step": info.trials.bad_step[p, t],
+            "bad_step": info.outcomes.bad_step[p, t],
             "place": np.array([episode, p, t]),
         }
         archives.save(path, arrays | {f"trial_{k}": v for k, v in trial._asdict().items()})

@@ -275,7 +275,7 @@ class Loop:
 
         def answer(reply: tuple[State, EpisodeInfo]) -> Outcome:
             told()
-            return reply[1].trials
+            return reply[1].outcomes
 
         return translated(
             asking,
@@ -304,7 +304,7 @@ class Loop:
         Raises:
           AllFailed: If every trial failed; the episode is saved.
         """
-        records.report(record.history, e, info)
+        records.add_report(record.history, e, info)
         self._save_failures(e, info)
         last = e + 1 == self.plan.settings.episodes or record.failed_status() is not None
         if last or (e + 1) % self._every == 0:
@@ -321,7 +321,7 @@ class Loop:
 
     def _save_failures(self, e: int, info: EpisodeInfo) -> None:
         """Saves failed worlds with their last good states, for `codesign replay`."""
-        if not types.failed(np.asarray(info.trials.status)).any():
+        if not types.failed(np.asarray(info.outcomes.status)).any():
             return
         for path in failures.save(self.run_directory.path, e + 1, info):
             self.run_directory.log(f"failed world: codesign replay {path}")
@@ -345,7 +345,7 @@ class Loop:
         with self.progress.busy("testing the final particles") as watch:
             told = partial(self._tested_some, watch, batch)
             test = yield from self._evaluated(testing, told)
-        record.test = jax.tree.map(lambda v: np.asarray(v)[same], test.trials)
+        record.test = jax.tree.map(lambda v: np.asarray(v)[same], test.outcomes)
         self._save(settings.episodes + 1, record)
         self._write_tables(record, settings.episodes)
         self._refuse_all_failed(record)
@@ -353,7 +353,7 @@ class Loop:
         self._say(f"final test: {grasps} grasps in {watch.seconds:.1f} s")
 
     def _report(self, history: History, e: int, seconds: float) -> None:
-        status = history.trials.status[e]
+        status = history.outcomes.status[e]
         line = self.progress.episode(
             e + 1,
             mean=float(history.cost[e].mean()),

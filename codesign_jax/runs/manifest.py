@@ -42,14 +42,14 @@ def new(settings: Settings, contents: Mapping[str, bytes], command: list[str]) -
         "schema": SCHEMA,
         "id": uuid.uuid4().hex,
         "settings": dataclasses.asdict(settings),
-        "started": start(command),
+        "started": start_note(command),
         "environment": environment(),
         "git": git_state(),
         "files": digests(contents),
     }
 
 
-def start(command: list[str]) -> dict[str, Any]:
+def start_note(command: list[str]) -> dict[str, Any]:
     """Time and command line of a start."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     return {"time": now, "command": command}

@@ -45,7 +45,7 @@ class Names(NamedTuple):
     texts: list[str]
 
 
-def library(what: str) -> ModuleType:
+def pyarrow_module(what: str) -> ModuleType:
     """Returns pyarrow.
 
     Args:
@@ -63,7 +63,7 @@ def library(what: str) -> ModuleType:
     return pyarrow
 
 
-def schema(pa: ModuleType, columns: Mapping[str, Column], notes: Mapping[str, Any]) -> Any:
+def arrow_schema(pa: ModuleType, columns: Mapping[str, Column], notes: Mapping[str, Any]) -> Any:
     """The schema of a file.
 
     Args:

@@ -152,7 +152,7 @@ def _device(engine: str, devices: int | None) -> str:
     return f"cpu x{cores or 1}"
 
 
-def record(work: Work, grasps_per_second: float, compile_seconds: float) -> None:
+def keep(work: Work, grasps_per_second: float, compile_seconds: float) -> None:
     """Keeps a measurement in the user's cache; one that cannot be written is left out."""
     today = datetime.date.today().isoformat()
     entry = Rate(work, grasps_per_second, compile_seconds, f"measured on this machine on {today}")

@@ -19,7 +19,7 @@ class History(NamedTuple):
 
     Attributes:
       population: Particles as simulated [SI units], shape (episode, particle, parameter).
-      trials: Outcomes, every array of shape (episode, particle, trial).
+      outcomes: Arrays of shape (episode, particle, trial).
       cost: Mean cost of each particle, shape (episode, particle).
       weight: Normalised weights, shape (episode, particle).
       ancestors: Row of the population that each new particle copies, -1 if it is from an earlier
@@ -27,14 +27,14 @@ class History(NamedTuple):
     """
 
     population: np.ndarray
-    trials: Outcome
+    outcomes: Outcome
     cost: np.ndarray
     weight: np.ndarray
     ancestors: np.ndarray
 
 
 class Start(NamedTuple):
-    """The particle that a run starts from, as `codesign.find_seed` found it.
+    """The particle that a run starts from, as `codesign.seed_search` found it.
 
     Attributes:
       design: The particle [SI units], shape (parameter,).
@@ -57,7 +57,7 @@ def empty_history(settings: Settings, num_parameters: int) -> History:
     real, whole = np.float32, np.int32
     return History(
         population=np.zeros((e, n, num_parameters), real),
-        trials=Outcome(
+        outcomes=Outcome(
             cost=trials(real),
             status=trials(whole),
             lost_time=trials(real),
@@ -77,10 +77,10 @@ def with_room(history: History, episodes: int) -> History:
     return jax.tree.map(lambda v: np.pad(v, [(0, more)] + [(0, 0)] * (v.ndim - 1)), history)
 
 
-def report(history: History, episode: int, info: EpisodeInfo) -> None:
+def add_report(history: History, episode: int, info: EpisodeInfo) -> None:
     """Writes the report of an episode into the history's arrays."""
     s = info.selection
-    new = History(info.population, info.trials, s.cost, s.weight, s.ancestors)
+    new = History(info.population, info.outcomes, s.cost, s.weight, s.ancestors)
     for array, value in zip(jax.tree.leaves(history), jax.tree.leaves(new), strict=True):
         array[episode] = np.asarray(value)
 
@@ -110,7 +110,7 @@ class Record:
     def failed_status(self) -> np.ndarray | None:
         """Status of the final test's or the last episode's trials where every one failed."""
         told = [] if self.test is None else [np.asarray(self.test.status)]
-        told += [np.asarray(self.history.trials.status[self.done - 1])] if self.done else []
+        told += [np.asarray(self.history.outcomes.status[self.done - 1])] if self.done else []
         return next((status for status in told if failed(status).all()), None)
 
     def last_outcomes(self) -> Outcome:
@@ -119,7 +119,7 @@ class Record:
         Every array has shape (particle, trial).
         """
         kept = self.history.ancestors[self.done - 1]
-        return jax.tree.map(lambda v: jnp.asarray(v[self.done - 1][kept]), self.history.trials)
+        return jax.tree.map(lambda v: jnp.asarray(v[self.done - 1][kept]), self.history.outcomes)
 
 
 def to_arrays(record: Record) -> dict:
@@ -128,7 +128,10 @@ def to_arrays(record: Record) -> dict:
     state = {"particles": s.particles, "episode": s.episode, "key": jax.random.key_data(s.key)}
     if s.memory is not None:
         state["memory"] = s.memory
-    arrays = {"state": state, "history": h._asdict() | {"trials": h.trials._asdict()}}
+    # The outcomes' name in checkpoints, of which there are many, is an older one.
+    history = h._asdict() | {"trials": h.outcomes._asdict()}
+    del history["outcomes"]
+    arrays = {"state": state, "history": history}
     if record.test is not None:
         arrays["test"] = record.test._asdict()
     if record.start is not None:
@@ -137,7 +140,7 @@ def to_arrays(record: Record) -> dict:
 
 
 def from_arrays(arrays: dict) -> Record:
-    """Inverse of `to_arrays`; the history is copied, so that `report` may write to it.
+    """Inverse of `to_arrays`; the history is copied, so that `add_report` may write to it.
 
     Raises:
       RunError: If they are not the arrays of a record, such as those of another version.
@@ -149,7 +152,8 @@ def from_arrays(arrays: dict) -> Record:
         state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
         test = _outcomes(jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
         start = Start(**arrays["start"]) if "start" in arrays else None
-        return Record(state, History(**(h | {"trials": _outcomes(h["trials"])})), test, start)
+        history = History(outcomes=_outcomes(h.pop("trials")), **h)
+        return Record(state, history, test, start)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RunError(
             f"its checkpoints hold other arrays than this version of codesign-jax has ({error}): "
@@ -189,7 +193,7 @@ def refuse_other(
         or history.population.shape != (room, n, d),
         f"they are not of {t} trials": any(
             np.shape(v) != (room, n, t)  # type: ignore[call-overload]  # one may be None
-            for v in history.trials
+            for v in history.outcomes
         ),
         f"checkpoint {step} holds episode {record.done}": own != step,
         f"they have {record.done} episodes of {e}": not 0 <= record.done <= min(room, e),

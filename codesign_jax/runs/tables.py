@@ -152,18 +152,19 @@ def status_names(status: int) -> str:
     return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
 
 
-def failure_counts(status: np.ndarray) -> str:
+def failure_counts(status: jax.typing.ArrayLike) -> str:
     """How often each cause of failure occurs, e.g. "SPEED 1, STUCK 3"; empty if none does."""
     return _counts(status, [bit for bit in Status if bit not in WARNINGS])
 
 
-def warning_counts(status: np.ndarray) -> str:
+def warning_counts(status: jax.typing.ArrayLike) -> str:
     """How often each warning occurs, which does not fail a trial, e.g. "SOLVER_CAP 3"."""
     return _counts(status, [*WARNINGS])
 
 
-def _counts(status: np.ndarray, bits: Iterable[Status]) -> str:
-    counts = {bit.name: int(((status & bit) != 0).sum()) for bit in bits}
+def _counts(status: jax.typing.ArrayLike, bits: Iterable[Status]) -> str:
+    every = np.asarray(status)
+    counts = {bit.name: int(((every & bit) != 0).sum()) for bit in bits}
     return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
 
 
@@ -174,7 +175,7 @@ def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[Row
             "episode": e + 1,
             "mean_cost": _number(history.cost[e].mean()),
             "best_cost": _number(history.cost[e, best]),
-            "failed_trials": int(types.failed(history.trials.status[e]).sum()),
+            "failed_trials": int(types.failed(history.outcomes.status[e]).sum()),
             "effective_sample_size": _number(1 / (history.weight[e] ** 2).sum()),
             **_designs("episodes.csv", space, history.population[e, best : best + 1])[0],
         }
@@ -194,7 +195,7 @@ def _particles(history: History, space: DesignSpace, span: range) -> Iterator[Ro
 
 
 def _trials(history: History, scene: Scene, span: range) -> Iterator[Row]:
-    names, trials = [s.name for s in scene.objects.object], history.trials
+    names, trials = [s.name for s in scene.objects.object], history.outcomes
     for e in span:
         for i, t in np.ndindex(*trials.cost.shape[1:]):
             own = {"episode": e + 1, "particle": i, "trial": t, "object": names[t % len(names)]}
@@ -243,7 +244,7 @@ def _of_episodes(
 
 def _of_test(space: DesignSpace, particles: np.ndarray, test: FinalTest) -> Iterator[Row]:
     """Rows of the table of the final test."""
-    failed = types.failed(np.asarray(test.trials.status))
+    failed = types.failed(np.asarray(test.outcomes.status))
     for i, design in enumerate(_designs(TESTS, space, particles)):
         yield {
             "particle": i,

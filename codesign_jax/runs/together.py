@@ -107,7 +107,7 @@ def optimize(
     return Results(found, timing or Timing())
 
 
-def names(every: Mapping[Path, Settings]) -> dict[Path, str]:
+def run_names(every: Mapping[Path, Settings]) -> dict[Path, str]:
     """What to call each of several runs: by its seed, and by its schedule if these differ."""
     several = len({own.schedule for own in every.values()}) > 1
     return {
@@ -130,7 +130,7 @@ def _group(
     settings, many = plan.settings, len(plans) > 1
     test = settings.finalists * settings.trials * settings.test_rounds
     ahead = {"test": test, "after": after}
-    called = names({folder: own.settings for folder, own in plans.items()})
+    called = run_names({folder: own.settings for folder, own in plans.items()})
     with contextlib.ExitStack() as stack:
         total = settings.episodes
         progress = GroupProgress(total, len(plans), **ahead) if many else Progress(total, **ahead)

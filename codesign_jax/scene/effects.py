@@ -67,7 +67,7 @@ EFFECTS: Mapping[str, Effect] = {
         {"mujoco": {True: _IMPEDANCE}, "mjx": {True: _IMPEDANCE}},
     ),
     "friction_memory": Effect(
-        "skinned fingers hold on one another without creep: their friction is kept from step to step"
+        "skinned fingers hold one another without creep: their friction is kept from step to step"
     ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),

@@ -55,7 +55,7 @@ def load(
         if chosen is None and not isinstance(named, str):
             continue  # missing or of the wrong type: `parse` has said so
         try:
-            source = _beside(path, named) if chosen is None else chosen
+            source = _beside(path, str(named)) if chosen is None else chosen
             parts[key] = loader(source, overrides=inside[key])
         except schema.InputError as error:
             problems += error.problems

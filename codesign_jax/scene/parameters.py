@@ -94,7 +94,7 @@ class DesignSpace:
             base=tuple(0.0 if source >= 0 else value for value, source in place),
         )
 
-    def expand(self, design: jax.Array) -> jax.Array:
+    def expand(self, design: jax.typing.ArrayLike) -> jax.Array:
         """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,).
 
         Raises:
@@ -102,16 +102,15 @@ class DesignSpace:
         """
         self._refuse_shape(design, "")
         self.refuse_unit_slips(design)
-        design = jnp.asarray(design)
-        source = np.asarray(self.source)
-        filled = design[np.maximum(source, 0)]
-        return jnp.where(source >= 0, filled, jnp.asarray(self.base, design.dtype))
+        values, source = jnp.asarray(design), np.asarray(self.source)
+        filled = values[np.maximum(source, 0)]
+        return jnp.where(source >= 0, filled, jnp.asarray(self.base, values.dtype))
 
-    def params(self, design: jax.Array) -> Params:
+    def params(self, design: jax.typing.ArrayLike) -> Params:
         """Returns the named parameters of a design vector [SI], shape (parameter,)."""
         return unflatten(self.hand, self.expand(design))
 
-    def project(self, design: jax.Array) -> jax.Array:
+    def project(self, design: jax.typing.ArrayLike) -> jax.Array:
         """Lowers free pressures under their limit p_i < per_wall * d_i (Table I).
 
         Args:
@@ -202,8 +201,8 @@ class DesignSpace:
 
     def _refuse_infinite(self, rows: np.ndarray) -> None:
         """Refuses numbers that are none, designs of shape (design, parameter) in any units."""
-        bad = ~np.isfinite(rows)
-        names = zip(self.names, bad.any(0), rows.T, bad.T, strict=True)
+        bad: np.ndarray = ~np.isfinite(rows)
+        names = zip(self.names, np.asarray(bad.any(0)), rows.T, bad.T, strict=True)
         found = [
             f"{name} = {column[where][0]} is not a finite number"
             for name, any_bad, column, where in names
@@ -335,7 +334,7 @@ def _refuse_draws(key: Any, n: Any) -> None:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def params_of(space: DesignSpace, designs: np.typing.ArrayLike) -> Params:
+def params_of(space: DesignSpace, designs: jax.typing.ArrayLike) -> Params:
     """Named parameters of designs [SI], shape (design, parameter); one program a space."""
     return jax.vmap(space.params)(designs)
 

@@ -308,13 +308,15 @@ def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
         problems.append(f"{path} = {shown(value)} must be {_kind(hint, field)}")
         return None
-    if hint is str and (problem := texts.problem(path, value, lines=field.name == "description")):
-        problems.append(problem)
-        return None
+    if isinstance(value, str):
+        problem = texts.problem(path, value, lines=field.name == "description")
+        if problem:
+            problems.append(problem)
+            return None
     options = field.metadata.get("options")
     if options and value not in options:
-        problems.append(f"{path} = {shown(value)} is not valid; {nearest(value, options)}")
-    if "low" in field.metadata:
+        problems.append(f"{path} = {shown(value)} is not valid; {nearest(str(value), options)}")
+    if "low" in field.metadata and not isinstance(value, str):
         problem = range_problem(path, value, *dataclasses.astuple(_range(field)))
         if problem:
             problems.append(problem)

@@ -29,7 +29,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.types import Status, Trial, failed
 from scripts.accuracy import decision, worlds
-from scripts.shared import output, provenance, work
+from scripts.shared import output, provenance, sets, work
 
 DESIGNS, TRIALS, FEW = 30, 40, 16
 """Designs, trials of each, and trials of the dearest variants: the first ones."""
@@ -102,6 +102,8 @@ VARIANTS: dict[str, Variant] = {
     "spheres": Variant(changes=("effects.surface=spheres",)),
     "fingers pass each other": Variant(changes=("effects.finger_finger=false",)),
     "fingers pass the palm": Variant(changes=("effects.finger_palm=false",)),
+    "fingers creep": Variant(changes=("effects.friction_memory=false",)),
+    "palm once inside": Variant(changes=("effects.speculative_palm=false",)),
     "constants": Variant(drawn=True),
     "4 iterations": Variant(changes=("newton.iterations=4",)),
     "1e-3": Variant(changes=LOOSE),
@@ -197,10 +199,8 @@ def calibrated(the_scene: Scene, trials: int, designs: int) -> Any:
       trials: Trials of a design.
       designs: Designs, which meet the same sets.
     """
-    from scripts.calibration import score, sets
-
     with np.load(CALIBRATED) as file:
-        left = file["units"][score.plausible(file["distances"])]
+        left = file["units"][sets.plausible(file["distances"])]
     rows = np.random.default_rng(decision.SEED).permutation(len(left))[
         np.arange(trials) % len(left)
     ]
@@ -260,7 +260,7 @@ def merged(folder: Path) -> dict[str, Any]:
 def main() -> int:
     """Runs the command and returns the exit status."""
     parser = provenance.parser(__doc__)
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper_palm"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--out", type=Path, default=Path("runs/budget"), help="folder of the files")
     parser.add_argument("--designs", type=int, default=DESIGNS)
     parser.add_argument("--trials", type=int, default=TRIALS)
@@ -277,7 +277,8 @@ def main() -> int:
     if args.report:
         from scripts.accuracy import budget_report
 
-        return budget_report.make(json.loads(args.merge.read_text()), args.page, args.figure)
+        found = budget_report.Budget(json.loads(args.merge.read_text()))
+        return budget_report.make(found, args.page, args.figure)
     if args.merge:
         output.write_json(args.merge, merged(args.out), indent=None)
         return 0

@@ -46,6 +46,8 @@ CHANGES = (
     Change("the material's damping alone", "standard", "least", NUMERICS),
     Change("step, links and skin at once: the truth", "standard", "truth", NUMERICS),
     Change("the truth refined again", "truth", "finer", NUMERICS),
+    Change("the palm acts once a finger is in it", "standard", "palm once inside", NUMERICS),
+    Change("fingers creep on one another", "standard", "fingers creep", MODELS),
     Change("soft touch", "standard", "soft touch", MODELS),
     Change("pressure resists sideways bending", "standard", "lateral threshold", MODELS),
     Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
@@ -84,6 +86,13 @@ class Budget:
         if rate := self.rates.get("gpu", {}).get(name):
             cells[5] = f"{float(format(rate['grasps_per_s'], '.2g')):,.0f}"
         return cells
+
+    def tables(self) -> dict[str, str]:
+        """Markdown by the name of its marks on docs/accuracy.md."""
+        return {
+            "presets": tables.markdown(presets_table(self)),
+            "budget": f"{tables.markdown(budget_table(self))}\n\n{luck(self)}",
+        }
 
 
 def points(value: Any) -> str:
@@ -141,12 +150,9 @@ def draw(budget: Budget, path: Path) -> Path:
     return figures.save(figure, path)
 
 
-def make(found: dict[str, Any], page: Path | None, figure: Path | None) -> int:
+def make(budget: Budget, page: Path | None, figure: Path | None) -> int:
     """Prints the tables, fills them into a page, draws the figure; returns the exit status."""
-    budget = Budget(found)
-    parts = {"presets": tables.markdown(presets_table(budget))}
-    parts["budget"] = f"{tables.markdown(budget_table(budget))}\n\n{luck(budget)}"
-    for mark, text in parts.items():
+    for mark, text in budget.tables().items():
         print(f"{text}\n")
         if page:
             tables.fill(page, text, mark)

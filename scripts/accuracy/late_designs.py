@@ -1,27 +1,24 @@
-"""Late designs of the default scene at finer steps, links and meshes, and how deep fingers cross.
+"""Late designs of the default scene at finer steps, links and meshes.
 
 python -m scripts.accuracy.late_designs --json docs/data/late_designs.json
 
 The designs are final particles of the 23-parameter searches in docs/data/paper_fingers, which were
-made before fingers touched the palm.  The table of the hard cases reads the file (case 24 and 35).
+made before fingers touched the palm.  The table of the hard cases reads the file (24 and 37).
 """
 
 import argparse
-import functools
 import sys
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 
-from codesign_jax import model, rollout
+from codesign_jax.codesign import Task
+from codesign_jax.commands import calls
 from codesign_jax.cost import particle_cost
-from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.scene import Scene, load, parameters
-from codesign_jax.types import Params, Status, Trial, failed
+from codesign_jax.scene import load, parameters
+from codesign_jax.types import Outcome, Status, failed
 from scripts.accuracy import decision
 from scripts.shared import output, provenance
 
@@ -35,128 +32,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
 SEED = 24
 
 
-def simulated(
-    scene: Scene, designs: np.ndarray, trials: int, chunk: int, *, deep: bool
-) -> dict[str, np.ndarray]:
-    """Status, and cost of trials, shape (design, trial); and depths of the fingers at the release.
-
-    Args:
-      scene: The scene.
-      designs: Designs [SI], shape (design, parameter).
-      trials: Trials of a design, the same for all.
-      chunk: Designs of a call.
-      deep: Whether to find the depths.
-    """
-    engine = StructuredEngine(scene)
-    drawn = rollout.sample_trials(scene, jax.random.key(SEED), trials)
-    step = int(scene.last_step("disturb"))
-
-    @jax.jit
-    def run(designs: jax.Array):
-        params = jax.vmap(lambda v: parameters.unflatten(scene.hand, v))(designs)
-        worlds = jax.tree.map(lambda v: jnp.repeat(v, trials, 0), params)
-        each = jax.tree.map(lambda v: jnp.tile(v, (len(designs), *[1] * (v.ndim - 1))), drawn)
-        found, trace = rollout.simulate(scene, engine, worlds, each, record_qpos=deep)
-        return found.status, found.cost, trace.qpos[:, step] if deep else None, worlds, each
-
-    parts = []
-    for first in range(0, len(designs), chunk):
-        status, cost, qpos, worlds, each = jax.tree.map(
-            np.asarray, run(jnp.asarray(designs[first : first + chunk], jnp.float32))
-        )
-        part = {"status": status, "cost": cost}
-        if deep:
-            part["depth"] = depths(scene, worlds, each, qpos)
-        parts.append(part)
-    return {
-        name: np.concatenate([p[name] for p in parts]).reshape(len(designs), trials)
-        for name in parts[0]
-    }
-
-
-def depths(scene: Scene, params: Params, trials: Trial, qpos: np.ndarray) -> np.ndarray:
-    """How deep the fingers of hands are in one another [m], shape (world,)."""
-    found = []
-    for world, q in enumerate(qpos):
-        mine = jax.tree.map(lambda v, world=world: v[world], (params, trials))
-        found.append(depth(scene, _model(scene, *mine), mine[0], q))
-    return np.array(found)
-
-
-def _model(scene: Scene, params: Params, trial: Trial) -> mujoco.MjModel:
-    """MuJoCo's model of a world, with which states are read."""
-    from codesign_jax.engines.mujoco import world_model
-
-    return world_model(scene, jax.tree.map(np.asarray, _fields(scene, params, trial)))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _fields(scene: Scene, params: Params, trial: Trial) -> Any:
-    return model.model_fields(scene, params, trial)
-
-
-def depth(scene: Scene, compiled: mujoco.MjModel, params: Params, qpos: np.ndarray) -> float:
-    """Largest depth of a point of a finger's outline in a link of another one [m].
-
-    A link reaches from its joint to the next one, the last to the tip, with the outline
-    |y/a|^4 + |z/b|^4 = 1, whose points stand at four places of each.
-
-    Args:
-      scene: The scene.
-      compiled: The model of the world.
-      params: The hand.
-      qpos: The state.
-    """
-    data, lay = mujoco.MjData(compiled), model.layout(scene)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(compiled, data)
-    around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    unit = np.stack([np.cos(around), np.sin(around)], 1)
-    unit /= ((unit**4).sum(1) ** 0.25)[:, None]
-    points, frames, halves = [], [], []
-    for f, bodies in enumerate(lay.bodies):
-        half = np.array([scene.hand.section.width, float(params.height[f])]) / 2
-        span = (
-            float(params.length[f])
-            / lay.links
-            * np.where(np.arange(lay.links) < lay.links - 1, 1, 0.5)
-        )
-        ring = np.c_[0 * unit[:, 0], unit * half + [0, half[1]]]
-        local = np.concatenate(
-            [ring + np.outer(part * span, [1, 0, 0])[:, None] for part in (0, 0.25, 0.5, 0.75)], 1
-        )
-        turn = data.xmat[bodies].reshape(-1, 3, 3)
-        points.append((data.xpos[bodies][:, None] + local @ turn.swapaxes(1, 2)).reshape(-1, 3))
-        frames.append((data.xpos[bodies], turn))
-        halves.append((span, *half))
-    worst = 0.0
-    for one, other in np.ndindex(len(points), len(points)):
-        if one == other:
-            continue
-        (place, turn), (span, a, b) = frames[other], halves[other]
-        x, y, z = np.moveaxis((points[one][:, None] - place)[..., None, :] @ turn, -1, 0)[..., 0]
-        units = np.abs([y / a, (z - b) / b])
-        phi = np.maximum((units**4).sum(0) ** 0.25, 1e-9)
-        slope = np.sqrt(((units / phi) ** 6 / np.array([a, b])[:, None, None] ** 2).sum(0))
-        inside = (x >= 0) & (x <= span) & (phi < 1)
-        if inside.any():
-            worst = max(worst, float(((1 - phi) / slope)[inside].max()))
-    return worst
-
-
-def told(scene: Scene, found: dict[str, np.ndarray]) -> dict[str, Any]:
-    """What the file keeps of a setting: a letter a trial, a text a design, and mean costs."""
-    status = found["status"]
-    letters = np.where(found["cost"] == 0, "k", "l")
-    letters = np.where(failed(status), np.where(status & Status.STUCK, "s", "f"), letters)
-    from codesign_jax.types import Outcome
-
-    outcome = Outcome(jnp.asarray(found["cost"]), jnp.asarray(status), 0.0, 0)  # type: ignore[arg-type]
-    cost = np.asarray(particle_cost(scene, outcome))
-    kept = {"trials": ["".join(row) for row in letters], "cost": [round(float(c), 4) for c in cost]}
-    if "depth" in found:
-        kept["depth_mm"] = [[round(1e3 * float(d), 1) for d in row] for row in found["depth"]]
-    return kept
+def letters(found: Outcome) -> np.ndarray:
+    """How trials ended, shape (design, trial): kept, lost, STUCK or failed otherwise."""
+    bad = np.where(found.status & Status.STUCK, "s", "f")
+    return np.where(failed(found.status), bad, np.where(found.cost == 0, "k", "l"))
 
 
 def main() -> int:
@@ -176,9 +55,13 @@ def main() -> int:
     found["settings"] = {}
     for name in args.settings.split(","):
         scene = load("paper", overrides={"discretization": SETTINGS[name]})
-        count = args.trials_at_h if name == "h" else args.trials
-        made = simulated(scene, designs, count, args.chunk, deep=name == "h")
-        found["settings"][name] = told(scene, made)
+        trials = args.trials_at_h if name == "h" else args.trials
+        task = Task(scene, parameters.design_space(scene.hand), trials)
+        outcomes = calls.joined([*calls.in_turn(task, jax.random.key(SEED), designs, args.chunk)])
+        found["settings"][name] = {
+            "trials": ["".join(row) for row in letters(outcomes)],
+            "cost": [round(float(c), 4) for c in particle_cost(scene, outcomes)],
+        }
         output.write_json(args.json, found)
         print(name, flush=True)
     return 0

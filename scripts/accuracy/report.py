@@ -1,14 +1,18 @@
 """From committed records to figures, tables and CSV."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 from scripts.accuracy import analysis, figures, presets, tables
+from scripts.accuracy.budget_report import Budget
 from scripts.accuracy.results import ERRORS, Study
 from scripts.shared import output
 from scripts.shared.tables import fill, markdown
 
 MACHINES = {"h200": "NVIDIA H200 and CPU cores of its host", "cpu": "2 CPU cores"}
+BUDGET = Path(__file__).parents[2] / "docs" / "data" / "budget_h100.json"
+"""What `scripts.accuracy.budget` found in the default scene."""
 SHORT = {"h200": "one H200", "cpu": "2 CPU cores"}
 
 
@@ -42,18 +46,20 @@ def make_summary(page: Path, note: Path, scenes: Path, found: dict[str, Study]) 
     """Fills in the tables of the presets and of the errors wanted, and the comments of their files.
 
     Args:
-      page: The user's page, which has the presets in short.
+      page: The user's page, of the default scene alone.
       note: The note of the study.
       scenes: Folder of the presets.
       found: See `studies`; the full size comes first.
     """
     named = {SHORT[n]: study for n, study in found.items()}
     full, *rest = named.values()
-    fill(page, markdown(presets.in_short(named)), "presets")
+    budget = Budget(json.loads(BUDGET.read_text()))
+    for mark, text in budget.tables().items():
+        fill(page, text, mark)
     fill(note, markdown(tables.wanted_here(full, rest[0] if rest else None)), "wanted")
     text = "\n\n".join(markdown(t) for t in (presets.presets_table(named), presets.standing(full)))
     fill(note, text, "presets")
-    presets.annotate(scenes, named)
+    presets.annotate(scenes, full, budget)
 
 
 def _section(study: Study, name: str, docs: Path) -> str:
@@ -75,7 +81,7 @@ def _section(study: Study, name: str, docs: Path) -> str:
         figures.convergence(lines, docs / "figures" / f"convergence_{name}.png")
         parts.append(f"![Orders of convergence](../figures/convergence_{name}.png)")
         add("The reference and the orders", tables.confirmed(study.records))
-    for part in ("tip", "impulse", "step"):
+    for part in ("tip", "impulse"):
         add(ERRORS[part][0], tables.errors_table(study, part))
     for population, words in tables.POPULATIONS.items():
         add(f"Decisions: {words}", tables.decisions_table(study, population))

@@ -86,7 +86,8 @@ def of_steps(scene: Scene, designs: np.ndarray) -> dict[str, Any]:
     qpos, qvel, acc, u = (v[:, steps].reshape(-1, v.shape[-1]) for v in states)
     solved = np.asarray(again(many, qpos, qvel, acc, u[:, None]))
     mass = np.asarray(many.body_mass)[:, -1]
-    force = mass * np.linalg.norm((solved - acc)[:, -6:-3], axis=1)
+    # Of the object the last three are linear, see `kinematics.Acc`.
+    force = mass * np.linalg.norm((solved - acc)[:, -3:], axis=1)
     residual = np.sqrt(found["residual"][:, steps].ravel())
     at_limit = residual**2 > engine.limits.tolerance
     if not at_limit.any():

@@ -14,7 +14,6 @@ from scripts.accuracy.settings import HULL, PRESETS, SPHERES, Setting, one_at_a_
 
 ERRORS = {
     "tip": ("finger tip [mm]", "tip_rms_mm"),
-    "step": ("acceleration of a step, 99 %", "step_p99"),
     "impulse": ("contact impulse, relative", "impulse_error"),
     "decision": ("verdicts that flip", "flipped"),
 }
@@ -22,7 +21,6 @@ SHARED = ("tip", "impulse")
 """Errors of what all engines solve alike, see `Study.points`."""
 WANTED = {
     "tip": (5.0, 2.0, 1.0, 0.5),
-    "step": (1e-3, 1e-4, 2e-5),
     "impulse": (0.05, 0.03, 0.02, 0.01),
     "decision": (0.07, 0.05, 0.03, 0.02),
 }
@@ -66,8 +64,6 @@ class Study:
     def _errors(self, part: str) -> Records:
         if part in ("tip", "impulse"):
             return [r for r in analysis.against_reference(self.records, part) if not r["more"]]
-        if part == "step":
-            return analysis.measured(self.records, part)
         return [
             {"of": setting, "flipped": row["flipped"].value}
             for setting, row in self.decisions("late").items()

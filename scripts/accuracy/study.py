@@ -7,14 +7,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scripts.accuracy import beam, decision, impulse, steps, timing, tip
+from scripts.accuracy import beam, decision, impulse, timing, tip
 from scripts.accuracy.settings import (
     FINGERS,
     HULL,
     LINKS,
     PRESETS,
     REFERENCE,
-    SPHERES,
     STANDARD,
     TIMESTEPS,
     Setting,
@@ -24,7 +23,7 @@ from scripts.accuracy.settings import (
 )
 from scripts.accuracy.store import Case
 
-PARTS = ("tip", "step", "impulse", "decision", "time")
+PARTS = ("tip", "impulse", "decision", "time")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,9 +35,8 @@ class Size:
       timesteps: Time steps of the reference [ms]: the reference and one that confirms it.
       links: Links of the reference.
       confirm_links: Links that confirm it.
-      hands: Hands of the parts tip, step and impulse.
+      hands: Hands of the parts tip and impulse.
       seconds: Simulated time of the part tip.
-      states: States of each hand in the part step.
       particles: Particles of a population.
       trials: Trials of a late particle at the presets.
       fewer: Trials of a late particle elsewhere.
@@ -48,7 +46,6 @@ class Size:
       repeats: Timed calls.
       finest: Shortest time step of a setting [ms].
       most_links: Most links of a setting.
-      engines: Engines of the parts tip, step and impulse besides MuJoCo C.
     """
 
     name: str
@@ -57,7 +54,6 @@ class Size:
     confirm_links: int
     hands: int
     seconds: float
-    states: int
     particles: int
     trials: int
     fewer: int
@@ -72,15 +68,15 @@ class Size:
 _GPU = {"structured": 16_384, "mujoco": 96, "mjx": 1_728}
 SIZES = {
     "full": Size(
-        "full", (0.1, 0.05), 40, 80, 12, 2.4, 40, 60, 200, 100,
+        "full", (0.1, 0.05), 40, 80, 12, 2.4, 60, 200, 100,
         {"structured": 480, "mujoco": 60, "mjx": 12}, _GPU, 50, 5,
     ),
     "quick": Size(
-        "quick", (0.5, 0.25), 20, 40, 3, 1.0, 8, 12, 12, 12,
+        "quick", (0.5, 0.25), 20, 40, 3, 1.0, 12, 12, 12,
         {"structured": 240, "mujoco": 24, "mjx": 6}, _GPU, 50, 5, 2.0, 20,
     ),
     "tiny": Size(
-        "tiny", (2.0, 1.0), 4, 5, 2, 0.3, 2, 3, 3, 3,
+        "tiny", (2.0, 1.0), 4, 5, 2, 0.3, 3, 3, 3,
         {"structured": 4, "mujoco": 4, "mjx": 4}, _GPU, 3, 2, 5.0, 3,
     ),
 }  # fmt: skip
@@ -100,7 +96,6 @@ def cases(
     """
     make = {
         "tip": _tip,
-        "step": _step,
         "impulse": _impulse,
         "decision": partial(_decision, data=data),
         "time": partial(_time, gpu=gpu),
@@ -183,23 +178,6 @@ def _tips(setting: Setting, size: Size) -> dict[str, Any]:
 
 TIP_STRIDE = 5
 """Every so many of the compared states are kept: ten a second."""
-
-
-def _step(size: Size, engines: Sequence[str]) -> list[Case]:
-    found = []
-    for engine in engines:
-        # Of spheres, which every engine has.
-        every = list(dict.fromkeys(replace(s, surface=SPHERES) for s in settings(size, engine)))
-        # What the error of a step depends on is the solver; discretizations share its equations.
-        base = every[0]
-        kept = [s for s in every if replace(s, iterations=None, precision="float32") == base]
-        kept += [replace(base, iterations=0, precision="float64")] * (engine == "structured")
-        kept += [s for s in every if (s.timestep, s.links) in ((1.0, 20), (10.0, 5), (10.0, 20))]
-        found += [
-            Case("step", s, (), partial(steps.measure, s, size.hands, size.states))
-            for s in dict.fromkeys(kept)
-        ]
-    return found
 
 
 def _impulse(size: Size, engines: Sequence[str]) -> list[Case]:

@@ -126,7 +126,6 @@ def errors_table(study: Study, part: str) -> list[list[str]]:
     heads = {
         "tip": ["tip_rms_mm", "tip_max_mm"],
         "impulse": ["impulse_error", "impulse_max", "grip_error", "touch_error_ms"],
-        "step": ["step_median", "step_p99", "step_max", "iterations_max"],
     }
     rows = [["engine", "setting", *(h.replace("_", " ") for h in heads[part]), *COST]]
     for r in study.errors(part):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,13 +12,7 @@ from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene, parameters
 from codesign_jax.types import Params, Trial
 from scripts.shared import work
-
-
-class Worlds(NamedTuple):
-    """Hands and trials as float32 NumPy arrays with leading axis (world,)."""
-
-    params: Params
-    trials: Trial
+from scripts.shared.work import Worlds
 
 
 @contextmanager
@@ -67,16 +61,6 @@ def paired(params: Params, drawn: Trial) -> Worlds:
     return Worlds(params, jax.tree.map(lambda x: x[index], drawn))
 
 
-def crossed(params: Params, drawn: Trial) -> Worlds:
-    """Every hand in every trial, hand by hand."""
-    hands, count = params.length.shape[0], drawn.yaw.shape[0]
-    index = np.arange(hands * count)
-    return Worlds(
-        jax.tree.map(lambda x: x[index // count], params),
-        jax.tree.map(lambda x: x[index % count], drawn),
-    )
-
-
 def cast(tree, dtype: type):
     """Arrays of floats in a float type; integers stay."""
     return jax.tree.map(lambda x: x.astype(dtype) if np.asarray(x).dtype.kind == "f" else x, tree)
@@ -90,5 +74,5 @@ def inputs(scene: Scene, worlds: Worlds, dtype: type) -> tuple[ModelFields, np.n
       worlds: The worlds.
       dtype: Float type; JAX must be in the same mode, see `floats`.
     """
-    made = work.inputs(scene, work.Worlds(*cast(worlds, dtype)))
+    made = work.inputs(scene, cast(worlds, dtype))
     return jax.tree.map(np.asarray, made)

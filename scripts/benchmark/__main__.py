@@ -6,8 +6,7 @@ A second run with the same file replaces the cases that it measures and keeps th
 engines can be measured in several runs: --engines structured, then --engines mjx.  The parts of a
 run (--parts) are: grasp (whole grasps, with verdicts against converged float64 MuJoCo C), window
 (short rollouts in contact, in which every world is simulated in every step), residual (relative
-error of accelerations), quality (the structured engine's iterations and decrements) and growth
-(cost against links, fingers and contact spheres).
+error of accelerations) and growth (cost against links, fingers and contact spheres).
 """
 
 import argparse
@@ -23,7 +22,7 @@ from typing import Any
 from scripts.benchmark import report
 from scripts.shared import output, peers, provenance
 
-PARTS = ("grasp", "window", "residual", "quality", "growth")
+PARTS = ("grasp", "window", "residual", "growth")
 # Worlds of the sizes measured; stock MJX and Warp get what their speed and memory allow.
 SIZES = {
     "cpu": {"structured": [60, 360], "mujoco": [60, 360], "mjx": [12, 60], "warp": []},
@@ -132,8 +131,6 @@ def plan(args: argparse.Namespace, kind: str, available: set[str]) -> list[dict[
             add(engine, setting, "window", worlds, weight, steps=steps)
         if "residual" in args.parts:
             add(engine, setting, "residual", [min(12, worlds[0])], weight, steps=steps)
-        if "quality" in args.parts and engine == "structured":
-            add(engine, setting, "quality", [min(worlds[0], 1728)], 0.5)
     if "growth" in args.parts:
         first = {name: peers.settings(name)[0] for name in available}
         for name in args.growth_engines:
@@ -142,8 +139,6 @@ def plan(args: argparse.Namespace, kind: str, available: set[str]) -> list[dict[
                     continue
                 more = {"variant": changed, "growth": True, "cached": False}
                 add(name, first[name], "window", [small["growth"]], 1.0, **more)
-                if name == "structured":
-                    add(name, first[name], "quality", [small["growth"]], 0.7, **more)
     return cases
 
 

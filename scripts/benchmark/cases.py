@@ -53,8 +53,6 @@ class Case:
             self.write({"provenance": self.provenance})
         elif kind == "residual":
             self.write({"provenance": self.provenance, **accelerations(self)})
-        elif kind == "quality":
-            self.write({"provenance": self.provenance, **quality(self)})
         elif kind == "compile":
             measure.use_cache(self.values["cache"])
             window = self.values["part"] == "window"
@@ -231,35 +229,3 @@ def _errors(scene: Scene, fields: Any, qpos: np.ndarray, ctrl: np.ndarray) -> np
         got = (velocity[k + 1] - velocity[k]) / h
         errors.append(np.linalg.norm(got - data.qacc) / max(np.linalg.norm(data.qacc), 100.0))
     return np.array(errors)
-
-
-def quality(case: Case) -> dict:
-    """Newton iterations and decrements of the structured engine's steps over whole grasps.
-
-    A case of growth has the short rollouts in contact that its times are of.
-    """
-    from codesign_jax.engines.structured import kernel
-    from codesign_jax.engines.structured.world_model import world_constants
-
-    worlds, scene = case.values["worlds"][0], case.scene
-    engine: Any = peers.build(case.engine, case.setting, scene)
-    if case.values.get("growth"):
-        distinct = case.values["distinct"]
-        fields, ctrl = work.window(scene, worlds, case.values["steps"], distinct=distinct)
-    else:
-        fields, ctrl = work.inputs(scene, work.make_worlds(scene, worlds))
-    program = kernel.Program.here(scene, engine.limits, ctrl.dtype, len(ctrl))
-    found = jax.jit(lambda f, c: program.run(world_constants(scene, f), engine.reset(f), c))(
-        fields, ctrl
-    )
-    iterations, residual = (np.asarray(found[n]) for n in ("iterations", "residual"))
-    limits = engine.limits
-    return {
-        "worlds": worlds,
-        "limits": list(limits),
-        "iterations_mean": float(iterations.mean()),
-        "iterations_max": float(iterations.max()),
-        "at_the_cap": float((iterations >= limits.iterations).mean()),
-        "above_tolerance": float((residual > limits.tolerance).mean()),
-        **{f"decrement_{k}": v for k, v in quantiles(residual).items()},
-    }

@@ -1,69 +1,34 @@
 """Compares the costs of the engines over many trials: how much of a difference is chaos?
 
 python -m scripts.benchmark.compare --trials 2000 --json docs/data/compare_engines.json
-python -m scripts.benchmark.compare --designs grid --trials 2400 --mjx-trials 0 \
-    --limits 24/14/1e-6 12/10/1e-5 --json runs/tolerances.json
 
 Single grasps differ after contact, where trajectories are chaotic; what must agree are the shares
 of successes, the costs' distributions and the designs' ranks.  Engines are compared with MuJoCo C
 over the same worlds, at equal settings; "mujoco, perturbed" is MuJoCo C against itself with the
-objects moved by a micrometre, which shows how much of a difference chaos alone makes.  --limits
-adds the structured engine with other limits of its solver: Newton iterations of a step, line-search
-evaluations of an iteration, relative decrement.
+objects moved by a micrometre, which shows how much of a difference chaos alone makes.
 """
 
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import Engine
-from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.scene import Scene, parameters
+from codesign_jax.scene import Scene
 from scripts.shared import output, peers, provenance, statistics, work
 
-Limits = tuple[int, int, float]
-"""Newton iterations, line-search evaluations, relative decrement."""
-GRID = 20
-"""Designs along a side of the grid over the 2D design space."""
 
-
-def limits(text: str) -> Limits:
-    """Reads 24/14/1e-6."""
-    iterations, evaluations, decrement = text.split("/")
-    return int(iterations), int(evaluations), float(decrement)
-
-
-def grid_worlds(scene: Scene, count: int) -> work.Worlds:
-    """The first worlds of a grid of 2D designs, each in `work.TRIALS` trials; then they repeat."""
-    space = parameters.design_space(scene.hand, "2d")
-    axes = [np.linspace(a, b, GRID) for a, b in zip(space.low, space.high, strict=True)]
-    designs = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    params = jax.vmap(space.params)(jnp.asarray(designs, jnp.float32))
-    trials = rollout.sample_trials(scene, jax.random.key(0), work.TRIALS)
-    index = np.arange(count) % (len(designs) * work.TRIALS)
-    return work.Worlds(
-        jax.tree.map(lambda x: x[index // work.TRIALS], params),
-        jax.tree.map(lambda x: x[index % work.TRIALS], trials),
-    )
-
-
-def engines(scene: Scene, chosen: list[Limits], *, mjx: bool) -> dict[str, Callable[[], Engine]]:
+def engines(scene: Scene, *, mjx: bool) -> dict[str, Callable[[], Engine]]:
     """What builds each engine, by the name in the file; MuJoCo C, which stands for all, first."""
     found: dict[str, Callable[[], Engine]] = {
         "mujoco": lambda: peers.build("mujoco", "equal", scene),
         "mujoco, perturbed": lambda: peers.build("mujoco", "equal", scene),
         "structured": lambda: peers.build("structured", "default", scene),
     }
-    for i, e, d in chosen:
-        build = partial(StructuredEngine, scene, iterations=i, evaluations=e, tolerance=d)
-        found[f"structured, {i}/{e}/{d:g}"] = build
     return found | ({"mjx": lambda: peers.build("mjx", "equal", scene)} if mjx else {})
 
 
@@ -109,17 +74,14 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=2000)
     parser.add_argument("--mjx-trials", type=int, default=120, help="0 leaves stock MJX out")
     parser.add_argument("--chunk", type=int, default=500)
-    parser.add_argument("--designs", choices=("usual", "grid"), default="usual")
-    parser.add_argument("--limits", type=limits, nargs="+", default=[], metavar="24/14/1e-6")
     parser.add_argument("--json", type=Path, required=True)
     args = parser.parse_args()
     scene = work.variant()
-    draw = grid_worlds if args.designs == "grid" else work.make_worlds
     found, seconds = {}, {}
-    for name, build in engines(scene, args.limits, mjx=args.mjx_trials > 0).items():
+    for name, build in engines(scene, mjx=args.mjx_trials > 0).items():
         count = min(args.mjx_trials, args.trials) if name == "mjx" else args.trials
         chunk = min(args.chunk, count)
-        worlds = draw(scene, -(-count // chunk) * chunk)
+        worlds = work.make_worlds(scene, -(-count // chunk) * chunk)
         if name.endswith("perturbed"):
             worlds = worlds._replace(trials=work.nudged(worlds.trials))
         each, seconds[name] = costs(scene, build(), worlds, chunk)

@@ -53,8 +53,6 @@ def line(record: dict[str, Any]) -> str:
     if "median_s" in record:
         rate = record["nominal_world_steps_per_s"]
         return f"{name}: {rate:,.0f} world-steps/s, compile {record['compile_s']:.1f} s"
-    if record["kind"] == "quality":
-        return f"{name}: {record['iterations_mean']:.2f} iterations a step"
     return f"{name}: median error {record['median']:.1e}, 99 % {record['p99']:.1e}"
 
 
@@ -138,55 +136,24 @@ def window_table(results: dict[str, Any]) -> list[list[str]]:
     return rows
 
 
-def quality_table(results: dict[str, Any]) -> list[list[str]]:
-    """Iterations and decrements of the structured engine."""
-    head = "setting, iterations mean, largest, at the cap, decrement median, 99 %, above tolerance"
-    rows = _head(head)
-    for r in measured(results, "quality"):
-        rows.append(
-            [
-                r["setting"],
-                f"{r['iterations_mean']:.2f}",
-                f"{r['iterations_max']:.0f}",
-                f"{r['at_the_cap']:.2%}",
-                f"{r['decrement_median']:.1e}",
-                f"{r['decrement_p99']:.1e}",
-                f"{r['above_tolerance']:.2%}",
-            ]
-        )
-    return rows
-
-
 def growth_table(results: dict[str, Any]) -> list[list[str]]:
     """Microseconds of a world's step against links, fingers and spheres."""
-    rows = [["engine", "against", "µs a world and step", "exponent", "Newton iterations"]]
-    counts = {
-        (r["engine"], *next(iter(r["variant"].items()))): r["iterations_mean"]
-        for r in results["records"]
-        if r.get("growth") and "iterations_mean" in r
-    }
+    rows = [["engine", "against", "µs a world and step", "exponent"]]
     for name in ("links", "fingers", "spheres"):
         for engine, points in growth(results, name).items():
             upper = [p for p in points if name != "links" or p[0] >= 10]
             slope = statistics.slope(*zip(*upper, strict=True)) if len(upper) > 1 else None
             text = ", ".join(f"{int(n)}: {cost:,.3g}" for n, cost in points)
-            done = [
-                f"{int(n)}: {counts[k]:.2f}"
-                for n, _ in points
-                if (k := (engine, name, n)) in counts
-            ]
-            rows.append([engine, name, text, _number(slope, ".2f"), ", ".join(done) or "–"])
+            rows.append([engine, name, text, _number(slope, ".2f")])
     for r in results["records"]:
         if r.get("growth") and "hand_name" in r["variant"] and "median_s" in r:
             cost = 1e6 / r["nominal_world_steps_per_s"]
-            rows.append(
-                [r["engine"], "hand", f"{r['variant']['hand_name']}: {cost:,.3g}", "–", "–"]
-            )
+            rows.append([r["engine"], "hand", f"{r['variant']['hand_name']}: {cost:,.3g}", "–"])
     return rows
 
 
 def tables(results: dict[str, Any]) -> str:
     """All tables that have rows, in Markdown."""
-    every = (grasp_table, window_table, quality_table, growth_table)
+    every = (grasp_table, window_table, growth_table)
     made = [table(results) for table in every]
     return "\n\n".join(markdown(rows) for rows in made if len(rows) > 1)

@@ -30,11 +30,11 @@ from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import keypaths, parameters
 from codesign_jax.scene.schema import InputError
-from scripts.calibration import files, score, sets
+from scripts.calibration import files, score
 from scripts.calibration.surrogate import Plan
 from scripts.calibration.wave import Size, Wave, keep
 from scripts.experiments import results
-from scripts.shared import provenance
+from scripts.shared import provenance, sets
 
 SCENE, PRESET = "paper", "2d"
 # Sets, grid points along a side, trials, most worlds of a call, and what changes in the scene.
@@ -197,9 +197,9 @@ def score_waves(args: argparse.Namespace) -> int:
 
 def _left(data: dict[str, np.ndarray]) -> str:
     """How many sets each target rules out, and how many are left."""
-    out = (data["distances"] > score.CUTOFF).sum(0)
+    out = (data["distances"] > sets.CUTOFF).sum(0)
     lines = [f"{t.name}: rules out {n}" for t, n in zip(score.TARGETS, out, strict=True)]
-    left = int(score.plausible(data["distances"]).sum())
+    left = int(sets.plausible(data["distances"]).sum())
     return "\n".join([*lines, f"{left} of {len(data['units'])} sets are left"])
 
 

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.calibration import score, sets
+from scripts.calibration import score
 from scripts.calibration.files import Scored
 from scripts.shared import figures as pictures
+from scripts.shared import sets
 
 COLUMNS = 5
 LANDSCAPES = 8

@@ -12,11 +12,11 @@ import numpy as np
 from codesign_jax.optimize import ParticleFilter
 from codesign_jax.scene import InputError, Scene
 from codesign_jax.types import Status
-from scripts.calibration import score, sets, summary
+from scripts.calibration import score, summary
 from scripts.calibration.surrogate import Plan, filled, make_runs
 from scripts.calibration.wave import Size, trial_costs
 from scripts.experiments.strategies import Arrays
-from scripts.shared import provenance
+from scripts.shared import provenance, sets
 
 SCORES = "_scores"
 """What follows a wave's name in the names of its scores."""
@@ -40,7 +40,7 @@ class Scored(NamedTuple):
     @property
     def plausible(self) -> np.ndarray:
         """Which sets no target rules out, bool, shape (set,)."""
-        return score.plausible(self.data["distances"])
+        return sets.plausible(self.data["distances"])
 
     @property
     def fidelity(self) -> str:
@@ -154,7 +154,7 @@ def next_sets(waves: Sequence[Scored], count: int, seed: int, keep: int) -> tupl
     """
     units = np.concatenate([w.data["units"] for w in waves])
     distances = np.concatenate([w.data["distances"] for w in waves])
-    left = np.flatnonzero(score.plausible(distances))
+    left = np.flatnonzero(sets.plausible(distances))
     text = f"around {len(left)} of {len(units)} sets that no target rules out"
     if len(left) < keep:
         left = score.best(distances, keep)

@@ -7,8 +7,9 @@ import numpy as np
 from scipy import stats
 
 from codesign_jax.scene import InputError
-from scripts.calibration import figures, files, score, sets
+from scripts.calibration import figures, files, score
 from scripts.calibration.files import Scored
+from scripts.shared import sets
 from scripts.shared.tables import fill
 
 MEASURES = {
@@ -121,7 +122,7 @@ def wave_table(waves: Sequence[Scored]) -> str:
 
 def target_table(wave: Scored) -> str:
     """What kept sets out: by each target, and by it alone."""
-    out = wave.data["distances"] > score.CUTOFF
+    out = wave.data["distances"] > sets.CUTOFF
     alone = out & (out.sum(-1, keepdims=True) == 1)
     lines = [
         "| target | the paper says | sets ruled out | by nothing else | median distance |",

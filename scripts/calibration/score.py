@@ -2,8 +2,8 @@
 
 Implausibility is the distance to the target in standard deviations: of the paper's own figure (a
 median of 30 runs), of the landscape from few trials, and of the surrogate.  History matching rules
-out what lies beyond `CUTOFF` for any target, and chooses no best fit.  The 23D experiment is held
-out: nothing of it is used here.
+out what lies beyond `sets.CUTOFF` for any target, and chooses no best fit.  The 23D experiment is
+held out: nothing of it is used here.
 """
 
 import dataclasses
@@ -13,9 +13,6 @@ import numpy as np
 
 from scripts.calibration.surrogate import Plan, Runs, episodes_to_converge
 
-CUTOFF = 3.0
-"""Implausibility above which a set is ruled out: three standard deviations, whatever the
-distribution as long as it has one peak (Pukelsheim 1994)."""
 READINGS = tuple(f"{kind}, {noise}" for kind in ("first", "stays") for noise in ("shared", "own"))
 """Converged at the first crossing or where the cost stays below; trials shared or each its own."""
 PAPER_2D = 420.0
@@ -141,11 +138,6 @@ def measures(runs: Mapping[str, Runs], plan: Plan) -> dict[str, np.ndarray]:
 def implausibility(measured: Mapping[str, np.ndarray]) -> np.ndarray:
     """Implausibility of each set by each of `TARGETS`, shape (set, target)."""
     return np.stack([t.distance(measured) for t in TARGETS], -1)
-
-
-def plausible(distances: np.ndarray, cutoff: float = CUTOFF) -> np.ndarray:
-    """Which sets no target rules out, bool, shape (set,)."""
-    return np.asarray((distances <= cutoff).all(-1))
 
 
 def best(distances: np.ndarray, count: int) -> np.ndarray:

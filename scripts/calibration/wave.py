@@ -17,9 +17,9 @@ from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, failed
-from scripts.calibration import sets
 from scripts.experiments.landscape import STREAM_GRID, grid
 from scripts.experiments.strategies import Arrays
+from scripts.shared import sets
 
 KEPT = np.iinfo(np.uint16).max
 """`lost_step` of a trial in which the object was not lost."""

@@ -19,7 +19,7 @@ PAGE, RESULT = Path("docs/notes/dataset.md"), Path("docs/data/dataset.json")
 
 def described(path: Path) -> dict[str, Any]:
     """Numbers, schema and SHA-256 digest of a file of `codesign sample`."""
-    pa = parquet.library("scripts.dataset")
+    pa = parquet.pyarrow_module("scripts.dataset")
     file = pa.parquet.ParquetFile(path)
     metadata = {k.decode(): v.decode() for k, v in file.schema_arrow.metadata.items()}
     question = json.loads(metadata["question"])

@@ -71,7 +71,7 @@ def read(path: Path, space: DesignSpace, names: list[str], most: int | None = No
       names: Names of the objects.
       most: Most grasps, from the first one on.
     """
-    pa = parquet.library("scripts.dataset.surrogate")
+    pa = parquet.pyarrow_module("scripts.dataset.surrogate")
     table = pa.parquet.read_table(path)[: most or None]
     own = [f.name for f in table.schema if b"parameter" in (f.metadata or {})]
     values = np.stack([table[n].to_numpy() for n in own], 1) * np.array(space.scale)
@@ -152,7 +152,7 @@ def train(grasps: Grasps, told: np.ndarray, seed: int = 0) -> Model:
     state = descent.init(layers)
 
     @jax.jit
-    def step(layers: list, state: Any, x: jax.Array, kept: jax.Array) -> tuple[list, Any]:
+    def step(layers: list, state: Any, x: jax.Array, kept: jax.Array) -> tuple[Any, Any]:
         updates, state = descent.update(jax.grad(_loss)(layers, x, kept), state, layers)
         return optax.apply_updates(layers, updates), state
 
@@ -255,7 +255,8 @@ def climbed(
         unit, state = carry
         slope = jax.grad(lambda u: -liking(model, u, told, noise).sum())(unit)
         updates, state = descent.update(slope, state)
-        return (jnp.clip(optax.apply_updates(unit, updates), 0, 1), state), None
+        moved: Any = optax.apply_updates(unit, updates)
+        return (jnp.clip(moved, 0, 1), state), None
 
     (unit, _), _ = jax.lax.scan(step, (unit, descent.init(unit)), length=200)
     designs = jax.vmap(space.project)(space.low + unit * (space.high - space.low))
@@ -281,7 +282,9 @@ def study(grasps: Grasps, told: np.ndarray, each: bool) -> tuple[dict[str, Any],
     train_on, rest = grasps.rows(~out), grasps.rows(out)
     base = shares(train_on, len(told))
     model = train(train_on, told)
-    found = {"designs": scores(predicted(model, rest, told), rest.kept, base[rest.object])}
+    found: dict[str, Any] = {
+        "designs": scores(predicted(model, rest, told), rest.kept, base[rest.object])
+    }
     if each:
         found["objects"] = {}
         for k in np.unique(grasps.object):

@@ -1,9 +1,8 @@
 """What gradients of short windows are good for: python -m scripts.demonstrations [--draw].
 
-Three problems of the default scene, each with a gradient and without one, in the same processor
-time: constants from a shake, an object held still, and first particles by shape.  Writes
-docs/data/demonstrations_cpu.json and draws docs/figures/demonstrations.png from it; the results
-are in docs/gradients.md.  `--only seeds` is for a GPU: three minutes there, an hour on two cores.
+Two problems of the default scene, each with a gradient and without one, in the same processor
+time: constants from a shake, and an object held still.  Writes docs/data/demonstrations_cpu.json
+and draws docs/figures/demonstrations.png from it; the results are in docs/gradients.md.
 """
 
 import argparse
@@ -14,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from codesign_jax import scene, use_compilation_cache
-from scripts.demonstrations import hold, identify, seeds
+from scripts.demonstrations import hold, identify
 from scripts.shared import figures, output, provenance
 
 DOCS = Path(__file__).parents[2] / "docs"
-STUDIES = {"identify": identify.run, "hold": hold.run, "seeds": seeds.run}
+STUDIES = {"identify": identify.run, "hold": hold.run}
 
 
 def main() -> None:
@@ -27,15 +26,13 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=DOCS / "data" / "demonstrations_cpu.json")
     parser.add_argument("--figure", type=Path, default=DOCS / "figures" / "demonstrations.png")
     parser.add_argument("--only", nargs="+", choices=STUDIES, default=list(STUDIES))
-    parser.add_argument("--runs", type=int, default=30, help="of the particle filter, for seeds")
     parser.add_argument("--draw", action="store_true", help="draw from the file; measure nothing")
     provenance.add_commit(parser)
     options = parser.parse_args()
     use_compilation_cache()
     results = json.loads(options.json.read_text()) if options.json.exists() else {}
     for name in [] if options.draw else options.only:
-        more = {"runs": options.runs} if name == "seeds" else {}
-        results[name] = STUDIES[name](scene.load("paper"), **more)
+        results[name] = STUDIES[name](scene.load("paper"))
         results[name]["provenance"] = provenance.measurement(options.commit)
         output.write_json(options.json, results)
     if {"identify", "hold"} <= set(results):
@@ -43,10 +40,9 @@ def main() -> None:
 
 
 def draw(results: dict[str, Any], path: Path) -> None:
-    """A panel for each study that was run."""
-    count = len(results)
-    figure = figures.new(4 * count, 3.4)
-    axes = figure.subplots(1, count)
+    """A panel for each study."""
+    figure = figures.new(8, 3.4)
+    axes = figure.subplots(1, 2)
     found = results["identify"]["seeds"]
     largest = lambda errors: 100 * np.abs(errors).max()  # noqa: E731
     columns = {
@@ -63,15 +59,6 @@ def draw(results: dict[str, Any], path: Path) -> None:
     paths |= {k: v["slip"] for k, v in results["hold"]["methods"].items()}
     axes[1].boxplot([1e3 * np.array(v) for v in paths.values()], tick_labels=list(paths))
     axes[1].set(ylabel="path of the object in the palm [mm]", ylim=(0, None), title="held still")
-    if "seeds" not in results:
-        figures.save(figure, path)
-        return
-    found = results["seeds"]
-    counts = found["simulations"]
-    for k, values in enumerate(counts.values()):
-        axes[2].plot(k + np.linspace(-0.15, 0.15, len(values)), np.sort(values), ".")
-    axes[2].set_xticks(range(len(counts)), counts)
-    axes[2].set(ylabel="simulations to convergence", ylim=(0, None), title="first particles")
     figures.save(figure, path)
 
 

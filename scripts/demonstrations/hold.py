@@ -68,7 +68,7 @@ def driven(ctrl: jax.Array, knots: jax.Array) -> jax.Array:
     return ctrl.at[..., 6:].multiply(1 + factors_of(knots, ctrl.shape[-2]))
 
 
-class Task:
+class Shaking:
     """The grasps and the programs of all methods."""
 
     def __init__(self, scene: Scene, seed: int):
@@ -140,7 +140,7 @@ class Gradient:
         """Takes the first moves' length."""
         self.length = jnp.full(GRASPS, length)
 
-    def __call__(self, task: "Task", plan: Plan, knots: jax.Array, random: Any) -> jax.Array:
+    def __call__(self, task: "Shaking", plan: Plan, knots: jax.Array, random: Any) -> jax.Array:
         """The knots of a plan, from those of the plan before."""
         best, least = knots, None
         slope = knots
@@ -170,7 +170,7 @@ class Sampled:
         """Weights of draws by their costs, both (draw, world)."""
         raise NotImplementedError
 
-    def __call__(self, task: "Task", plan: Plan, knots: jax.Array, random: Any) -> jax.Array:
+    def __call__(self, task: "Shaking", plan: Plan, knots: jax.Array, random: Any) -> jax.Array:
         """The knots of a plan, from those of the plan before."""
         noise = self.spread * random.normal(size=(self.rollouts, *task.shape))
         noise[0] = 0.0
@@ -198,7 +198,7 @@ class PathIntegral(Sampled):
         return found / found.sum(0)
 
 
-def nothing(task: "Task", plan: Plan, knots: jax.Array, random: Any) -> jax.Array:
+def nothing(task: "Shaking", plan: Plan, knots: jax.Array, random: Any) -> jax.Array:
     """Constant pressure."""
     return jnp.zeros_like(knots)
 
@@ -213,7 +213,7 @@ def shifted(knots: jax.Array) -> jax.Array:
     return jax.vmap(jax.vmap(one, 1, 1))(knots)
 
 
-def drive(task: Task, choose: Callable, seed: int = 0) -> tuple[np.ndarray, float]:
+def drive(task: Shaking, choose: Callable, seed: int = 0) -> tuple[np.ndarray, float]:
     """Paths of slip over the shaking [m], (world,), and the processor time of all choices [s]."""
     random, (plan, knots) = np.random.default_rng(seed), task.first()
     slip, seconds = np.zeros(GRASPS), 0.0
@@ -228,7 +228,7 @@ def drive(task: Task, choose: Callable, seed: int = 0) -> tuple[np.ndarray, floa
     return slip, seconds
 
 
-def check(task: Task, step: float = 0.02) -> dict[str, Any]:
+def check(task: Shaking, step: float = 0.02) -> dict[str, Any]:
     """Cosine of the gradient by all knots with differences, and what both programs cost."""
     plan, none = task.first()
     plan = plan._replace(ctrl=jnp.asarray(task.ctrl[:, BEGIN : BEGIN + HORIZON]))
@@ -246,7 +246,7 @@ def check(task: Task, step: float = 0.02) -> dict[str, Any]:
 
 def run(scene: Scene) -> dict[str, Any]:
     """All methods on grasps of seed 1, with the lengths that served best on those of seed 2."""
-    task, other = Task(scene, 1), Task(scene, 2)
+    task, other = Shaking(scene, 1), Shaking(scene, 2)
     found: dict[str, Any] = {"grasps": GRASPS, "cosine": check(task), "methods": {}}
     plan, none = task.first()
     draws = jnp.stack([none] * 6)

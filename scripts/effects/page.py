@@ -30,13 +30,8 @@ def draw(results: dict[str, Any], path: Path) -> None:
         axis.errorbar(value, place, xerr=error, fmt="o", ms=4, capsize=2)
         axis.axvline(rows[REFERENCE][field], color="black", lw=0.8, ls="--")
         axis.grid(axis="x", alpha=0.3)
-    place = [k for k, n in enumerate(names) if "flops" in rows[n]]
-    flops = np.array([rows[names[k]]["flops"] for k in place]) / rows[REFERENCE]["flops"]
-    left.plot(flops, place, "x", color="tab:orange", ms=5, label="operations of one iteration")
-    left.plot([], [], "o", color="tab:blue", label="time, median and quartiles")
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, 1.08), ncols=2, frameon=False, fontsize=8)
     left.set_yticks(range(len(names)), names)
-    left.set(xlabel="a step, relative to the scene as it is", xlim=(0, None))
+    left.set(xlabel="time of a step, relative to the scene as it is, quartiles", xlim=(0, None))
     right.set(xlabel="success rate with 95 % interval")
     pictures.save(figure, path)
 
@@ -56,18 +51,15 @@ def support_table() -> list[list[str]]:
 
 def measured_table(results: dict[str, Any]) -> list[list[str]]:
     """A row for each change of the scene; what was not measured is a dash."""
-    head = ["change", "equations", "kFLOP", "µs a step", "time ×"]
+    head = ["change", "µs a step", "time ×"]
     table = [[*head, "success (95 %)", "same verdict", "rank corr."]]
     rows = results["effects"]
     for name, r in rows.items():
         same = " (same program)" if _same(rows, name) else ""
-        flops = f"{r['flops'] / 1e3:.1f}" if "flops" in r else "–"
-        program = [str(r.get("equations", "–")), flops]
-        if "ratio" not in r:
-            program += ["–"] * 2
-        else:
+        program = ["–"] * 2
+        if "ratio" in r:
             low, high = r["ratio_quartiles"]
-            program += [
+            program = [
                 f"{r['step_seconds'] * 1e6:.1f}",
                 f"{r['ratio']:.2f} ({low:.2f}–{high:.2f})",
             ]

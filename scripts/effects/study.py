@@ -20,7 +20,6 @@ from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import Scene, parameters
 from codesign_jax.scene.effects import refusals
 from codesign_jax.types import Params, failed
-from scripts.effects.program_cost import jaxpr_size
 from scripts.shared.statistics import agreement
 from scripts.shared.work import Worlds, inputs
 
@@ -141,7 +140,7 @@ class Steps(NamedTuple):
     Attributes:
       run: The program; None if it was not to be compiled.
       args: Its arguments: constants and states of the worlds, and controls (world, time, nu).
-      record: Size of the kernel, and a digest of its jaxpr.
+      record: A digest of the kernel's jaxpr.
     """
 
     run: Callable | None
@@ -167,13 +166,10 @@ def compile_steps(
     state = engine.place(engine.reset(fields), q, v)
     args = world_constants(scene, fields), state, ctrl[:, at.step : at.step + STEPS]
     program = Program.here(scene, engine.limits, ctrl.dtype)
-    jaxpr = program.jaxpr(*args)
-    size, digest = jaxpr_size(jaxpr), hashlib.sha256(str(jaxpr).encode()).hexdigest()[:16]
-    flops = size.flops / program.block
-    record = {"equations": size.equations, "flops": flops, "program": digest}
+    digest = hashlib.sha256(str(program.jaxpr(*args)).encode()).hexdigest()[:16]
     if digest not in compiled and new:
         compiled[digest] = jax.jit(program.simulate).lower(*args).compile()
-    return Steps(compiled.get(digest), args, record)
+    return Steps(compiled.get(digest), args, {"program": digest})
 
 
 def measure(programs: dict[str, Steps], repeats: int) -> dict[str, list[float]]:

@@ -5,7 +5,6 @@ timeout -s INT 500 python -m scripts.experiments 2d --out runs/reproduction    #
 python -m scripts.experiments 2d --out runs/big --share 1/4        # beside 2/4, 3/4 and 4/4
 python -m scripts.experiments 2d --out runs/big --gather           # then: results of all shares
 python -m scripts.experiments 2d --out runs/small --size cpu       # minutes on a CPU
-python -m scripts.experiments 2d --parquet runs/2d.parquet         # every grasp, also afterwards
 python -m scripts.experiments types --videos docs/figures            # what the landscape's hands do
 python -m scripts.experiments figures                                # of docs/data/experiments
 """
@@ -23,11 +22,10 @@ from codesign_jax import runs, scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES, make_engine
-from codesign_jax.runs.parquet import library
 from codesign_jax.runs.together import Timing
 from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.scene.schema import InputError
-from scripts.experiments import landscape, parquet, plan, results, strategies
+from scripts.experiments import landscape, plan, results, strategies
 from scripts.shared import output, provenance
 
 
@@ -70,7 +68,6 @@ def parse() -> argparse.Namespace:
         type=Path,
         help="write every trial to this .npz",
     )
-    parser.add_argument("--parquet", type=Path, help="write every grasp as a row of this file")
     parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument(
         "--earlier", type=Path, nargs="+", default=[], help="folders of the same in earlier scenes"
@@ -84,8 +81,6 @@ def parse() -> argparse.Namespace:
 def simulate(args: argparse.Namespace) -> int:
     """Runs or resumes an experiment; returns the exit status."""
     common.use_compilation_cache()
-    if args.parquet:
-        library(parquet.FLAG)  # refused before hours of simulation, not after
     the_plan = plan.experiment(args.experiment, args.size)
     try:
         the_plan = plan.narrowed(the_plan, args.strategies, args.runs)
@@ -141,9 +136,7 @@ def _strategies(
     screened = strategies.screened(the_plan, found)
     grasps = found["status"].size
     grasps += the_plan.worlds * the_plan.rounds if "test_status" in found else 0
-    notes = _write(args, kept, found, log, before, (the_plan, the_scene), (grasps, screened))
-    if args.parquet:
-        print(parquet.write_strategies(args.parquet, the_plan, space, found, notes))
+    _write(args, kept, found, log, before, (the_plan, the_scene), (grasps, screened))
     return code
 
 
@@ -169,9 +162,7 @@ def _landscape(
     process = results.Process(grasps, seconds, 0.0, grasps / seconds)
     log = results.log(args.out / f"{args.experiment}.processes", process, args.commit)
     sizes = the_plan.grasps, 0
-    notes = _write(args, kept, found, log, before, (the_plan, the_scene), sizes)
-    if args.parquet:
-        print(parquet.write_landscape(args.parquet, the_plan.name, space, found, notes))
+    _write(args, kept, found, log, before, (the_plan, the_scene), sizes)
     return 0
 
 
@@ -183,8 +174,8 @@ def _write(
     before: dict[str, Any] | None,
     subject: tuple[Any, Scene],
     grasps: tuple[int, int],
-) -> dict[str, Any]:
-    """Writes the results; returns their provenance: that of who made them, if nothing is new."""
+) -> None:
+    """Writes the results; where nothing is new, who made them stays noted."""
     notes = before or {}
     settings = json.loads(json.dumps(results.settings_of(*subject, args.engine, args.seed)))
     new = log and notes.get("processes") != log
@@ -194,7 +185,6 @@ def _write(
             print(path)
     if args.trials:
         print(output.write_arrays(args.trials, found))
-    return notes
 
 
 def find_types(args: argparse.Namespace) -> int:

@@ -1,7 +1,7 @@
 """Every strategy's best final particles on fresh trials, at several accuracies.
 
-python -m scripts.experiments.fresh --data docs/data/paper --set effects.finger_finger=false
-python -m scripts.experiments.fresh --accuracies standard --engine mujoco ...   # adds to the file
+python -m scripts.experiments.fresh --experiments 23d --accuracies standard,reference
+python -m scripts.experiments.fresh --experiments 23d --objects household --label meshes   # adds
 python -m scripts.experiments.fresh --report --page docs/notes/results.md
 
 An optimiser picks what the errors of its simulation favour (the winner's curse), so the order of
@@ -94,7 +94,9 @@ def run(args: argparse.Namespace) -> None:
     """Simulates at the accuracies that the file does not have yet."""
     path = args.data / "fresh.npz"
     arrays = dict(np.load(path)) if path.exists() else {}
-    notes = json.loads(path.with_suffix(".json").read_text()) if path.exists() else {"runs": []}
+    notes: dict[str, Any] = {"runs": []}
+    if path.exists():
+        notes = json.loads(path.with_suffix(".json").read_text())
     found = {name: winners(args.data, name) for name in args.experiments}
     arrays |= {f"{name}|strategies": np.array(names) for name, (names, _) in found.items()}
     every = {name: particles for name, (_, particles) in found.items()}
@@ -104,7 +106,8 @@ def run(args: argparse.Namespace) -> None:
         if all(f"{name}|{label}|cost" in arrays for name in every):
             continue
         overrides = keypaths.parse(args.set)
-        the_scene = scene.load(args.scene, accuracy=accuracy, overrides=overrides)
+        how = {"accuracy": accuracy, "object_set": args.objects, "overrides": overrides}
+        the_scene = scene.load(args.scene, **how)
         new = simulate(the_scene, args.engine, every, args.trials)
         for key, value in new.items():
             name, what = key.split("|")
@@ -175,13 +178,14 @@ def parse() -> argparse.Namespace:
     """Reads the command line."""
     parser = provenance.parser(__doc__)
     names = lambda text: text.split(",")  # noqa: E731 - three options read the same
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--scene", default="paper", help="that of the experiments")
     parser.add_argument("--experiments", type=names, default=list(EXPERIMENTS))
     parser.add_argument("--accuracies", type=names, default=["standard", "reference"])
     parser.add_argument("--engine", choices=NAMES, default="structured")
     parser.add_argument("--trials", type=int, default=24)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--objects", help="object set instead of the scene's")
     parser.add_argument("--label", help="what --set changes, in the names of the results")
     parser.add_argument("--report", action="store_true", help="print the tables and stop")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")

@@ -14,11 +14,12 @@ import numpy as np
 from codesign_jax import runs
 from codesign_jax.runs.manifest import read_provenance
 from codesign_jax.scene import InputError
-from scripts.search.study import CANDIDATES, ROUNDS
 from scripts.shared import output, provenance
 
 AT = (2400, 11_520, 23_040, 46_080)
 """Grasps of a run, those by which it then chooses a design included."""
+CANDIDATES, ROUNDS = 25, 12
+"""Particles and trials of each by which scripts.search.judge chooses."""
 
 
 def read(folders: list[Path], at: list[int]) -> dict[str, np.ndarray]:
@@ -36,7 +37,7 @@ def read(folders: list[Path], at: list[int]) -> dict[str, np.ndarray]:
     if not records or None in records:
         raise InputError(["not all of the folders hold a run that has begun"])
     known = [record for record in records if record is not None]
-    _, particles, trials = known[0].history.trials.cost.shape
+    _, particles, trials = known[0].history.outcomes.cost.shape
     worlds, tested = particles * trials, min(CANDIDATES, particles) * ROUNDS
     seeds = [read_provenance(folder)["settings"]["seed"] for folder in folders]
     found = {"seeds": np.array(seeds)}

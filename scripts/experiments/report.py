@@ -37,6 +37,7 @@ def make(data: Path, pictures: Path, page: Path | None = None, earlier: Sequence
     """
     studies = {name: load_study(data, name) for name in ("2d", "23d")}
     grid, types = load(data, "landscape"), load(data, "types")
+    shown = next((f for f in (data, *earlier) if load(f, "types")), data)
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
     for name, study in studies.items():
         before = [s for folder in earlier if (s := load_study(folder, name))]
@@ -45,14 +46,18 @@ def make(data: Path, pictures: Path, page: Path | None = None, earlier: Sequence
             _draw(name, study, pictures, "")
         for other in joined(before, whole) if study else []:
             text += f"\n\n{beside(study, other)}"  # type: ignore[arg-type]
-            if len(other.strategies) > len(study.strategies):  # type: ignore[union-attr]
+            if len(other.strategies) > len(study.strategies) or not study.tested:  # type: ignore[union-attr]
                 _draw(name, other, pictures, "_earlier")
     others = [found for folder in earlier if (found := load(folder, "landscape"))]
     if grid and others:
         text += f"\n\n{landscapes(grid, others)}"
-    _draw_landscape(grid, types, pictures / "fig8_landscape.png")
+    if shown != data and (grid := load(shown, "landscape")):
+        text += f"\n\nThe earlier scene's landscape, commit {grid[1]['commit']}: {_regions(grid)}."
     if page:
         fill(page, text, "results")
+    grid, types = load(shown, "landscape"), load(shown, "types")
+    name = "fig8_landscape.png" if shown == data else "fig8_landscape_earlier.png"
+    _draw_landscape(grid, types, pictures / name)
     if grid and types:
         table = grasp_types.describe(grid[0], types[0])
         if page:
@@ -163,6 +168,7 @@ def _against_last(study: Study) -> list[str]:
     ]
     for s in others:
         cells = [figures.label(study.strategies[s]), *(_p(float(c[s])) for c in columns)]
+        cells[1:3] = cells[1:3] if study.tested else ["–", "–"]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
@@ -230,7 +236,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     both = [statistics.median(study.convergence(r)[-1] * study.per_episode) for r in RULES]
     converged = (
         f"{name}: {paper} simulations to convergence (concurrent)",
-        f"median {_interval(both[0])}, mean {_interval(_mean(episodes[-1] * study.per_episode))}; "
+        f"median {_interval(both[0])}, mean {_interval(mean(episodes[-1] * study.per_episode))}; "
         f"failed trials at the maximum: median {_interval(both[1])}",
     )
     if len(study.strategies) < 3:  # a trend needs three
@@ -248,7 +254,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     ]
 
 
-def _mean(simulations: np.ndarray) -> Interval:
+def mean(simulations: np.ndarray) -> Interval:
     """Mean with its interval; without end where a run never converged."""
     if not np.isfinite(simulations).all():
         return Interval(np.inf, np.inf, np.inf)

@@ -87,7 +87,7 @@ def gather(plan: Strategies, folder: Path, seed: int) -> Arrays | None:
 
 def _one(record: Record, done: int, tested: bool) -> Arrays:
     """Arrays of a run."""
-    history, trials = record.history, record.history.trials
+    history, trials = record.history, record.history.outcomes
     found = {
         "particles": np.asarray(record.state.particles),
         "cost": history.cost[:done],

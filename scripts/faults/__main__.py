@@ -20,8 +20,6 @@ from scripts.faults.harness import Harness
 from scripts.faults.store import Store
 from scripts.shared import output, provenance
 
-DOCS = Path(__file__).parents[2] / "docs"
-
 
 def main() -> int:
     """Runs what is left and returns the exit status."""
@@ -37,7 +35,7 @@ def main() -> int:
     left = {c.name: sum(map(len, store.left(c.name, counts[c.name], c.size))) for c in chosen}
     if options.list:
         for c in cases.CAMPAIGNS.values():
-            print(f"{c.name:14} {c.count:8}  {c.fault}")
+            print(f"{c.name:18} {c.count:8}  {page.rows()[c.name][1]}")
         return 0
     if any(left.values()):
         store.start(provenance.measurement(options.commit))
@@ -49,7 +47,7 @@ def main() -> int:
     if options.page:
         data = {"starts": store.starts, "campaigns": found}
         output.write_json(options.json, data)
-        page.write(data, DOCS / "faults.md")
+        page.write(data)
     return _conclude(found)
 
 
@@ -92,7 +90,7 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--list", action="store_true", help="print the campaigns and stop")
     parser.add_argument("--page", action="store_true", help="write docs/faults.md and its data")
-    parser.add_argument("--json", type=Path, default=DOCS / "data" / "faults.json")
+    parser.add_argument("--json", type=Path, default=page.PAGE.parent / "data" / "faults.json")
     provenance.add_commit(parser)
     return parser.parse_args()
 

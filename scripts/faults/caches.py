@@ -283,57 +283,9 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 CAMPAIGNS = (
-    Campaign(
-        "caches",
-        len(_ENTRIES) * len(_WAYS),
-        damaged,
-        frozenset({"same"}),
-        "compiled programs, kernels and lists of the caches damaged in eight ways, then a run",
-        "the same run without a warning; what was damaged is made again",
-        "test_damaged_programs_go_and_sound_ones_stay, test_code_is_kept_and_damage_is_seen",
-        limit=900,
-    ),
-    Campaign(
-        "exchanged",
-        2,
-        exchanged,
-        frozenset({"same"}),
-        "JAX's compiled programs exchanged with one another",
-        "the same run; none of them is used",
-        "test_programs_in_the_place_of_each_other_go",
-        limit=900,
-    ),
-    Campaign(
-        "caches-full",
-        2,
-        full,
-        frozenset({"same"}),
-        "a full disk below the caches",
-        "the same run; the next one finds nothing torn",
-        "test_jax_compiles_again_what_was_damaged_and_keeps_it",
-        limit=900,
-    ),
-    Campaign(
-        "cold",
-        2,
-        cold,
-        frozenset({"same"}),
-        "SIGKILL while empty caches are filled",
-        "no torn entry: the next process says nothing of them",
-        "test_jax_compiles_again_what_was_damaged_and_keeps_it",
-        limit=900,
-    ),
-    Campaign(
-        "archives",
-        25_000,
-        archive,
-        frozenset({"refused", "same", "fewer parts"}),
-        "a byte or some of `reference.npz`, `landscape.npz`, `landscape.part.npz`, "
-        "`failures/*.npz` or a stored grid changed or gone",
-        "refused in words or computed again; never a wrong number",
-        "test_any_damage_of_arrays_is_one_error, "
-        "test_a_failed_world_with_any_damage_is_refused_or_whole",
-        size=2500,
-        limit=120,
-    ),
+    Campaign("caches", len(_ENTRIES) * len(_WAYS), damaged, "same", limit=900),
+    Campaign("exchanged", 2, exchanged, "same", limit=900),
+    Campaign("caches-full", 2, full, "same", limit=900),
+    Campaign("cold", 2, cold, "same", limit=900),
+    Campaign("archives", 25_000, archive, "fewer parts, refused, same", size=2500, limit=120),
 )

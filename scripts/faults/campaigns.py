@@ -1,4 +1,4 @@
-"""A campaign: numbered cases of one fault, and what is promised about them."""
+"""A campaign: numbered cases of one fault; docs/faults.md says what each promises."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,13 +15,10 @@ class Campaign:
     """Cases of one fault, a row of the page's table.
 
     Attributes:
-      name: Name in the store and on the command line.
+      name: Name in the store, on the command line and on the page.
       count: Cases of `make faults`.
       case: Runs one.
-      good: Outcomes that keep the promise.
-      fault: What happens, for the page.
-      promise: What is promised.
-      test: The quick tests that keep the idea, their names with commas.
+      keeping: Outcomes that keep the promise, with commas between.
       size: Cases that are done and stored together, by one process.
       limit: Time that a case may take [s], generous: a case beyond it is ended and counts as hung.
       tries: Tally that the page counts as tries; by default the cases.
@@ -32,10 +29,7 @@ class Campaign:
     name: str
     count: int
     case: Case
-    good: frozenset[str]
-    fault: str
-    promise: str
-    test: str = ""
+    keeping: str
     size: int = 1
     limit: float = 180.0
     tries: str = ""
@@ -43,6 +37,6 @@ class Campaign:
     environment: tuple[tuple[str, str], ...] = ()
 
     @property
-    def tests(self) -> list[str]:
-        """Names of the quick tests."""
-        return [name for name in self.test.split(", ") if name]
+    def good(self) -> frozenset[str]:
+        """Outcomes that keep the promise."""
+        return frozenset(self.keeping.split(", "))

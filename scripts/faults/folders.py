@@ -214,43 +214,12 @@ def notes(bench: Bench, number: int) -> Result:
         return _ended(bench, said, run, before, f"{name} {way}")
 
 
-def campaign(name: str, count: int, case: Any, good: str, *words: str) -> Campaign:
-    """A campaign; outcomes that keep its promise are given by commas."""
-    return Campaign(name, count, case, frozenset(good.split(", ")), *words)
-
-
-_MENDED = "it is written again from the checkpoints, or said"
 CAMPAIGNS = (
-    campaign(
-        *("tables", len(finished.TABLES) * len(_WAYS), tables, "same, refused"),
-        "each table of a finished run damaged in thirteen ways, then `optimize`",
-        _MENDED,
-        "test_tables_are_mended_from_the_checkpoints",
+    Campaign("tables", len(finished.TABLES) * len(_WAYS), tables, "same, refused"),
+    Campaign("scenes", 3 * len(finished.SOURCES) * (len(_WAYS) + 1), scenes, "refused, same scene"),
+    Campaign("provenance", 3 * (len(_WAYS) + len(_HOSTILE)), provenance, "refused, same, harmless"),
+    Campaign(
+        "permissions", len(_MODES) * _PLACES, permissions, "same, refused; then same, no such place"
     ),
-    campaign(
-        *("scenes", 3 * len(finished.SOURCES) * (len(_WAYS) + 1), scenes, "refused, same scene"),
-        "`scene.toml`, `hand.toml`, `objects.toml` of a run damaged, or a digit changed; then "
-        "`optimize`, `evaluate`, `report`",
-        "refused; a change of comments alone does not matter",
-        "test_changed_scene_files_are_refused_by_all_that_read_the_run",
-    ),
-    campaign(
-        *("provenance", 3 * (len(_WAYS) + len(_HOSTILE)), provenance, "refused, same, harmless"),
-        "`provenance.json` damaged or hostile; then `optimize`, `evaluate`, `report`",
-        "refused, and no file of the run is lost",
-        "test_a_hostile_provenance_is_refused_in_words",
-    ),
-    campaign(
-        *("permissions", len(_MODES) * _PLACES, permissions),
-        "same, refused; then same, no such place",
-        "files and folders of a run that may not be read or written",
-        "said; once they may, the run goes on to the same end",
-        "test_a_step_that_cannot_be_read_now_is_kept",
-    ),
-    campaign(
-        *("notes", 2 * len(_WAYS), notes, "same, refused"),
-        "`events.log` and `.lock` damaged, then `optimize`",
-        "the run goes on, or the command says why not",
-        "test_second_process_on_a_folder_is_refused",
-    ),
+    Campaign("notes", 2 * len(_WAYS), notes, "same, refused"),
 )

@@ -127,59 +127,15 @@ def failing(bench: Bench, number: int, *, mode: Mode, of: int) -> Result:
 
 
 CAMPAIGNS = (
-    Campaign(
-        "kills",
-        100,
-        killed,
-        frozenset({"same"}),
-        "SIGKILL, SIGINT, SIGTERM at random moments of `optimize`, one to three in a run",
-        "the same command goes on, and the run is that of no interruption bit for bit",
-        "test_interrupted_run_resumes_bit_for_bit, "
-        "test_runs_of_a_batch_stop_fail_and_go_on_by_themselves",
-        limit=900,
-        tries="kills",
-    ),
-    Campaign(
-        "operations",
-        _OPERATIONS,
-        killed_at,
-        frozenset({"same", "not reached"}),
-        "SIGKILL at a file operation of `optimize`, half of a write done",
-        "the same",
-        "test_a_run_killed_before_its_last_rows_writes_them, "
-        "test_a_start_that_was_cut_short_begins_anew, "
-        "test_step_cut_short_before_its_digest_is_refused",
-        limit=600,
-    ),
-    Campaign(
-        "full",
-        _FULL,
-        partial(failing, mode=Mode.FULL, of=_FULL),
-        frozenset({"same"}),
-        "disk full (ENOSPC) from a file operation of `optimize` on",
-        "exit status 1 and a message; with room again, the same",
-        test="test_full_disk_is_said_and_older_steps_stay, "
-        "test_a_run_that_cannot_be_saved_says_why",
-        limit=300,
-    ),
-    Campaign(
-        "broken",
-        _BROKEN,
-        partial(failing, mode=Mode.BROKEN, of=_BROKEN),
-        frozenset({"same"}),
-        "EIO once at a file operation of `optimize`",
-        "the same",
-        test="test_errors_of_the_disk_are_a_line_that_says_what_to_do",
-        limit=300,
-    ),
+    Campaign("kills", 100, killed, "same", limit=900, tries="kills"),
+    Campaign("operations", _OPERATIONS, killed_at, "not reached, same", limit=600),
+    Campaign("full", _FULL, partial(failing, mode=Mode.FULL, of=_FULL), "same", limit=300),
+    Campaign("broken", _BROKEN, partial(failing, mode=Mode.BROKEN, of=_BROKEN), "same", limit=300),
     Campaign(
         "read-only",
         _READ_ONLY,
         partial(failing, mode=Mode.READ_ONLY, of=_READ_ONLY),
-        frozenset({"same"}),
-        "EROFS from a file operation of `optimize` on",
-        "the same",
-        test="test_errors_of_the_disk_are_a_line_that_says_what_to_do",
+        "same",
         limit=300,
     ),
 )

@@ -168,27 +168,6 @@ def full(bench: Bench, number: int) -> Result:
 
 
 CAMPAIGNS = (
-    Campaign(
-        "products",
-        24,
-        killed,
-        frozenset({"whole or absent"}),
-        "SIGKILL of `landscape`, `export`, `evaluate --render`, `report` at random moments and "
-        "file operations",
-        "a file is whole or absent, and the same command completes them; what a killed process was "
-        "writing may stay as a file in `.tmp`",
-        "test_an_interrupted_landscape_goes_on, test_stopped_landscape_leaves_nothing",
-        limit=600,
-        tries="kills",
-    ),
-    Campaign(
-        "products-full",
-        64,
-        full,
-        frozenset({"whole or absent"}),
-        "ENOSPC from a file operation of the same commands on, or EIO at one",
-        "exit status 1 or 2 and a message; the same",
-        "test_what_cannot_be_written_in_the_end_is_said_in_words",
-        limit=300,
-    ),
+    Campaign("products", 24, killed, "whole or absent", limit=600, tries="kills"),
+    Campaign("products-full", 64, full, "whole or absent", limit=300),
 )

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from scripts.faults import checkpoints, damage, finished
 from scripts.faults.bench import Bench
-from scripts.faults.folders import KIND, campaign, changes, snapshot, words_of
+from scripts.faults.campaigns import Campaign
+from scripts.faults.folders import KIND, changes, snapshot, words_of
 from scripts.faults.kills import judged
 from scripts.faults.store import Result
 
@@ -171,25 +172,7 @@ def places(bench: Bench, number: int) -> Result:
 
 
 CAMPAIGNS = (
-    campaign(
-        *("whose", len(_WHOSE) * (1 + len(checkpoints.READERS)), whose, "refused"),
-        "checkpoints of another run, of another step, none, or all damaged; five commands",
-        "refused, and nothing is deleted",
-        "test_checkpoints_of_another_run_are_refused, "
-        "test_a_step_under_another_name_is_refused, "
-        "test_losing_every_checkpoint_is_refused_until_fresh",
-    ),
-    campaign(
-        *("foreign", len(_FOREIGN), foreign, "refused"),
-        "`optimize` into a folder with somebody's own files, or a run without `provenance.json`",
-        "refused, and none of the files is changed",
-        "test_a_users_own_scene_stays_where_it_is, test_what_is_no_run_is_not_cleared",
-    ),
-    campaign(
-        *("places", len(_OUTS), places, "same, refused"),
-        "strange names and places for `--out`",
-        "they work, or exit status 2",
-        "test_a_folder_whose_name_is_no_text_is_refused, "
-        "test_places_that_cannot_be_written_are_said_before_a_simulation",
-    ),
+    Campaign("whose", len(_WHOSE) * (1 + len(checkpoints.READERS)), whose, "refused"),
+    Campaign("foreign", len(_FOREIGN), foreign, "refused"),
+    Campaign("places", len(_OUTS), places, "same, refused"),
 )

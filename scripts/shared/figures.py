@@ -1,6 +1,7 @@
 """Matplotlib figures without pyplot: no state of a session and no display is touched."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib.figure
 
@@ -15,7 +16,7 @@ def new(width: float, height: float) -> matplotlib.figure.Figure:
     return matplotlib.figure.Figure(figsize=(width, height), dpi=120, layout="constrained")
 
 
-def save(figure: matplotlib.figure.Figure, path: Path, **options: float) -> Path:
+def save(figure: matplotlib.figure.Figure, path: Path, **options: Any) -> Path:
     """Writes a figure, its folder included, and returns its path.
 
     Args:

@@ -44,8 +44,8 @@ def add(axes: Axes, labels: Sequence[Label], points: np.ndarray, size: float = 6
                 best, cost = middle, total
         taken.append(_box(best, extent))
         axes.annotate(
-            text, (x, y), xytext=(best - here) / scale, textcoords="offset points", color=color,
-            fontsize=size, ha="center", va="center", annotation_clip=False,
+            text, (x, y), xytext=tuple((best - here) / scale), textcoords="offset points",
+            color=color, fontsize=size, ha="center", va="center", annotation_clip=False,
             arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "0.5", "shrinkA": 0, "shrinkB": 2},
         )  # fmt: skip
 

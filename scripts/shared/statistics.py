@@ -103,7 +103,7 @@ def kolmogorov_smirnov(a: ArrayLike, b: ArrayLike) -> dict:
       b: Sample, shape (m,).
     """
     x, y = np.asarray(a, float), np.asarray(b, float)
-    distance = float(scipy.stats.ks_2samp(x, y, method="asymp")[0])
+    distance = float(np.asarray(scipy.stats.ks_2samp(x, y, method="asymp"))[0])
     # The limiting law: SciPy's own p-value is that of an exact test of n m / (n + m) values.
     scaled = distance * np.sqrt(x.size * y.size / (x.size + y.size))
     return {"distance": distance, "p": float(scipy.stats.kstwobign.sf(scaled))}
@@ -215,13 +215,13 @@ def wilcoxon(a: np.ndarray, b: np.ndarray, episodes: int) -> float:
     a, b = (np.minimum(v, episodes + 1) for v in (a, b))
     if (a == b).all():
         return 1.0
-    return float(scipy.stats.wilcoxon(a, b, method="approx", zero_method="pratt")[1])
+    return float(np.asarray(scipy.stats.wilcoxon(a, b, method="approx", zero_method="pratt"))[1])
 
 
 def fisher(a: np.ndarray, b: np.ndarray) -> float:
     """Fisher's exact two-sided test of unpaired successes, shape (run,): the p-value."""
     table = [[int(v.sum()), int((~v).sum())] for v in (a, b)]
-    return float(scipy.stats.fisher_exact(table)[1])
+    return float(np.asarray(scipy.stats.fisher_exact(table))[1])
 
 
 def mann_whitney(a: np.ndarray, b: np.ndarray) -> float:

@@ -283,16 +283,6 @@ def late_by_step(engine, step, precision):
     **stored,
 )
 def late_stuck(engine, step, precision):
-    """And, where the file has it, how deep fingers were in one another at the release."""
-    found, note = verdicts("h"), ""
-    if depth := late()["settings"]["h"].get("depth_mm"):
-        stuck, free = (np.array(depth)[found == letter] for letter in "sk")
-        above = stats.mannwhitneyu(stuck, free).statistic / (len(stuck) * len(free))
-        note = (
-            f"; deepest crossing of fingers at the release: {np.median(stuck):.1f} mm where it is "
-            f"STUCK, {np.median(free):.1f} mm where it is not, deeper in {above:.0%} of pairs"
-        )
+    stuck = verdicts("h") == "s"
     # What was asked for of late trials at this setting.
-    return Found(
-        (found == "s").mean(), 3e-3, f"{(found == 's').sum()} of {found.size}{note}; {made()}"
-    )
+    return Found(stuck.mean(), 3e-3, f"{stuck.sum()} of {stuck.size}; {made()}")

@@ -1,4 +1,4 @@
-"""How deep fingers stand in the palm and in one another, from recorded states."""
+"""How deep fingers are in the palm and in one another, from recorded states."""
 
 from typing import Any, NamedTuple
 
@@ -68,3 +68,56 @@ def in_palm(scene: Scene, params: Params, at: Poses) -> np.ndarray:
         inside = np.minimum(disc.radius - np.hypot(x, y), np.minimum(z, disc.thickness - z))
         deepest = np.maximum(deepest, inside.max(1))
     return deepest
+
+
+AROUND, ALONG = 16, (0.0, 0.25, 0.5, 0.75)
+"""Points of an outline, and its places on a link as shares of the link."""
+
+
+def in_fingers(scene: Scene, params: Params, at: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of the deepest point of a finger's outline in a link of another one.
+
+    A link reaches from its joint to the next one, the last to the tip, with the outline
+    |y/a|^4 + |z/b|^4 = 1; a depth is the distance to it, to first order.
+
+    Args:
+      scene: The scene.
+      params: The hand.
+      at: Its poses.
+
+    Returns:
+      The depth [m], and the largest share of the way from an outline to its section's axis, both of
+      shape (state,); 0 where no finger is in another.
+    """
+    lay = model.layout(scene)
+    angle = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
+    unit = np.stack([np.cos(angle), np.sin(angle)], 1)
+    unit /= ((unit**4).sum(1) ** 0.25)[:, None]
+    points, sizes = [], []
+    for f, bodies in enumerate(lay.bodies):
+        half = np.array([scene.hand.section.width, float(params.height[f])]) / 2
+        whole = np.where(np.arange(lay.links) < lay.links - 1, 1, 0.5)
+        span = float(params.length[f]) / lay.links * whole
+        ring = np.c_[0 * unit[:, 0], unit * half + [0, half[1]]]
+        local = np.concatenate(
+            [ring + np.outer(part * span, [1, 0, 0])[:, None] for part in ALONG], 1
+        )
+        place = at.place[:, bodies, None] + local @ at.turn[:, bodies].swapaxes(-1, -2)
+        points.append(place.reshape(len(place), -1, 3))
+        sizes.append((span, *half))
+    worst = np.zeros((2, len(at.place)))
+    for one, other in np.ndindex(len(points), len(points)):
+        if one == other:
+            continue
+        bodies, (span, a, b) = lay.bodies[other], sizes[other]
+        away = points[one][:, :, None] - at.place[:, None, bodies]
+        x, y, z = np.moveaxis(np.einsum("spli,slij->splj", away, at.turn[:, bodies]), -1, 0)
+        units = np.abs([y / a, (z - b) / b])
+        phi = np.maximum((units**4).sum(0) ** 0.25, 1e-9)
+        sides = np.array([a, b])[:, None, None, None]
+        slope = np.sqrt(((units / phi) ** 6 / sides**2).sum(0))
+        inside = (x >= 0) & (x <= span) & (phi < 1)
+        depth = np.where(inside, (1 - phi) / slope, 0.0).max((1, 2))
+        share = np.where(inside, 1 - phi, 0.0).max((1, 2))
+        worst = np.maximum(worst, [depth, share])
+    return worst[0], worst[1]

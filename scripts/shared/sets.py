@@ -16,6 +16,11 @@ CLEARANCE = 0.002
 """Smallest gap between the sections of a pair of fingers at a spread of zero [m]."""
 
 
+CUTOFF = 3.0
+"""Implausibility above which a set is ruled out: three standard deviations, whatever the
+distribution as long as it has one peak (Pukelsheim 1994)."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Open:
     """A constant that the paper does not give.
@@ -196,3 +201,8 @@ def _objects(objects, chosen: Mapping[str, np.ndarray]):
     )
     table = objects.table._replace(friction=chosen["table_friction"])
     return objects._replace(object=shapes, table=table)
+
+
+def plausible(distances: np.ndarray, cutoff: float = CUTOFF) -> np.ndarray:
+    """Which sets no target rules out, bool, shape (set,)."""
+    return np.asarray((distances <= cutoff).all(-1))

@@ -1,0 +1,91 @@
+"""What docs/results.md states of the experiments, from docs/data alone; a test reads both."""
+
+from pathlib import Path
+
+import numpy as np
+
+from codesign_jax.report.statistics import Interval, wilson
+from scripts.experiments import report, study
+from scripts.experiments.study import Study
+from scripts.shared import statistics
+
+SWITCHES = ("switch-1", "switch-2", "switch-4", "switch-8", "switch-16", "switch-32")
+STATEMENTS = (
+    "{single_2d:.0f} % of 30 runs {single_2d_interval}, concurrent {both_2d:.0f} % "
+    "{both_2d_interval}",
+    "{single_2d:.0f}, {one_2d:.0f} and {two_2d:.0f} % with none, one and two switches",
+    "from two switches on there is no trend (p = {level:.2f})",
+    "medians of {medians} simulations with 1 to 32 switches",
+    "fastest of all: {median_2d:,.0f} simulations",
+    "median {median_2d:,.0f} {median_2d_interval}, mean {mean_2d:,.0f} {mean_2d_interval}",
+    "median {median_23d:,.0f} {median_23d_interval}, mean {mean_23d:,.0f} {mean_23d_interval}",
+    "{growth:.1f} times {growth_interval} by medians, {growth_mean:.1f} times by means",
+    "{converged_23d:.0f} of 30 runs converge",
+    "{concurrent_before:,.0f} simulations, one switch after {one_before:,.0f}, a single domain "
+    "after {single_before:,.0f}",
+    "in a single domain {single_runs_before:.0f}",
+    "from {one_2d:.0f} % with two parameters",
+)
+
+
+def interval(value: Interval, factor: float = 1.0, form: str = ",.0f") -> str:
+    """The ends of an interval in brackets."""
+    return f"[{factor * value.low:{form}}, {factor * value.high:{form}}]"
+
+
+def figures(now: Path, earlier: list[Path]) -> dict[str, float | str]:
+    """The numbers that the page states.
+
+    Args:
+      now: Folder of the default scene's experiments; success in 2D is the earlier scene's as long
+        as these have no final test.
+      earlier: Folders of the earlier scene's.
+    """
+    two, many = (study.load_study(now, name) for name in ("2d", "23d"))
+    assert two is not None and many is not None
+    found: dict[str, float | str] = {}
+    tested = two if two.tested else study.load_study(earlier[0], "2d")
+    assert tested is not None
+    for name, strategy in (("single", "single"), ("one", "switch-1"), ("two", "switch-2")):
+        found |= _success(tested, f"{name}_2d", strategy)
+    found |= _success(tested, "both_2d", "concurrent")
+    found["level"] = statistics.trend(1.0 * tested.success()[2:])
+    medians = [f"{_median(two, s).value:,.0f}" for s in SWITCHES]
+    found["medians"] = ", ".join(medians[:-1]) + f" and {medians[-1]}"
+    for name, one in (("2d", two), ("23d", many)):
+        median, mean = _median(one, "concurrent"), report.mean(_simulations(one, "concurrent"))
+        found |= {f"median_{name}": median.value, f"median_{name}_interval": interval(median)}
+        found |= {f"mean_{name}": mean.value, f"mean_{name}_interval": interval(mean)}
+    a, b = (_simulations(s, "concurrent") for s in (many, two))
+    growth = statistics.ratio_of_medians(a, b)
+    found |= {"growth": growth.value, "growth_interval": interval(growth, form=".1f")}
+    found |= {"growth_mean": float(a.mean() / b.mean())}
+    place = many.strategies.index("concurrent")
+    found["converged_23d"] = float(np.isfinite(many.convergence()[place]).sum())
+    names = ["single", "switch-1", "concurrent"]
+    [before] = study.joined([s for f in earlier if (s := study.load_study(f, "23d"))], names)
+    for name, strategy in (("single", "single"), ("one", "switch-1"), ("concurrent", "concurrent")):
+        found[f"{name}_before"] = _median(before, strategy).value
+        runs = before.success()[before.strategies.index(strategy)].sum()
+        found[f"{name}_runs_before"] = float(runs)
+    return found
+
+
+def sentences(now: Path, earlier: list[Path]) -> list[str]:
+    """`STATEMENTS` with their figures."""
+    found = figures(now, earlier)
+    return [s.format(**found) for s in STATEMENTS]
+
+
+def _simulations(one: Study, strategy: str) -> np.ndarray:
+    return one.convergence()[one.strategies.index(strategy)] * one.per_episode
+
+
+def _median(one: Study, strategy: str) -> Interval:
+    return statistics.median(_simulations(one, strategy))
+
+
+def _success(one: Study, name: str, strategy: str) -> dict[str, float | str]:
+    good = one.success()[one.strategies.index(strategy)]
+    share = wilson(int(good.sum()), good.size)
+    return {name: 100 * float(good.mean()), f"{name}_interval": interval(share, 100)}

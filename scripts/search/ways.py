@@ -98,9 +98,9 @@ class Search:
 
     def __init__(self, simulate: Simulator, seed: int, emitters: int, batch: int, path: Path):
         """Goes on with what a file holds, or begins with random designs."""
-        from ribs.archives import GridArchive
-        from ribs.emitters import EvolutionStrategyEmitter
-        from ribs.schedulers import Scheduler
+        from ribs.archives import GridArchive  # pyright: ignore[reportMissingImports]
+        from ribs.emitters import EvolutionStrategyEmitter  # pyright: ignore[reportMissingImports]
+        from ribs.schedulers import Scheduler  # pyright: ignore[reportMissingImports]
 
         self.simulate, self.space, self.path = simulate, simulate.space, path
         self.key, width = jax.random.key(seed), simulate.space.num_parameters
@@ -150,7 +150,7 @@ class Search:
         noise = codesign.stream_key(self.key, codesign.STREAM_TRIAL, self.done)
         found = self.simulate(designs, noise, 1)
         self.done, self.grasps = self.done + 1, self.grasps + len(designs) * self._objects
-        none = np.isnan(found.ways).any(1)
+        none = np.asarray(np.isnan(found.ways).any(1))
         objective = np.where(none, 10 * WORST, -found.cost)
         return objective, np.where(none[:, None], 0.0, found.ways)
 
@@ -220,7 +220,7 @@ def draw(
     rows = apart(found["ways"], found["kept"], pictures)
     rows.sort(key=lambda row: found["ways"][row, 1])
     figure = figures.new(11.0, 7.0)
-    above, below = figure.subfigures(2, 1, height_ratios=[1.35, 1])
+    above, below = np.ravel(figure.subfigures(2, 1, height_ratios=[1.35, 1]))
     maps = above.subplots(1, 2)
     parts = ((found["kept"], "share of fresh grasps kept"), (1e3 * length, "finger length [mm]"))
     for place, (values, name) in enumerate(parts):

@@ -93,9 +93,10 @@ def test_an_object_that_is_held_out_is_met_by_the_judge_alone(tmp_path):
     engine, space = ToyEngine(three), tiny()[1]
     shapes = unseen.folds(3)
     np.testing.assert_array_equal(shapes, [[1, 2], [0, 2], [0, 1]])
-    how = {"seeds": 3, "budget": 100, "tests": 4, "marks": 1, "chunk": 48, "shapes": shapes}
+    how = {"seeds": 3, "budget": 180, "tests": 4, "marks": 1, "chunk": 48, "shapes": shapes}
     case = make_case(f"screened-es:{SIZES}", space, "2d")
     made = finish(Study(case, three, engine, space, **how, path=tmp_path / "folds.npz"))
+    assert made.marks == [9], "a single mark is at the end: 3 x 36 of 180 grasps are its test"
     drawn = made.drawn(made.keys, 5, shapes, three)
     np.testing.assert_array_equal(drawn.shape, shapes[:, [0, 1, 0, 1, 0]])
     found = unseen.judged(made, three, {"mine": made.designs[made.done][:2]}, 6)

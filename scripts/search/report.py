@@ -92,7 +92,11 @@ def draw(rows: list[dict[str, Any]], path: Path) -> Path:
     Variants of an optimiser, but for its sizes, are in the table alone.
     """
     rows = [row for row in rows if not variant(row["optimizer"])]
-    kinds = sorted({(row["preset"], row.get("objects") or "three objects") for row in rows})
+    every = [(row["preset"], row.get("objects") or "three objects") for row in rows]
+    points = {kind: 0 for kind in sorted(every)}
+    for kind, row in zip(every, rows, strict=True):
+        points[kind] += len(row["grasps"])
+    kinds = [kind for kind, count in points.items() if count > 1]  # a lone point shows nothing
     figure = figures.new(4.6 * len(kinds), 3.6)
     for place, kind in enumerate(kinds):
         axes = figure.add_subplot(1, len(kinds), place + 1)

@@ -154,7 +154,8 @@ class Study:
         first = getattr(case.optimizer, "screening", 0) + getattr(case.optimizer, "retests", 0) + 1
         self.marks = sorted(
             {*map(self._episodes, at)}
-            or {*np.geomspace(min(first, episodes), episodes, marks).round().astype(int)}
+            # Backwards, so that a single mark is the last one.
+            or {*np.geomspace(episodes, min(first, episodes), marks).round().astype(int)}
         )
         self.kept: dict[int, np.ndarray] = {}
         self.designs: dict[int, np.ndarray] = {}

@@ -137,7 +137,6 @@ def test_labels_cover_neither_each_other_nor_points():
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
-@pytest.mark.skipif(not report.BUDGET.exists(), reason="the default scene's study is not run yet")
 def test_the_presets_files_and_the_pages_state_what_was_measured(tmp_path, monkeypatch):
     """As `python -m scripts.accuracy --report` writes them: new data without it would fail."""
     monkeypatch.setattr(analysis, "RESAMPLES", 2)  # neither states an interval

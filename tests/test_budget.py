@@ -41,7 +41,7 @@ def test_biases_and_flips_are_those_that_were_planted(found, tmp_path):
     assert rows["step, links and skin at once: the truth"][2].startswith("-5.0 [")
     assert "spheres in place of the skin" not in rows, "refused"
     page, figure = tmp_path / "page.md", tmp_path / "figure.png"
-    marks = "".join(f"<!-- {m}:begin -->\n<!-- {m}:end -->\n" for m in ("presets", "budget"))
+    marks = "".join(f"<!-- {m}:begin -->\n<!-- {m}:end -->\n" for m in ("budget", "against-truth"))
     page.write_text(marks)
     assert budget_report.make(made, page, figure) == 0
     assert "`standard`" in page.read_text() and figure.stat().st_size > 5000

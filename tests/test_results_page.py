@@ -3,6 +3,7 @@
 import json
 import re
 
+from scripts.accuracy.budget_report import Budget
 from scripts.experiments import fresh, report, stated
 from scripts.front_page import ROOT, words
 
@@ -55,3 +56,11 @@ def test_the_page_states_what_the_data_have():
     for name, standard, whole, finer in kept:
         table = fresh.report(DATA / f"paper_fingers{names[name]}").split("23d:")[1].splitlines()[-1]
         assert f"| {standard} % | {whole} of 30" in table and f"| {finer} % |" in table
+
+
+def test_the_default_scene_s_budget_is_that_of_the_data():
+    page = (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    found = json.loads((DATA / "budget.json").read_text())
+    assert between(page, "budget") == Budget(found).tables()["budget"]
+    mine = commits(found) | commits(json.loads((NOW / "23d.json").read_text()))
+    assert len({c[:7] for c in mine}) == 1, mine

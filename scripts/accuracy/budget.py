@@ -3,8 +3,8 @@
 python -m scripts.accuracy.budget --data runs/paper --out runs/budget              # again to resume
 python -m scripts.accuracy.budget --data runs/paper --out runs/budget --share 1/8  # beside 7 others
 python -m scripts.accuracy.budget --data runs/paper --out runs/budget --time  # then: rates, alone
-python -m scripts.accuracy.budget --out runs/budget --merge docs/data/budget_h100.json
-python -m scripts.accuracy.budget --merge docs/data/budget_h100.json --report
+python -m scripts.accuracy.budget --out runs/budget --merge docs/data/budget.json
+python -m scripts.accuracy.budget --merge docs/data/budget.json --report
 
 All variants have the same designs, in which the concurrent runs of --data ended, one of each, and
 the same trials.  The truth has the finer step, links and mesh; `finer` refines all three again.  A

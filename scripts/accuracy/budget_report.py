@@ -89,10 +89,10 @@ class Budget:
 
     def tables(self) -> dict[str, str]:
         """Markdown by the name of its marks on docs/accuracy.md."""
-        return {
-            "presets": tables.markdown(presets_table(self)),
-            "budget": f"{tables.markdown(budget_table(self))}\n\n{luck(self)}",
-        }
+        found = {"budget": f"{tables.markdown(budget_table(self))}\n\n{luck(self)}"}
+        if "truth" in self.costs:
+            found["against-truth"] = tables.markdown(presets_table(self))
+        return found
 
 
 def points(value: Any) -> str:

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.accuracy.budget_report import Budget
+from codesign_jax.codesign import SUCCESS_COST
 from scripts.accuracy.results import ERRORS, Study
 from scripts.accuracy.settings import PRESETS, Setting
 from scripts.accuracy.tables import COST, cost_cells
 
+FINEST_MESH = Setting(timestep=2.0, links=20, surface="hull 4 x 16", damping="least")
 _COMMENT = "# measured: "
 
 
@@ -29,7 +30,33 @@ def presets_table(studies: dict[str, Study]) -> list[list[str]]:
 
 
 WITHOUT = "without contact between fingers"
-"""What the study leaves out of the default scene, which `budget` has."""
+"""What the study leaves out of the default scene."""
+
+
+def in_short(studies: dict[str, Study]) -> list[list[str]]:
+    """The presets for a user: three errors and grasps a second; the heads say what is left out."""
+    full = next(iter(studies.values()))
+    heads = [ERRORS[part][0] for part in ERRORS]
+    heads[-1] += f", {WITHOUT}, against 0.5 ms and 20 links"
+    heads.append("against 2 ms, 20 links and a skin of 4 x 16 points")
+    rates = (f"grasps/s in contact, {WITHOUT}, {name}" for name in studies)
+    rows = [["preset", "setting", *heads, *rates]]
+    for name, setting in PRESETS.items():
+        errors = [full.error(part, setting) for part in ERRORS]
+        cells = ["–" if e is None else f"{e:.2g}" for e in [*errors, _flips(full, setting)]]
+        cells += [cost_cells(s.cost("structured", setting))[1] for s in studies.values()]
+        rows.append([f"`{name}`", setting.label, *cells])
+    return rows
+
+
+def _flips(study: Study, setting: Setting) -> float | None:
+    """Share of late verdicts that differ from the finest mesh; None if not measured."""
+    mine, finest = (study.grasps.get((s, False, "late")) for s in (setting, FINEST_MESH))
+    if mine is None or finest is None:
+        return None
+    trials = min(mine.shape[1], finest.shape[1])
+    kept, right = (cost[:, :trials] < SUCCESS_COST for cost in (mine, finest))  # failed: not kept
+    return float((kept != right).mean())
 
 
 def standing(study: Study) -> list[list[str]]:
@@ -60,35 +87,32 @@ def _standing(study: Study, setting: Setting, part: str) -> str:
     return f"beaten by {label} (cost {less_cost:+.0%}, error {less_error:+.0%})"
 
 
-def comment(name: str, study: Study, budget: Budget) -> str:
-    """What was measured of a preset, as comment lines of its file.
-
-    Args:
-      name: The preset.
-      study: Errors of the finger tip and of the contact impulse.
-      budget: Verdicts and rates in the default scene.
-    """
-    setting = PRESETS[name]
-    form = {"tip": "finger tip {:.3g} mm", "impulse": "contact impulse {:.1%}"}
-    errors = {part: study.error(part, setting) for part in form}
+def comment(name: str, studies: dict[str, Study]) -> str:
+    """What was measured of a preset, as comment lines of its file."""
+    setting, full = PRESETS[name], next(iter(studies.values()))
+    form = {"tip": "finger tip {:.3g} mm"}
+    form |= {"impulse": "contact impulse {:.1%}", "decision": "verdicts that flip {:.1%}"}
+    errors = {part: full.error(part, setting) for part in form}
     words = [form[part].format(e) for part, e in errors.items() if e is not None]
+    costs = []
+    for machine, study in studies.items():
+        if cost := study.cost("structured", setting):
+            seconds, rate = cost_cells(cost)
+            costs.append(f"{seconds} on {machine} ({rate} grasps/s)")
     lines = [", ".join(words) + f" ({WITHOUT})"]
-    _, success, flips, rank, moved, rate = budget.row(name, name)
-    lines.append(f"success of late designs, points from the truth: {success}")
-    lines.append(f"their verdicts that flip: {flips}, {moved} by a micrometre; ranks: {rank}")
-    lines.append(f"grasps/s on one H100: {rate}")
-    return "".join(f"{_COMMENT}{line}\n" for line in lines if not line.endswith("–"))
+    if costs:
+        lines.append("wall s / simulated s: " + ", ".join(costs) + f" ({WITHOUT})")
+    return "".join(f"{_COMMENT}{line}\n" for line in lines)
 
 
-def annotate(folder: Path, study: Study, budget: Budget) -> None:
+def annotate(folder: Path, studies: dict[str, Study]) -> None:
     """Puts what was measured into the presets' files, instead of what an earlier study found.
 
     Args:
       folder: Folder with a .toml file for each preset.
-      study: See `comment`.
-      budget: See `comment`.
+      studies: The studies by the machine's name, the one with the errors first.
     """
     for name in PRESETS:
         path = folder / f"{name}.toml"
         kept = re.sub(f"^{_COMMENT}.*\n", "", path.read_text(), flags=re.MULTILINE)
-        path.write_text(comment(name, study, budget) + kept)
+        path.write_text(comment(name, studies) + kept)

@@ -1,18 +1,14 @@
 """From committed records to figures, tables and CSV."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from scripts.accuracy import analysis, figures, presets, tables
-from scripts.accuracy.budget_report import Budget
 from scripts.accuracy.results import ERRORS, Study
 from scripts.shared import output
 from scripts.shared.tables import fill, markdown
 
 MACHINES = {"h200": "NVIDIA H200 and CPU cores of its host", "cpu": "2 CPU cores"}
-BUDGET = Path(__file__).parents[2] / "docs" / "data" / "budget_h100.json"
-"""What `scripts.accuracy.budget` found in the default scene."""
 SHORT = {"h200": "one H200", "cpu": "2 CPU cores"}
 
 
@@ -46,20 +42,18 @@ def make_summary(page: Path, note: Path, scenes: Path, found: dict[str, Study]) 
     """Fills in the tables of the presets and of the errors wanted, and the comments of their files.
 
     Args:
-      page: The user's page, of the default scene alone.
+      page: The user's page, which has the presets in short.
       note: The note of the study.
       scenes: Folder of the presets.
       found: See `studies`; the full size comes first.
     """
     named = {SHORT[n]: study for n, study in found.items()}
     full, *rest = named.values()
-    budget = Budget(json.loads(BUDGET.read_text()))
-    for mark, text in budget.tables().items():
-        fill(page, text, mark)
+    fill(page, markdown(presets.in_short(named)), "presets")
     fill(note, markdown(tables.wanted_here(full, rest[0] if rest else None)), "wanted")
     text = "\n\n".join(markdown(t) for t in (presets.presets_table(named), presets.standing(full)))
     fill(note, text, "presets")
-    presets.annotate(scenes, full, budget)
+    presets.annotate(scenes, named)
 
 
 def _section(study: Study, name: str, docs: Path) -> str:

@@ -6,7 +6,7 @@ python -m scripts.winners.picture --random 20 --out runs/picture_random
 A file is what `scripts.search` keeps (what its last mark recommends to each seed) or the 23d.npz or
 2d.npz of `scripts.experiments` (the best particle of each run).  Every design meets fresh trials in
 the default scene.  --out gets picture.json, and a film strip of each design's first trials with the
-moments at which a finger was deepest; --video adds an animation.  12 designs in 6 trials take two
+moments at which a finger was deepest; --video adds an animation.  12 designs in 6 trials take a few
 minutes on two cores.
 """
 

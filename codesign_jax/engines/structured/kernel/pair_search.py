@@ -194,7 +194,7 @@ class Search:
         def enter() -> None:
             motion, vel = (pairs.side(name, row) for name in ("motion", "vel"))
             with pairs.with_cone(0):
-                fields = pairs.begin(place, motion, vel, seen)
+                fields = pairs.begin(place, motion, vel, ahead=seen)
             number = lanes([self.like + jnp.asarray(row, self.like.dtype)], (1, 1), wide=True)
             fields |= {"row": number} | pairs.remembered({"owner": 1.0, "sphere": sphere})
             pairs.add(0, which, fields, self.block.own)

@@ -118,7 +118,7 @@ def test_a_test_of_few_particles_runs_beside_episodes():
     for request, (_, info) in zip(requests, together(requests), strict=True):
         [(_, alone)] = Batch(task, optimizer)([request])
         np.testing.assert_array_equal(info.population, request.state.particles)
-        np.testing.assert_array_equal(info.outcomes.cost, alone.trials.cost)
+        np.testing.assert_array_equal(info.outcomes.cost, alone.outcomes.cost)
 
 
 def test_devices_that_there_are_not_and_calls_without_grasps(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""Friction that fingers hold from step to step: its law on contacts alone, and who refuses it.
+"""Friction that fingers hold from step to step: its law on contacts alone, and who has it.
 
 The kernel's steps are compared with a dense solve in `test_planted_contacts`, its derivatives with
 differences in `test_reverse`; hard case 34 has the creep of two crossed fingers.
@@ -13,7 +13,7 @@ from codesign_jax import scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.laws import holding
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, constraint_update
-from codesign_jax.scene import InputError
+from codesign_jax.model.layout import pairings_held
 
 MU = 0.8
 
@@ -78,8 +78,9 @@ def test_bodies_apart_hold_nothing():
     assert not grip.any() and not np.asarray(force).any()
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "mjx"])
-def test_engines_without_it_say_so(engine):
-    chosen = scene.load("paper_spheres", overrides={"effects.friction_memory": True})
-    with pytest.raises(InputError, match="effects.friction_memory = true .*no state"):
-        make_engine(engine, chosen)
+def test_spheres_keep_nothing():
+    """Their contact is that of MuJoCo, which has no state, so that every engine simulates it."""
+    for surface, held in ("hull", 3), ("spheres", 0):
+        chosen = scene.load("paper", overrides={"effects.surface": surface})
+        assert chosen.effects.friction_memory and pairings_held(chosen) == held
+    make_engine("mujoco", chosen)

@@ -211,7 +211,7 @@ def test_landscape_varies_two_of_many_and_counts_what_it_should():
     start = np.asarray(space.default(), np.float32)
     case = Case(the_scene, space, start, "mujoco")
     columns = (space.names.index("pressure[0]"), space.names.index("wall[0]"))
-    made = command.grid(case, columns, 4)
+    made = command.make_plane(case, columns, 4)
     others = np.delete(np.arange(space.num_parameters), columns)
     np.testing.assert_array_equal(made.designs[:, others], np.tile(start[others], (16, 1)))
     np.testing.assert_allclose(made.designs[:, columns[1]], np.tile(made.axes[1], 4), rtol=1e-6)

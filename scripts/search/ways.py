@@ -220,8 +220,8 @@ def draw(
     rows = apart(found["ways"], found["kept"], pictures)
     rows.sort(key=lambda row: found["ways"][row, 1])
     figure = figures.new(11.0, 7.0)
-    parts: Any = figure.subfigures(2, 1, height_ratios=[1.35, 1])
-    above, below = parts
+    halves: Any = figure.subfigures(2, 1, height_ratios=[1.35, 1])
+    above, below = halves
     maps = above.subplots(1, 2)
     parts = ((found["kept"], "share of fresh grasps kept"), (1e3 * length, "finger length [mm]"))
     for place, (values, name) in enumerate(parts):

@@ -224,7 +224,6 @@ def between_spheres(
     mine: tuple[Place, Any, Any],
     theirs: tuple[Place, Any, Any],
     numbers: Any,
-    held: tuple,
     which: tuple,
 ) -> jax.Array:
     """Power of two fingers' spheres on one another.
@@ -234,15 +233,13 @@ def between_spheres(
       mine: Link, and centres and radii of its spheres, on the lane's own side.
       theirs: The same of the other finger.
       numbers: Numbers of the cone.
-      held: What the fingers hold, see `holding.held`, and cotangents of the sums of
-        `holding.hold`; nothing where they have no such state.
       which: Number of the sphere on either link.
     """
     balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
     one, other = sections.between(*balls)
     cone = cone_of(scene, numbers)
     ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in (one, other)]
-    return _between(ends, mine[0][2:], theirs[0][2:], held)
+    return _between(ends, mine[0][2:], theirs[0][2:])
 
 
 def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, which) -> jax.Array:
@@ -330,7 +327,8 @@ def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers, held: 
       mine: Sides before and behind the row.
       theirs: The same of the other row.
       numbers: Numbers of the cone.
-      held: As in `between_spheres`.
+      held: What the fingers hold, see `holding.held`, and cotangents of the sums of
+        `holding.hold`; nothing where they have no such state.
     """
     cone = cone_of(scene, numbers)
     ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]

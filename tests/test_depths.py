@@ -37,7 +37,25 @@ def test_a_face_is_as_deep_in_another_finger_as_it_was_moved_there(straight, par
     turn[:, other] = turn[:, one]
     place[:, other] = place[:, one] + (2 - part) * half * turn[:, one][..., 1]
     found = depths.in_fingers(the_scene, params, depths.Poses(place, turn))
-    np.testing.assert_allclose([found[0][0], found[1][0]], [part * half, part], rtol=1e-6)
+    share = part * half / min(2 * half, float(params.height[0]))
+    np.testing.assert_allclose([found[0][0], found[1][0]], [part * half, share], rtol=1e-6)
+
+
+@pytest.mark.parametrize("inside", [0.001, 0.004])
+def test_a_tip_is_as_deep_in_another_one_as_their_faces_are(straight, inside):
+    """Two fingers end on end: the way to the tip's face, not that to the sides, 9 mm away."""
+    the_scene, params, at = straight
+    lay = model.layout(the_scene)
+    place, turn = at.place.copy(), at.turn.copy()
+    one, other = lay.bodies[0], lay.bodies[1]
+    along, across, up = np.moveaxis(turn[:, one], -1, 0)
+    turn[:, other] = np.stack([-along, -across, up], -1)
+    face = place[:, one] + 0.1 / 6 * along  # half a segment behind the last joint
+    place[:, other] = face[:, -1:] + (0.1 / 6 - inside) * along[:, -1:]
+    place[:, other[:-1]] = place[:, other[-1:]] + 1.0  # out of the way
+    place[:, lay.bodies[2:]] += [2.0, 0.0, 0.0]
+    found = depths.in_fingers(the_scene, params, depths.Poses(place, turn))
+    np.testing.assert_allclose(found[0], inside, rtol=1e-6)
 
 
 @pytest.mark.parametrize("inside", [0.001, 0.004])

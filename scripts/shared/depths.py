@@ -70,15 +70,17 @@ def in_palm(scene: Scene, params: Params, at: Poses) -> np.ndarray:
     return deepest
 
 
-AROUND, ALONG = 16, (0.0, 0.25, 0.5, 0.75)
-"""Points of an outline, and its places on a link as shares of the link."""
+AROUND, ALONG, INNER = 16, (0.0, 0.25, 0.5, 0.75, 1.0), (0.9, 0.5, 0.0)
+"""Points of an outline, its places on a link as shares of the link, and outlines of the tip's face
+as shares of the section."""
 
 
 def in_fingers(scene: Scene, params: Params, at: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the deepest point of a finger's outline in a link of another one.
+    """Depth of the deepest point of a finger's surface in a link of another one.
 
-    A link reaches from its joint to the next one, the last to the tip, with the outline
-    |y/a|^4 + |z/b|^4 = 1; a depth is the distance to it, to first order.
+    A link reaches from its joint to the next one, the last to the tip's flat face, with the outline
+    |y/a|^4 + |z/b|^4 = 1; a depth is the distance to it, to first order, or to the tip's face where
+    that is nearer.
 
     Args:
       scene: The scene.
@@ -86,8 +88,8 @@ def in_fingers(scene: Scene, params: Params, at: Poses) -> tuple[np.ndarray, np.
       at: Its poses.
 
     Returns:
-      The depth [m], and the largest share of the way from an outline to its section's axis, both of
-      shape (state,); 0 where no finger is in another.
+      The depth [m], and the largest one as a share of the other finger's section, of the smaller of
+      its width and height, both of shape (state,); 0 where no finger is in another.
     """
     lay = model.layout(scene)
     angle = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
@@ -103,7 +105,10 @@ def in_fingers(scene: Scene, params: Params, at: Poses) -> tuple[np.ndarray, np.
             [ring + np.outer(part * span, [1, 0, 0])[:, None] for part in ALONG], 1
         )
         place = at.place[:, bodies, None] + local @ at.turn[:, bodies].swapaxes(-1, -2)
-        points.append(place.reshape(len(place), -1, 3))
+        face = np.concatenate([unit * half * inner for inner in INNER]) + [0, half[1]]
+        tip = np.c_[np.full(len(face), span[-1]), face] @ at.turn[:, bodies[-1]].swapaxes(-1, -2)
+        tip += at.place[:, bodies[-1:]]
+        points.append(np.concatenate([place.reshape(len(place), -1, 3), tip], 1))
         sizes.append((span, *half))
     worst = np.zeros((2, len(at.place)))
     for one, other in np.ndindex(len(points), len(points)):
@@ -111,13 +116,13 @@ def in_fingers(scene: Scene, params: Params, at: Poses) -> tuple[np.ndarray, np.
             continue
         bodies, (span, a, b) = lay.bodies[other], sizes[other]
         away = points[one][:, :, None] - at.place[:, None, bodies]
-        x, y, z = np.moveaxis(np.einsum("spli,slij->splj", away, at.turn[:, bodies]), -1, 0)
+        x, y, z = np.moveaxis(away.swapaxes(1, 2) @ at.turn[:, bodies], -1, 0).swapaxes(2, 3)
         units = np.abs([y / a, (z - b) / b])
         phi = np.maximum((units**4).sum(0) ** 0.25, 1e-9)
         sides = np.array([a, b])[:, None, None, None]
         slope = np.sqrt(((units / phi) ** 6 / sides**2).sum(0))
         inside = (x >= 0) & (x <= span) & (phi < 1)
-        depth = np.where(inside, (1 - phi) / slope, 0.0).max((1, 2))
-        share = np.where(inside, 1 - phi, 0.0).max((1, 2))
-        worst = np.maximum(worst, [depth, share])
+        face = np.where(np.arange(lay.links) == lay.links - 1, span - x, np.inf)
+        depth = np.where(inside, np.minimum((1 - phi) / slope, face), 0.0).max((1, 2))
+        worst = np.maximum(worst, [depth, depth / (2 * min(a, b))])
     return worst[0], worst[1]

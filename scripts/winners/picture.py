@@ -34,8 +34,10 @@ STREAM_PICTURE = 0x70696374
 """Stream of these trials ("pict"): no search has met them."""
 EVERY = 5
 """Every how many steps fingers are looked for in one another."""
+LASTING = 0.5
+"""How long a finger is so deep in another that it is counted apart [s]."""
 PALM_LIMIT, SHARE_LIMIT = 2e-3, 1 / 3
-"""Depth in the palm [m], and in a finger as a share of half its section, that are counted."""
+"""Depth in the palm [m], and in a finger as a share of its section, that are counted."""
 
 
 def recommended(path: Path, count: int) -> np.ndarray:
@@ -108,6 +110,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "palm_mm": of("palm_mm", 1e3 * PALM_LIMIT),
         "finger_mm": of("finger_mm", np.inf),
         "finger_share": of("finger_share", SHARE_LIMIT),
+        "finger_deep_s": of("finger_deep_s", LASTING),
     }
 
 
@@ -119,8 +122,9 @@ def told(found: dict[str, Any]) -> str:
         f"{s['kept']} of {s['grasps']} grasps kept, {s['stuck']} STUCK, {s['failed']} failed. "
         f"In kept grasps a vertex is at most {palm['most']:.1f} mm in the palm, in "
         f"{palm['beyond']} of them more than {1e3 * PALM_LIMIT:.0f} mm; a finger is at most "
-        f"{s['finger_mm']['most']:.1f} mm in another, {share['most']:.2f} of half a section, in "
-        f"{share['beyond']} more than a third."
+        f"{s['finger_mm']['most']:.1f} mm in another, {share['most']:.2f} of its section, in "
+        f"{share['beyond']} more than a third, in {s['finger_deep_s']['beyond']} of them for more "
+        f"than {LASTING} s."
     )
 
 

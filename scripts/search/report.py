@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import ticker
 
 from codesign_jax.optimize import DEFAULT, NAMES
 from codesign_jax.report.statistics import wilson
@@ -136,7 +137,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> Path:
     """
     rows = sorted((row for row in rows if not variant(row["optimizer"])), key=order)
     every = [(row["preset"], row.get("objects") or "three objects") for row in rows]
-    points = {kind: 0 for kind in sorted(every)}
+    points = dict.fromkeys(every, 0)  # in the table's order
     for kind, row in zip(every, rows, strict=True):
         points[kind] += len(row["grasps"])
     kinds = [kind for kind, count in points.items() if count > 1]  # a lone point shows nothing
@@ -153,11 +154,14 @@ def draw(rows: list[dict[str, Any]], path: Path) -> Path:
             away = [middle - low, high - middle]
             axes.errorbar(at, middle, away, color=line.get_color(), lw=1, capsize=3)
         axes.axhline(RELIABLE, color="0.6", lw=0.8)
-        title = f"{kind[0]}, {kind[1]}"
+        title = f"{kind[0].removesuffix('d')} parameters, {kind[1]}"
         axes.set(xscale="log", xlabel="grasps of a seed, all counted", title=title, ylim=(0, 1.01))
         axes.set_ylabel("share of fresh grasps kept")
         ticks = sorted({g for row in shown for g in row["grasps"]})
         axes.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
+        axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.xaxis.set_minor_formatter(ticker.NullFormatter())
         axes.legend(fontsize=7, loc="lower right")
     return figures.save(figure, path)
 

@@ -16,10 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from codesign_jax.optimize import DEFAULT, PAPER
+from codesign_jax.report.verdicts import RELIABLE
 from codesign_jax.types import failed
 from scripts.accuracy.results import Study
 from scripts.accuracy.settings import PRESETS, Setting
 from scripts.experiments import study
+from scripts.search import report as search
 from scripts.shared.tables import fill, markdown
 
 ROOT = Path(__file__).parents[1]
@@ -122,9 +125,11 @@ def _fresh(data: Path) -> Iterator[tuple[str, float]]:
 
 def _searches(data: Path) -> Iterator[tuple[str, float]]:
     """Runs of the default search and of the filter whose design keeps 95 % in the end."""
-    for name, file in (("ours", "screened-es-a"), ("filter", "particle-filter")):
-        found = _json(data / "search" / f"23d-{file}.json")
-        good = np.array(found["kept"][-1]) >= 0.95
+    rows = search.merged([_json(path) for path in sorted((data / "search").glob("*.json"))])
+    for name, optimizer in (("ours", DEFAULT), ("filter", PAPER)):
+        case = optimizer, "23d", None
+        [found] = [r for r in rows if (r["optimizer"], r["preset"], r.get("objects")) == case]
+        good = np.array(found["kept"][-1]) >= RELIABLE
         yield f"{name}_good", float(good.sum())
         yield f"{name}_runs", float(good.size)
         yield f"{name}_share", 100 * float(good.mean())

@@ -30,7 +30,11 @@ def finish(made):
     return made
 
 
-@pytest.mark.parametrize("name", ["screened-es", "particle-filter"])
+@pytest.mark.parametrize(
+    "name",
+    # slow: the next test runs the particle filter to its end
+    ["screened-es", pytest.param("particle-filter", marks=pytest.mark.slow)],
+)
 def test_seeds_are_runs_of_the_library_and_go_on(name, tmp_path):
     whole = finish(make(tmp_path / "whole.npz", name))
     begun = make(tmp_path / "begun.npz", name)

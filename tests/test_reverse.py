@@ -309,7 +309,7 @@ def test_derivatives_by_every_group_equal_central_differences():
     assert np.abs(slope - c.difference).max() < BOUND * largest
 
 
-@pytest.mark.slow  # half a minute for what the test itself notices; quick: the sound derivative
+@pytest.mark.slow  # a minute for what differences notice; quick: that sound ones agree with them
 @pytest.mark.parametrize("name", FAULTS)
 def test_differences_notice_a_fault(name):
     """Some group's derivative is wrong by much more than the bound."""
@@ -440,7 +440,7 @@ def valid(code):
 
 
 def test_the_kernel_is_valid_for_gpus():
-    """LLVM makes PTX of the reverse pass, of few parts; the assembler takes those of whole scenes."""
+    """LLVM makes PTX of the reverse pass, here of few parts; the assembler takes whole scenes."""
     assert valid(next(ptx(grasps.pinch("sphere", links=2, **SHORT))))
 
 

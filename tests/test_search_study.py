@@ -91,6 +91,7 @@ def test_the_page_gets_a_table_and_a_figure(tmp_path):
         report.merged([row, later | {"first_seed": 3}])
 
 
+@pytest.mark.slow  # a study of its own, with programs of its own: 10 s
 def test_an_object_that_is_held_out_is_met_by_the_judge_alone(tmp_path):
     """Trials of a fold have the other objects in turn, and `kept` tells objects apart."""
     three = scene.load(TINY, object_set="paper")

@@ -49,7 +49,7 @@ quick: $(QUICK)
 test-browser: $(STAMP)
 	$(BIN)/python -m pytest -q -m browser -rs $$(grep -l mark.browser tests/test_*.py)
 
-# Kernels for GPUs by NVIDIA's assembler, without a GPU: half a minute.
+# Kernels for GPUs by NVIDIA's assembler, without a GPU: a minute of one core.
 test-ptx: $(STAMP)
 	$(BIN)/python -m pytest -q -rs -m slow tests/test_reverse.py -k assembler
 
@@ -103,8 +103,10 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix $(CHECKED)
 	$(BIN)/ruff format $(CHECKED)
 
+# Two threads are sooner done, one takes three quarters of their work.
+THREADS ?= 2
 types: $(STAMP)
-	$(BIN)/pyright --threads 2 --pythonpath $(BIN)/python
+	$(BIN)/pyright --threads $(THREADS) --pythonpath $(BIN)/python
 
 # Installed again only when the dependencies change. Python compiles what is imported; pip would compile everything, for 40 s.
 define install

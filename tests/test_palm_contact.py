@@ -120,8 +120,8 @@ def simulated(surface):
     return np.linalg.norm(acc - expected, axis=1) / np.linalg.norm(expected)
 
 
-# A kernel each. The hull that touches ahead has the hull's own contacts as well; without it the
-# step is one of `test_planted_contacts`.
+# A kernel each. The hull that touches ahead has the hull's own contacts with the palm as well, and
+# their faults are planted there too.
 SLOW = pytest.mark.slow
 SURFACES = [pytest.param("hull", marks=SLOW), "ahead", "spheres"]
 

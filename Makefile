@@ -6,7 +6,11 @@ PYTHON ?= $(shell for p in python3 python3.12 python3.13 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; \
 	done)
 BIN := $(VENV)/bin
+# Of what is installed: everything; what the demo needs; what the quick core needs.
 STAMP := $(VENV)/.installed
+DEMO := $(VENV)/.demo
+QUICK := $(VENV)/.quick
+EXTRAS := notebooks,report,test,docs,dev
 CHECKED := codesign_jax scripts tests notebooks
 
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
@@ -30,7 +34,7 @@ help:
 	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make format      ruff format          make clean       remove what make built"
 
-demo: $(STAMP)
+demo: $(DEMO)
 	$(BIN)/python -m scripts.demo
 
 test: $(STAMP)
@@ -38,14 +42,14 @@ test: $(STAMP)
 
 # The quick core: a minute for another Python, make quick PYTHON=python3.13 VENV=.venv-python3.13
 CORE := layers scene parameters schedule optimizers compiler planted_faults codesign run_folder
-quick: $(STAMP)
+quick: $(QUICK)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(CORE:%=tests/test_%.py)
 
 # What needs a browser: the report and its 3D replay in a headless Chromium.
 test-browser: $(STAMP)
 	$(BIN)/python -m pytest -q -m browser -rs $$(grep -l mark.browser tests/test_*.py)
 
-# Kernels for GPUs by NVIDIA's assembler, without a GPU: half a minute.
+# Kernels for GPUs by NVIDIA's assembler, without a GPU: a minute of one core.
 test-ptx: $(STAMP)
 	$(BIN)/python -m pytest -q -rs -m slow tests/test_reverse.py -k assembler
 
@@ -99,15 +103,30 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix $(CHECKED)
 	$(BIN)/ruff format $(CHECKED)
 
+# Two threads are sooner done, one takes three quarters of their work.
+THREADS ?= 2
 types: $(STAMP)
-	$(BIN)/pyright --threads 2 --pythonpath $(BIN)/python
+	$(BIN)/pyright --threads $(THREADS) --pythonpath $(BIN)/python
 
 # Installed again only when the dependencies change. Python compiles what is imported; pip would compile everything, for 40 s.
-$(STAMP): pyproject.toml
+define install
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found: apt-get install python3 python3-venv" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
 		{ echo "No venv module: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -e '.[notebooks,report,test,docs,dev]'
+	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -e '.[$(1)]'
+endef
+
+$(STAMP): pyproject.toml
+	$(call install,$(EXTRAS))
+	@touch $@ $(DEMO) $(QUICK)
+
+# A third of the packages: who asks for the demo does not wait for the others.
+$(DEMO): pyproject.toml
+	$(call install,report)
+	@touch $@
+
+$(QUICK): pyproject.toml
+	$(call install,quick)
 	@touch $@
 
 clean:

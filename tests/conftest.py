@@ -39,11 +39,12 @@ def pytest_configure(config):
 # Files of more than ten seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other.
 LONG = """
-test_many_runs test_compose test_resume test_effects test_engines test_kernel test_containment
-test_mesh_grasps test_calibration test_constants test_codesign test_planted_contacts test_winners
-test_docs test_experiments test_accuracy test_hard_cases test_rollout test_model
-test_particle_filter test_grasp test_batch test_export_sheet test_report test_showing
-test_effects_physics test_optimizers test_accuracy_report
+test_resume test_reverse test_sample test_kernel test_compose test_effects test_containment
+test_many_runs test_palm_contact test_engines test_experiments test_mesh_grasps test_batch
+test_search_study test_own test_run_reading test_library test_preflight test_calibration
+test_planted_faults test_sections test_hard_cases test_accuracy_report test_planted_contacts
+test_scene test_runtime test_constants test_soft_touch test_report_page test_docs test_codesign
+test_resampling test_optimizers test_hull_contact test_parameters test_rollout
 """.split()
 
 

@@ -365,7 +365,7 @@ def slopes_of_a_share(value, x, broken):
 @pytest.mark.parametrize(
     "slopes",
     [
-        slopes_of_a_batch,
+        pytest.param(slopes_of_a_batch, marks=pytest.mark.slow),  # the share's are made of it
         slopes_of_a_share,
         pytest.param(slopes_by_vmap, marks=pytest.mark.slow),
     ],

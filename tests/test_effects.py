@@ -304,7 +304,7 @@ def check_combination(values, shape):
 OPTIONS = {"deadline": None, "derandomize": True, "phases": [Phase.generate]}
 
 
-@settings(max_examples=3, **OPTIONS)
+@settings(max_examples=2, **OPTIONS)
 @given(values=COMBINATIONS, shape=st.sampled_from(grasps.SHAPES))
 def test_a_combination_builds_or_is_refused(values, shape):
     check_combination(values, shape)

@@ -30,7 +30,11 @@ def finish(made):
     return made
 
 
-@pytest.mark.parametrize("name", ["screened-es", "particle-filter"])
+@pytest.mark.parametrize(
+    "name",
+    # slow: the next test runs the particle filter to its end
+    ["screened-es", pytest.param("particle-filter", marks=pytest.mark.slow)],
+)
 def test_seeds_are_runs_of_the_library_and_go_on(name, tmp_path):
     whole = finish(make(tmp_path / "whole.npz", name))
     begun = make(tmp_path / "begun.npz", name)
@@ -99,6 +103,7 @@ def test_the_page_gets_a_table_and_a_figure(tmp_path):
         report.merged([row, later | {"first_seed": 3}])
 
 
+@pytest.mark.slow  # a study of its own, with programs of its own: 10 s
 def test_an_object_that_is_held_out_is_met_by_the_judge_alone(tmp_path):
     """Trials of a fold have the other objects in turn, and `kept` tells objects apart."""
     three = scene.load(TINY, object_set="paper")

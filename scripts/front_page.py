@@ -39,18 +39,17 @@ STATEMENTS = (
     "particle-filter`) after {filter_grasps:,.0f}",
     "both at once succeeds in {success_2d_concurrent:.0f} of {runs:.0f} runs, one alone in "
     "{success_2d_single:.0f}",
-    "keep {kept_2d_concurrent:.0f} % of fresh grasps",
-    "{success_23d_concurrent:.0f} and {success_23d_single:.0f} of {runs:.0f} runs succeed, and "
-    "the best designs keep {kept_23d_concurrent:.0f} %",
+    "keep {kept_2d:.0f} % of fresh grasps",
+    "{success_23d_concurrent:.0f} of {runs:.0f} runs succeed, and the best designs keep "
+    "{kept_23d:.0f} %",
+    "{flips:.1f} % of fresh grasps of the best designs with {parameters:.0f} parameters, of which "
+    "they keep {kept_finely:.0f} %",
     "With {parameters:.0f} parameters",
-    "best designs with {parameters:.0f} parameters",
     "takes {converged_2d:,.0f} simulated grasps with two parameters ({paper_2d:,.0f} in the paper) "
     "and {converged_23d:,.0f} with {parameters:.0f} ({paper_23d:,.0f})",
     "takes {install_seconds:.0f} seconds or more and {install_gb:.1f} GB",
     "{c_ratio:.0f} times as many grasps a second as MuJoCo C on two cores",
     "{c_ratio_here:.0f} times as many steps in contact",
-    "{flips_concurrent:.1f} % of fresh grasps",
-    "{flips_switch:.1f} % with one switch and {flips_single:.1f} % in a single domain",
     "{few_faster:.1f} and {many_faster:.1f} times as fast with {few:,.0f} and {many:,.0f} grasps",
     "{fast_rate:.1f} times the rate of `standard`",
     "{compared:,.0f} of {same:,.0f} verdicts",
@@ -88,18 +87,14 @@ def _json(path: Path) -> Any:
 
 
 def _experiments(data: Path) -> Iterator[tuple[str, float]]:
-    """Convergence with the default scene, success in an earlier one: 30 runs a strategy."""
-    folders = {"concurrent": "paper_fingers", "single": "paper_fingers_single"}
+    """Convergence and success with the default scene: 30 runs a strategy."""
     for name, paper in (("2d", 420), ("23d", 6120)):
-        for strategy, folder in folders.items():
-            found = study.load_study(data / ("paper_fingers" if name == "2d" else folder), name)
-            assert found is not None, f"docs/data has no {name} of {folder}"
-            place = found.strategies.index(strategy)
-            yield f"success_{name}_{strategy}", float(found.success()[place].sum())
-            yield "runs", float(found.success()[place].size)
-            yield "parameters", float(found.data["final_particles"].shape[-1])
         now = study.load_study(data / "experiments", name)
         assert now is not None, f"docs/data has no {name} of the default scene"
+        for strategy, good in zip(now.strategies, now.success(), strict=True):
+            yield f"success_{name}_{strategy}", float(good.sum())
+            yield "runs", float(good.size)
+            yield "parameters", float(now.data["final_particles"].shape[-1])
         episodes = np.median(now.convergence()[now.strategies.index("concurrent")])
         yield f"converged_{name}", float(episodes * now.per_episode)
         yield f"paper_{name}", float(paper)
@@ -107,20 +102,16 @@ def _experiments(data: Path) -> Iterator[tuple[str, float]]:
 
 def _fresh(data: Path) -> Iterator[tuple[str, float]]:
     """What the winners keep of fresh trials, and how many verdicts `reference` changes [%]."""
-    folders = {"concurrent": "paper_fingers", "single": "paper_fingers_single"}
-    for strategy, folder in {**folders, "switch": "paper_fingers_switch"}.items():
-        with np.load(data / folder / "fresh.npz", allow_pickle=False) as file:
-            for name in ("2d", "23d"):
-                if f"{name}|standard|cost" not in file:
-                    continue
-                names = [str(s) for s in file[f"{name}|strategies"]]
-                place = next(i for i, s in enumerate(names) if s.startswith(strategy))
-                kept, good = _verdicts(file, name, "standard", place)
-                yield f"kept_{name}_{strategy}", 100 * float(kept[good].mean())
-                if f"{name}|reference|cost" in file:
-                    other, fine = _verdicts(file, name, "reference", place)
-                    both = good & fine
-                    yield f"flips_{strategy}", 100 * float((kept != other)[both].mean())
+    with np.load(data / "experiments" / "fresh.npz", allow_pickle=False) as file:
+        for name in ("2d", "23d"):
+            place = [str(s) for s in file[f"{name}|strategies"]].index("concurrent")
+            kept, good = _verdicts(file, name, "standard", place)
+            yield f"kept_{name}", 100 * float(kept[good].mean())
+            if f"{name}|reference|cost" in file:
+                other, fine = _verdicts(file, name, "reference", place)
+                both = good & fine
+                yield "flips", 100 * float((kept != other)[both].mean())
+                yield "kept_finely", 100 * float(other[fine].mean())
 
 
 def _searches(data: Path) -> Iterator[tuple[str, float]]:

@@ -3,15 +3,29 @@
 import json
 import re
 
+import numpy as np
+
 from scripts.accuracy.budget_report import Budget
-from scripts.experiments import fresh, report, stated
+from scripts.calibration import files, itself, score
+from scripts.calibration import report as calibration
+from scripts.experiments import fresh, grasp_types, report, stated, study
 from scripts.front_page import ROOT, words
+from scripts.shared import sets
 
 DATA = ROOT / "docs" / "data"
 NOW = DATA / "experiments"
 EARLIER = [
     DATA / name for name in ("paper_fingers", "paper_fingers_single", "paper_fingers_switch")
 ]
+SHORT = {"single domain": "s.d.", "one switch": "1", "two switches": "2", "concurrent": "conc."}
+"""Strategies of the page as the note's tables call them."""
+SCENE = {
+    "tilt": 70, "base_x": 36, "pair_gap": 35, "zero_height": 5, "shear_modulus": 35, "width": 24,
+    "lateral": 0.75, "torsion": 2.6, "half_size": 30, "mass": 50, "friction": 0.86,
+    "table_friction": 0.4, "wrist_linear": 180, "wrist_angular": 12, "shake_amplitude": 38,
+    "shake_frequency": 1.5, "normal_stiffness": 4, "friction_ratio": 30, "cost_maximum": 3,
+}  # fmt: skip
+"""The default scene's constants, in the units of `sets.OPEN`, as docs/calibration.md has them."""
 NOTE = (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")
 
 
@@ -50,17 +64,72 @@ def test_the_note_s_tables_are_those_of_the_data(tmp_path):
 def test_the_page_states_what_the_data_have():
     text = words((ROOT / "docs" / "results.md").read_text(encoding="utf-8"))
     assert not [said for said in stated.sentences(NOW, EARLIER) if said not in text]
-    kept = re.findall(r"23 parameters, ([a-z ]+) ([\d.]+) % (\d+) ([\d.]+) % at", text)
-    names = {"single domain": "_single", "one switch": "_switch", "concurrent": ""}
-    assert len(kept) == 3
-    for name, standard, whole, finer in kept:
-        table = fresh.report(DATA / f"paper_fingers{names[name]}").split("23d:")[1].splitlines()[-1]
-        assert f"| {standard} % | {whole} of 30" in table and f"| {finer} % |" in table
+    form = r"(\d+) parameters, ([a-z ]+) (default|older) ([\d.]+) % (\d+) (–|[\d.]+ %)"
+    rows = re.findall(form, text)
+    assert len(rows) == 7
+    for parameters, strategy, scene, standard, whole, finer in rows:
+        older = {"single domain": EARLIER[1], "one switch": EARLIER[2]}
+        table = fresh.report(NOW if scene == "default" else older[strategy])
+        part = table.split(f"{parameters}d:")[1].split("\n\n")[1].splitlines()
+        [row] = [line for line in part if line.startswith(f"| {SHORT[strategy]} |")]
+        assert f"| {standard} % | {whole} of 30" in row
+        assert finer == "–" or f"| {finer} |" in row
+
+
+def test_the_presets_loss_is_that_of_the_winners():
+    """The loss at `reference` that the pages of results and accuracy state."""
+    row = fresh.report(NOW).split("23d:")[1].splitlines()[-1]
+    [loss] = re.findall(r"-(\d\.\d) \[-(\d\.\d), -(\d\.\d)\]", row)
+    texts = [words((ROOT / "docs" / f"{n}.md").read_text("utf-8")) for n in ("results", "accuracy")]
+    assert f"lose {loss[0]} points [{loss[2]}, {loss[1]}]" in texts[0]
+    assert f"keep {loss[0]} points less there than at `standard` [{loss[2]}, {loss[1]}]" in texts[1]
+
+
+def test_the_landscape_s_grasp_types_are_those_of_the_data():
+    grid, types = (study.load(NOW, name)[0] for name in ("landscape", "types"))
+    assert between(NOTE, "types") == grasp_types.describe(grid, types)
+    tilt = np.degrees(types["tilt"][types["type"] == 1])  # of the wrap
+    cuboid, cylinder = (100 * float((tilt[:, k] > 60).mean()) for k in (0, 1))
+    text = words((ROOT / "docs" / "results.md").read_text(encoding="utf-8"))
+    said = f"{cuboid:.0f} % of these designs turn the cuboid by more than 60°, {cylinder:.0f} %"
+    assert said in text
 
 
 def test_the_default_scene_s_budget_is_that_of_the_data():
     page = (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8")
     found = json.loads((DATA / "budget.json").read_text())
-    assert between(page, "budget") == Budget(found).tables()["budget"]
+    for mark, table in Budget(found).tables().items():
+        assert between(page, mark) == table
     mine = commits(found) | commits(json.loads((NOW / "23d.json").read_text()))
     assert len({c[:7] for c in mine}) == 1, mine
+
+
+def test_the_calibration_page_states_what_its_last_wave_has():
+    """The sets that today's contacts leave, and that the default scene lies among them."""
+    folder = DATA / "calibration"
+    [first, now] = files.read_scores([folder / f"{n}_scores.npz" for n in ("gpu_hull", "palm")])
+    assert now.notes["wave"]["commit"] == json.loads((NOW / "2d.json").read_text())["commit"]
+    place = {row.tobytes(): k for k, row in enumerate(first.data["units"])}
+    before = np.array([place[row.tobytes()] for row in now.data["units"]])
+    was, left = first.plausible[before], now.plausible
+    text = words((ROOT / "docs" / "calibration.md").read_text(encoding="utf-8"))
+    assert f"the {was.sum()} sets and {(~was).sum()} of the others" in text
+    assert f"{left.sum()} of the {left.size} are, {(was & left).sum()} of them from the" in text
+    out = (now.data["distances"] > sets.CUTOFF)[was & ~left].sum(0)
+    of = dict(zip([t.name for t in score.TARGETS], out, strict=True))
+    lost = f"Of the {(was & ~left).sum()} that are lost {of['two regions']} lose the second region"
+    assert f"{lost}, {of['420 simulations']} the speed, {of['single is poor']} the poor" in text
+    worst = now.data["distances"].max(1)
+    [near] = np.flatnonzero(before == 290)  # the default scene has round numbers near this set
+    assert f"{worst[near]:.1f} standard deviations from the worst" in text
+    assert (worst < worst[near]).sum() == 1 and "one set lies nearer" in text
+    values = sets.values(now.data["units"][left])
+    low, high = ({n: np.quantile(v, q) for n, v in values.items()} for q in (0.05, 0.95))
+    assert all(low[n] <= value <= high[n] for n, value in SCENE.items())
+    assert not score.implausibility(itself.measured(NOW)).any() and "meets every target" in text
+
+
+def test_the_calibration_note_s_tables_are_those_of_the_data(tmp_path):
+    note = (ROOT / "docs" / "notes" / "calibration.md").read_text(encoding="utf-8")
+    made = calibration.make(DATA / "calibration", tmp_path, experiments=NOW)
+    assert between(note, "calibration") == made

@@ -34,8 +34,6 @@ CHANCE, NUMERICS, MODELS = "chance", "numerics", "models"
 COLORS = {CHANCE: "tab:gray", NUMERICS: "tab:blue", MODELS: "tab:orange"}
 CHANGES = (
     Change("object moved by a micrometre, `standard`", "standard", "standard, moved", CHANCE),
-    Change("the same, `fast`", "fast", "fast, moved", CHANCE),
-    Change("the same, `fine`", "fine", "fine, moved", CHANCE),
     Change("the same, the truth", "truth", "truth, moved", CHANCE),
     Change("time step of 5 ms", "standard", "5 ms", NUMERICS),
     Change("time step of 2 ms", "standard", "2 ms", NUMERICS),
@@ -106,7 +104,8 @@ def presets_table(budget: Budget) -> list[list[str]]:
     head = ["setting", "success, points from the truth", "verdicts that flip", "rank correlation"]
     rows = [[*head, "flips by a micrometre", "grasps/s, one H100"]]
     rows += [budget.row(name, f"`{name}`") for name in PRESETS]
-    return rows + [budget.row(n, words) for n, words in CANDIDATES.items() if n in budget.costs]
+    rows += [budget.row(n, words) for n, words in CANDIDATES.items() if n in budget.costs]
+    return rows if budget.rates else [row[:-1] for row in rows]
 
 
 def budget_table(budget: Budget) -> list[list[str]]:
@@ -145,7 +144,7 @@ def draw(budget: Budget, path: Path) -> Path:
     words = [c.words.replace("`", "") for c, _ in found]
     axes.set_yticks([-k for k in range(len(found))], words, fontsize=8)
     handles = [Patch(color=color, alpha=0.8) for color in COLORS.values()]
-    axes.legend(handles, list(COLORS), frameon=False, fontsize=8, loc="lower right")
+    axes.legend(handles, list(COLORS), frameon=False, fontsize=8, loc="upper right")
     axes.set(xlabel="verdicts of late designs that flip [%]", xlim=(0, None))
     return figures.save(figure, path)
 

@@ -86,6 +86,7 @@ def parse() -> argparse.Namespace:
     report.add_argument("--data", type=Path, default=Path("docs/data/calibration"))
     report.add_argument("--figures", type=Path, default=Path("docs/figures"))
     report.add_argument("--page", type=Path)
+    report.add_argument("--experiments", type=Path, help="those of the default scene, beside them")
     return parser.parse_args()
 
 
@@ -123,6 +124,7 @@ def build(args: argparse.Namespace) -> tuple[Wave, dict[str, object]]:
     effects = the_scene.effects
     fidelity = f"{effects.surface}, {the_scene.discretization.links} links"
     fidelity += ", contact between fingers" if effects.finger_finger else ""
+    fidelity += ", contact with the palm" if effects.finger_palm else ""
     print(f"{len(units)} sets: {text}; {fidelity}", flush=True)
     try:
         wave = Wave(
@@ -225,7 +227,7 @@ def main() -> int:
         sys.exit(f"error: {error.name} is missing: pip install 'codesign-jax[study]'")
     if args.command == "compare":
         return compare(args)
-    print(report.make(args.data, args.figures, args.page))
+    print(report.make(args.data, args.figures, args.page, args.experiments))
     return 0
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from codesign_jax.scene import InputError
-from scripts.calibration import figures, files, score
+from scripts.calibration import figures, files, itself, score
 from scripts.calibration.files import Scored
 from scripts.shared import sets
 from scripts.shared.tables import fill
@@ -29,7 +29,9 @@ SHOWN = 40
 """Number of best sets that the page shows where too few are left."""
 
 
-def make(data: Path, pictures: Path, page: Path | None = None) -> str:
+def make(
+    data: Path, pictures: Path, page: Path | None = None, experiments: Path | None = None
+) -> str:
     """Draws the figures of all scored waves and writes the tables.
 
     Waves of one fidelity belong together; the largest such group is the page's subject, the others
@@ -39,6 +41,7 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
       data: Folder of the scores.
       pictures: Folder of the figures.
       page: Markdown page whose text between the marks is replaced; None for none.
+      experiments: Folder of the default scene's own experiments; None for none.
 
     Returns:
       The tables in Markdown.
@@ -64,6 +67,8 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
         for other in waves
         if other.fidelity != wave.fidelity and len(_common(wave, other)[0]) > FEW
     ]
+    if experiments:
+        parts.append(f"The default scene by its own experiments:\n\n{itself.table(experiments)}")
     text = "\n\n".join(parts)
     if page:
         fill(page, text, "calibration")

@@ -24,7 +24,10 @@ STATEMENTS = (
     "{concurrent_before:,.0f} simulations, one switch after {one_before:,.0f}, a single domain "
     "after {single_before:,.0f}",
     "in a single domain {single_runs_before:.0f}",
-    "from {one_2d:.0f} % with two parameters",
+    "{concurrent_runs:.0f} of 30 runs succeed",
+    "from {one_2d:.0f} % with two parameters to {one_runs_before:.0f} of 30 runs",
+    "{first:.1f} % of the plane, (b) {second:.1f} %",
+    "only (a) has designs below 0.1",
 )
 
 
@@ -37,19 +40,16 @@ def figures(now: Path, earlier: list[Path]) -> dict[str, float | str]:
     """The numbers that the page states.
 
     Args:
-      now: Folder of the default scene's experiments; success in 2D is the earlier scene's as long
-        as these have no final test.
-      earlier: Folders of the earlier scene's.
+      now: Folder of the default scene's experiments and landscape.
+      earlier: Folders of the earlier scene's experiments with 23 parameters.
     """
     two, many = (study.load_study(now, name) for name in ("2d", "23d"))
     assert two is not None and many is not None
     found: dict[str, float | str] = {}
-    tested = two if two.tested else study.load_study(earlier[0], "2d")
-    assert tested is not None
     for name, strategy in (("single", "single"), ("one", "switch-1"), ("two", "switch-2")):
-        found |= _success(tested, f"{name}_2d", strategy)
-    found |= _success(tested, "both_2d", "concurrent")
-    found["level"] = statistics.trend(1.0 * tested.success()[2:])
+        found |= _success(two, f"{name}_2d", strategy)
+    found |= _success(two, "both_2d", "concurrent")
+    found["level"] = statistics.trend(1.0 * two.success()[2:])
     medians = [f"{_median(two, s).value:,.0f}" for s in SWITCHES]
     found["medians"] = ", ".join(medians[:-1]) + f" and {medians[-1]}"
     for name, one in (("2d", two), ("23d", many)):
@@ -62,6 +62,8 @@ def figures(now: Path, earlier: list[Path]) -> dict[str, float | str]:
     found |= {"growth_mean": float(a.mean() / b.mean())}
     place = many.strategies.index("concurrent")
     found["converged_23d"] = float(np.isfinite(many.convergence()[place]).sum())
+    found["concurrent_runs"] = float(many.success()[place].sum())
+    found |= _landscape(now)
     names = ["single", "switch-1", "concurrent"]
     [before] = study.joined([s for f in earlier if (s := study.load_study(f, "23d"))], names)
     for name, strategy in (("single", "single"), ("one", "switch-1"), ("concurrent", "concurrent")):
@@ -83,6 +85,21 @@ def _simulations(one: Study, strategy: str) -> np.ndarray:
 
 def _median(one: Study, strategy: str) -> Interval:
     return statistics.median(_simulations(one, strategy))
+
+
+def _landscape(now: Path) -> dict[str, float | str]:
+    """Shares of the plane of the two regions below a cost of 0.5, the one with short fingers first.
+
+    Raises:
+      ValueError: If the landscape has another number of regions, or below a cost of 0.1 other ones
+        than that with short fingers.
+    """
+    loaded = study.load(now, "landscape")
+    assert loaded is not None
+    (short, long), (best,) = (study.regions(loaded[0], cost) for cost in (0.5, 0.1))
+    if not (best.points <= short.points).all():
+        raise ValueError("the best designs are not those with short fingers")
+    return {"first": 100 * short.share, "second": 100 * long.share}
 
 
 def _success(one: Study, name: str, strategy: str) -> dict[str, float | str]:

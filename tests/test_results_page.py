@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 
-from scripts.accuracy.budget_report import Budget
+from scripts.accuracy.budget_report import CHANGES, PRESETS, Budget
 from scripts.calibration import files, itself, score
 from scripts.calibration import report as calibration
 from scripts.experiments import fresh, grasp_types, report, stated, study
@@ -77,12 +77,14 @@ def test_the_page_states_what_the_data_have():
 
 
 def test_the_presets_loss_is_that_of_the_winners():
-    """The loss at `reference` that the pages of results and accuracy state."""
+    """The loss at `reference` that pages state."""
     row = fresh.report(NOW).split("23d:")[1].splitlines()[-1]
     [loss] = re.findall(r"-(\d\.\d) \[-(\d\.\d), -(\d\.\d)\]", row)
-    texts = [words((ROOT / "docs" / f"{n}.md").read_text("utf-8")) for n in ("results", "accuracy")]
+    names = ("results", "accuracy", "stability")
+    texts = [words((ROOT / "docs" / f"{n}.md").read_text("utf-8")) for n in names]
     assert f"lose {loss[0]} points [{loss[2]}, {loss[1]}]" in texts[0]
     assert f"keep {loss[0]} points less there than at `standard` [{loss[2]}, {loss[1]}]" in texts[1]
+    assert f"concurrent runs with 23 parameters lose {loss[0]} points" in texts[2]
 
 
 def test_the_landscape_s_grasp_types_are_those_of_the_data():
@@ -100,6 +102,24 @@ def test_the_default_scene_s_budget_is_that_of_the_data():
     found = json.loads((DATA / "budget.json").read_text())
     for mark, table in Budget(found).tables().items():
         assert between(page, mark) == table
+    made, text = Budget(found), words(page)
+    flips = {c: made.compared(c.to, c.of) for c in CHANGES}
+    points = {c.to: 100 * r["flipped"].value for c, r in flips.items() if r}
+    numerics = [points[c.to] for c in CHANGES if c.kind == "numerics" and c.to in points]
+    touch = [points[f"fingers pass {what}"] for what in ("each other", "the palm")]
+    assert f"Numerics flip {min(numerics):.0f} to {max(numerics):.0f} %" in text
+    assert f"contacts of fingers {min(touch):.0f} to {max(touch):.0f} %" in text
+    lost = [-100 * r["success_difference"].value for c, r in flips.items() if c.to == "constants"]
+    said = f"flips {points['constants']:.0f} % of the verdicts and costs {lost[0]:.0f} points"
+    assert f"{said} of success, the bending law {points['neo-Hookean']:.0f} %" in text
+    chance = [made.compared(f"{n}, moved", n)["flipped"].value for n in ("truth", "fast", "fine")]
+    assert f"flips {chance[0]:.1%} of the truth's own".replace("%", " %") in text
+    assert {f"{c:.1%}" for c in chance[1:]} == {"4.8%"} and "4.8 % of those of `fast`" in text
+    against = {n: made.compared(n, "truth")["success_difference"] for n in PRESETS}
+    worst = max(abs(100 * r.value) for r in against.values())
+    mine = abs(100 * against["standard"].value)
+    assert worst <= 2.5 and f"by 2.5 points at most and by {mine:.1f} at `standard`" in text
+    assert [n for n, r in against.items() if r.low > 0 or r.high < 0] == ["fast"]
     mine = commits(found) | commits(json.loads((NOW / "23d.json").read_text()))
     assert len({c[:7] for c in mine}) == 1, mine
 
@@ -126,7 +146,15 @@ def test_the_calibration_page_states_what_its_last_wave_has():
     values = sets.values(now.data["units"][left])
     low, high = ({n: np.quantile(v, q) for n, v in values.items()} for q in (0.05, 0.95))
     assert all(low[n] <= value <= high[n] for n, value in SCENE.items())
+    own = {name: float(value[0]) for name, value in itself.measured(NOW).items()}
     assert not score.implausibility(itself.measured(NOW)).any() and "meets every target" in text
+    speed = [own[f"simulations concurrent, {kind}, own"] for kind in ("first", "stays")]
+    said = (
+        f"{speed[0]:.0f} simulations until the mean cost is first below 1 and {speed[1]:.0f} until"
+    )
+    assert said in text and f"a cost of {own['saddle']:g} separates" in text
+    alone, both = (100 * own[f"success {s}, own"] for s in ("single", "concurrent"))
+    assert f"success in {alone:.0f} % of the runs with a single domain and {both:.0f} %" in text
 
 
 def test_the_calibration_note_s_tables_are_those_of_the_data(tmp_path):

@@ -111,7 +111,8 @@ def test_the_default_scene_s_budget_is_that_of_the_data():
     assert f"contacts of fingers {min(touch):.0f} to {max(touch):.0f} %" in text
     lost = [-100 * r["success_difference"].value for c, r in flips.items() if c.to == "constants"]
     said = f"flips {points['constants']:.0f} % of the verdicts and costs {lost[0]:.0f} points"
-    assert f"{said} of success, the bending law {points['neo-Hookean']:.0f} %" in text
+    laws = f"the bending law {points['neo-Hookean']:.0f} %, pressure that resists sideways bending"
+    assert f"{said} of success, {laws} {points['lateral threshold']:.0f} %" in text
     chance = [made.compared(f"{n}, moved", n)["flipped"].value for n in ("truth", "fast", "fine")]
     assert f"flips {chance[0]:.1%} of the truth's own".replace("%", " %") in text
     assert {f"{c:.1%}" for c in chance[1:]} == {"4.8%"} and "4.8 % of those of `fast`" in text

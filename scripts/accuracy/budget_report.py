@@ -35,6 +35,7 @@ COLORS = {CHANCE: "tab:gray", NUMERICS: "tab:blue", MODELS: "tab:orange"}
 CHANGES = (
     Change("object moved by a micrometre, `standard`", "standard", "standard, moved", CHANCE),
     Change("the same, the truth", "truth", "truth, moved", CHANCE),
+    Change("CPUs in place of a GPU, `standard`", "standard", "standard, on CPUs", CHANCE),
     Change("time step of 5 ms", "standard", "5 ms", NUMERICS),
     Change("time step of 2 ms", "standard", "2 ms", NUMERICS),
     Change("20 links", "standard", "20 links", NUMERICS),
@@ -46,8 +47,8 @@ CHANGES = (
     Change("the truth refined again", "truth", "finer", NUMERICS),
     Change("the palm acts once a finger is in it", "standard", "palm once inside", NUMERICS),
     Change("fingers creep on one another", "standard", "fingers creep", MODELS),
-    Change("soft touch", "standard", "soft touch", MODELS),
-    Change("pressure resists sideways bending", "standard", "lateral threshold", MODELS),
+    Change("soft touch", "standard, on CPUs", "soft touch", MODELS),
+    Change("pressure resists sideways bending", "standard, on CPUs", "lateral threshold", MODELS),
     Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
     Change("spheres in place of the skin", "standard", "spheres", MODELS),
     Change("fingers pass one another", "standard", "fingers pass each other", MODELS),

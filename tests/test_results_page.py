@@ -2,6 +2,7 @@
 
 import json
 import re
+from typing import Any
 
 import numpy as np
 
@@ -88,7 +89,8 @@ def test_the_presets_loss_is_that_of_the_winners():
 
 
 def test_the_landscape_s_grasp_types_are_those_of_the_data():
-    grid, types = (study.load(NOW, name)[0] for name in ("landscape", "types"))
+    loaded = [study.load(NOW, name) for name in ("landscape", "types")]
+    grid, types = (found[0] for found in loaded if found)
     assert between(NOTE, "types") == grasp_types.describe(grid, types)
     tilt = np.degrees(types["tilt"][types["type"] == 1])  # of the wrap
     cuboid, cylinder = (100 * float((tilt[:, k] > 60).mean()) for k in (0, 1))
@@ -103,20 +105,26 @@ def test_the_default_scene_s_budget_is_that_of_the_data():
     for mark, table in Budget(found).tables().items():
         assert between(page, mark) == table
     made, text = Budget(found), words(page)
+
+    def compared(of: str, to: str) -> dict[str, Any]:
+        both = made.compared(of, to)
+        assert both is not None
+        return both
+
     flips = {c: made.compared(c.to, c.of) for c in CHANGES}
     points = {c.to: 100 * r["flipped"].value for c, r in flips.items() if r}
     numerics = [points[c.to] for c in CHANGES if c.kind == "numerics" and c.to in points]
     touch = [points[f"fingers pass {what}"] for what in ("each other", "the palm")]
     assert f"Numerics flip {min(numerics):.0f} to {max(numerics):.0f} %" in text
     assert f"contacts of fingers {min(touch):.0f} to {max(touch):.0f} %" in text
-    lost = [-100 * r["success_difference"].value for c, r in flips.items() if c.to == "constants"]
-    said = f"flips {points['constants']:.0f} % of the verdicts and costs {lost[0]:.0f} points"
+    lost = -100 * compared("constants", "standard")["success_difference"].value
+    said = f"flips {points['constants']:.0f} % of the verdicts and costs {lost:.0f} points"
     laws = f"the bending law {points['neo-Hookean']:.0f} %, pressure that resists sideways bending"
     assert f"{said} of success, {laws} {points['lateral threshold']:.0f} %" in text
-    chance = [made.compared(f"{n}, moved", n)["flipped"].value for n in ("truth", "fast", "fine")]
+    chance = [compared(f"{n}, moved", n)["flipped"].value for n in ("truth", "fast", "fine")]
     assert f"flips {chance[0]:.1%} of the truth's own".replace("%", " %") in text
     assert {f"{c:.1%}" for c in chance[1:]} == {"4.8%"} and "4.8 % of those of `fast`" in text
-    against = {n: made.compared(n, "truth")["success_difference"] for n in PRESETS}
+    against = {n: compared(n, "truth")["success_difference"] for n in PRESETS}
     worst = max(abs(100 * r.value) for r in against.values())
     mine = abs(100 * against["standard"].value)
     assert worst <= 2.5 and f"by 2.5 points at most and by {mine:.1f} at `standard`" in text

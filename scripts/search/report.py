@@ -146,7 +146,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> Path:
     for place, (kind, own) in enumerate(shown.items()):
         kept, share = (figure.add_subplot(len(shown), 2, 2 * place + i) for i in (1, 2))
         for number, row in enumerate(own):
-            name, beside = row["optimizer"].split(":")[0], 1.04 ** (number - len(own) // 2)
+            name, beside = row["optimizer"].split(":")[0], 1.02 ** (number - len(own) // 2)
             at, found = beside * np.array(row["grasps"]), [np.array(k) for k in row["kept"]]
             color = f"C{NAMES.index(name)}" if name in NAMES else None
             style: dict[str, Any] = {"fmt": "o-", "ms": 4, "lw": 1.4, "elinewidth": 1, "capsize": 3}

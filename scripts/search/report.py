@@ -130,40 +130,62 @@ def variant(name: str) -> bool:
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> Path:
-    """Kept share of the recommended design against grasps: medians and 25 to 75 % of the seeds.
+    """What recommended designs keep, and how many seeds' designs keep `RELIABLE`, over grasps.
 
-    Variants of an optimiser, but for its sizes, are in the table alone.  Marks of optimisers at the
-    same number of grasps stand a little beside one another.
+    Variants of an optimiser, but for its sizes, are in the table alone, as are questions that one
+    optimiser was asked, or at one number of grasps.  Marks of optimisers at the same number of
+    grasps stand a little beside one another.
     """
     rows = sorted((row for row in rows if not variant(row["optimizer"])), key=order)
-    every = [(row["preset"], row.get("objects") or "three objects") for row in rows]
-    points = dict.fromkeys(every, 0)  # in the table's order
-    for kind, row in zip(every, rows, strict=True):
-        points[kind] += len(row["grasps"])
-    kinds = [kind for kind, count in points.items() if count > 1]  # a lone point shows nothing
-    figure = figures.new(4.6 * len(kinds), 3.6)
-    for place, kind in enumerate(kinds):
-        axes = figure.add_subplot(1, len(kinds), place + 1)
-        shown = [row for own, row in zip(every, rows, strict=True) if own == kind]
-        for number, row in enumerate(shown):
-            name, beside = row["optimizer"].split(":")[0], 1.03 ** (number - len(shown) // 2)
-            at = beside * np.array(row["grasps"])
-            low, middle, high = np.quantile(np.array(row["kept"]), [0.25, 0.5, 0.75], axis=1)
+    kinds: dict[tuple[str, str], list[dict[str, Any]]] = {}  # in the table's order
+    for row in rows:
+        kinds.setdefault((row["preset"], row.get("objects") or "three objects"), []).append(row)
+    shown = {k: v for k, v in kinds.items() if len(v) > 1 and max(len(r["grasps"]) for r in v) > 1}
+    shown = shown or kinds
+    figure = figures.new(9.2, 3.8 * len(shown))
+    for place, (kind, own) in enumerate(shown.items()):
+        kept, share = (figure.add_subplot(len(shown), 2, 2 * place + i) for i in (1, 2))
+        for number, row in enumerate(own):
+            name, beside = row["optimizer"].split(":")[0], 1.02 ** (number - len(own) // 2)
+            at, found = beside * np.array(row["grasps"]), [np.array(k) for k in row["kept"]]
             color = f"C{NAMES.index(name)}" if name in NAMES else None
-            (line,) = axes.plot(at, middle, "o-", ms=4, color=color, label=name)
-            away = [middle - low, high - middle]
-            axes.errorbar(at, middle, away, color=line.get_color(), lw=1, capsize=3)
-        axes.axhline(RELIABLE, color="0.6", lw=0.8)
+            style: dict[str, Any] = {"fmt": "o-", "ms": 4, "lw": 1.4, "elinewidth": 1, "capsize": 3}
+            low, middle, high = np.array([np.quantile(k, [0.25, 0.5, 0.75]) for k in found]).T
+            seeds = " to ".join(str(n) for n in sorted({k.size for k in found}))
+            style |= {"color": color, "label": f"{name}, {seeds} seeds"}
+            kept.errorbar(at, middle, [middle - low, high - middle], **style)
+            counts = [(int((k >= RELIABLE).sum()), k.size) for k in found]
+            good, ends = np.array([g / n for g, n in counts]), [wilson(*c) for c in counts]
+            away = [good - [e.low for e in ends], [e.high for e in ends] - good]
+            share.errorbar(at, good, np.maximum(away, 0), **style)
+        kept.axhline(RELIABLE, color="0.6", lw=0.8)
+        # Shares near 1 are what differs: even steps are equal ratios of what is lost.
+        kept.set_yscale("function", functions=(_stretched, _unstretched))
+        kept.yaxis.set_major_locator(ticker.FixedLocator([0, 0.5, 0.8, 0.9, 0.95, 0.98, 1]))
+        kept.yaxis.set_minor_locator(ticker.NullLocator())
+        kept.yaxis.set_major_formatter(ticker.PercentFormatter(1))
+        share.yaxis.set_major_formatter(ticker.PercentFormatter(1))
         title = f"{kind[0].removesuffix('d')} parameters, {kind[1]}"
-        axes.set(xscale="log", xlabel="grasps of a seed, all counted", title=title, ylim=(0, 1.01))
-        axes.set_ylabel("share of fresh grasps kept")
-        ticks = sorted({g for row in shown for g in row["grasps"]})
-        axes.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
-        axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter("{x:,.0f}")
-        axes.xaxis.set_minor_formatter(ticker.NullFormatter())
-        axes.legend(fontsize=7, loc="lower right")
+        kept.set(title=f"{title}: fresh grasps kept,\nmedian and middle half of the seeds")
+        share.set(title=f"seeds whose design keeps {100 * RELIABLE:.0f} %,\nwith 95 % intervals")
+        ticks = sorted({g for row in own for g in row["grasps"]})
+        for axes in (kept, share):
+            axes.set(xscale="log", xlabel="grasps of a seed, all counted", ylim=(0, 1.002))
+            axes.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
+            axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:,.0f}")
+            axes.xaxis.set_minor_formatter(ticker.NullFormatter())
+            axes.grid(axis="y", lw=0.3)
+        kept.legend(fontsize=7, loc="lower right")
     return figures.save(figure, path)
+
+
+def _stretched(share: np.ndarray) -> np.ndarray:
+    return -np.log(1.01 - np.minimum(share, 1.005))
+
+
+def _unstretched(height: np.ndarray) -> np.ndarray:
+    return 1.01 - np.exp(-height)
 
 
 def main(arguments: list[str] | None = None) -> int:

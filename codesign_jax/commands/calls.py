@@ -178,7 +178,7 @@ class Calls:
         key = " ".join(map(str, (outcomes.key(*how), size, *trials.stream)))
         self._trials, self._size, self._part = trials, size, archives.Store(part, key)
         self.refused = self._part.refused
-        kept = [Outcome._make(map(arrays.get, Outcome._fields)) for arrays in self._part.found]
+        kept = [Outcome(**arrays) for arrays in self._part.found]  # a part has no fields of None
         self._kept = joined(kept) if kept else None
         self.found = sum(len(outcome.cost) for outcome in kept)
         self._next, self._seconds = 0, []

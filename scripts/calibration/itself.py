@@ -6,6 +6,7 @@ import numpy as np
 
 from scripts.calibration import score, summary
 from scripts.experiments import study
+from scripts.shared import tables
 
 STRATEGIES = ("single", "switch-4", "concurrent")
 """Those whose success and speed the targets ask for."""
@@ -60,8 +61,7 @@ def table(folder: Path) -> str:
     found = measured(folder)
     [distances] = score.implausibility(found)
     numbers = {name: float(value[0]) for name, value in found.items()}
-    lines = ["| target | the default scene | distance, standard deviations |", "|---|---|---|"]
+    rows = [["target", "the default scene", "distance, standard deviations"]]
     for target, distance in zip(score.TARGETS, distances, strict=True):
-        text = SAYS[target.name].format(**numbers)
-        lines.append(f"| {target.name} | {text} | {distance:.1f} |")
-    return "\n".join(lines)
+        rows.append([target.name, SAYS[target.name].format(**numbers), f"{distance:.1f}"])
+    return tables.markdown(rows)

@@ -88,8 +88,8 @@ def in_fingers(scene: Scene, params: Params, at: Poses) -> tuple[np.ndarray, np.
       at: Its poses.
 
     Returns:
-      The depth [m], and the largest one as a share of the other finger's section, of the smaller of
-      its width and height, both of shape (state,); 0 where no finger is in another.
+      The depth [m], and the largest quotient of a depth and the smaller side (width or height) of
+      the section that it is in, both of shape (state,); 0 where no finger is in another.
     """
     lay = model.layout(scene)
     angle = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
@@ -105,8 +105,8 @@ def in_fingers(scene: Scene, params: Params, at: Poses) -> tuple[np.ndarray, np.
             [ring + np.outer(part * span, [1, 0, 0])[:, None] for part in ALONG], 1
         )
         place = at.place[:, bodies, None] + local @ at.turn[:, bodies].swapaxes(-1, -2)
-        face = np.concatenate([unit * half * inner for inner in INNER]) + [0, half[1]]
-        tip = np.c_[np.full(len(face), span[-1]), face] @ at.turn[:, bodies[-1]].swapaxes(-1, -2)
+        inner = np.concatenate([unit * half * part for part in INNER]) + [0, half[1]]
+        tip = np.c_[np.full(len(inner), span[-1]), inner] @ at.turn[:, bodies[-1]].swapaxes(-1, -2)
         tip += at.place[:, bodies[-1:]]
         points.append(np.concatenate([place.reshape(len(place), -1, 3), tip], 1))
         sizes.append((span, *half))
@@ -122,7 +122,7 @@ def in_fingers(scene: Scene, params: Params, at: Poses) -> tuple[np.ndarray, np.
         sides = np.array([a, b])[:, None, None, None]
         slope = np.sqrt(((units / phi) ** 6 / sides**2).sum(0))
         inside = (x >= 0) & (x <= span) & (phi < 1)
-        face = np.where(np.arange(lay.links) == lay.links - 1, span - x, np.inf)
-        depth = np.where(inside, np.minimum((1 - phi) / slope, face), 0.0).max((1, 2))
+        to_face = np.where(np.arange(lay.links) == lay.links - 1, span - x, np.inf)
+        depth = np.where(inside, np.minimum((1 - phi) / slope, to_face), 0.0).max((1, 2))
         worst = np.maximum(worst, [depth, depth / (2 * min(a, b))])
     return worst[0], worst[1]

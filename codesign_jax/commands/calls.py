@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -178,7 +178,8 @@ class Calls:
         key = " ".join(map(str, (outcomes.key(*how), size, *trials.stream)))
         self._trials, self._size, self._part = trials, size, archives.Store(part, key)
         self.refused = self._part.refused
-        kept = [Outcome(**arrays) for arrays in self._part.found]  # a part has no fields of None
+        found: list[dict[str, Any]] = [*self._part.found]
+        kept = [Outcome(**arrays) for arrays in found]  # a part has no fields that are None
         self._kept = joined(kept) if kept else None
         self.found = sum(len(outcome.cost) for outcome in kept)
         self._next, self._seconds = 0, []

@@ -200,6 +200,24 @@ def test_the_particles_of_the_default_are_what_was_simulated_as_particle_0():
     np.testing.assert_array_equal(with_random.particles, random[order[:PARTICLES]])
 
 
+def test_with_few_parameters_the_final_test_takes_the_best_screened_designs_too():
+    """They stay in rows 3 to 5, of any size of a run, while the strategy goes on."""
+    few = Screened(optimize.Space(LOW[:2], HIGH[:2]))
+    assert (few.finalists, Screened(SPACE).finalists) == (6, 3)
+
+    def tops(population):
+        return ((population - LOW[:2]) ** 2).sum(-1)
+
+    for particles in (13, 5):
+        state = few.init(jax.random.key(0), SEED[:2], particles)
+        screened_state, *_ = run(few, state, OPEN[:5, :2], tops)
+        for episodes in (1, 6):
+            later, _, infos = run(few, screened_state, OPEN[:episodes, :2], tops)
+            best = np.asarray(screened_state.particles)[: particles - 3][:3]
+            np.testing.assert_array_equal(later.particles[3:6], best)
+            assert (np.asarray(infos[-1].ancestors)[3:6] == -1).all()
+
+
 def test_an_optimiser_of_the_package_needs_no_evosax(monkeypatch):
     """A second own one is built by its entry, without evosax; NAMES keeps the two kinds apart."""
     monkeypatch.setattr(names, "OWN", {**names.OWN, "wide": lambda s: ParticleFilter(s, sigma=0.5)})

@@ -200,10 +200,10 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     space = design_space(scene.hand, settings.preset)
     batch = settings.particles * settings.trials
     seed = batch if runs.needs_poor_seed(plan) else 0
-    print(f"grasps: {settings.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
+    print(f"grasps: {plan.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
     if tested := settings.test_rounds * settings.trials:
         whole = f", in whole rounds of {settings.trials}" if tested != settings.test_trials else ""
-        many, few = settings.finalists * tested, settings.finalists
+        many, few = plan.test_grasps, plan.finalists
         print(f"final test: {many} of these grasps, {tested} trials of {few} particles{whole}")
     if count > 1:
         how = f"{options.jobs} at a time" if options.jobs else "in one batch"
@@ -215,7 +215,7 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     together = 1 if options.jobs else count
     work = rates.work(scene, settings, runs=together, devices=options.devices)
-    parts = [TimedPart("", work, count * (settings.grasps + seed))]
+    parts = [TimedPart("", work, count * (plan.grasps + seed))]
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
         parts.append(reference.part(scene, settings, trials, count))

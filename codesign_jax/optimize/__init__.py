@@ -25,7 +25,7 @@ from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Info, Optimizer, State
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
 from codesign_jax.optimize.schedule import schedule
-from codesign_jax.optimize.screened import FINALISTS, Screened
+from codesign_jax.optimize.screened import Screened
 from codesign_jax.optimize.seeding import (
     NoSeed,
     answer,
@@ -37,7 +37,6 @@ from codesign_jax.optimize.seeding import (
 __all__ = [
     "DEFAULT",
     "EVOSAX",
-    "FINALISTS",
     "MAX_PARTICLES",
     "NAMES",
     "PAPER",

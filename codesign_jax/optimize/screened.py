@@ -4,7 +4,9 @@ Grasps are noisy: a design that loses none of three objects may lose one in ten.
 particle is believed.  The mean of an evolution strategy moves where particles keep their objects on
 the whole; the average of these means over the episodes, recent ones weighing more, has less noise
 still, and no trial chose it.  Each average is simulated as particle 0 of the next episode, and the
-final test takes the newest one and two earlier ones.
+final test takes the newest one and two earlier ones.  Where parameters are few, random designs come
+close to the best, and a strategy's mean can stay at a poor one: there the final test takes the best
+random designs as well.
 
 The strategy is OpenAI's.  Its draws come in mirrored pairs and designs of equal cost have equal
 weight, so that its mean stays where it is while all particles keep all of their objects; that of
@@ -48,6 +50,8 @@ LEAST = 3
 """Fewest particles: the average, and two for the strategy to rank."""
 FINALISTS = 3
 """Averages that the final test takes."""
+STARTS, FEW = 3, 4
+"""Screened designs that it takes as well, and the most parameters with which it does."""
 STRATEGIES = {"open-es": OPEN_SIGMA, "cma-es": 0.2}
 """The strategies, and the first standard deviation of each as a fraction of the parameter range."""
 
@@ -62,14 +66,14 @@ class Screened:
     more than they do.  Later ones simulate the average so far, as particle 0, and draws of the
     strategy.  Particles 1 and 2 of the state are the averages after a third and two thirds of
     these, at most as many ago as there are particles: a guard against a mean that has left a good
-    place.  All others are the newest average, and the final test takes the first three alone: so
-    few are compared in many trials.  When a schedule opens other parameters, strategy and average
-    start anew at particle 0.
+    place.  With up to `FEW` parameters particles 3 to 5 are the best screened designs.  All others
+    are the newest average, and the final test takes these first three or six alone: so few are
+    compared in many trials.  When a schedule opens other parameters, strategy and average start
+    anew at particle 0.
 
     Attributes:
       keeps_best: True: the final test counts new trials only; see `Optimizer.keeps_best`.
       screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
-      finalists: Particles of the state that the final test takes.
       space: Bounds and constraint of the parameters.
       strategy: One of `STRATEGIES`. With "open-es", whose draws come in pairs, the last one of
         an even number of particles is the strategy's mean.
@@ -83,7 +87,6 @@ class Screened:
 
     keeps_best = True
     screens = True
-    finalists = FINALISTS
 
     space: Space
     strategy: str = dataclasses.field(default="open-es", metadata={"static": True})
@@ -102,6 +105,11 @@ class Screened:
             raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
         if not (min(self.screening, self.retests, self.sigma) >= 0 and self.recency >= 1):
             raise ValueError(f"need recency >= 1, screening, retests and sigma >= 0: {self}")
+
+    @property
+    def finalists(self) -> int:
+        """Particles of the state that the final test takes: averages, and screened designs."""
+        return FINALISTS + (STARTS if jnp.size(self.space.low) <= FEW else 0)
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0; see `Optimizer.init`.
@@ -169,13 +177,18 @@ class Screened:
         rows, third = jnp.arange(len(cost)), now["averaged"] // 3
         ago = jnp.where(rows < FINALISTS, jnp.array([0, 2, 1])[rows % FINALISTS] * third, 0)
         finalists = way[jnp.minimum(ago, len(cost) - 1)]
+        # Screened designs stand best first until the strategy begins.
+        starts = (rows >= FINALISTS) & (rows < self.finalists)
+        begins = state.episode == self.screening + self.retests
+        screened_rows = jnp.where(begins, jnp.maximum(rows - FINALISTS, 0), rows)
+        finalists = jnp.where(starts[:, None], state.particles[screened_rows], finalists)
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
             "way": jnp.where(screens, state.memory["way"], way),
             "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
             "cost": jnp.where(screens, costs[best], state.memory["cost"]),
         }
         copied = jnp.where(
-            screens, jnp.where(best < len(cost), best, -1), jnp.where(ago > 0, -1, 0)
+            screens, jnp.where(best < len(cost), best, -1), jnp.where(starts | (ago > 0), -1, 0)
         )
         particles = jnp.where(screens, screened, finalists)
         next_state = State(particles, state.episode + 1, state.key, following)

@@ -4,8 +4,8 @@ The numerical modules know nothing of files; this package knows nothing of physi
 
 >>> from codesign_jax import runs
 >>> settings = runs.make_settings("2d", "concurrent", "morphology", "structured", seed=0)
->>> settings.particles, settings.trials, settings.episodes, settings.grasps  # the paper's
-(10, 6, 64, 4200)
+>>> settings.particles, settings.trials, settings.episodes, settings.test_rounds  # the paper's
+(10, 6, 64, 6)
 """
 
 from codesign_jax.runs.directory import check_folder, setting_of

@@ -77,6 +77,23 @@ class Plan(NamedTuple):
         """The design space."""
         return self.task.space
 
+    @property
+    def finalists(self) -> int:
+        """Particles that the final test simulates; see `optimize.Optimizer`."""
+        every = self.settings.particles
+        return min(every, getattr(self.optimizer, "finalists", every))
+
+    @property
+    def test_grasps(self) -> int:
+        """Grasps of the final test."""
+        return self.finalists * self.settings.trials * self.settings.test_rounds
+
+    @property
+    def grasps(self) -> int:
+        """Grasps of the episodes and the final test, without those that find the seed."""
+        own = self.settings
+        return own.episodes * own.particles * own.trials + self.test_grasps
+
 
 class RunResult(NamedTuple):
     """How a run ended.
@@ -395,7 +412,7 @@ def _finalists(plan: Plan, particles: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     They are all of them, unless the optimiser says that few differ, and so few do.
     """
-    every, most = len(particles), getattr(plan.optimizer, "finalists", len(particles))
+    every, most = len(particles), plan.finalists
     _, first, same = np.unique(particles, axis=0, return_index=True, return_inverse=True)
     if most >= every or len(first) > most:
         return particles, np.arange(every)

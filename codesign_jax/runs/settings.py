@@ -47,18 +47,6 @@ class Settings:
     cost: str = SCENE_COST
 
     @property
-    def grasps(self) -> int:
-        """Grasps of the episodes and the final test, without those that find the seed."""
-        episodes, test = self.episodes * self.particles, self.test_rounds * self.finalists
-        return self.trials * (episodes + test)
-
-    @property
-    def finalists(self) -> int:
-        """Particles that the final test simulates; see `optimize.Optimizer`."""
-        few = self.optimizer in optimize.SCREENED
-        return min(self.particles, optimize.FINALISTS) if few else self.particles
-
-    @property
     def test_rounds(self) -> int:
         """Batches of `trials` trials that the final test simulates."""
         return -(-self.test_trials // self.trials)
@@ -68,7 +56,7 @@ class Settings:
 # the optimisers that are compared with the paper's share; and those of the screened searches, by
 # docs/notes/search.md.
 _SIZES = {"2d": (10, 6, 64, 36), "": (60, 6, 128, 72)}
-_SCREENED_SIZES = {"2d": (13, 3, 22, 36), "": (25, 3, 30, 48)}
+_SCREENED_SIZES = {"2d": (13, 3, 19, 36), "": (25, 3, 30, 48)}
 
 _RANGES = {
     "particles": (1, MAX_PARTICLES),

@@ -128,8 +128,7 @@ def _group(
     """`optimize` of as many runs as fit into one process; `begun` is how to open the folders."""
     plan = next(iter(plans.values()))
     settings, many = plan.settings, len(plans) > 1
-    test = settings.finalists * settings.trials * settings.test_rounds
-    ahead = {"test": test, "after": after}
+    ahead = {"test": plan.test_grasps, "after": after}
     called = run_names({folder: own.settings for folder, own in plans.items()})
     with contextlib.ExitStack() as stack:
         total = settings.episodes
@@ -220,7 +219,7 @@ class _Together:
     def _test(self, request: Request) -> Request | None:
         """What the final test will ask for, if that is another program than an episode's."""
         settings, optimizer = self.plan.settings, self.plan.optimizer
-        few = settings.finalists
+        few = self.plan.finalists
         if settings.test_trials == 0 or few == len(request.state.particles):
             return None
         return Request(*codesign.closed(optimizer, request.state.particles[:few], self.plan.key))

@@ -211,8 +211,8 @@ def test_with_few_parameters_the_final_test_takes_the_best_screened_designs_too(
     for particles in (13, 5):
         state = few.init(jax.random.key(0), SEED[:2], particles)
         screened_state, *_ = run(few, state, OPEN[:5, :2], tops)
-        for episodes in (1, 6):
-            later, _, infos = run(few, screened_state, OPEN[:episodes, :2], tops)
+        for count in (1, 6):
+            later, _, infos = run(few, screened_state, OPEN[:count, :2], tops)
             best = np.asarray(screened_state.particles)[: particles - 3][:3]
             np.testing.assert_array_equal(later.particles[3:6], best)
             assert (np.asarray(infos[-1].ancestors)[3:6] == -1).all()

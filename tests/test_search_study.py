@@ -16,7 +16,8 @@ from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 SIZES = "particles=4,trials=2"
 
 
-def make(path, name, budget=140):
+def make(path, name):
+    budget = 176 if name == "screened-es" else 140  # its final test is larger
     the_scene, space, engine = tiny()
     case = make_case(f"{name}:{SIZES}", space, "2d")
     how = {"seeds": 3, "budget": budget, "tests": 5, "chunk": 20}
@@ -56,7 +57,7 @@ def test_seeds_are_runs_of_the_library_and_go_on(name, tmp_path):
     # All grasps are counted: those that find a poor seed, the episodes, and the test.
     before = 8 if name == "particle-filter" else 0
     assert whole.row()["grasps"][-1] == before + 8 * whole.done + whole.tested
-    assert whole.tested == (4 * study.ROUNDS if name == "particle-filter" else 3 * 36)
+    assert whole.tested == (4 * study.ROUNDS if name == "particle-filter" else 4 * 36)
 
 
 def test_what_is_recommended_was_chosen_by_fresh_trials(tmp_path):
@@ -78,9 +79,10 @@ def test_the_page_gets_a_table_and_a_figure(tmp_path):
     (tmp_path / "2d-ours.json").write_text(json.dumps(row))
     whole = row | {"optimizer": "screened-es", "preset": "23d", "first_seed": 100}
     part = whole | {"optimizer": "screened-es:tests=0", "first_seed": 102, "kept": [[0.5, 0.99]]}
+    part["grasps"] = [40]
     unlike = part | {"first_seed": 103}, part | {"preset": "2d", "first_seed": 102}
     (tmp_path / "23d-screened-es.json").write_text(json.dumps(whole))
-    (tmp_path / "23d-tests0.json").write_text(json.dumps(part | {"grasps": [40]}))
+    (tmp_path / "23d-tests0.json").write_text(json.dumps(part))
     page = tmp_path / "page.md"
     marks = ("search", "parts")
     page.write_text("".join(f"<!-- {m}:begin -->\n<!-- {m}:end -->\n" for m in marks))
@@ -101,6 +103,12 @@ def test_the_page_gets_a_table_and_a_figure(tmp_path):
     assert whole["kept"][0] == [0.5, 0.96, 0.2, 0.96, 0.1] and len(whole["kept"]) == 3
     with pytest.raises(ValueError, match="overlap"):
         report.merged([row, later | {"first_seed": 3}])
+    sooner = row | {"grasps": [5, 30], "kept": [[0.0] * 4, [0.6] * 4]}
+    [joined] = report.merged([row, sooner])
+    assert joined["grasps"] == [5, 10, 20, 30, 40] and joined["kept"][3] == [0.6] * 4
+    with pytest.raises(ValueError, match="other seeds"):
+        report.merged([row, sooner | {"first_seed": 1}])
+    assert row["kept"][0] == [0.5, 0.96, 0.2, 0.96], "what is merged stays as it was"
 
 
 @pytest.mark.slow  # a study of its own, with programs of its own: 10 s

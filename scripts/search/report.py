@@ -22,24 +22,35 @@ PAGE, FIGURE = Path("docs/notes/search.md"), Path("docs/figures/search.png")
 
 
 def merged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of one search over other seeds as one row, in the order of their first seeds.
+    """Rows of one search over other seeds, or of the same seeds at other marks, as one row each.
 
     Raises:
-      ValueError: If they have a seed in common, or recommended at other times.
+      ValueError: If rows of the same marks have a seed in common, or rows of other marks have not
+        all seeds in common.
     """
     found: dict[tuple, dict[str, Any]] = {}
     for row in sorted(rows, key=lambda row: row.get("first_seed", 0)):
-        name = tuple(row.get(n) for n in ("optimizer", "preset", "scene", "objects"))
-        first = row.get("first_seed", 0)
-        if name not in found:
-            found[name] = row | {"next_seed": first + len(row["kept"][-1])}
-            continue
-        whole = found[name]
-        if first < whole["next_seed"] or row["grasps"] != whole["grasps"]:
-            raise ValueError(f"two files of {name} overlap, or have other marks")
+        first, place = row.get("first_seed", 0), (_question(row), *row["grasps"])
+        if place in found and first < found[place]["next_seed"]:
+            raise ValueError(f"two files of {place} overlap")
+        whole = found.setdefault(place, row | {"kept": [[] for _ in row["grasps"]]})
         whole["kept"] = [a + b for a, b in zip(whole["kept"], row["kept"], strict=True)]
         whole["next_seed"] = first + len(row["kept"][-1])
-    return [*found.values()]
+    searches: dict[tuple, dict[str, Any]] = {}
+    for (name, *_), row in found.items():
+        one = searches.setdefault(name, row)
+        if one is row:
+            continue
+        if any(one.get(n) != row.get(n) for n in ("first_seed", "next_seed")):
+            raise ValueError(f"two files of {name} have other marks and other seeds")
+        marks = dict(zip(one["grasps"] + row["grasps"], one["kept"] + row["kept"], strict=True))
+        one["grasps"] = sorted(marks)
+        one["kept"] = [marks[n] for n in one["grasps"]]
+    return [*searches.values()]
+
+
+def _question(row: dict[str, Any]) -> tuple:
+    return tuple(row.get(n) for n in ("optimizer", "preset", "scene", "objects"))
 
 
 def reached(row: dict[str, Any], share: float) -> str:
@@ -98,28 +109,29 @@ def share_of(kept: np.ndarray) -> str:
 
 
 def parts(rows: list[dict[str, Any]]) -> str:
-    """A row for each part of the default that is left out, beside the default on the same seeds."""
+    """Rows for each part of the default that is left out, beside the default on the same seeds.
+
+    A variant has a row at each of its marks, beside the default's mark that is nearest.
+    """
     found = [["without", "seeds", "grasps of a seed", "median kept"]]
     found[0] += ["share of seeds that keep 95 % (95 % interval)", "the default on these seeds"]
     found[0] += ["median of the default", "only the default keeps 95 %, only the variant does"]
-
-    def question(row: dict[str, Any]) -> tuple:
-        return tuple(row.get(n) for n in ("preset", "scene", "objects"))
-
-    whole = {question(row): row for row in rows if row["optimizer"] == DEFAULT}
+    whole = {_question(row)[1:]: row for row in rows if row["optimizer"] == DEFAULT}
     for row in sorted((r for r in rows if variant(r["optimizer"])), key=order):
-        name, kept = row["optimizer"].partition(":")[2], np.array(row["kept"][-1])
-        beside = whole.get(question(row))
+        name, beside = row["optimizer"].partition(":")[2], whole.get(_question(row)[1:])
         if beside is None or not row["optimizer"].startswith(f"{DEFAULT}:"):
             continue
         start = row.get("first_seed", 0) - beside.get("first_seed", 0)
-        same = np.array(beside["kept"][-1])[max(0, start) :][: kept.size]
-        if start < 0 or same.size < kept.size:
-            continue  # the default has not these seeds
-        good, other = kept >= RELIABLE, same >= RELIABLE
-        cells = [f"`{name}`", str(kept.size), f"{row['grasps'][-1]:,}", f"{np.median(kept):.3f}"]
-        cells += [share_of(kept), share_of(same), f"{np.median(same):.3f}"]
-        found.append([*cells, f"{int((other & ~good).sum())}, {int((good & ~other).sum())}"])
+        for grasps, shares in zip(row["grasps"], row["kept"], strict=True):
+            kept = np.array(shares)
+            near = np.abs(np.array(beside["grasps"]) - grasps).argmin()
+            same = np.array(beside["kept"][near])[max(0, start) :][: kept.size]
+            if start < 0 or same.size < kept.size:
+                continue  # the default has not these seeds
+            good, other = kept >= RELIABLE, same >= RELIABLE
+            cells = [f"`{name}`", str(kept.size), f"{grasps:,}", f"{np.median(kept):.3f}"]
+            cells += [share_of(kept), share_of(same), f"{np.median(same):.3f}"]
+            found.append([*cells, f"{int((other & ~good).sum())}, {int((good & ~other).sum())}"])
     return tables.markdown(found)
 
 

@@ -38,7 +38,7 @@ WORDS = {
     "4 x 16, least, 1e-3": "10 ms, 1e-3, finer skin",
     "5 ms, least, 1e-3": "5 ms, tolerance 1e-3",
 }
-"""Settings whose verdicts are shown where their rate is known, and how they are called."""
+"""Settings whose verdicts are shown where their rate is known, and what they are called."""
 SPHERES = "spheres, no skin"
 BENCHMARKS = {
     ("structured", "default", 360): "cpu",
@@ -111,8 +111,8 @@ def spheres(budget: Budget, data: Path) -> list[Place]:
 def tips(studies: dict[str, Study]) -> list[Place]:
     """Errors of the finger tip by the first study, and costs of all machines.
 
-    Engines solve the same equations in the air, so that MuJoCo C has this engine's error. It has
-    no limit of iterations: of a preset it has time step, links and damping.
+    Engines solve the same equations in the air, so that MuJoCo C has this engine's error. Its
+    solver is its own: of a preset it has time step, links and damping.
 
     Args:
       studies: By the machine's name; the first has the errors.

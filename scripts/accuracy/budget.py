@@ -6,6 +6,9 @@ python -m scripts.accuracy.budget --data runs/paper --out runs/budget --time  # 
 python -m scripts.accuracy.budget --out runs/budget --merge docs/data/budget.json
 python -m scripts.accuracy.budget --merge docs/data/budget.json --report
 
+With --page docs/accuracy.md and --figure docs/figures/budget.png the report fills in the page's
+tables and draws that figure, and beside it accuracy_time.png.
+
 All variants have the same designs, in which the concurrent runs of --data ended, one of each, and
 the same trials.  The truth has the finer step, links and mesh; `finer` refines all three again.  A
 variant has a file of its own, so that several processes share the work; each compiles its own
@@ -273,13 +276,16 @@ def main() -> int:
     parser.add_argument("--merge", type=Path, help="write the files into this one and stop")
     parser.add_argument("--report", action="store_true", help="show the tables of --merge and stop")
     parser.add_argument("--page", type=Path, help="page whose tables are filled in")
-    parser.add_argument("--figure", type=Path, help="file of the figure")
+    parser.add_argument("--figure", type=Path, help="file of the first figure")
     args = parser.parse_args()
     use_compilation_cache()
     if args.report:
-        from scripts.accuracy import budget_report
+        from scripts.accuracy import against_time, budget_report, report
 
         found = budget_report.Budget(json.loads(args.merge.read_text()))
+        if args.figure:
+            data, path = args.merge.parent, args.figure.with_name("accuracy_time.png")
+            print(against_time.make(found, report.studies(data.parent), data, path))
         return budget_report.make(found, args.page, args.figure)
     if args.merge:
         output.write_json(args.merge, merged(args.out), indent=None)

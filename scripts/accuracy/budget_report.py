@@ -1,4 +1,7 @@
-"""The tables and the figure of `scripts.accuracy.budget`, from its file alone."""
+"""The tables and the figure of `scripts.accuracy.budget`, from its file alone.
+
+The figure of accuracy against time, which needs other files as well, is `against_time`.
+"""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +22,8 @@ CANDIDATES = {
     "5 ms, least, 1e-3": "`fine` with a tolerance of 1e-3 and 24 iterations",
     "5 ms, 3 x 12, least, 1e-3": "the same, a skin of 3 × 12 points a link",
 }
+RATED = {"gpu": "one H100", "cpu": "2 CPU cores"}
+"""Machines whose rates the file has, in words."""
 
 
 class Change(NamedTuple):
@@ -76,15 +81,14 @@ class Budget:
     def row(self, name: str, words: str) -> list[str]:
         """A setting beside the truth."""
         beside, moved = self.compared(name, "truth"), self.compared(name, f"{name}, moved")
-        cells = [words, *["–"] * 5]
+        rates = [self.rates.get(machine, {}).get(name) for machine in RATED]
+        cells = [words, *["–"] * 4]
         if beside:
             cells[1] = points(beside["success_difference"])
             cells[2], cells[3] = interval(beside["flipped"]), interval(beside["rank"], ".2f")
         if moved:
             cells[4] = f"{moved['flipped'].value:.1%}"
-        if rate := self.rates.get("gpu", {}).get(name):
-            cells[5] = f"{float(format(rate['grasps_per_s'], '.2g')):,.0f}"
-        return cells
+        return cells + [f"{r['grasps_per_s']:,.0f}" if r else "–" for r in rates]
 
     def tables(self) -> dict[str, str]:
         """Markdown by the name of its marks on docs/accuracy.md."""
@@ -103,10 +107,10 @@ def points(value: Any) -> str:
 def presets_table(budget: Budget) -> list[list[str]]:
     """Presets and candidates beside the truth."""
     head = ["setting", "success, points from the truth", "verdicts that flip", "rank correlation"]
-    rows = [[*head, "flips by a micrometre", "grasps/s, one H100"]]
+    rows = [[*head, "flips by a micrometre", *(f"grasps/s, {m}" for m in RATED.values())]]
     rows += [budget.row(name, f"`{name}`") for name in PRESETS]
     rows += [budget.row(n, words) for n, words in CANDIDATES.items() if n in budget.costs]
-    return rows if budget.rates else [row[:-1] for row in rows]
+    return rows if budget.rates else [row[: -len(RATED)] for row in rows]
 
 
 def budget_table(budget: Budget) -> list[list[str]]:

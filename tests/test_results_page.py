@@ -136,15 +136,16 @@ def test_the_default_scene_s_budget_is_that_of_the_data():
 def test_the_rates_that_the_accuracy_page_states_are_those_of_the_data():
     text = words((ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8"))
     found = json.loads((DATA / "budget.json").read_text())
-    assert len(commits(found["rates"])) == 1, "of one commit, newer than the verdicts"
+    assert not commits(found["rates"]) & commits(found["variants"]), "newer than the verdicts"
     machines = [found["rates"][n]["rates"] for n in ("gpu", "cpu")]
     names = ("fast", "standard", "least, 1e-3")
     gpu, cpu = ({n: m[n]["grasps_per_s"] for n in names} for m in machines)
     assert {m["fast"]["grasps"] for m in machines} == {1200, 480}
     ratios = [m["fast"] / m["standard"] for m in (gpu, cpu)]
-    assert f"at {ratios[0]:.1f} to {ratios[1]:.1f} times the rate in the default scene" in text
+    assert f"{ratios[0]:.1f}" == f"{ratios[1]:.1f}", "on both machines"
+    assert f"at {ratios[0]:.1f} times the rate in the default scene" in text
     assert f"({gpu[names[2]]:.0f} grasps/s beside {gpu['fast']:.0f}, 1,200 a call)" in text
-    assert f"({cpu[names[2]]:.0f} beside {cpu['fast']:.0f}, 480 a call, beside other work)" in text
+    assert f"({cpu[names[2]]:.0f} beside {cpu['fast']:.0f}, 480 a call)" in text
     bias = Budget(found).compared("least, 1e-3", "truth")
     assert bias is not None and bias["success_difference"].low < 0 < bias["success_difference"].high
 

@@ -124,17 +124,18 @@ def test_sizes_default_to_the_papers():
     assert sizes("23d") == (60, 6, 128, 72)
     # Figure 7's budget, per run: 64 episodes of 60 grasps and 36 more tests of 10 particles.
     two = settings_module.make_settings(
-        "2d", "concurrent", "control", "mujoco", 0, optimizer="particle-filter"
+        "2d", "concurrent", "control", "structured", 0, optimizer="particle-filter"
     )
-    assert two.grasps == 64 * 60 + 360
+    assert runs.prepare(scene.load(), two).grasps == 64 * 60 + 360
     # The default optimiser's: each of its trials is one with another object.
     assert sizes("23d", optimize.DEFAULT) == (25, 3, 30, 48)
     assert sizes("full", optimize.DEFAULT, objects=8) == (25, 8, 30, 48)
-    # Its final test simulates three averages, and no copies of them.
-    made = settings_module.make_settings(
-        "23d", "concurrent", "control", "mujoco", 0, optimizer=optimize.DEFAULT
-    )
-    assert made.grasps == 30 * 75 + 3 * 48
+    # Its final test simulates three averages, and no copies of them; in 2D three designs more.
+    for preset, grasps in (("23d", 30 * 75 + 3 * 48), ("2d", 19 * 39 + 6 * 36)):
+        made = settings_module.make_settings(
+            preset, "concurrent", "control", "structured", 0, optimizer=optimize.DEFAULT
+        )
+        assert runs.prepare(scene.load(), made).grasps == grasps
 
 
 def test_settings_report_every_problem():

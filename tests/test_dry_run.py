@@ -35,7 +35,7 @@ def dry_run(capsys, command, *arguments):
 
 def test_optimize_says_that_the_test_has_whole_rounds(workplace, capsys):
     sizes = ["--trials", 4, "--test-trials"]
-    words = "final test: 24 of these grasps, 8 trials of 3 particles"
+    words = "final test: 48 of these grasps, 8 trials of 6 particles"
     assert f"{words}, in whole rounds of 4\n" in dry_run(capsys, "optimize", *sizes, 6)
     assert f"{words}\n" in dry_run(capsys, "optimize", *sizes, 8)
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from codesign_jax import codesign, files, optimize, scene
+from codesign_jax import codesign, files, optimize, runs, scene
 from codesign_jax.runs import columns, rates, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module

@@ -301,7 +301,8 @@ def test_more_episodes_extend_a_run_bit_for_bit(optimizer, tmp_path, capsys):
 
 
 def test_the_default_search_goes_on_and_a_run_keeps_its_optimiser(finished, tmp_path, capsys):
-    run = without([*RUN], "--optimizer")
+    usual = without([*RUN], "--optimizer")
+    run = [*usual, "--particles", "8"]
     long, grown = tmp_path / "long", tmp_path / "grown"
     assert command(*run, "--episodes", "8", "--out", long) == 0
     assert "seed" not in capsys.readouterr().out, "it looks for its start by itself"
@@ -309,14 +310,19 @@ def test_the_default_search_goes_on_and_a_run_keeps_its_optimiser(finished, tmp_
         assert command(*run, "--episodes", episodes, "--out", grown) == 0
     assert_same_run(grown, long)
     assert runs.read_run(grown)[1].optimizer == "screened-es"
-    # In 2D up to six particles are tested, so all four of this run.
-    assert "final test: 16 grasps" in (long / "events.log").read_text()
+    # The final test simulates six particles, and those that are copies have their outcomes.
+    assert "final test: 24 grasps" in (long / "events.log").read_text()
+    particles, test = (lambda r: (r.state.particles, r.test))(choice.read_record(long))
+    _, same = np.unique(particles, axis=0, return_inverse=True)
+    assert len(np.unique(same)) <= 6 < len(same)
+    costs = {(s, *c) for s, c in zip(same.ravel(), test.cost.tolist(), strict=True)}
+    assert len(costs) == len(np.unique(same))
     # The design that was found was simulated in an episode, whose grasp can be shown.
     scene, record = runs.read_run(grown)[0], choice.read_record(grown)
     chosen, grasp = choice.choose(scene, record), choice.find_grasp(scene, record)
     np.testing.assert_array_equal(grasp.design, chosen.design)
     copy = shutil.copytree(finished, tmp_path / "filter")
-    assert command(*run, "--out", copy) == 0
+    assert command(*usual, "--out", copy) == 0
     assert f"all {EPISODES} episodes are done" in capsys.readouterr().out
     assert runs.read_run(copy)[1].optimizer == "particle-filter"
 

@@ -48,10 +48,12 @@ STREAM_TELL = 0x636D6174
 """Stream of its draws in `tell` ("cmat")."""
 LEAST = 3
 """Fewest particles: the average, and two for the strategy to rank."""
-FINALISTS = 3
+AVERAGES = 3
 """Averages that the final test takes."""
-STARTS, FEW = 3, 4
-"""Screened designs that it takes as well, and the most parameters with which it does."""
+STARTS = 3
+"""Best screened designs that it takes as well, where a design has at most `FEW` parameters."""
+FEW = 4
+"""Most parameters with which random designs count as close to the best."""
 STRATEGIES = {"open-es": OPEN_SIGMA, "cma-es": 0.2}
 """The strategies, and the first standard deviation of each as a fraction of the parameter range."""
 
@@ -109,7 +111,7 @@ class Screened:
     @property
     def finalists(self) -> int:
         """Particles of the state that the final test takes: averages, and screened designs."""
-        return FINALISTS + (STARTS if jnp.size(self.space.low) <= FEW else 0)
+        return AVERAGES + (STARTS if jnp.size(self.space.low) <= FEW else 0)
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0; see `Optimizer.init`.
@@ -175,12 +177,12 @@ class Screened:
         # The averages that were simulated, newest first, and which of them the final test takes.
         way = jnp.concatenate([population[:1], state.memory["way"][:-1]])
         rows, third = jnp.arange(len(cost)), now["averaged"] // 3
-        ago = jnp.where(rows < FINALISTS, jnp.array([0, 2, 1])[rows % FINALISTS] * third, 0)
+        ago = jnp.where(rows < AVERAGES, jnp.array([0, 2, 1])[rows % AVERAGES] * third, 0)
         finalists = way[jnp.minimum(ago, len(cost) - 1)]
         # Screened designs stand best first until the strategy begins.
-        starts = (rows >= FINALISTS) & (rows < self.finalists)
+        starts = (rows >= AVERAGES) & (rows < self.finalists)
         begins = state.episode == self.screening + self.retests
-        screened_rows = jnp.where(begins, jnp.maximum(rows - FINALISTS, 0), rows)
+        screened_rows = jnp.where(begins, jnp.maximum(rows - AVERAGES, 0), rows)
         finalists = jnp.where(starts[:, None], state.particles[screened_rows], finalists)
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
             "way": jnp.where(screens, state.memory["way"], way),

@@ -230,7 +230,7 @@ def test_tips_of_a_shorter_step_come_closer_to_the_reference():
 
 
 def test_populations_are_distinct_final_particles_of_every_quality():
-    data = ROOT / "docs" / "data" / "paper_fingers_single"
+    data = ROOT / "docs" / "data" / "experiments"
     found = decision.populations(data, 60)
     with np.load(data / "23d.npz") as file:
         final, cost = file["final_particles"], file["test_exclude"].ravel()
@@ -294,7 +294,7 @@ def test_a_case_that_kills_its_process_counts_as_failed_after_two_attempts(tmp_p
 
 
 def test_cases_have_names_of_their_own():
-    data = ROOT / "docs" / "data" / "paper_fingers"
+    data = ROOT / "docs" / "data" / "experiments"
     for size in study.SIZES.values():
         every = study.cases(size, study.PARTS, ENGINES, data, gpu=True)
         assert len({c.key for c in every}) == len(every)

@@ -10,7 +10,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-import scipy.stats
 from rich.console import Console
 
 from codesign_jax import codesign, runs
@@ -299,7 +298,6 @@ def test_both_readings_of_converged():
     one = study.Study({}, {}, {"mean_exclude": means})
     np.testing.assert_array_equal(one.first_below(), [[2.0, np.inf]])
     np.testing.assert_array_equal(one.convergence(), [[4.0, np.inf]])
-    np.testing.assert_array_equal(one.convergence(episodes=3), [[np.inf, np.inf]])
 
 
 def test_regions_are_counted_and_specks_are_not():
@@ -345,41 +343,6 @@ def test_figures_and_page_are_made_from_files_alone(finished, tmp_path):
     assert text in filled and "old" not in filled
     assert filled.startswith("before") and filled.endswith("after\n")
     assert json.loads((tmp_path / "2d.json").read_text())["grasps"] == PLAN.grasps
-
-    # Another landscape, in the place of an earlier scene's, which was stopped.
-    other, moved = tmp_path / "earlier", dict(study.load(tmp_path, "landscape")[0])
-    moved["exclude"] = np.cumsum(moved["exclude"]).reshape(moved["exclude"].shape)
-    notes = {"grasps": 2 * moved["exclude"].size, "wall_seconds": 1.0, "commit": "4567def"}
-    results.write(other, "landscape", moved, notes)
-    both = report.make(tmp_path, tmp_path / "figures", earlier=[other, tmp_path])
-    assert "the earlier scene by commit" in both and "Wilcoxon): s.d. = 1.000" in both
-    plain = study.load(tmp_path, "landscape")[0]["exclude"]
-    expected = scipy.stats.pearsonr(plain.ravel(), moved["exclude"].ravel()).statistic
-    row = next(line for line in both.splitlines() if "4567def" in line).split(" | ")
-    assert row[1] == "2" and float(row[-1].strip(" |")) == pytest.approx(expected, abs=6e-4)
-
-
-def test_strategies_of_the_same_runs_are_joined(finished):
-    arrays, order = summarized(finished), [str(s) for s in PLAN.strategies]
-
-    def part(rows, commit, **changed):
-        names = [order[k] for k in rows]
-        own = {
-            k: v[rows] if len(v) == len(order) and k not in ("first", "seeds") else v
-            for k, v in arrays.items()
-        } | changed
-        plan = dataclasses.asdict(PLAN) | {"strategies": names}
-        notes = {"settings": {"plan": plan, "scene": "paper"}, "commit": commit}
-        return study.Study(plan, notes, own)
-
-    last = list(range(1, len(order)))
-    parts = part(last, "1111111"), part([0], "2222222")
-    (whole,) = study.joined(parts, order)
-    assert whole.strategies == order and whole.notes["commit"] == "2222222, 1111111"
-    assert all(np.array_equal(whole.data[k], v) for k, v in arrays.items())
-    assert report.details(whole) == report.details(part([*range(len(order))], ""))
-    other = part([0], "2222222", seeds=arrays["seeds"] + 1)
-    assert study.joined([parts[0], other], order) == [parts[0], other], "other runs"
 
 
 def test_what_was_not_run_is_said(tmp_path):

@@ -15,9 +15,6 @@ from scripts.shared import sets
 
 DATA = ROOT / "docs" / "data"
 NOW = DATA / "experiments"
-EARLIER = [
-    DATA / name for name in ("paper_fingers", "paper_fingers_single", "paper_fingers_switch")
-]
 SHORT = {"single domain": "s.d.", "one switch": "1", "two switches": "2", "concurrent": "conc."}
 """Strategies of the page as the note's tables call them."""
 SCENE = {
@@ -56,34 +53,33 @@ def test_the_note_s_tables_are_those_of_the_data(tmp_path):
     """As `python -m scripts.experiments figures` makes them."""
     page = tmp_path / "page.md"
     page.write_text(NOTE)
-    report.make(NOW, tmp_path / "figures", page, earlier=EARLIER)
+    report.make(NOW, tmp_path / "figures", page)
     assert page.read_text() == NOTE
-    for mark, folder in zip(("fingers", "single", "switch"), EARLIER, strict=True):
-        assert between(NOTE, f"fresh_{mark}") == fresh.report(folder)
+    assert between(NOTE, "fresh") == fresh.report(NOW)
 
 
 def test_the_page_states_what_the_data_have():
     text = words((ROOT / "docs" / "results.md").read_text(encoding="utf-8"))
-    assert not [said for said in stated.sentences(NOW, EARLIER) if said not in text]
-    form = r"(\d+) parameters, ([a-z ]+) (default|older) ([\d.]+) % (\d+) (–|[\d.]+ %)"
+    assert not [said for said in stated.sentences(NOW) if said not in text]
+    form = r"(\d+) parameters, ([a-z ]+) ([\d.]+) % (\d+) (–|[\d.]+ %) (–|[\d.]+ %)"
     rows = re.findall(form, text)
     assert len(rows) == 7
-    for parameters, strategy, scene, standard, whole, finer in rows:
-        older = {"single domain": EARLIER[1], "one switch": EARLIER[2]}
-        table = fresh.report(NOW if scene == "default" else older[strategy])
+    table = fresh.report(NOW)
+    for parameters, strategy, standard, whole, finer, unseen in rows:
         part = table.split(f"{parameters}d:")[1].split("\n\n")[1].splitlines()
         [row] = [line for line in part if line.startswith(f"| {SHORT[strategy]} |")]
         assert f"| {standard} % | {whole} of 30" in row
-        assert finer == "–" or f"| {finer} |" in row
+        assert all(share == "–" or f"| {share} |" in row for share in (finer, unseen))
 
 
 def test_the_presets_loss_is_that_of_the_winners():
     """The loss at `reference` that pages state."""
     row = fresh.report(NOW).split("23d:")[1].splitlines()[-1]
-    [loss] = re.findall(r"-(\d\.\d) \[-(\d\.\d), -(\d\.\d)\]", row)
+    loss, truth = re.findall(r"-(\d\.\d) \[-(\d\.\d), -(\d\.\d)\]", row)
     names = ("results", "accuracy", "stability")
     texts = [words((ROOT / "docs" / f"{n}.md").read_text("utf-8")) for n in names]
     assert f"lose {loss[0]} points [{loss[2]}, {loss[1]}]" in texts[0]
+    assert f"lose {truth[0]} [{truth[2]}, {truth[1]}] in the first 12" in texts[0]
     assert f"keep {loss[0]} points less there than at `standard` [{loss[2]}, {loss[1]}]" in texts[1]
     assert f"concurrent runs with 23 parameters lose {loss[0]} points" in texts[2]
 

@@ -40,7 +40,7 @@ def parse() -> argparse.Namespace:
         "--share", default="1/1", metavar="I/N", help="every N-th case from the I-th on, of several"
     )
     parser.add_argument("--budget", type=float, default=1e9, help="seconds to begin cases in")
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper_fingers"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--merge", type=Path, nargs="+", help="write these files into one and stop")
     parser.add_argument("--list", action="store_true", help="print the cases and stop")
     parser.add_argument("--report", action="store_true", help="draw what docs/data holds and stop")

@@ -2,8 +2,9 @@
 
 python -m scripts.accuracy.late_designs --json docs/data/late_designs.json
 
-The designs are final particles of the 23-parameter searches in docs/data/paper_fingers, which were
-made before fingers touched the palm.  The table of the hard cases reads the file (24 and 37).
+The designs are final particles of concurrent runs with 23 parameters.  The table of the hard cases
+reads the file (24 and 37); its designs are docs/data/paper_fingers of commit c7f4a91, found before
+fingers touched the palm.
 """
 
 import argparse
@@ -42,7 +43,7 @@ def main() -> int:
     """Runs the command and returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper_fingers"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--designs", type=int, default=60)
     parser.add_argument("--trials", type=int, default=24)
     parser.add_argument("--trials-at-h", type=int, default=96, help="a multiple of --trials")

@@ -76,7 +76,7 @@ def main() -> int:
     """Runs the command and returns the exit status."""
     parser = addition.parser(__doc__, "laws")
     parser.add_argument("change", nargs="*", help="values of the scene's keys, with commas between")
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper_fingers"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--particles", type=int, default=60)
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--block", type=int, default=100, help="trials of a call")

@@ -152,7 +152,7 @@ def table(found: dict[str, Any]) -> str:
 def main() -> int:
     """Runs the command and returns the exit status."""
     parser = addition.parser(__doc__, "residual")
-    parser.add_argument("--data", type=Path, default=Path("docs/data/paper_fingers"))
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     return addition.main(parser.parse_args(), run, table, "residual")
 
 

@@ -69,9 +69,6 @@ def parse() -> argparse.Namespace:
         help="write every trial to this .npz",
     )
     parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
-    parser.add_argument(
-        "--earlier", type=Path, nargs="+", default=[], help="folders of the same in earlier scenes"
-    )
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--videos", type=Path, help="folder for a video of each grasp type")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
@@ -232,7 +229,7 @@ def main() -> int:
         from scripts.experiments import report
     except ModuleNotFoundError as error:
         sys.exit(f"error: {error.name} is missing: pip install 'codesign-jax[study]'")
-    print(report.make(args.data, args.figures, args.page, args.earlier))
+    print(report.make(args.data, args.figures, args.page))
     return 0
 
 

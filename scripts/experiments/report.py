@@ -1,63 +1,44 @@
 """From committed results to figures and the table of the paper's statements beside ours."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.types import WARNINGS
 from scripts.experiments import figures, grasp_types
-from scripts.experiments.plan import PAPER, PAPER_GRASPS, TOTAL_GRASPS
+from scripts.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
 from scripts.experiments.results import BITS
-from scripts.experiments.study import RULES, Study, joined, load, load_study, regions
+from scripts.experiments.study import RULES, Study, load, load_study, regions
 from scripts.shared import statistics
 from scripts.shared.tables import fill
-
-Loaded = tuple[dict[str, np.ndarray], dict[str, Any]]
-"""Arrays and provenance of a landscape, see `study.load`."""
 
 _THRESHOLDS = (0.1, 0.5, 1.0)
 _HEAD = "| the paper | here |\n|---|---|"
 
 
-def make(data: Path, pictures: Path, page: Path | None = None, earlier: Sequence[Path] = ()) -> str:
+def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     """Draws the figures of whatever results there are and writes the table.
 
     Args:
       data: Folder of the results.
       pictures: Folder of the figures.
       page: Markdown page whose text between the marks is replaced; None for none.
-      earlier: Folders of the same with an earlier scene; strategies of the same runs are joined.
-        Those with more strategies than `data` has are drawn, with a suffix.
 
     Returns:
       The table in Markdown.
     """
     studies = {name: load_study(data, name) for name in ("2d", "23d")}
     grid, types = load(data, "landscape"), load(data, "types")
-    shown = next((f for f in (data, *earlier) if load(f, "types")), data)
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
-    for name, study in studies.items():
-        before = [s for folder in earlier if (s := load_study(folder, name))]
-        whole = [str(s) for s in PAPER[name].strategies]  # type: ignore[union-attr]
+    for study in studies.values():
         if study and len(study.strategies) > 1:
-            _draw(name, study, pictures, "")
-        for other in joined(before, whole) if study else []:
-            text += f"\n\n{beside(study, other)}"  # type: ignore[arg-type]
-            if len(other.strategies) > len(study.strategies) or not study.tested:  # type: ignore[union-attr]
-                _draw(name, other, pictures, "_earlier")
-    others = [found for folder in earlier if (found := load(folder, "landscape"))]
-    if grid and others:
-        text += f"\n\n{landscapes(grid, others)}"
-    if shown != data and (grid := load(shown, "landscape")):
-        text += f"\n\nThe earlier scene's landscape, commit {grid[1]['commit']}: {_regions(grid)}."
+            _draw(study, pictures)
     if page:
         fill(page, text, "results")
-    grid, types = load(shown, "landscape"), load(shown, "types")
-    name = "fig8_landscape.png" if shown == data else "fig8_landscape_earlier.png"
-    _draw_landscape(grid, types, pictures / name)
+    if grid:
+        shown = types[0]["type"] if types else None
+        figures.landscape(grid[0], pictures / "fig8_landscape.png", types=shown)
     if grid and types:
         table = grasp_types.describe(grid[0], types[0])
         if page:
@@ -66,35 +47,15 @@ def make(data: Path, pictures: Path, page: Path | None = None, earlier: Sequence
     return text
 
 
-def _draw(name: str, study: Study, pictures: Path, suffix: str) -> None:
+def _draw(study: Study, pictures: Path) -> None:
     """Draws the figures of an experiment on strategies."""
+    name = study.plan["name"]
     if name == "2d":
-        figures.evolution(study, pictures / f"fig6_cost_evolution{suffix}.png")
+        figures.evolution(study, pictures / "fig6_cost_evolution.png")
     number = {"2d": 7, "23d": 9}[name]
     if study.tested:
-        figures.success(study, pictures / f"fig{number}a_success{suffix}.png")
-    figures.convergence(study, pictures / f"fig{number}b_convergence{suffix}.png")
-
-
-def _draw_landscape(grid: Loaded | None, types: Loaded | None, path: Path) -> None:
-    """Draws a landscape, if there is one, with its grasp types, if they were found."""
-    if grid:
-        figures.landscape(grid[0], path, types=types[0]["type"] if types else None)
-
-
-def landscapes(now: Loaded, earlier: Sequence[Loaded]) -> str:
-    """The landscape beside those of earlier scenes, as a Markdown table."""
-    lines = [
-        "| landscape | trials a design | regions | correlation with the first |",
-        "|---|---|---|---|",
-    ]
-    for k, grid in enumerate((now, *earlier)):
-        data, notes = grid
-        trials = notes["grasps"] // data["exclude"].size  # fewer than planned if it was stopped
-        alike = np.corrcoef(data["exclude"].ravel(), now[0]["exclude"].ravel())[0, 1]
-        words = f"{'earlier scene' if k else 'default scene'}, commit {notes['commit']}"
-        lines.append(f"| {words} | {trials} | {_regions(grid)} | {alike:.3f} |")
-    return "\n".join(lines)
+        figures.success(study, pictures / f"fig{number}a_success.png")
+    figures.convergence(study, pictures / f"fig{number}b_convergence.png")
 
 
 def comparison(studies: dict[str, Study | None], grid) -> str:
@@ -171,45 +132,6 @@ def _against_last(study: Study) -> list[str]:
         cells[1:3] = cells[1:3] if study.tested else ["–", "–"]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
-
-
-def beside(now: Study, earlier: Study) -> str:
-    """An experiment beside the same in an earlier scene, over the episodes that both have.
-
-    Of one that is complete also what `details` tells.
-    """
-    count = min(now.episodes, earlier.episodes)
-    lines = [
-        f"{now.plan['name']}, the first {count} episodes ({count * now.per_episode:,} "
-        f"simulations), the earlier scene by commit {earlier.notes.get('commit')}: "
-        "mean cost stays below 1",
-        "",
-        "| strategy | default scene | median simulations [quartiles] "
-        "| earlier scene | median simulations [quartiles] |",
-        "|---|---|---|---|---|",
-    ]
-    both = [
-        (v.per_episode, dict(zip(v.strategies, v.convergence(episodes=count), strict=True)))
-        for v in (now, earlier)
-    ]
-    for strategy in earlier.strategies:
-        cells = [figures.label(strategy)]
-        for per_episode, episodes in both:
-            each = episodes.get(strategy)
-            known = each is not None
-            cells += [f"{int(np.isfinite(each).sum())}/{each.size}" if known else "not run"]
-            cells += [_quartiles(each * per_episode) if known else "–"]
-        lines.append(f"| {' | '.join(cells)} |")
-    common = [s for s in earlier.strategies if s in both[0][1]]
-    pairs = [statistics.wilcoxon(both[0][1][s], both[1][1][s], count) for s in common]
-    each = ", ".join(f"{figures.label(s)} {_p(p)}" for s, p in zip(common, pairs, strict=True))
-    lines += ["", f"p of a difference between the scenes, paired (Wilcoxon): {each}."]
-    if not earlier.tested:
-        return "\n".join(lines)
-    if len(earlier.strategies) > 2:
-        rows = [f"| {a} | {b} |" for a, b in _rows(earlier.plan["name"], earlier)]
-        lines += ["", _HEAD.replace("here", "here, in the earlier scene"), *rows]
-    return "\n".join([*lines, "", f"Earlier scene, {details(earlier)}"])
 
 
 def _quartiles(values: np.ndarray) -> str:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,21 +51,20 @@ class Study:
         """Whether any final particle's mean test cost is below 0.01, bool, (strategy, run)."""
         return np.any(self.data[f"test_{rule}"] < SUCCESS_COST, axis=-1)
 
-    def convergence(self, rule: str = "exclude", *, episodes: int | None = None) -> np.ndarray:
+    def convergence(self, rule: str = "exclude") -> np.ndarray:
         """Episodes simulated when the mean cost is below 1.0 for good, (strategy, run).
 
         The episode that converged is counted; infinite where a run did not converge.
 
         Args:
           rule: Rule for failed trials.
-          episodes: As if the runs had ended after so many; None for all.
         """
 
         def count(means: np.ndarray) -> float:
             episode = convergence_episode(means)
             return np.inf if episode is None else episode + 1.0
 
-        return np.apply_along_axis(count, -1, self.data[f"mean_{rule}"][..., :episodes])
+        return np.apply_along_axis(count, -1, self.data[f"mean_{rule}"])
 
     def first_below(self, rule: str = "exclude") -> np.ndarray:
         """Episodes simulated when the mean cost is below 1.0 for the first time, (strategy, run).
@@ -94,46 +92,6 @@ def load_study(folder: Path, name: str) -> Study | None:
         return None
     data, notes = found
     return Study(notes["settings"]["plan"], notes, data)
-
-
-def joined(studies: Sequence[Study], order: Sequence[str]) -> list[Study]:
-    """Complete experiments with strategies of the same runs become one; others stay as they are.
-
-    They are the same runs if seed particles, sizes and scene are the same: runs of one number then
-    have the same noise as well, whatever their strategy.
-
-    Args:
-      studies: Experiments, maybe of several commits.
-      order: Order of the strategies.
-    """
-    groups: dict[Any, list[Study]] = {}
-    for k, study in enumerate(studies):
-        plan = {name: v for name, v in study.plan.items() if name != "strategies"}
-        scene, seeds = study.notes["settings"]["scene"], study.data["seeds"].tobytes()
-        same = (json.dumps(plan, sort_keys=True), scene, seeds) if study.tested else k
-        groups.setdefault(same, []).append(study)
-    return [_join(group, order) if len(group) > 1 else group[0] for group in groups.values()]
-
-
-def _join(studies: list[Study], order: Sequence[str]) -> Study:
-    one = sorted(
-        (
-            (order.index(name), k, study)
-            for study in studies
-            for k, name in enumerate(study.strategies)
-        ),
-        key=lambda entry: entry[0],
-    )
-    last = one[-1][2]
-    # Of one strategy or of the runs; everything else has an axis of strategies in front.
-    whole = ("first", "parameters", "seeds", "seed_cost", "seed_candidates", "particle_cost")
-    data = {
-        name: last.data[name] if name in whole else np.stack([s.data[name][k] for _, k, s in one])
-        for name in last.data
-    }
-    commits = dict.fromkeys(study.notes["commit"] for *_, study in one)
-    plan = last.plan | {"strategies": [str(name) for name in data["strategies"]]}
-    return Study(plan, last.notes | {"commit": ", ".join(commits)}, data)
 
 
 class Region(NamedTuple):

@@ -40,8 +40,8 @@ STATEMENTS = (
     "both at once succeeds in {success_2d_concurrent:.0f} of {runs:.0f} runs, one alone in "
     "{success_2d_single:.0f}",
     "keep {kept_2d:.0f} % of fresh grasps",
-    "{success_23d_concurrent:.0f} of {runs:.0f} runs succeed, and the best designs keep "
-    "{kept_23d:.0f} %",
+    "{success_23d_concurrent:.0f} of {runs:.0f} runs succeed, one alone {success_23d_single:.0f}, "
+    "and the best designs keep {kept_23d:.0f} %",
     "{flips:.1f} % of fresh grasps of the best designs with {parameters:.0f} parameters, of which "
     "they keep {kept_finely:.0f} %",
     "With {parameters:.0f} parameters",

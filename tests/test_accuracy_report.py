@@ -137,20 +137,17 @@ def test_labels_cover_neither_each_other_nor_points():
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
-def test_the_presets_files_and_the_pages_state_what_was_measured(tmp_path, monkeypatch):
+def test_the_presets_files_and_the_note_state_what_was_measured(tmp_path, monkeypatch):
     """As `python -m scripts.accuracy --report` writes them: new data without it would fail."""
     monkeypatch.setattr(analysis, "RESAMPLES", 2)  # neither states an interval
-    found, page, note = report.studies(ROOT / "docs"), tmp_path / "page.md", tmp_path / "note.md"
+    found, note = report.studies(ROOT / "docs"), tmp_path / "note.md"
     stated = {n: library.find("accuracy", n).read_text() for n in PRESETS}
     for preset_name, text in stated.items():  # the values alone, and what an earlier study found
         values = [line for line in text.splitlines(True) if not line.startswith("# measured: ")]
         (tmp_path / f"{preset_name}.toml").write_text("# measured: old\n" + "".join(values))
-    pages = {page: ROOT / "docs" / "accuracy.md", note: ROOT / "docs" / "notes" / "accuracy.md"}
-    for copy, original in pages.items():
-        shutil.copy(original, copy)
-    report.make_summary(page, note, tmp_path, found)
-    for copy, original in pages.items():
-        assert copy.read_text() == original.read_text()
+    shutil.copy(ROOT / "docs" / "notes" / "accuracy.md", note)
+    report.make_summary(note, tmp_path, found)
+    assert note.read_text() == (ROOT / "docs" / "notes" / "accuracy.md").read_text()
     assert stated == {n: (tmp_path / f"{n}.toml").read_text() for n in PRESETS}
     assert all("# measured: finger tip" in text for text in stated.values())
 

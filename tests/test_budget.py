@@ -7,8 +7,6 @@ import pytest
 
 from codesign_jax.scene import load
 from scripts.accuracy import against_time, budget, budget_report, decision
-from scripts.accuracy.results import Study
-from scripts.accuracy.settings import PRESETS, Setting
 from scripts.shared import figures
 
 WINDOW = load("paper").window
@@ -38,7 +36,7 @@ def test_biases_and_flips_are_those_that_were_planted(found, tmp_path):
     made = budget_report.Budget(found)
     row = made.row("standard", "`standard`")
     assert row[1].startswith("+5.0 [") and row[2].startswith("5.0% [")  # 12 of 240
-    assert row[4] == "2.5%" and row[5] == "–"
+    assert row[4] == "2.5%" and row[5:] == ["–"] * 3
     rows = {cells[0]: cells for cells in budget_report.budget_table(made)}
     assert rows["object moved by a micrometre, `standard`"][2].startswith("-2.5 [")
     assert rows["step, links and skin at once: the truth"][2].startswith("-5.0 [")
@@ -55,63 +53,31 @@ def rate(value):
 
 
 def test_rates_stand_in_the_table_beside_what_they_buy(found):
-    assert len(budget_report.presets_table(budget_report.Budget(found))[0]) == 5
+    assert len(budget_report.presets_table(budget_report.Budget(found))[0]) == 6
     found["rates"] = {"gpu": {"rates": {"standard": rate(1234.4)}}, "cpu": {"rates": {}}}
     head, *rows = budget_report.presets_table(budget_report.Budget(found))
-    assert head[5:] == ["grasps/s, one H100", "grasps/s, 2 CPU cores"]
-    assert {row[0]: row[5:] for row in rows}["`standard`"] == ["1,234", "–"]
-    assert rows[0][5:] == ["–", "–"]
-
-
-class Tips(Study):
-    """Errors of the finger tip and costs of a machine without their records."""
-
-    def __init__(self, costs):
-        self.costs = costs
-
-    def error(self, part, setting):
-        assert part == "tip"
-        return {10.0: 5.0, 5.0: 1.0}.get(setting.timestep)
-
-    def cost(self, engine, setting):
-        return self.costs.get((engine, setting.timestep, setting.iterations))
+    assert head[6:] == ["grasps/s, one H100", "grasps/s, 2 CPU cores"]
+    assert {row[0]: row[6:] for row in rows}["`standard`"] == ["1,234", "–"]
+    assert rows[0][6:] == ["–", "–"]
 
 
 def test_the_figure_against_time_has_what_was_planted(found, tmp_path):
     """A setting without rate or without error is no mark; nothing stands for what is not there."""
-    found["variants"]["spheres"] = found["variants"]["standard"]
+    found["variants"]["spheres, MuJoCo C"] = found["variants"]["standard"]
     found["rates"] = {
         "gpu": {"rates": {"standard": rate(500), "fast": rate(600)}},  # fast has no verdicts
-        "cpu": {"rates": {"standard": rate(50), "truth": rate(1)}},
+        "cpu": {"rates": {"standard": rate(50), "truth": rate(1), "spheres, MuJoCo C": rate(3)}},
     }
+    found["tips"] = {"tip_rms_mm": {"standard": 5.0, "fast": 2.0, "least, 1e-3": 2.0}}
     made = budget_report.Budget(found)
-    marks = against_time.verdicts(made)
-    assert {(m.who, m.setting, m.rate) for m in marks} == {
-        ("this engine, one H100", "standard", 500),
-        ("this engine, 2 CPU cores", "standard", 50),
-    }
-    assert all(m.error.value == 0.05 and m.error.low < 0.05 < m.error.high for m in marks)
-
-    known = {"kind": "grasp", "setting": "documented", "worlds": 360, "grasps_per_s": 11.0}
-    other = [{"worlds": 60}, {"kind": "steps"}, {"engine": "mjx"}, {"grasps_per_s": None}]
-    records = [known | {"engine": "mujoco"} | change for change in ({}, *other)]
-    (tmp_path / "benchmark_cpu.json").write_text(json.dumps({"records": records}))
-    [sphere] = against_time.spheres(made, tmp_path)
-    assert sphere[:3] == ("MuJoCo C, 2 CPU cores", against_time.SPHERES, 11.0) and sphere.hollow
-
-    grasp = load("paper").phases.ungrasp
-    gpu = Tips({("structured", 10.0, None): 1 / grasp, ("structured", 5.0, 6): 0.5 / grasp})
-    cpu = Tips({("mujoco", 5.0, None): 4 / grasp})
-    tips = against_time.tips({"h200": gpu, "cpu": cpu})
-    assert PRESETS["fine"] == Setting(timestep=5.0, damping="least", iterations=6)
-    named = {m[:2]: (m.rate, m.error.value) for m in tips if m.setting}
-    assert named == {
-        ("this engine, one H200", "standard"): (pytest.approx(1), 5.0),
-        ("this engine, one H200", "fine"): (pytest.approx(2), 1.0),
-        ("MuJoCo C, 2 CPU cores", "fine"): (pytest.approx(0.25), 1.0),
-    }
-    file = against_time.make(made, {"h200": gpu, "cpu": cpu}, tmp_path, tmp_path / "time.png")
-    assert file.stat().st_size > 5000
+    left, right = against_time.marks(made)
+    ours, c = "this engine", ("MuJoCo C, 2 CPU cores", "spheres, no skin", 3)
+    of_standard = {(f"{ours}, one H100", "standard", 500), (f"{ours}, 2 CPU cores", "standard", 50)}
+    assert {m[:3] for m in left} == of_standard | {c}
+    assert all(m.error.value == 0.05 and m.error.low < 0.05 < m.error.high for m in left)
+    assert {m[:3] for m in right} == of_standard | {(f"{ours}, one H100", "fast", 600)}
+    assert {m.error.value for m in right if m.setting == "fast"} == {2.0}
+    assert against_time.make(made, tmp_path / "time.png").stat().st_size > 5000
 
 
 def test_names_that_would_meet_are_moved_apart():

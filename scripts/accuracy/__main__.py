@@ -62,7 +62,7 @@ def main() -> int:
         found = report.studies(args.docs)
         print(report.make(args.docs, found))
         note = args.docs / "notes" / "accuracy.md"
-        report.make_summary(args.docs / "accuracy.md", note, SCENES, found)
+        report.make_summary(note, SCENES, found)
         return 0
     if args.merge:
         merge(args.merge, args.json)

@@ -1,10 +1,8 @@
 """One figure of accuracy against time: verdicts and finger tip, by machine and engine.
 
-`scripts.accuracy.budget --report` draws it, from the files of docs/data alone.
+`scripts.accuracy.budget --report` draws it, from its own file alone.
 """
 
-import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,19 +12,13 @@ from matplotlib.lines import Line2D
 
 from codesign_jax.report.statistics import Interval
 from scripts.accuracy.budget_report import RATED, Budget
-from scripts.accuracy.figures import grasps
-from scripts.accuracy.report import SHORT
-from scripts.accuracy.results import Study
-from scripts.accuracy.settings import HULL, PRESETS, one_at_a_time
 from scripts.shared import figures
 
-ENGINES = {"structured": "this engine", "mujoco": "MuJoCo C", "warp": "MuJoCo Warp"}
+C = "MuJoCo C"
 LOOKS = {
     "this engine, one H100": ("tab:blue", "o"),
-    "this engine, one H200": ("tab:cyan", "o"),
     "this engine, 2 CPU cores": ("tab:orange", "o"),
     "MuJoCo C, 2 CPU cores": ("tab:green", "s"),
-    "MuJoCo Warp, one H200": ("tab:purple", "^"),
 }
 """Color and marker of an engine on a machine, the same in both panels."""
 WORDS = {
@@ -37,16 +29,12 @@ WORDS = {
     "least, 1e-3": "10 ms, tolerance 1e-3",
     "4 x 16, least, 1e-3": "10 ms, 1e-3, finer skin",
     "5 ms, least, 1e-3": "5 ms, tolerance 1e-3",
+    "spheres": "spheres, no skin",
+    "spheres, MuJoCo C": "spheres, no skin",
 }
-"""Settings whose verdicts are shown where their rate is known, and what they are called."""
-SPHERES = "spheres, no skin"
-BENCHMARKS = {
-    ("structured", "default", 360): "cpu",
-    ("mujoco", "documented", 360): "cpu",
-    ("structured", "default", 1728): "h200",
-    ("warp", "documented", 1728): "h200",
-}
-"""Records of docs/data/benchmark_*.json: engine, its settings, grasps of a call; and the file."""
+"""Variants that are shown where their rate is known, and what they are called."""
+IN_THE_AIR = ("fast", "standard", "fine", "reference", "spheres", "spheres, MuJoCo C")
+"""Those of which the finger tip is shown."""
 
 
 class Place(NamedTuple):
@@ -54,17 +42,15 @@ class Place(NamedTuple):
 
     Attributes:
       who: Engine and machine, one of `LOOKS`.
-      setting: What the setting is called; marks of one name are joined. Empty: a small mark.
-      rate: Grasps a second.
+      setting: What the setting is called; marks of one name are joined.
+      rate: Grasps a second, whole ones in the default scene.
       error: Error with its interval; one without width has no bar.
-      hollow: Whether the rate is of another scene than the error.
     """
 
     who: str
     setting: str
     rate: float
     error: Interval
-    hollow: bool = False
 
 
 def exactly(error: float) -> Interval:
@@ -72,63 +58,14 @@ def exactly(error: float) -> Interval:
     return Interval(error, error, error)
 
 
-def verdicts(budget: Budget) -> list[Place]:
-    """Verdicts that flip against the truth in the default scene, and the settings' rates there."""
-    return [
-        Place(f"this engine, {RATED[machine]}", words, rate["grasps_per_s"], found["flipped"])
-        for name, words in WORDS.items()
-        for machine, rates in budget.rates.items()
-        if (rate := rates.get(name)) and (found := budget.compared(name, "truth"))
-    ]
-
-
-def spheres(budget: Budget, data: Path) -> list[Place]:
-    """What engines without the skin can do: spheres.
-
-    The error is this engine's in the default scene with spheres; the rates are those of the
-    scene paper_spheres, in which the engines' verdicts agree.
-
-    Args:
-      budget: The variants.
-      data: Folder of the benchmarks.
-    """
-    found, error = [], budget.compared("spheres", "truth")
-    if error is None:
-        return found
-    for (engine, setting, worlds), machine in BENCHMARKS.items():
-        file = data / f"benchmark_{machine}.json"
-        records = json.loads(file.read_text())["records"] if file.exists() else []
-        asked = {"engine": engine, "setting": setting, "worlds": worlds, "kind": "grasp"}
-        who = f"{ENGINES[engine]}, {SHORT[machine]}"
-        found += [
-            Place(who, SPHERES, r["grasps_per_s"], error["flipped"], hollow=True)
-            for r in records
-            if r.get("grasps_per_s") and asked.items() <= r.items()
-        ]
-    return found
-
-
-def tips(studies: dict[str, Study]) -> list[Place]:
-    """Errors of the finger tip by the first study, and costs of all machines.
-
-    Engines solve the same equations in the air, so that MuJoCo C has this engine's error. Its
-    solver is its own: of a preset it has time step, links and damping.
-
-    Args:
-      studies: By the machine's name; the first has the errors.
-    """
-    full, names = next(iter(studies.values())), {s: n for n, s in PRESETS.items()}
-    usual = {"surface": HULL, "extra": (), "precision": "float32", "keep_contact": False}
+def places(budget: Budget, errors: dict[str, Interval]) -> list[Place]:
+    """Marks of the variants that have an error, one for each machine whose rate is known."""
     found = []
-    for setting in one_at_a_time("structured"):
-        plain, error = replace(setting, iterations=None), full.error("tip", setting)
-        if not error or setting not in (*names, replace(plain, **usual)):
-            continue
-        for machine, study in studies.items():
-            for engine, of in {"structured": setting, "mujoco": plain}.items():
-                if cost := study.cost(engine, of):
-                    who = f"{ENGINES[engine]}, {SHORT[machine]}"
-                    found.append(Place(who, names.get(setting, ""), grasps(cost), exactly(error)))
+    for name, error in errors.items():
+        for machine, rates in budget.rates.items():
+            if rate := rates.get(name):
+                who = f"{C if C in name else 'this engine'}, {RATED[machine]}"
+                found.append(Place(who, WORDS[name], rate["grasps_per_s"], error))
     return found
 
 
@@ -144,16 +81,17 @@ def draw(left: list[Place], right: list[Place], floor: float | None, path: Path)
     figure = figures.new(12.5, 5.8)
     verdict, tip = figure.subplots(1, 2)
     _marks(verdict, [p._replace(error=Interval(*(100 * v for v in p.error))) for p in left])
+    words = "grasps a second: whole grasps of designs that hold"
     verdict.set(
         title="Verdicts in the default scene, paper",
-        xlabel="grasps a second: whole grasps of designs that hold",
+        xlabel=words,
         ylabel="verdicts that flip against the truth [%]",
         ylim=(0, None),
     )
     _marks(tip, right)
     tip.set(
         title="Finger tip in a fast motion in the air, no contact",
-        xlabel="grasps a second: 9 s of steps in contact, none between fingers",
+        xlabel=words,
         ylabel="root mean square error [mm]",
         yscale="log",
     )
@@ -173,11 +111,6 @@ def _key(places: list[Place]) -> list[Line2D]:
     """What marks mean."""
     shown = {p.who for p in places}
     looks = [(who, {"color": c, "marker": m}) for who, (c, m) in LOOKS.items() if who in shown]
-    if any(p.hollow for p in places):
-        words = "hollow: rate in paper_spheres, designs half random"
-        looks.append((words, {"color": "0.3", "marker": "o", "mfc": "white"}))
-    if not all(p.setting for p in places):
-        looks.append(("small: other settings", {"color": "0.3", "marker": "o", "ms": 3}))
     return [Line2D([], [], ls="none", label=words, **look) for words, look in looks]
 
 
@@ -186,9 +119,13 @@ def _marks(axis: Axes, places: list[Place]) -> None:
     for place in places:
         color, marker = LOOKS[place.who]
         middle, low, high = place.error
-        look: dict[str, Any] = {"color": color, "marker": marker, "ls": "none", "zorder": 3}
-        look |= {"mfc": "white"} if place.hollow else {}
-        look |= {"ms": 7} if place.setting else {"ms": 3, "alpha": 0.6}
+        look: dict[str, Any] = {
+            "color": color,
+            "marker": marker,
+            "ls": "none",
+            "zorder": 3,
+            "ms": 7,
+        }
         error = [[middle - low], [high - middle]] if high > low else None
         axis.errorbar(place.rate, middle, yerr=error, elinewidth=0.8, capsize=2, **look)
     axis.set_xscale("log")
@@ -203,7 +140,7 @@ def _names(axis: Axes, places: list[Place], unit: float = 1) -> None:
       places: Marks.
       unit: What the axis shows of an error of one.
     """
-    names = sorted({p.setting for p in places} - {""})
+    names = sorted({p.setting for p in places})
     rows = [sorted((p.rate, unit * p.error.value) for p in places if p.setting == n) for n in names]
     heights = _apart(axis, [row[0] for row in rows])
     gaps = [_gap([rate for rate, _ in row]) for row in rows]
@@ -237,15 +174,21 @@ def _apart(axis: Axes, points: list[tuple[float, float]], least: float = 0.04) -
     return [float(y) for _, y in scale.inverted().transform([(0.0, h) for h in height])]
 
 
-def make(budget: Budget, studies: dict[str, Study], data: Path, path: Path) -> Path:
-    """Draws the figure.
+def marks(budget: Budget) -> tuple[list[Place], list[Place]]:
+    """Marks of both panels.
+
+    In the air engines solve the same equations, so that MuJoCo C has this engine's error there.
 
     Args:
-      budget: Variants of the default scene and their rates.
-      studies: Of the finger tip, by the machine's name, see `report.studies`.
-      data: Folder of the benchmarks.
-      path: Picture.
+      budget: Variants of the default scene, their rates and the errors of their finger tips.
     """
-    left = verdicts(budget) + spheres(budget, data)
+    beside = {name: budget.compared(name, "truth") for name in WORDS}
+    flipped = {name: found["flipped"] for name, found in beside.items() if found}
+    tips = {name: exactly(budget.tips[name]) for name in IN_THE_AIR if name in budget.tips}
+    return places(budget, flipped), places(budget, tips)
+
+
+def make(budget: Budget, path: Path) -> Path:
+    """Draws the figure of `marks` into a file."""
     moved = budget.compared("truth, moved", "truth")
-    return draw(left, tips(studies), moved["flipped"].value if moved else None, path)
+    return draw(*marks(budget), moved["flipped"].value if moved else None, path)

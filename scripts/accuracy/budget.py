@@ -3,6 +3,7 @@
 python -m scripts.accuracy.budget --data runs/paper --out runs/budget              # again to resume
 python -m scripts.accuracy.budget --data runs/paper --out runs/budget --share 1/8  # beside 7 others
 python -m scripts.accuracy.budget --data runs/paper --out runs/budget --time  # then: rates, alone
+python -m scripts.accuracy.budget --out runs/budget --tip              # errors of the finger tip
 python -m scripts.accuracy.budget --out runs/budget --merge docs/data/budget.json
 python -m scripts.accuracy.budget --merge docs/data/budget.json --report
 
@@ -31,13 +32,14 @@ from codesign_jax import rollout, scene, use_compilation_cache
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.types import Status, Trial, failed
-from scripts.accuracy import decision, worlds
+from scripts.accuracy import decision, study, tip, worlds
+from scripts.accuracy.settings import PRESETS, Setting
 from scripts.shared import output, provenance, sets, work
 
 DESIGNS, TRIALS, FEW = 30, 40, 16
 """Designs, trials of each, and trials of the dearest variants: the first ones."""
 BITS = {str(b.name): b.value for b in Status if b.value}
-CALIBRATED = Path("docs/data/calibration/gpu_hull_scores.npz")
+CALIBRATED = Path("docs/data/calibration/palm_scores.npz")
 """Sets of constants, of which those that no target ruled out are drawn."""
 
 
@@ -51,6 +53,7 @@ class Variant:
       moved: Whether the objects are displaced by a micrometre.
       drawn: Whether each trial has constants of its own, drawn from their calibrated range.
       few: Whether it is so dear that it has `FEW` trials.
+      engine: Name of the engine.
     """
 
     accuracy: str = "standard"
@@ -58,6 +61,7 @@ class Variant:
     moved: bool = False
     drawn: bool = False
     few: bool = False
+    engine: str = "structured"
 
     def scene(self, more: tuple[str, ...] = ()) -> Scene:
         """The default scene so changed."""
@@ -83,6 +87,7 @@ TRUTH, FINER = discretized(2, 20, 4, 16), discretized(1, 30, 5, 20)
 LOOSE = ("newton.decrement=1e-3", "newton.iterations=24")
 """A looser tolerance of the contact solver, in place of fewer iterations."""
 LEAST = "discretization.spring_damping=least"
+SPHERES = "effects.surface=spheres"
 VARIANTS: dict[str, Variant] = {
     # The dearest first: the last process ends early.
     "truth": Variant(changes=TRUTH),
@@ -104,7 +109,8 @@ VARIANTS: dict[str, Variant] = {
     "neo-Hookean": Variant(changes=("effects.neo_hookean=true",)),
     "lateral threshold": Variant(changes=("effects.lateral_threshold=true",)),
     "soft touch": Variant(changes=("effects.soft_touch=true",)),
-    "spheres": Variant(changes=("effects.surface=spheres",)),
+    "spheres": Variant(changes=(SPHERES,)),
+    "spheres, MuJoCo C": Variant(changes=(SPHERES,), few=True, engine="mujoco"),
     "fingers pass each other": Variant(changes=("effects.finger_finger=false",)),
     "fingers pass the palm": Variant(changes=("effects.finger_palm=false",)),
     "fingers creep": Variant(changes=("effects.friction_memory=false",)),
@@ -118,8 +124,23 @@ VARIANTS: dict[str, Variant] = {
     "4 x 16, least, 1e-3": Variant(changes=(*discretized(10, 10, 4, 16), *LOOSE)),
     "5 ms, 3 x 12, least, 1e-3": Variant(changes=(*discretized(5, 10, 3, 12), *LOOSE)),
 }
-TIMED = ("fast", "standard", "fine", "reference", "least, 1e-3", "5 ms, least, 1e-3", "truth")
+TIMED = (
+    *("fast", "standard", "fine", "reference", "least, 1e-3", "5 ms, least, 1e-3"),
+    *("4 x 16, least, 1e-3", "spheres", "spheres, MuJoCo C"),
+)
 """Variants whose rate is measured, one after another."""
+DEAR = ("reference", "spheres, MuJoCo C")
+"""Those of which one call is timed."""
+TIPS = {
+    **PRESETS,
+    "least, 1e-3": PRESETS["fast"],
+    "4 x 16, least, 1e-3": PRESETS["fast"],
+    "5 ms, least, 1e-3": PRESETS["fine"],
+    "truth": Setting(timestep=2, links=20, damping="least"),
+    "spheres": PRESETS["standard"],
+    "spheres, MuJoCo C": PRESETS["standard"],
+}
+"""Settings of variants in the air, where engines, skins and contact solvers do not differ."""
 
 
 class Study:
@@ -159,7 +180,7 @@ class Study:
         variant = VARIANTS[name]
         call, _ = self._call(name, variant, variant.scene(self.more))
         seconds = []
-        for _ in range(1 if name in ("reference", "truth") else 3):
+        for _ in range(1 if name in DEAR else 3):
             start = time.perf_counter()
             jax.block_until_ready(call())
             seconds.append(time.perf_counter() - start)
@@ -172,7 +193,7 @@ class Study:
     def _call(self, name: str, variant: Variant, the_scene: Scene) -> tuple[Any, float]:
         """A function that simulates, compiled, and the time that this took [s]."""
         space = parameters.design_space(the_scene.hand)
-        engine, count = make_engine("structured", the_scene), self._trials(variant)
+        engine, count = make_engine(variant.engine, the_scene), self._trials(variant)
         drawn = worlds.trials(the_scene, count, seed=decision.SEED)
         drawn = work.nudged(drawn) if variant.moved else drawn
         designs, trials = crossed(self.designs, drawn)
@@ -224,11 +245,11 @@ def simulate(args: argparse.Namespace) -> None:
     """Simulates the variants of this process that have no file yet."""
     first, count = (int(n) for n in args.share.split("/"))
     names = [n for n in VARIANTS if not args.only or n in args.only.split(";")][first - 1 :: count]
-    left, study = [n for n in names if not path_of(args.out, n).exists()], None
+    left, made = [n for n in names if not path_of(args.out, n).exists()], None
     for name in left:
-        study = study or Study(args)
+        made = made or Study(args)
         try:
-            found = study.run(name)
+            found = made.run(name)
         except InputError as error:  # an effect that the surface does not have: a result as well
             found = {"variant": dataclasses.asdict(VARIANTS[name]), "refused": str(error)}
         output.write_json(path_of(args.out, name), {"name": name, **found})
@@ -239,15 +260,29 @@ def simulate(args: argparse.Namespace) -> None:
 
 def measure(args: argparse.Namespace) -> None:
     """Measures rates, one variant after another; a machine has a file of its own."""
-    study, name = Study(args), jax.devices()[0].platform
+    made, name = Study(args), jax.devices()[0].platform
     path = args.out / f"times_{name}.json"
     found = json.loads(path.read_text()) if path.exists() else {"rates": {}}
     for variant in args.only.split(";") if args.only else TIMED:
         if variant not in found["rates"]:
-            found["rates"][variant] = study.rate(variant)
+            found["rates"][variant] = made.rate(variant)
             found["made"] = provenance.measurement(args.commit)
             output.write_json(path, found)
             print(f"{variant}: {found['rates'][variant]['grasps_per_s']:.0f} grasps/s", flush=True)
+
+
+def measure_tips(args: argparse.Namespace) -> None:
+    """Measures errors of the finger tip in a fast motion in the air, against MuJoCo C."""
+    size = study.SIZES["full"]
+    exact = tip.motion(study.reference(size), size.hands, size.seconds)
+    errors: dict[Setting, float] = {}
+    for setting in TIPS.values():
+        if setting not in errors:
+            found = tip.compare(tip.motion(setting, size.hands, size.seconds), exact)
+            errors[setting] = found["tip_rms_mm"]
+    named = {name: errors[setting] for name, setting in TIPS.items()}
+    made = provenance.measurement(args.commit)
+    output.write_json(args.out / "tips.json", {"tip_rms_mm": named, "made": made})
 
 
 def merged(folder: Path) -> dict[str, Any]:
@@ -259,6 +294,8 @@ def merged(folder: Path) -> dict[str, Any]:
             p.stem.split("_")[1]: json.loads(p.read_text()) for p in folder.glob("times_*.json")
         },
     }
+    if (path := folder / "tips.json").exists():
+        found["tips"] = json.loads(path.read_text())
     return found
 
 
@@ -273,6 +310,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="these variants, with ; between")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--time", action="store_true", help="measure rates")
+    parser.add_argument("--tip", action="store_true", help="measure errors of the finger tip")
     parser.add_argument("--merge", type=Path, help="write the files into this one and stop")
     parser.add_argument("--report", action="store_true", help="show the tables of --merge and stop")
     parser.add_argument("--page", type=Path, help="page whose tables are filled in")
@@ -280,18 +318,17 @@ def main() -> int:
     args = parser.parse_args()
     use_compilation_cache()
     if args.report:
-        from scripts.accuracy import against_time, budget_report, report
+        from scripts.accuracy import against_time, budget_report
 
         found = budget_report.Budget(json.loads(args.merge.read_text()))
         if args.figure:
-            data, path = args.merge.parent, args.figure.with_name("accuracy_time.png")
-            print(against_time.make(found, report.studies(data.parent), data, path))
+            print(against_time.make(found, args.figure.with_name("accuracy_time.png")))
         return budget_report.make(found, args.page, args.figure)
     if args.merge:
         output.write_json(args.merge, merged(args.out), indent=None)
         return 0
     args.out.mkdir(parents=True, exist_ok=True)
-    (measure if args.time else simulate)(args)
+    (measure_tips if args.tip else measure if args.time else simulate)(args)
     return 0
 
 

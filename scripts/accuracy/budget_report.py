@@ -1,6 +1,6 @@
 """The tables and the figure of `scripts.accuracy.budget`, from its file alone.
 
-The figure of accuracy against time, which needs other files as well, is `against_time`.
+The figure of accuracy against time is `against_time`.
 """
 
 from pathlib import Path
@@ -56,6 +56,12 @@ CHANGES = (
     Change("pressure resists sideways bending", "standard, on CPUs", "lateral threshold", MODELS),
     Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
     Change("spheres in place of the skin", "standard", "spheres", MODELS),
+    Change(
+        "MuJoCo C in place of this engine, both with spheres",
+        "spheres",
+        "spheres, MuJoCo C",
+        MODELS,
+    ),
     Change("fingers pass one another", "standard", "fingers pass each other", MODELS),
     Change("fingers pass the palm", "standard", "fingers pass the palm", MODELS),
     Change("constants drawn from their calibrated range", "standard", "constants", MODELS),
@@ -71,6 +77,7 @@ class Budget:
         records = {n: r for n, r in found["variants"].items() if "lost" in r}
         self.costs = {n: decision.costs(scene, r) for n, r in records.items()}
         self.rates = {n: r["rates"] for n, r in found.get("rates", {}).items()}
+        self.tips: dict[str, float] = found.get("tips", {}).get("tip_rms_mm", {})
 
     def compared(self, of: str, to: str) -> dict[str, Any] | None:
         """`analysis.compare` of a variant with another one, None if either was not run."""
@@ -82,12 +89,14 @@ class Budget:
         """A setting beside the truth."""
         beside, moved = self.compared(name, "truth"), self.compared(name, f"{name}, moved")
         rates = [self.rates.get(machine, {}).get(name) for machine in RATED]
-        cells = [words, *["–"] * 4]
+        cells = [words, *["–"] * 5]
         if beside:
             cells[1] = points(beside["success_difference"])
             cells[2], cells[3] = interval(beside["flipped"]), interval(beside["rank"], ".2f")
         if moved:
             cells[4] = f"{moved['flipped'].value:.1%}"
+        if name in self.tips:
+            cells[5] = f"{self.tips[name]:.2g} mm"
         return cells + [f"{r['grasps_per_s']:,.0f}" if r else "–" for r in rates]
 
     def tables(self) -> dict[str, str]:
@@ -107,7 +116,8 @@ def points(value: Any) -> str:
 def presets_table(budget: Budget) -> list[list[str]]:
     """Presets and candidates beside the truth."""
     head = ["setting", "success, points from the truth", "verdicts that flip", "rank correlation"]
-    rows = [[*head, "flips by a micrometre", *(f"grasps/s, {m}" for m in RATED.values())]]
+    head += ["flips by a micrometre", "finger tip in the air"]
+    rows = [[*head, *(f"grasps/s, {m}" for m in RATED.values())]]
     rows += [budget.row(name, f"`{name}`") for name in PRESETS]
     rows += [budget.row(n, words) for n, words in CANDIDATES.items() if n in budget.costs]
     return rows if budget.rates else [row[: -len(RATED)] for row in rows]

@@ -5,12 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign_jax.codesign import SUCCESS_COST
 from scripts.accuracy.results import ERRORS, Study
 from scripts.accuracy.settings import PRESETS, Setting
 from scripts.accuracy.tables import COST, cost_cells
 
-FINEST_MESH = Setting(timestep=2.0, links=20, surface="hull 4 x 16", damping="least")
 _COMMENT = "# measured: "
 
 
@@ -31,32 +29,6 @@ def presets_table(studies: dict[str, Study]) -> list[list[str]]:
 
 WITHOUT = "without contact between fingers"
 """What the study leaves out of the default scene."""
-
-
-def in_short(studies: dict[str, Study]) -> list[list[str]]:
-    """The presets for a user: three errors and grasps a second; the heads say what is left out."""
-    full = next(iter(studies.values()))
-    heads = [ERRORS[part][0] for part in ERRORS]
-    heads[-1] += f", {WITHOUT}, against 0.5 ms and 20 links"
-    heads.append("against 2 ms, 20 links and a skin of 4 x 16 points")
-    rates = (f"grasps/s in contact, {WITHOUT}, {name}" for name in studies)
-    rows = [["preset", "setting", *heads, *rates]]
-    for name, setting in PRESETS.items():
-        errors = [full.error(part, setting) for part in ERRORS]
-        cells = ["–" if e is None else f"{e:.2g}" for e in [*errors, _flips(full, setting)]]
-        cells += [cost_cells(s.cost("structured", setting))[1] for s in studies.values()]
-        rows.append([f"`{name}`", setting.label, *cells])
-    return rows
-
-
-def _flips(study: Study, setting: Setting) -> float | None:
-    """Share of late verdicts that differ from the finest mesh; None if not measured."""
-    mine, finest = (study.grasps.get((s, False, "late")) for s in (setting, FINEST_MESH))
-    if mine is None or finest is None:
-        return None
-    trials = min(mine.shape[1], finest.shape[1])
-    kept, right = (cost[:, :trials] < SUCCESS_COST for cost in (mine, finest))  # failed: not kept
-    return float((kept != right).mean())
 
 
 def standing(study: Study) -> list[list[str]]:

@@ -38,18 +38,16 @@ def make(docs: Path, found: dict[str, Study] | None = None) -> str:
     return text
 
 
-def make_summary(page: Path, note: Path, scenes: Path, found: dict[str, Study]) -> None:
+def make_summary(note: Path, scenes: Path, found: dict[str, Study]) -> None:
     """Fills in the tables of the presets and of the errors wanted, and the comments of their files.
 
     Args:
-      page: The user's page, which has the presets in short.
       note: The note of the study.
       scenes: Folder of the presets.
       found: See `studies`; the full size comes first.
     """
     named = {SHORT[n]: study for n, study in found.items()}
     full, *rest = named.values()
-    fill(page, markdown(presets.in_short(named)), "presets")
     fill(note, markdown(tables.wanted_here(full, rest[0] if rest else None)), "wanted")
     text = "\n\n".join(markdown(t) for t in (presets.presets_table(named), presets.standing(full)))
     fill(note, text, "presets")

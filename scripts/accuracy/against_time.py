@@ -97,6 +97,8 @@ def draw(left: list[Place], right: list[Place], floor: float | None, path: Path)
     )
     _names(verdict, left, 100)
     _names(tip, right)
+    for axis in (verdict, tip):
+        axis.set_xlim(axis.get_xlim()[0] / 2)  # room for the name of a mark at the edge
     if floor is not None:
         verdict.axhline(100 * floor, color="0.4", ls=":", lw=1)
         verdict.text(

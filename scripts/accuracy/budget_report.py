@@ -50,21 +50,23 @@ CHANGES = (
     Change("the material's damping alone", "standard", "least", NUMERICS),
     Change("step, links and skin at once: the truth", "standard", "truth", NUMERICS),
     Change("the truth refined again", "truth", "finer", NUMERICS),
-    Change("the palm acts once a finger is in it", "standard", "palm once inside", NUMERICS),
-    Change("fingers creep on one another", "standard", "fingers creep", MODELS),
+    Change(
+        "the palm acts once a finger is in it", "standard, on CPUs", "palm once inside", NUMERICS
+    ),
+    Change("fingers creep on one another", "standard, on CPUs", "fingers creep", MODELS),
     Change("soft touch", "standard, on CPUs", "soft touch", MODELS),
     Change("pressure resists sideways bending", "standard, on CPUs", "lateral threshold", MODELS),
     Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
     Change("spheres in place of the skin", "standard", "spheres", MODELS),
     Change(
-        "MuJoCo C in place of this engine, both with spheres",
+        "MuJoCo C in place of this engine, with spheres",
         "spheres",
         "spheres, MuJoCo C",
-        MODELS,
+        NUMERICS,
     ),
     Change("fingers pass one another", "standard", "fingers pass each other", MODELS),
     Change("fingers pass the palm", "standard", "fingers pass the palm", MODELS),
-    Change("constants drawn from their calibrated range", "standard", "constants", MODELS),
+    Change("constants drawn from their calibrated range", "standard, on CPUs", "constants", MODELS),
 )
 
 

@@ -96,6 +96,7 @@ class Setting:
                 "twist": self.axes > 2,
                 "surface": kind,
                 "finger_finger": False,
+                "finger_palm": False,
             },
         }
         if self.iterations == 0:
@@ -109,7 +110,7 @@ class Setting:
         return merge(tables, keypaths.parse(self.extra))
 
     def scene(self, more: Overrides | None = None, **names: Any) -> Scene:
-        """The scene `paper` at this setting, without contact between fingers.
+        """The scene `paper` at this setting, without contact among fingers and with the palm.
 
         Args:
           more: Further overrides.

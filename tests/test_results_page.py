@@ -111,8 +111,8 @@ def test_the_default_scene_s_budget_is_that_of_the_data():
     points = {c.to: 100 * r["flipped"].value for c, r in flips.items() if r}
     numerics = [points[c.to] for c in CHANGES if c.kind == "numerics" and c.to in points]
     touch = [points[f"fingers pass {what}"] for what in ("each other", "the palm")]
-    left = files.read_scores([DATA / "calibration" / "palm_scores.npz"])[0].plausible.sum()
-    assert f"of the {left} that the [calibration](calibration.md) left in this scene" in text
+    [palm] = files.read_scores([DATA / "calibration" / "palm_scores.npz"])
+    assert f"of the {palm.plausible.sum()} that the first {len(palm.plausible)} of the" in text
     assert f"A truth refined once more flips {points['finer']:.0f} %" in text
     assert f"and this engine differ in {points['spheres, MuJoCo C']:.0f} %" in text
     assert f"Numerics flip {min(numerics):.0f} to {max(numerics):.0f} %" in text
@@ -127,7 +127,8 @@ def test_the_default_scene_s_budget_is_that_of_the_data():
     against = {n: compared(n, "truth")["success_difference"] for n in PRESETS}
     worst = max(abs(100 * r.value) for r in against.values())
     mine = abs(100 * against["standard"].value)
-    assert worst <= 2.5 and f"by 2.5 points at most and by {mine:.1f} at `standard`" in text
+    assert f"by {worst:.1f} points at most and by {mine:.1f} at `standard`" in text
+    assert f"judges {100 * against['fast'].value:.1f} points too well" in text
     assert [n for n, r in against.items() if r.low > 0 or r.high < 0] == ["fast"]
     mine = commits(found) | commits(json.loads((NOW / "23d.json").read_text()))
     assert len({c[:7] for c in mine}) == 1, mine
@@ -142,7 +143,7 @@ def test_the_rates_that_the_accuracy_page_states_are_those_of_the_data():
     assert {m["fast"]["grasps"] for m in machines} == {1200, 480}
     ratios = [m["fast"] / m["standard"] for m in (gpu, cpu)]
     assert f"{ratios[0]:.1f}" == f"{ratios[1]:.1f}", "on both machines"
-    assert f"at {ratios[0]:.1f} times the rate." in text
+    assert f"at {ratios[0]:.1f} times the rate, and judges" in text
     assert f"({gpu[names[2]]:.0f} grasps/s beside {gpu['fast']:.0f}, 1,200 a call)" in text
     assert f"({cpu[names[2]]:.0f} beside {cpu['fast']:.0f}, 480 a call)" in text
     both = [machines[1][n]["grasps_per_s"] for n in ("spheres", "spheres, MuJoCo C")]
@@ -164,7 +165,7 @@ def test_the_calibration_page_states_what_its_waves_have():
     every = calibration.join([palm, near])
     text = words((ROOT / "docs" / "calibration.md").read_text(encoding="utf-8"))
     left, most = int(every.plausible.sum()), len(every.plausible)
-    assert f"then {len(near.plausible)} near those" in text
+    assert f"and {len(near.plausible)} near those" in text
     assert f"No target rules out {left} of these {most} sets" in text
     assert f"Share of the {most} sets" in text
     assert f"Of the {palm.plausible.sum()} sets that are left of the {len(palm.plausible)}" in text

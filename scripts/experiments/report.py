@@ -210,7 +210,7 @@ def _grasps_row(studies: dict[str, Study | None], grid) -> tuple[str, str]:
     paper = ", ".join(f"{name} {count:,}" for name, count in PAPER_GRASPS.items())
     return (
         f"grasps: {paper}; {TOTAL_GRASPS:,} in all",
-        f"{counts or 'none'}; {total:,} in all, in {minutes:.1f} minutes",
+        f"{counts or 'none'}; {total:,} in all, {minutes:.1f} minutes summed over the experiments",
     )
 
 

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 
 def test_the_standard_preset_is_the_scene_and_the_study_s_default():
     assert scene.load("paper", accuracy="standard") == scene.load("paper")
-    off = {"effects.finger_finger": False}
+    off = {"effects.finger_finger": False, "effects.finger_palm": False}
     assert STANDARD.scene() == scene.load("paper", overrides=off)
 
 

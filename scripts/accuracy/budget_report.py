@@ -53,17 +53,17 @@ CHANGES = (
     Change(
         "the palm acts once a finger is in it", "standard, on CPUs", "palm once inside", NUMERICS
     ),
-    Change("fingers creep on one another", "standard, on CPUs", "fingers creep", MODELS),
-    Change("soft touch", "standard, on CPUs", "soft touch", MODELS),
-    Change("pressure resists sideways bending", "standard, on CPUs", "lateral threshold", MODELS),
-    Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
-    Change("spheres in place of the skin", "standard", "spheres", MODELS),
     Change(
         "MuJoCo C in place of this engine, with spheres",
         "spheres",
         "spheres, MuJoCo C",
         NUMERICS,
     ),
+    Change("fingers creep on one another", "standard, on CPUs", "fingers creep", MODELS),
+    Change("soft touch", "standard, on CPUs", "soft touch", MODELS),
+    Change("pressure resists sideways bending", "standard, on CPUs", "lateral threshold", MODELS),
+    Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
+    Change("spheres in place of the skin", "standard", "spheres", MODELS),
     Change("fingers pass one another", "standard", "fingers pass each other", MODELS),
     Change("fingers pass the palm", "standard", "fingers pass the palm", MODELS),
     Change(
@@ -167,7 +167,7 @@ def draw(budget: Budget, path: Path) -> Path:
     axes.set_yticks([-k for k in range(len(found))], words, fontsize=8)
     handles = [Patch(color=color, alpha=0.8) for color in COLORS.values()]
     axes.legend(handles, list(COLORS), frameon=False, fontsize=8, loc="upper right")
-    axes.set(xlabel="verdicts of late designs that flip [%]", xlim=(0, None))
+    axes.set(xlabel="verdicts that flip [%]", xlim=(0, None))
     return figures.save(figure, path)
 
 

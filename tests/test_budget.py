@@ -1,5 +1,6 @@
 """What moves a verdict: the tables from records whose flips are known, and the variants' scenes."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from codesign_jax.scene import load
 from scripts.accuracy import against_time, budget, budget_report, decision
+from scripts.accuracy.settings import PRESETS, Setting
 from scripts.shared import figures
 
 WINDOW = load("paper").window
@@ -89,6 +91,11 @@ def test_names_that_would_meet_are_moved_apart():
 
 def test_every_variant_is_a_scene_and_every_row_has_its_variants(tmp_path):
     scenes = {name: variant.scene() for name, variant in budget.VARIANTS.items()}
+    air = {name: budget.VARIANTS[name].in_the_air() for name in ("standard", "fine", "truth")}
+    assert air["standard"] == Setting() and air["truth"] == Setting(
+        timestep=2.0, links=20, damping="least"
+    )
+    assert air["fine"] == dataclasses.replace(PRESETS["fine"], iterations=None)
     fine = scenes["truth"].discretization
     assert (fine.timestep, fine.links, fine.hull_rings, fine.hull_points) == (0.002, 20, 4, 16)
     assert scenes["1e-3"].newton.decrement == 1e-3 and scenes["4 iterations"].newton.iterations == 4

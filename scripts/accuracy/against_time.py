@@ -1,10 +1,10 @@
 """One figure of accuracy against time: verdicts and finger tip, by machine and engine.
 
-`scripts.accuracy.budget --report` draws it, from its own file alone.
+`scripts.accuracy.budget --report` draws it, from the file of --merge alone.
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -121,15 +121,11 @@ def _marks(axis: Axes, places: list[Place]) -> None:
     for place in places:
         color, marker = LOOKS[place.who]
         middle, low, high = place.error
-        look: dict[str, Any] = {
-            "color": color,
-            "marker": marker,
-            "ls": "none",
-            "zorder": 3,
-            "ms": 7,
-        }
         error = [[middle - low], [high - middle]] if high > low else None
-        axis.errorbar(place.rate, middle, yerr=error, elinewidth=0.8, capsize=2, **look)
+        axis.errorbar(
+            place.rate, middle, yerr=error, color=color, marker=marker, ms=7, ls="none",
+            zorder=3, elinewidth=0.8, capsize=2,
+        )  # fmt: skip
     axis.set_xscale("log")
     axis.grid(alpha=0.3, which="both", lw=0.4)
 

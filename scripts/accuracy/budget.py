@@ -33,7 +33,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.types import Status, Trial, failed
 from scripts.accuracy import decision, study, tip, worlds
-from scripts.accuracy.settings import PRESETS, Setting
+from scripts.accuracy.settings import Setting
 from scripts.shared import output, provenance, sets, work
 
 DESIGNS, TRIALS, FEW = 30, 40, 16
@@ -67,6 +67,12 @@ class Variant:
         """The default scene so changed."""
         overrides = keypaths.parse([*self.changes, *more])
         return scene.load("paper", accuracy=self.accuracy, overrides=overrides)
+
+    def in_the_air(self) -> Setting:
+        """Step, links and damping; without contact skin, solver and engine do not matter."""
+        found = self.scene().discretization
+        step = round(1e3 * found.timestep, 6)
+        return Setting(timestep=step, links=found.links, damping=found.spring_damping)
 
 
 def discretized(step: float, links: int, rings: int, points: int) -> tuple[str, ...]:
@@ -131,16 +137,6 @@ TIMED = (
 """Variants whose rate is measured, one after another."""
 DEAR = ("reference", "spheres, MuJoCo C")
 """Those of which one call is timed."""
-TIPS = {
-    **PRESETS,
-    "least, 1e-3": PRESETS["fast"],
-    "4 x 16, least, 1e-3": PRESETS["fast"],
-    "5 ms, least, 1e-3": PRESETS["fine"],
-    "truth": Setting(timestep=2, links=20, damping="least"),
-    "spheres": PRESETS["standard"],
-    "spheres, MuJoCo C": PRESETS["standard"],
-}
-"""Settings of variants in the air, where engines, skins and contact solvers do not differ."""
 
 
 class Study:
@@ -245,11 +241,11 @@ def simulate(args: argparse.Namespace) -> None:
     """Simulates the variants of this process that have no file yet."""
     first, count = (int(n) for n in args.share.split("/"))
     names = [n for n in VARIANTS if not args.only or n in args.only.split(";")][first - 1 :: count]
-    left, made = [n for n in names if not path_of(args.out, n).exists()], None
+    left, the_study = [n for n in names if not path_of(args.out, n).exists()], None
     for name in left:
-        made = made or Study(args)
+        the_study = the_study or Study(args)
         try:
-            found = made.run(name)
+            found = the_study.run(name)
         except InputError as error:  # an effect that the surface does not have: a result as well
             found = {"variant": dataclasses.asdict(VARIANTS[name]), "refused": str(error)}
         output.write_json(path_of(args.out, name), {"name": name, **found})
@@ -260,12 +256,12 @@ def simulate(args: argparse.Namespace) -> None:
 
 def measure(args: argparse.Namespace) -> None:
     """Measures rates, one variant after another; a machine has a file of its own."""
-    made, name = Study(args), jax.devices()[0].platform
+    the_study, name = Study(args), jax.devices()[0].platform
     path = args.out / f"times_{name}.json"
     found = json.loads(path.read_text()) if path.exists() else {"rates": {}}
     for variant in args.only.split(";") if args.only else TIMED:
         if variant not in found["rates"]:
-            found["rates"][variant] = made.rate(variant)
+            found["rates"][variant] = the_study.rate(variant)
             found["made"] = provenance.measurement(args.commit)
             output.write_json(path, found)
             print(f"{variant}: {found['rates'][variant]['grasps_per_s']:.0f} grasps/s", flush=True)
@@ -273,14 +269,11 @@ def measure(args: argparse.Namespace) -> None:
 
 def measure_tips(args: argparse.Namespace) -> None:
     """Measures errors of the finger tip in a fast motion in the air, against MuJoCo C."""
-    size = study.SIZES["full"]
+    size, settings = study.SIZES["full"], {n: v.in_the_air() for n, v in VARIANTS.items()}
     exact = tip.motion(study.reference(size), size.hands, size.seconds)
-    errors: dict[Setting, float] = {}
-    for setting in TIPS.values():
-        if setting not in errors:
-            found = tip.compare(tip.motion(setting, size.hands, size.seconds), exact)
-            errors[setting] = found["tip_rms_mm"]
-    named = {name: errors[setting] for name, setting in TIPS.items()}
+    found = {s: tip.motion(s, size.hands, size.seconds) for s in dict.fromkeys(settings.values())}
+    errors = {s: tip.compare(tips, exact)["tip_rms_mm"] for s, tips in found.items()}
+    named = {name: errors[setting] for name, setting in settings.items()}
     made = provenance.measurement(args.commit)
     output.write_json(args.out / "tips.json", {"tip_rms_mm": named, "made": made})
 

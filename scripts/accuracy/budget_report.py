@@ -85,12 +85,15 @@ class Budget:
         self.costs = {n: decision.costs(scene, r) for n, r in records.items()}
         self.rates = {n: r["rates"] for n, r in found.get("rates", {}).items()}
         self.tips: dict[str, float] = found.get("tips", {}).get("tip_rms_mm", {})
+        self._compared: dict[tuple[str, str], dict[str, Any]] = {}
 
     def compared(self, of: str, to: str) -> dict[str, Any] | None:
         """`analysis.compare` of a variant with another one, None if either was not run."""
         if of not in self.costs or to not in self.costs:
             return None
-        return analysis.compare(self.costs[of], self.costs[to])
+        if (of, to) not in self._compared:  # tables and figures ask for the same ones
+            self._compared[of, to] = analysis.compare(self.costs[of], self.costs[to])
+        return self._compared[of, to]
 
     def row(self, name: str, words: str) -> list[str]:
         """A setting beside the truth."""

@@ -7,7 +7,6 @@ import pytest
 from codesign_jax import model, scene
 from codesign_jax.model import hull
 from scripts.shared import depths
-from scripts.winners import picture
 from tests.helpers import grasps
 
 
@@ -73,16 +72,3 @@ def test_a_tip_is_as_deep_in_the_palm_as_its_face_is(straight, inside):
     place[:, 1] = tip - inside * along
     found = depths.in_palm(the_scene, params, depths.Poses(place, turn))
     np.testing.assert_allclose(found, inside, rtol=1e-6)
-
-
-def test_designs_are_those_of_the_last_mark_or_the_best_of_each_run(tmp_path):
-    early, late = np.zeros((3, 4)), np.arange(12.0).reshape(3, 4)
-    np.savez(tmp_path / "search.npz", designs9=early, designs31=late, kept9=0, kept31=0)
-    np.testing.assert_array_equal(picture.recommended(tmp_path / "search.npz", 2), late[:2])
-    particles, cost = np.arange(24.0).reshape(1, 2, 3, 4), np.array([[[3, 1, 2], [0, 4, 5]]])
-    np.savez(tmp_path / "runs.npz", final_particles=particles, test_exclude=cost)
-    found = picture.recommended(tmp_path / "runs.npz", 2)
-    np.testing.assert_array_equal(found, [particles[0, 0, 1], particles[0, 1, 0]])
-    np.savez(tmp_path / "other.npz", a=0)
-    with pytest.raises(scene.InputError, match="no designs"):
-        picture.recommended(tmp_path / "other.npz", 2)

@@ -21,7 +21,7 @@ from codesign_jax.scene import InputError
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
 from scripts.experiments import __main__ as experiments
-from scripts.experiments import figures, landscape, marks, plan, report, results, strategies, study
+from scripts.experiments import figures, landscape, plan, report, results, strategies, study
 from scripts.experiments.plan import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
 from tests.helpers import episodes
@@ -389,20 +389,6 @@ def test_shares_of_several_processes_make_the_whole(toy, finished, tmp_path, mon
     assert all(np.array_equal(arrays[name], value) for name, value in whole.items())
     times = [{"ended": 10.0, "seconds": 4.0}, {"ended": 12.0, "seconds": 5.0}]
     assert results.wall_seconds([*times, {"ended": 20.0, "seconds": 1.0}]) == 7.0
-
-
-def test_particles_on_the_way_are_those_of_their_episodes(finished):
-    """Episodes that the grasps allow, with what finds the seed and what chooses counted."""
-    folder, got = finished
-    folders = strategies.folders(PLAN, folder, SEED)["concurrent"]
-    other = 18 + PLAN.particles * marks.ROUNDS
-    found = marks.read(folders, [other + 18 * e + 5 for e in (1, 3, 9)])
-    assert sorted(found) == ["cost36", "cost72", "particles36", "particles72", "seeds"]
-    assert found["seeds"].tolist() == [SEED, SEED + 1]
-    for name, episode in (("cost36", 0), ("cost72", 2)):
-        np.testing.assert_array_equal(found[name], got["cost"][-1][:, episode])
-    with pytest.raises(InputError, match="has begun"):
-        marks.read([*folders, folder / "none"], [100])
 
 
 @pytest.mark.slow

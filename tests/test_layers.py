@@ -36,10 +36,9 @@ cli
 ORDER = {name: level for level, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 TOPS = ("codesign_jax", "scripts")
 ENGINE = "codesign_jax.engines.structured"
-STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "search", "winners"}
+STUDIES = {"accuracy", "benchmark", "calibration", "effects", "experiments", "search"}
 # Studies of results: they take up what these left.
-BUILD_ON = {name: {"experiments"} for name in ("accuracy", "calibration", "winners")}
-BUILD_ON["front_page"] = {"accuracy", "experiments", "search"}  # it quotes what they found
+BUILD_ON = {name: {"experiments"} for name in ("accuracy", "calibration")}
 
 
 def modules(root=ROOT):
@@ -167,7 +166,7 @@ def test_imports_point_one_way():
         (f"{ENGINE}.kernel.skin", f"{ENGINE}.laws.hull", False),
         ("scripts.shared.output", "scripts.experiments.plan", True),
         ("scripts.accuracy.tables", "scripts.benchmark.report", True),
-        ("scripts.winners.variants", "scripts.experiments.study", False),
+        ("scripts.calibration.wave", "scripts.experiments.landscape", False),
     ],
 )
 def test_an_import_against_the_arrows_would_be_found(name, other, forbidden):

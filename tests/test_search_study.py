@@ -6,12 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, rollout, scene
+from codesign_jax import codesign
 from codesign_jax.cost import particle_cost
-from codesign_jax.types import failed
-from scripts.search import report, study, unseen
+from scripts.search import report, study
 from scripts.search.study import Study, make_case
-from tests.helpers.toy_engine import TINY, ToyEngine, tiny
+from tests.helpers.toy_engine import tiny
 
 SIZES = "particles=4,trials=2"
 
@@ -109,30 +108,3 @@ def test_the_page_gets_a_table_and_a_figure(tmp_path):
     with pytest.raises(ValueError, match="other seeds"):
         report.merged([row, sooner | {"first_seed": 1}])
     assert row["kept"][0] == [0.5, 0.96, 0.2, 0.96], "what is merged stays as it was"
-
-
-@pytest.mark.slow  # a study of its own, with programs of its own: 10 s
-def test_an_object_that_is_held_out_is_met_by_the_judge_alone(tmp_path):
-    """Trials of a fold have the other objects in turn, and `kept` tells objects apart."""
-    three = scene.load(TINY, object_set="paper")
-    engine, space = ToyEngine(three), tiny()[1]
-    shapes = unseen.folds(3)
-    np.testing.assert_array_equal(shapes, [[1, 2], [0, 2], [0, 1]])
-    how = {"seeds": 3, "budget": 180, "tests": 4, "marks": 1, "chunk": 48, "shapes": shapes}
-    case = make_case(f"screened-es:{SIZES}", space, "2d")
-    made = finish(Study(case, three, engine, space, **how, path=tmp_path / "folds.npz"))
-    assert made.marks == [9], "a single mark is at the end: 3 x 36 of 180 grasps are its test"
-    drawn = made.drawn(made.keys, 5, shapes, three)
-    np.testing.assert_array_equal(drawn.shape, shapes[:, [0, 1, 0, 1, 0]])
-    found = unseen.judged(made, three, {"mine": made.designs[made.done][:2]}, 6)
-    assert found["held_out"] == [0, 1, 2] and np.shape(found["usual"]["mine"]) == (2, 3)
-    # The same by the library: fold 1's design with object 1.
-    key = codesign.stream_key(jax.random.key(1), study.STREAM_JUDGE)
-    trials = rollout.sample_trials(three, key, 6)._replace(shape=np.full(6, 1))
-    hand = jax.vmap(space.params)(made.designs[made.done][1:2])
-    outcome = rollout.evaluate(three, engine, hand, trials)
-    share = np.mean(~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < 0.01))
-    assert found["usual"]["unseen"][1] == pytest.approx(share)
-    row = found | {"objects": ["a", "b", "c"]}
-    lines = unseen.table(row).splitlines()
-    assert len(lines) == 6 and lines[3].startswith("| b |") and "`mine` keeps" in lines[0]

@@ -1,1 +1,0 @@
-"""What gradients of short windows are good for: three problems with and without them."""

@@ -1,1 +1,0 @@
-"""Final particles of the experiments, simulated again with other engines, steps and hands."""

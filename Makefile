@@ -75,7 +75,7 @@ faults: $(STAMP)
 notebooks: $(STAMP)
 	$(BIN)/python -m scripts.run_notebooks
 
-# About 40 minutes; a file that exists is extended.
+# Whole grasps of all engines; a file that exists is extended.
 BENCHMARK ?= runs/benchmark.json
 benchmark: $(STAMP)
 	$(BIN)/python -m scripts.benchmark --json $(BENCHMARK) $(ARGS)

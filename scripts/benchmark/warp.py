@@ -76,16 +76,15 @@ def _places(
 class WarpProgram:
     """A rollout of worlds; has the times and the `run` of `measure.JaxProgram`."""
 
-    def __init__(self, scene: Scene, fields: ModelFields, ctrl: np.ndarray, *, trajectory: bool):
+    def __init__(self, scene: Scene, fields: ModelFields, ctrl: np.ndarray):
         """Puts model and data on the device and captures a step.
 
         Args:
           scene: The scene.
           fields: Model fields and start states, leading axis (world,).
           ctrl: Controls, shape (world, time, nu).
-          trajectory: Whether to return qpos of every step, by way of the host.
         """
-        self.trajectory, self.worlds, self.steps = trajectory, *ctrl.shape[:2]
+        self.worlds, self.steps = ctrl.shape[:2]
         template, lay = copy.deepcopy(compile_template(scene)), layout(scene)
         # Warp never resets a world and refuses the flag that asks for that.
         template.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -136,12 +135,9 @@ class WarpProgram:
     def run(self) -> tuple[Trace, float]:
         """Runs once; returns the trace, leading axes (world, time), and seconds."""
         self._reset()
-        states = []
         wp.synchronize()
         begin = time.perf_counter()
         for _ in range(self.steps):
-            if self.trajectory:
-                states.append(np.array(self.data.qpos.numpy()))
             if self.graph is None:
                 self._step()
             else:
@@ -149,8 +145,8 @@ class WarpProgram:
         wp.synchronize()
         seconds = time.perf_counter() - begin
         out = np.array(np.moveaxis(self.out.numpy(), 0, 1))
-        qpos = np.stack(states, 1) if states else np.zeros((*out.shape[:2], 0), np.float32)
-        return Trace(out[..., 0], out[..., 1], out[..., 2], qpos), seconds
+        none = np.zeros((*out.shape[:2], 0), np.float32)
+        return Trace(out[..., 0], out[..., 1], out[..., 2], none), seconds
 
     def memory(self) -> int:
         """Largest memory of the device's pool so far [byte]; 0 where Warp does not count it."""

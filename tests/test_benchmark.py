@@ -1,6 +1,5 @@
 """The benchmark's statistics against closed forms and SciPy, its worlds, and its book-keeping."""
 
-
 import jax
 import numpy as np
 import pytest

@@ -10,12 +10,11 @@ from typing import Annotated, Literal
 import tyro
 
 from codesign_jax import caches
-from codesign_jax.commands import flags, mistyped, status
+from codesign_jax.commands import flags, status
 from codesign_jax.commands.flags import (
     Count,
     File,
     Flag,
-    JobParameters,
     Overrides,
     RunOrDesign,
     Shown,
@@ -88,10 +87,6 @@ class Optimize(Command):
     seeds: Text = None
     """Several seeds, such as 0-9 or 1,3,5: a run of each, simulated in one batch, and a
     comparison. Each is the run that it would be alone."""
-    jobs: Count = None
-    """With --seeds or several --schedule: each run in a process of its own, so many at a time:
-    SLURM jobs where there is SLURM, else local processes."""
-    job_set: JobParameters = ()
     devices: Count = None
     """Devices that share the batch; default: every GPU of this host. Results do not depend on
     it."""
@@ -339,7 +334,7 @@ def main(arguments: list[str] | None = None) -> int:
     def run() -> int:
         if given == ["--version"]:
             return _version()
-        refuse(flags.text_problems(given) or mistyped.problems(given, COMMANDS))
+        refuse(flags.text_problems(given))
         command = tyro.cli(
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,

@@ -2,55 +2,37 @@
 
 import gc
 import os
-import re
 import signal
 import subprocess
 import sys
 import threading
 import time
 import tomllib
-import typing
 from pathlib import Path
 
 import pytest
 
 from codesign_jax import cli, codesign
-from codesign_jax.commands import mistyped, preflight, status
+from codesign_jax.commands import preflight, status
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.scene import effects
 from tests.helpers.command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
-MISTYPED = {
-    "optimise --preset 2d": "'optimise' is not a command; did you mean optimize?",
-    "optimzie": "'optimzie' is not a command; did you mean optimize?",
-    "judge": "'judge' is not a command; valid: optimize, evaluate, landscape,",
-    "evaluate --object mug": "evaluate has no --object; did you mean --objects?",
-    "evaluate --trails=12": "evaluate has no --trails; did you mean --trials?",
-    "evaluate --trials": "--trials needs a value",
-    "evaluate --trials --seed 1": "--trials needs a value",
-    "optimize --particles ten": "--particles 'ten' must be a whole number",
-    "optimize --seed=1.5": "--seed '1.5' must be a whole number",
-    "optimize --first body": "--first 'body' must be one of morphology, control",
-    "export --out part --draft flat": "--draft 'flat' must be a number",
-}
 
-
-@pytest.mark.parametrize("line", MISTYPED)
-def test_a_mistyped_command_is_answered_in_a_line(line, capsys):
-    assert cli.main(line.split()) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and len(said.err.splitlines()) == 1
-    assert said.err.startswith(f"error: {MISTYPED[line]}")
-
-
-@pytest.mark.parametrize("command", typing.get_args(cli.COMMANDS))
-def test_flags_that_are_looked_at_are_those_that_the_parser_has(command, capsys):
-    name = command.__name__.lower()
-    with pytest.raises(SystemExit):
-        cli.main([name, "--help"])
-    shown = re.findall(r"^[^\w-] (--[a-z][a-z-]*)", capsys.readouterr().out, re.M)
-    assert {*mistyped.known_flags(command)} == {*shown} - {"--help"}
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("optimise --preset 2d", "available subcommands: optimize"),
+        ("evaluate --trails 12", "--trials"),
+        ("optimize --particles ten", "--particles"),
+    ],
+)
+def test_a_mistyped_command_is_refused_by_the_parser(line, words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(line.split())
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err.lower()
 
 
 def test_help_imports_nothing_heavy():
@@ -110,20 +92,12 @@ WRONG = {
             "objects.nois is not a known key; did you mean 'objects.noise'?",
         ],
     ),
-    "parameters of no jobs": (
-        ["--job-set", "slurm_partition=gpu", "cpus_per_task"],
-        ["--job-set needs --jobs", "--job-set 'cpus_per_task' must be KEY=VALUE"],
-    ),
     "seeds that are none": (["--seeds", "0-"], ["--seeds '0-' must be seeds such as 0-9 or 1,3,5"]),
     "seeds backwards": (["--seeds", "9-0"], ["must be seeds such as"]),
     "too many seeds": (["--seeds", "0-99999"], ["names more than 1000 runs"]),
     "hosts without seeds": (
         ["--distributed", "auto"],
         ["--distributed needs --seeds"],
-    ),
-    "hosts and jobs": (
-        ["--seeds", "0-1", "--distributed", "auto", "--jobs", "2"],
-        ["error: --distributed and --jobs exclude each other"],
     ),
     "a preset of too many": (["--preset", "24d"], ["did you mean '23d'?"]),
     "hosts that are none": (

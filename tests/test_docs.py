@@ -12,7 +12,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-import submitit
 import yaml
 
 from codesign_jax import cli
@@ -106,8 +105,6 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
 @pytest.mark.slow
 @pytest.mark.parametrize("example", [e for e in CODESIGN if "failures" not in e])
 def test_every_command_runs_at_a_small_size(example, here, monkeypatch):
-    # SLURM's commands may be installed without a cluster to take the jobs.
-    monkeypatch.setattr(submitit.SlurmExecutor, "affinity", classmethod(lambda cls: -1))
     size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
     size["export"] = ["--overwrite", "--trials", "0", "--tolerance", "off"]
     size["landscape"] = ["--points", "2", "--trials", "1"]
@@ -115,8 +112,6 @@ def test_every_command_runs_at_a_small_size(example, here, monkeypatch):
     arguments = here_alone(example)
     if arguments[0] == "optimize" and "switch" in example:
         size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]
-    if "--jobs" in arguments:  # a process each
-        size["optimize"] = [*SMALL, "--fresh", "--seeds", "0-1"]
     assert cli.main([*arguments, *size.get(arguments[0], [])]) == 0
 
 

@@ -1,4 +1,4 @@
-"""Many runs of one command: in one batch, as jobs, on several hosts, with the same bits."""
+"""Many runs of one command: in one batch, on several hosts, with the same bits."""
 
 import contextlib
 import csv
@@ -9,7 +9,6 @@ import os
 import shutil
 import signal
 import socket
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,7 +18,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, runs, scene
 from codesign_jax.batch import Batch
-from codesign_jax.commands import jobs, seeds
+from codesign_jax.commands import seeds
 from codesign_jax.commands.seeds import Compared
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs.checkpoint import Checkpoints
@@ -148,53 +147,6 @@ def test_strategies_are_compared(compared, tmp_path, capsys):
     assert "did you mean 'single'?" in capsys.readouterr().err
     assert command(*TWO, "--schedule", "single,single", "--out", tmp_path / "no") == 2
     assert "names a strategy more than once" in capsys.readouterr().err
-
-
-class Here:
-    """In the place of submitit's executor: runs each job in this process as it is submitted."""
-
-    cluster, folder = "here", "none"
-
-    def submit(self, function, *arguments):
-        code = function(*arguments)
-        there = SimpleNamespace(exists=lambda: True)
-        return SimpleNamespace(
-            done=lambda: True,
-            exception=lambda: None,
-            result=lambda: code,
-            paths=SimpleNamespace(result_pickle=there, stderr=Path("none")),
-        )
-
-
-def assert_jobs_are_the_batch(compared, out, *more):
-    both, _ = compared
-    assert command(*TWO, "--jobs", "2", *more, "--out", out) == 0
-    assert (out / "seeds.csv").read_bytes() == (both / "seeds.csv").read_bytes()
-    for seed in ("seed-2", "seed-3"):
-        assert stored(out / seed) == stored(both / seed)
-
-
-def test_jobs_have_the_bits_of_a_batch(compared, tmp_path, monkeypatch, capsys):
-    """Each a run by itself, here within this process; the next test has processes, other SLURM."""
-    monkeypatch.setattr(jobs, "executor", lambda options, folder: Here())
-    monkeypatch.setattr(sys, "argv", sys.argv)
-    assert_jobs_are_the_batch(compared, tmp_path / "jobs")
-    assert "2 runs, 2 at a time, on here" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_jobs_are_processes_where_there_is_no_slurm(compared, tmp_path):
-    local = ("--job-set", "cluster=local", "timeout_min=5")
-    assert_jobs_are_the_batch(compared, tmp_path / "jobs", *local)
-
-
-def test_wrong_jobs_are_refused(tmp_path, capsys):
-    assert command(*BASE, "--episodes", "2", "--jobs", "2") == 2
-    assert "--jobs needs --seeds" in capsys.readouterr().err
-    run = [*TWO, "--jobs", "2", "--job-set", "cluster=local"]
-    for wrong, words in (("timeout_min", "must be KEY=VALUE"), ("memory=3", "memory")):
-        assert command(*run, wrong, "--out", tmp_path / "no") == 2
-        assert words in capsys.readouterr().err
 
 
 def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch, capsys):

@@ -2,14 +2,13 @@
 
 import dataclasses
 import os
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
 
 from codesign_jax import engines, optimize, own, runs
-from codesign_jax.commands import common, jobs, seeds
+from codesign_jax.commands import common, seeds
 from codesign_jax.runs import Settings
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.schema import InputError
@@ -80,16 +79,7 @@ def _flag_problems(options: "Optimize") -> list[str]:
     schedules = options.schedule.split(",")
     if len({*schedules}) < len(schedules):
         problems.append(f"--schedule {options.schedule!r} names a strategy more than once")
-    if options.jobs is not None and (not several(options) or options.jobs < 1):
-        problems.append("--jobs needs --seeds or strategies, and at least one run at a time")
-    if options.job_set and options.jobs is None:
-        problems.append("--job-set needs --jobs: its parameters are those of jobs")
-    try:
-        jobs.job_parameters([*chain.from_iterable(options.job_set)])
-    except InputError as error:
-        problems += error.problems
-    # Jobs have the devices of their own hosts, and check there.
-    available = jax.local_device_count() if options.jobs is None else options.devices or 1
+    available = jax.local_device_count()
     if options.devices is not None and not 1 <= options.devices <= available:
         problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
     return problems + common.number_problems(

@@ -22,17 +22,6 @@ Overrides = Annotated[
     ),
 ]
 
-JobParameters = Annotated[
-    tuple[tuple[str, ...], ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(
-        metavar="KEY=VALUE ...",
-        help="Parameters of submitit for --jobs: timeout_min=600 cpus_per_task=8 gpus_per_node=1 "
-        "slurm_partition=gpu; cluster=local for processes here though there is SLURM",
-        help_behavior_hint="",
-    ),
-]
-
 # Without a default of its own: the help text says what takes its place.
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Count = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import shlex
-import signal
 import sys
 import traceback
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import asked, common, hosts, jobs, reference, seeds, status, time_needed
+from codesign_jax.commands import asked, common, hosts, reference, seeds, status, time_needed
 from codesign_jax.commands.time_needed import TimedPart
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
@@ -54,8 +53,6 @@ def main(options: "Optimize") -> int:
     if options.dry_run:
         _dry_run(plan, len(every), options)
         return 0
-    if options.jobs is not None:
-        return _jobs(options, scene, every)
     devices, chunk = options.devices, options.chunk
     trials = reference.number_of_trials(options.reference_trials, settings)
     after = trials * reference.steps_and_links(scene)
@@ -91,8 +88,6 @@ def _distributed(options: "Optimize") -> int:
     problems = []
     if options.seeds is None:
         problems.append("--distributed needs --seeds: the hosts share the runs of several seeds")
-    if options.jobs is not None:
-        problems.append("--distributed and --jobs exclude each other: both share out the seeds")
     if options.dry_run:
         problems.append("--dry-run knows one host: leave out --distributed to have its estimate")
     if problems:
@@ -107,7 +102,7 @@ def _compare_all(options: "Optimize") -> int:
     """Compares the runs of all hosts; returns the exit status."""
     scene, settings = asked.resolve(options)
     every = asked.runs_of(options, scene, settings)
-    results = {folder: jobs.read(scene, folder) for folder in every}
+    results = {folder: seeds.read(scene, folder) for folder in every}
     _compare(options, scene, every, results, Console(highlight=False, soft_wrap=True))
     return int(any(result is None for result in results.values()))
 
@@ -162,17 +157,6 @@ def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
         rates.keep(work, timing.grasps / timing.seconds, timing.compile_seconds)
 
 
-def _jobs(options: "Optimize", scene: Scene, every: dict[Path, Settings]) -> int:
-    """Runs all of them as jobs and compares them; returns the exit status."""
-    console = Console(highlight=False, soft_wrap=True)
-    try:
-        results = jobs.run(options, scene, every, console)
-    except KeyboardInterrupt:
-        return 128 + signal.SIGINT
-    _compare(options, scene, every, results, console)
-    return int(any(result is None for result in results.values()))
-
-
 def _preflight(scene: Scene, settings: Settings) -> list[str]:
     """Checks the ends of the design space, as every particle lies between them.
 
@@ -206,15 +190,11 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
         many, few = plan.test_grasps, plan.finalists
         print(f"final test: {many} of these grasps, {tested} trials of {few} particles{whole}")
     if count > 1:
-        how = f"{options.jobs} at a time" if options.jobs else "in one batch"
-        print(f"runs: {count}, {how}; grasps and disk are those of each")
-    if options.jobs:
-        print(f"processes: on {jobs.plan(options)}")
+        print(f"runs: {count}, in one batch; grasps and disk are those of each")
     row = 40 + 12 * space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
-    together = 1 if options.jobs else count
-    work = rates.work(scene, settings, runs=together, devices=options.devices)
+    work = rates.work(scene, settings, runs=count, devices=options.devices)
     parts = [TimedPart("", work, count * (plan.grasps + seed))]
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")

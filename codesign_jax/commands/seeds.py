@@ -12,7 +12,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import codesign, cost, files
+from codesign_jax import codesign, cost, files, runs
+from codesign_jax.commands import common
 from codesign_jax.report import statistics, verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns
@@ -227,3 +228,16 @@ def _row(scene: Scene, run: Compared) -> tuple[str, ...]:
     word = "yes" if verdicts.success(judged.scene, judged.outcomes) else "no"
     numbers = f"{found.kept} of {found.total}", *map(str, found[1:]), f"{mean:.4f}"
     return (converged, where, *numbers, word)
+
+
+def read(scene: Scene, folder: Path) -> RunResult | None:
+    """The run in a folder as it is; None if it has no checkpoint, or every trial failed."""
+    try:
+        record = runs.load_record(folder, tell=common.warn)
+    except InputError as error:
+        common.warn(str(error))
+        return None
+    if record is None or record.failed_status() is not None:
+        return None
+    test = None if record.test is None else codesign.summarize_test(scene, record.test)
+    return RunResult(record, test, 0)

@@ -153,8 +153,6 @@ _FLAGS = {
     "--reference-trials": NUMBERS,
     "--seed": NUMBERS,
     "--seeds": ("0-3", "3-1", "0-99999", ",", "1,2,x", *NUMBERS),
-    "--jobs": NUMBERS,
-    "--job-set": ("cluster=local", "nodes=2", "x", "=1", "memory=3", *TEXTS),
     "--devices": NUMBERS,
     "--chunk": NUMBERS,
     "--points": NUMBERS,

@@ -106,7 +106,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
 @pytest.mark.parametrize("example", [e for e in CODESIGN if "failures" not in e])
 def test_every_command_runs_at_a_small_size(example, here, monkeypatch):
     size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
-    size["export"] = ["--overwrite", "--trials", "0", "--tolerance", "off"]
+    size["export"] = ["--overwrite", "--trials", "0", "--tolerance-trials", "1"]
     size["landscape"] = ["--points", "2", "--trials", "1"]
     size["sample"] = ["--designs", "2", "--trials", "1"]
     arguments = here_alone(example)

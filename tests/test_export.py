@@ -152,14 +152,20 @@ def test_contacts_have_the_declared_stiffness(friction):
 
 
 def test_what_plain_mujoco_does_not_simulate_is_named():
-    [rubber] = plain.obstacles(pinch(effects__neo_hookean=True))
-    assert "effects.neo_hookean = true" in rubber
-    ours = pinch(effects__lateral_threshold=True, effects__soft_touch=True)
-    assert len(plain.obstacles(ours)) == 2
-    household = scene.load("paper", object_set="household")
-    assert any("'mug' is a mesh" in text for text in plain.obstacles(household))
-    assert not plain.obstacles(pinch()) and not plain.stand_in(pinch())
-    assert 'effects.surface = "hull" is in the model as points' in plain.stand_in(household)
+    ours = ["lateral_threshold", "neo_hookean", "soft_touch"]
+    found = plain.differences(pinch(**{f"effects__{name}": True for name in ours}))
+    assert sorted(text.split("effects.")[1].split(":")[0] for text in found) == ours
+    of_hull = {"friction_memory": "finger_finger", "speculative_palm": "finger_palm"}
+    default, word = scene.load("paper"), "the model is without effects.{}"
+    for name, contact in of_hull.items():
+        assert any(word.format(name) in text for text in plain.differences(default))
+        off = scene.load("paper", overrides={f"effects.{contact}": False})
+        assert not any(name in text for text in plain.differences(off))
+    household = plain.differences(scene.load("paper", object_set="household"))
+    assert any("mesh 'mug' as its convex hull" in text for text in household)
+    assert any('effects.surface = "hull" as points' in text for text in household)
+    spheres = pinch(**{f"effects__{name}": True for name in [*of_hull, *of_hull.values()]})
+    assert not plain.differences(spheres), "spheres never have these effects"
 
 
 @pytest.fixture(scope="module")
@@ -330,7 +336,7 @@ def test_commands_are_the_key_frames(tmp_path):
 
 
 def export(*arguments):
-    return cli.main(["export", "--tolerance", "off", *map(str, arguments)])
+    return cli.main(["export", *map(str, arguments)])
 
 
 def test_command_writes_models_and_commands(tmp_path, capsys):
@@ -342,11 +348,29 @@ def test_command_writes_models_and_commands(tmp_path, capsys):
     assert "in plain MuJoCo: sphere: " in capsys.readouterr().out
     assert export("--scene", TINY, "--out", out) == 2
     assert "choose another folder, or give --overwrite" in capsys.readouterr().err
-    rubber = ["--set", "effects.surface=hull", "effects.neo_hookean=true", "--overwrite"]
-    assert export("--scene", TINY, "--out", out, *rubber) == 0
-    assert "no model: plain MuJoCo does not simulate effects.neo_hookean = true" in (
-        capsys.readouterr().out
-    )
+
+
+def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):
+    """Hull, effects that plain MuJoCo does not have, and a mesh: models without them, and notes."""
+    out = tmp_path / "out"
+    own = ["effects.surface=hull", "effects.finger_finger=true", "effects.friction_memory=true"]
+    own += ["effects.neo_hookean=true", "--objects", "household"]
+    assert export("--scene", TINY, "--out", out, "--no-parts", "--no-sheet", "--set", *own) == 0
+    said = capsys.readouterr().out
+    notes = (out / "model" / "README.txt").read_text()
+    for words in ("without effects.neo_hookean", "without effects.friction_memory", "mesh 'mug'"):
+        assert f"note: the model {'has the ' * ('mesh' in words)}" in said
+        assert words in said and words in notes
+    mug = next(s for s in scene.load("paper", object_set="household").objects.object if s.mesh)
+    loaded = mujoco.MjModel.from_xml_path(str(out / "model" / f"{mug.name}.xml"))
+    data = mujoco.MjData(loaded)
+    mujoco.mj_resetDataKeyframe(loaded, data, 0)
+    mujoco.mj_kinematics(loaded, data)
+    # The file's vertices stand in the world where the mesh's do, in the orientation of the start.
+    turn, place = data.body("object").xmat.reshape(3, 3), data.body("object").xpos
+    geom = data.geom("object_0")
+    vertices = loaded.mesh_vert @ geom.xmat.reshape(3, 3).T + geom.xpos
+    np.testing.assert_allclose(vertices, mug.mesh.vertices @ turn.T + place, atol=1e-7)  # float32
 
 
 def test_command_refuses_in_words_and_writes_nothing(tmp_path, capsys):

@@ -190,6 +190,7 @@ def test_drawing_is_one_page(page, tmp_path):
 
 TOY = ["export", "--scene", str(TINY), "--no-parts", "--design", "length=100", "arm_z=40"]
 TOY += ["--set", "objects.noise.position=0", "--tolerance-trials", "4"]
+FREE = ["--tolerance", "free"]
 
 
 @pytest.fixture
@@ -200,18 +201,23 @@ def by_toy(toy, tmp_path, monkeypatch):
 
 
 def test_command_writes_the_sheet(tmp_path, capsys, by_toy):
-    assert cli.main([*TOY, "--out", str(tmp_path / "out")]) == 0
-    output = capsys.readouterr().out
     grasps = (1 + 2 * 2 * STEPS) * 4
+    assert cli.main([*TOY, "--out", str(tmp_path / "plain")]) == 0
+    output = capsys.readouterr().out
+    assert f"--tolerance free --overwrite simulates them, at most {grasps} grasps" in output
+    assert "simulating at most" not in output, "minutes are asked for"
+    assert "Not simulated" in (tmp_path / "plain" / "build_sheet.md").read_text()
+    assert cli.main([*TOY, *FREE, "--out", str(tmp_path / "out")]) == 0
+    output = capsys.readouterr().out
     assert f"tolerance of length, arm_z: simulating at most {grasps} grasps" in output
-    assert "time: about 0:" in output and "build_sheet.pdf: build sheet" in output
+    assert "build_sheet.pdf: build sheet" in output and "no tolerances" not in output
     text = (tmp_path / "out" / "build_sheet.md").read_text()
     assert "Of 4 grasps of the design itself 100 % [51, 100] succeed." in text
     assert "| length | mm | 100 |" in text and "Design: length=100 mm arm_z=40 mm" in text
     # The toy scene's hand has two fingers: lengths and height of the arm of 15 parameters.
     assert "12 further parameters of the hand's table were not moved" in text
     assert (tmp_path / "out" / "build_sheet.pdf").exists()
-    assert [p.name for p in tmp_path.iterdir() if p.name != "cache"] == ["out"]
+    assert {p.name for p in tmp_path.iterdir()} - {"cache"} == {"out", "plain"}
     assert cli.main([*TOY, "--tolerance-steps", "0", "--out", str(tmp_path / "no")]) == 2
     assert "--tolerance-steps" in capsys.readouterr().err and not (tmp_path / "no").exists()
 
@@ -228,13 +234,13 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, by_toy, monkeypatch):
         advance(meter, grasps)
 
     monkeypatch.setattr(Meter, "advance", stopping)
-    assert cli.main([*TOY, "--out", str(out)]) == 130
+    assert cli.main([*TOY, *FREE, "--out", str(out)]) == 130
     assert "stopped, nothing is exported; the same command goes on" in capsys.readouterr().out
     assert not out.exists() and sum(simulated) == (1 + 4 + 4) * 4
-    assert cli.main([*TOY, "--out", str(out)]) == 0
+    assert cli.main([*TOY, *FREE, "--out", str(out)]) == 0
     assert f"going on after {(1 + 4 + 4) * 4} grasps" in capsys.readouterr().out
     again = sum(simulated)
-    assert cli.main([*TOY, "--out", str(tmp_path / "whole")]) == 0
+    assert cli.main([*TOY, *FREE, "--out", str(tmp_path / "whole")]) == 0
     assert sum(simulated) - again == again  # nothing twice
     texts = [(tmp_path / name / "build_sheet.md").read_text() for name in ("out", "whole")]
     assert texts[0] == texts[1]

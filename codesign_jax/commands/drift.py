@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from codesign_jax.commands import calls, common, time_needed
+from codesign_jax.commands import calls, common
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case
 from codesign_jax.engines import Engine
@@ -24,7 +24,7 @@ PART = "tolerance.part"
 def simulate(
     case: Case, engine: Engine, options: "Export", folder: Path, console: Console
 ) -> "sheet.Drift":
-    """Tolerances of the design: says how many grasps they take and about how long, and simulates.
+    """Tolerances of the design: says how many grasps they take at most, and simulates.
 
     Args:
       case: The design.
@@ -36,12 +36,11 @@ def simulate(
     from codesign_jax.export import sheet, tolerance  # with the extra
 
     steps, count = options.tolerance_steps, options.tolerance_trials
-    free = options.tolerance == "free"
-    planned = tolerance.study(case.scene, case.space, case.design, steps, free=free)
+    planned = study(case, options)
     trials = Trials(case.scene, case.engine, planned.space, count, options.seed)
     first = 1 + int(planned.room.sum())
     size = calls.equal(first, calls.most_designs(trials))
-    _announce(planned, trials, size, options, console)
+    _announce(planned, options, console)
     run = Calls(trials, engine, size, folder / PART, planned.designs)
     if run.refused:
         console.print(f"{folder / PART} {run.refused}: simulated again", markup=False)
@@ -61,10 +60,17 @@ def simulate(
     return sheet.Drift(found[0], count, steps, case.engine, rows, fixed)
 
 
-def _announce(
-    planned: "Study", trials: Trials, size: int, options: "Export", console: Console
-) -> None:
-    names, most = planned.space.names, planned.most * trials.count
+def study(case: Case, options: "Export") -> "Study":
+    """The designs of the tolerances; of the free parameters if none are asked for."""
+    from codesign_jax.export import tolerance  # with the extra
+
+    free = options.tolerance != "all"
+    steps = options.tolerance_steps
+    return tolerance.study(case.scene, case.space, case.design, steps, free=free)
+
+
+def _announce(planned: "Study", options: "Export", console: Console) -> None:
+    names, most = planned.space.names, planned.most * options.tolerance_trials
     moved = ", ".join(names) if len(names) <= 4 else f"{len(names)} parameters"
     others = {"free": "all moves the hand's whole table", "all": "free moves fewer"}
     console.print(
@@ -72,4 +78,3 @@ def _announce(
         f"(--tolerance {others[options.tolerance]}, off none)",
         markup=False,
     )
-    console.print(time_needed.text([time_needed.TimedPart("", calls.work(trials, size), most)]))

@@ -57,7 +57,7 @@ def main(options: "Export") -> int:
     except KeyboardInterrupt:
         console.print("stopped, nothing is exported; the same command goes on")
         return 130
-    _tell(options, console)
+    _tell(case, options, console)
     return 0
 
 
@@ -131,7 +131,7 @@ def write_files(
             _sheet(case, params, sizes, found, folder, options)
 
 
-def _tell(options: "Export", console: Console) -> None:
+def _tell(case: Case, options: "Export", console: Console) -> None:
     """Says where everything is."""
     from codesign_jax.export import sheet
 
@@ -145,6 +145,12 @@ def _tell(options: "Export", console: Console) -> None:
         console.print("  parts/: fingers and moulds, in millimetres", markup=False)
     if not options.no_sheet:
         console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet", markup=False)
+        if options.tolerance == "off":
+            most = drift.study(case, options).most * options.tolerance_trials
+            console.print(
+                "  the sheet has no tolerances: --tolerance free --overwrite simulates them, at "
+                f"most {most:,} grasps"
+            )
 
 
 def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console) -> None:
@@ -166,12 +172,8 @@ def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console)
 
 
 def _models(case: Case, params: Params, folder: Path, options: "Export", console: Console) -> None:
-    if found := plain.obstacles(case.scene):
-        for text in found:
-            console.print(f"no model: plain MuJoCo does not simulate {text}", markup=False)
-        return
-    if other := plain.stand_in(case.scene):
-        console.print(f"note: {other}", markup=False)
+    for difference in plain.differences(case.scene):
+        console.print(f"note: {difference} (docs/export.md)", markup=False)
     folder = folder / tables.MODELS
     folder.mkdir(exist_ok=True)
     trials = _trials(case, options)

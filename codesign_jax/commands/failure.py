@@ -100,9 +100,6 @@ def _where(trace: Trace, k: int) -> str:
 
 def _one_step(scene: Scene, space: DesignSpace, failure: Failure) -> None:
     """Takes the step after the last good state in MuJoCo C: is it the state or the engine?"""
-    if obstacles := plain.obstacles(scene):
-        print(f"its last good state is not tried in MuJoCo C: {'; '.join(obstacles)}")
-        return
     if not np.isfinite(failure.state).all():
         print("the world was not finite from its start")
         return
@@ -115,8 +112,8 @@ def _one_step(scene: Scene, space: DesignSpace, failure: Failure) -> None:
         f"{when}: speed {before:.4g}, {_contacts(data)}; "
         f"MuJoCo C goes on with an acceleration of {acc:.4g} to a speed of {after:.4g}"
     )
-    if plain.stand_in(scene):
-        print("(MuJoCo C has the hull as points on single links, docs/export.md)")
+    for difference in plain.differences(scene):
+        print(f"  in MuJoCo C {difference}")
 
 
 def _last_state(scene: Scene, space: DesignSpace, failure: Failure) -> mujoco.MjData:

@@ -43,7 +43,7 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
     """Builds a grasp and plays it in plain MuJoCo, for its key frames and its outcome.
 
     Args:
-      scene: The scene; `plain.obstacles` says which scenes have no such model.
+      scene: The scene; `plain.differences` says what its model lacks.
       params: Parameters as concrete arrays.
       trial: The trial as concrete arrays.
     """

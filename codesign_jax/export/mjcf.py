@@ -31,7 +31,7 @@ def text(spec: mujoco.MjSpec) -> str:
     model = spec.compile()
     root = ElementTree.fromstring(spec.to_xml())
     for element, parent in _walk(root, None):
-        for attribute, value in _numbers(model, element, parent).items():
+        for attribute, value in _numbers(spec, model, element, parent).items():
             element.set(attribute, " ".join(repr(float(v)) for v in np.ravel(value)))
     ElementTree.indent(root)
     found = ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -66,7 +66,10 @@ def _walk(element: ElementTree.Element, parent: ElementTree.Element | None):
 
 
 def _numbers(
-    model: mujoco.MjModel, element: ElementTree.Element, parent: ElementTree.Element | None
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    element: ElementTree.Element,
+    parent: ElementTree.Element | None,
 ) -> dict[str, Any]:
     """The numbers that an element's attributes abbreviate, by attribute."""
     if element.tag == "option":
@@ -81,6 +84,10 @@ def _numbers(
         return {name: getattr(model, f"pair_{name}")[index] for name in names}
     if element.tag == "inertial" and parent is not None:
         return _written(element, _INERTIAL, model.body(parent.get("name")))
+    if element.tag == "mesh":
+        return {"vertex": spec.mesh(element.get("name")).uservert}
+    if element.get("type") == "mesh":
+        return {}  # the compiled model has geom and vertices in the frame of its inertia
     accessor, names = _NAMED.get(element.tag, (None, {}))
     if accessor is None or element.get("name") is None:
         return {}

@@ -23,6 +23,7 @@ import numpy as np
 
 from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
+from codesign_jax.model.layout import pairings_held, palm_ahead
 from codesign_jax.model.pairs import SOLIMP
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trial
@@ -31,13 +32,14 @@ _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 """Of (1 - d) / d, as MuJoCo keeps an impedance d between 0.0001 and 0.9999."""
 
 
-_OBSTACLES = {
-    "neo_hookean": "its moments follow the angles by a law that MuJoCo's joints do not have",
-    "lateral_threshold": "the stiffness of its joints follows pressure and angles",
-    "friction_memory": "MuJoCo's contacts keep nothing from step to step",
-    "soft_touch": "in MuJoCo the elastic force grows with the impedance",
+_LEFT_OUT = {
+    "neo_hookean": "joints have the linear law of bending, which is stiffer at large strain",
+    "lateral_threshold": "pressure does not resist sideways bending",
+    "soft_touch": "damping and friction of a contact are whole from the first touch",
+    "friction_memory": "fingers that hold one another creep",
+    "speculative_palm": "fingers touch the palm's disc once they are in it",
 }
-"""Effects that plain MuJoCo does not have, and why."""
+"""What a model is like without an effect that plain MuJoCo does not have."""
 
 NONE: Mapping[str, float] = MappingProxyType({})
 
@@ -46,29 +48,24 @@ class Inexpressible(ValueError):
     """A contact that MJCF cannot say."""
 
 
-def obstacles(scene: Scene) -> list[str]:
-    """What of a scene plain MuJoCo does not simulate, a sentence each; empty if nothing."""
+def differences(scene: Scene) -> list[str]:
+    """What of a scene the model lacks or has in another form, a sentence each."""
+    acts = {name: getattr(scene.effects, name) for name in _LEFT_OUT}
+    acts |= {"friction_memory": pairings_held(scene) > 0, "speculative_palm": palm_ahead(scene)}
     found = [
-        f"effects.{name} = true ({why}); --set effects.{name}=false exports another scene"
-        for name, why in _OBSTACLES.items()
-        if getattr(scene.effects, name)
+        f"the model is without effects.{name}: {how}"
+        for name, how in _LEFT_OUT.items()
+        if acts[name]
     ]
+    if scene.effects.surface == "hull":
+        found.append(
+            'the model has effects.surface = "hull" as points on the links that its vertices follow'
+        )
     return found + [
-        f"object {shape.name!r} is a mesh (MuJoCo takes its convex hull); leave it out by --objects"
+        f"the model has the mesh {shape.name!r} as its convex hull"
         for shape in scene.objects.object
         if shape.mesh
     ]
-
-
-def stand_in(scene: Scene) -> str:
-    """What of a scene the model has in another form, a sentence; empty if nothing."""
-    if scene.effects.surface != "hull":
-        return ""
-    return (
-        'effects.surface = "hull" is in the model as points on the links that its vertices follow: '
-        "plain MuJoCo's geoms are rigid parts of single bodies, so that some grasps end otherwise "
-        "(docs/export.md)"
-    )
 
 
 def single_object(scene: Scene, trial: Trial) -> tuple[Scene, Trial]:

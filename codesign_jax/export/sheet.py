@@ -59,7 +59,7 @@ def sheet_sections(
     """
     found = [_fingers(scene, params, sizes), _mounts(scene, params), _material(scene)]
     found.append(_control(scene, params))
-    return found + ([tolerance_section(drift)] if drift else [])
+    return [*found, tolerance_section(drift)]
 
 
 def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
@@ -162,8 +162,11 @@ def _control(scene: Scene, params: Params) -> SheetSection:
     return SheetSection("Grasp", head, rows, notes)
 
 
-def tolerance_section(drift: Drift) -> SheetSection:
-    """Tolerances as a table."""
+def tolerance_section(drift: Drift | None) -> SheetSection:
+    """Tolerances as a table, or how to have them simulated."""
+    if drift is None:
+        note = "Not simulated: codesign export --tolerance free says how far parameters may drift."
+        return SheetSection("Tolerance", (), [], [note])
     nominal = f"Of {drift.trials} grasps of the design itself {_percent(drift.nominal)} succeed"
     limit = f"{100 * WANTED:.0f} %"
     if not drift.rows:

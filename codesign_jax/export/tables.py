@@ -8,12 +8,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from codesign_jax.export import plain
 from codesign_jax.export.grasps import PLAYER, Grasp
 from codesign_jax.model.layout import WRIST
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status, Trial, failed
 
-COMMANDS, MODELS, GRASPS = "commands.csv", "model", "grasps.csv"
+COMMANDS, MODELS, GRASPS, NOTES = "commands.csv", "model", "grasps.csv", "README.txt"
 
 COMMAND_COLUMNS = {
     "time_s": "time from the start of the grasp",
@@ -79,7 +80,7 @@ def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
 def write_grasps(
     folder: Path, scene: Scene, trials: Sequence[tuple[str, Trial]], grasps: Iterable[Grasp]
 ) -> Iterator[str]:
-    """Writes models, controls, player and grasps.csv, as far as its lines are asked for.
+    """Writes notes, models, controls, player and grasps.csv, as far as its lines are asked for.
 
     Args:
       folder: An existing folder.
@@ -90,6 +91,9 @@ def write_grasps(
     Yields:
       What became of each grasp, a line each, as it is written.
     """
+    lines = ["Grasps of codesign-jax for plain MuJoCo: python play.py NAME.xml; docs/export.md"]
+    lines += [f"Unlike the scene {scene.name}: {text}" for text in plain.differences(scene)]
+    (folder / NOTES).write_text("\n".join(lines) + "\n", encoding="utf-8")
     rows = []
     for (name, trial), grasp in zip(trials, grasps, strict=True):
         if grasp.xml is not None:

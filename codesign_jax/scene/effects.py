@@ -20,10 +20,12 @@ class Effect(NamedTuple):
     Attributes:
       meaning: What is simulated, in a line.
       refused: Why an engine cannot do a value of the effect, by engine and value.
+      hull: Whether it acts with the surface "hull" alone.
     """
 
     meaning: str
     refused: Mapping[str, Mapping[Any, str]] = {}
+    hull: bool = False
 
 
 _PRESCRIBED = (
@@ -52,7 +54,8 @@ EFFECTS: Mapping[str, Effect] = {
     "finger_finger": Effect("fingers touch one another"),
     "finger_palm": Effect("fingers touch the palm's disc"),
     "speculative_palm": Effect(
-        "the hull touches the palm already in the step that would carry it in; spheres do not"
+        "the hull touches the palm already in the step that would carry it in; spheres do not",
+        hull=True,
     ),
     "surface": Effect(
         "the fingers' contact points: spheres, or the vertices of the skinned hull",
@@ -67,7 +70,8 @@ EFFECTS: Mapping[str, Effect] = {
         {"mujoco": {True: _IMPEDANCE}, "mjx": {True: _IMPEDANCE}},
     ),
     "friction_memory": Effect(
-        "skinned fingers hold one another without creep: their friction is kept from step to step"
+        "skinned fingers hold one another without creep: their friction is kept from step to step",
+        hull=True,
     ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),
@@ -121,8 +125,11 @@ def setting(effects: Any, name: str) -> str:
 
 
 def state(effects: Any, name: str, engine: str) -> str:
-    """An effect in a scene and an engine: on, off, the model chosen, or unsupported."""
-    if name in refusals(effects, engine):
+    """An effect in a scene and an engine: on, off, the model chosen, unsupported, or no hull."""
+    refused = refusals(effects, engine)
+    if name in refused:
         return f"unsupported ({setting(effects, name)})"
+    if EFFECTS[name].hull and "surface" in refused:
+        return "no hull"
     value = getattr(effects, name)
     return {True: "on", False: "off"}.get(value, str(value))

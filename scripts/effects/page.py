@@ -44,7 +44,8 @@ def support_table() -> list[list[str]]:
         for engine in ENGINES:
             refused = effect.refused.get(engine, {})
             words = [f"not {str(v).lower() if isinstance(v, bool) else v}" for v in refused]
-            cells.append(", ".join(words) or "yes")
+            no_hull = effect.hull and "hull" in EFFECTS["surface"].refused.get(engine, {})
+            cells.append(", ".join(words) or ("no hull" if no_hull else "yes"))
         table.append([f"`{name}`", effect.meaning, *cells])
     return table
 

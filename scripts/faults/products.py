@@ -17,7 +17,7 @@ from scripts.faults.store import Result
 KIND = "filter"
 COMMANDS = {
     "landscape": ("landscape", "{run}", "--points", "3", "--trials", "1", "--out", "{out}"),
-    "export": ("export", "{run}", "--tolerance", "off", "--no-parts", "--out", "{out}"),
+    "export": ("export", "{run}", "--no-parts", "--out", "{out}"),
     "evaluate": ("evaluate", "{run}", "--trials", "1", "--render", "{out}/grasp.png"),
     "report": ("report", "{run}", "--no-replay", "--out", "{out}/report.html"),
 }

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import model, scene
-from codesign_jax.commands import clearance, preflight
+from codesign_jax.commands import preflight
 from codesign_jax.scene import constants, hand, schema
 from codesign_jax.types import Params
 from tests.helpers.grasps import DATA, hand_world
@@ -70,7 +70,6 @@ def test_contact_between_fingers_finds_none_at_rest():
     corners = itertools.product(CORNERS, SPREADS[[0, -1]])
     worlds = [hand_world(the_scene, length=n, height=h, spread=s)[0] for (n, h), s in corners]
     designs = Params(*(np.stack(v) for v in zip(*worlds, strict=True)))
-    assert (clearance.between_fingers(the_scene, designs) <= 0.0).all()
     assert not preflight.check(the_scene, designs._replace(wall=0 * designs.wall + 0.005)).refusals
 
 
@@ -117,22 +116,6 @@ def test_base_points_are_constants():
     far = tuple(f._replace(base=(0.3, 0.0)) for f in start.hand.finger)
     with pytest.raises(schema.InputError, match=r"finger\[0\].base\[0\] = 0.3 is outside"):
         constants.check(the_scene, start._replace(hand=start.hand._replace(finger=far)))
-
-
-def test_the_lowest_point_of_base_points_is_that_of_the_circle_through_them():
-    """A circle's base point, written as a base of its own, is the same hand."""
-    circle = coarse("paper_spheres")
-    params, _ = hand_world(circle, spread=0.7, arm=np.array([0, 0, 0.02, 0.5, -0.4, 0.3]))
-    changes = {}
-    for i, f in enumerate(circle.hand.finger):
-        angle = np.deg2rad(f.azimuth) + f.spread * 0.7
-        changes[f"hand.finger.{i}.base"] = [f.radius * np.cos(angle), f.radius * np.sin(angle)]
-    points = scene.load("paper", overrides={"discretization.links": 1, **changes})
-    # 1 nm: radians of hand_world are doubles.
-    low = clearance.lowest_point(circle, params)
-    assert abs(clearance.lowest_point(points, params) - low) < 1e-9
-    low = preflight.check(circle, Params(*(v[None] for v in params)))
-    assert preflight.check(points, Params(*(v[None] for v in params))).warnings == low.warnings
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
-"""Preflight: what it refuses without simulating, and that an ordinary start costs no program."""
+"""Preflight: what it refuses without simulating."""
 
 import dataclasses
+import itertools
 import re
 
 import jax
@@ -9,15 +10,11 @@ import numpy as np
 import pytest
 
 from codesign_jax import model, scene, start
-from codesign_jax.commands import clearance, preflight
+from codesign_jax.commands import preflight
+from codesign_jax.model.layout import first_on_palm
 from codesign_jax.scene import parameters
 from codesign_jax.types import Params
 from tests.helpers.grasps import hand_world, pinch, random_worlds, still
-
-
-def low_start():
-    """The pinch scene with an arm that starts so low that long fingers reach table or box."""
-    return pinch(links=2, arm__start_height=0.15)
 
 
 def hands(scene, count):
@@ -26,101 +23,61 @@ def hands(scene, count):
     return Params(*(np.asarray(v, float) for v in params))
 
 
-def single(designs):
-    """The designs in float32."""
-    return Params(*(v.astype(np.float32) for v in designs))
+def deepest(compiled, data, geoms, others):
+    """Deepest overlap [m] of a geom with one of the others' by MuJoCo C."""
+    pairs = itertools.product(geoms, others)
+    return -min(mujoco.mj_geomDistance(compiled, data, a, b, 1.0, None) for a, b in pairs)
 
 
-def test_lowest_point_bounds_mujocos_geoms():
-    """MuJoCo C places the same hand: spheres lie above the bound, and not far above it."""
-    scene = low_start()
-    designs, gaps = hands(scene, 4), []
-    starts = jax.jit(jax.vmap(lambda p: model.model_fields(scene, p, still()).start))
-    for one, qpos in zip(zip(*designs, strict=True), starts(single(designs)), strict=True):
-        one = Params(*one)
-        compiled = model.compile_model(scene, one, still())
-        data = mujoco.MjData(compiled)
-        data.qpos[:] = qpos
-        mujoco.mj_forward(compiled, data)
-        names = [compiled.geom(g).name for g in range(compiled.ngeom)]
-        spheres = [g for g, name in enumerate(names) if name.startswith(("finger", "palm"))]
-        lowest = (data.geom_xpos[spheres, 2] - compiled.geom_size[spheres, 0]).min()
-        gaps.append(lowest - clearance.lowest_point(scene, one))
-    # Rounding of float32; half the section's width of 20 mm and half a link of 180 / 2 mm.
-    assert -1e-6 < min(gaps) and max(gaps) < 0.010 + 0.045
-
-
-def test_starts_inside_table_or_object_are_refused_and_those_called_clear_are_clear():
-    scene = low_start()
-    designs = hands(scene, 64)
-    exact = np.asarray(clearance.depths(*clearance._arguments(scene, single(designs))))[0]
-    low = [clearance.lowest_point(scene, Params(*one)) for one in zip(*designs, strict=True)]
-    clear = np.array(low) >= 0.06  # the box's height
-    assert clear.any() and (exact[clear] <= 0).all()
-    deep = np.flatnonzero(exact > scene.limits.penetration)
-    assert 0 < len(deep) < 64
-    refusals = preflight.check(scene, designs).refusals
-    assert [text.split(":")[0] for text in refusals] == [f"design {i}" for i in deep]
-    for part in (f"starts {1e3 * exact[deep[0]]:.0f} mm", "'box'", "raise arm.start_height = 0.15"):
-        assert part in refusals[0]
-
-
-def test_fingers_overlap_as_deep_as_engines_find():
-    """`start.depth_between`, of random hands whose mounts are close."""
-    the_scene = scene.load("paper_spheres", overrides={"effects": {"finger_finger": True}})
-    designs = hands(the_scene, 16)
-
-    @jax.jit
-    def depths(designs):
-        fields = jax.vmap(lambda p: model.model_fields(the_scene, p, still()))(designs)
-        return start.depth_between(the_scene, fields)
-
-    with jax.enable_x64(True):
-        exact = depths(designs)
-    found = clearance.between_fingers(the_scene, designs)
-    np.testing.assert_allclose(found, exact, atol=1e-12)
-    assert np.ptp(found) > 0.003
-
-
-@pytest.mark.parametrize("surface", ["hull", "spheres"])
-def test_fingers_are_as_deep_in_the_palm_as_engines_find(surface):
-    """`start.depth_in_palm`, of random hands with a finger that is mounted into the palm."""
-    overrides = {"effects": {"finger_palm": True, "surface": surface}}
-    overrides["limits"] = {"penetration": 0.002}
-    the_scene = scene.load("paper_spheres", overrides=overrides)
+def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
+    """By `start`, of hands with a sphere a link and a finger that is mounted into the palm."""
+    effects = {"finger_finger": True, "finger_palm": True}
+    sizes = {"links": 3, "spheres_per_link": 1}
+    changes = {"effects": effects, "discretization": sizes, "limits": {"penetration": 0.002}}
+    the_scene = scene.load("paper_spheres", overrides=changes)
     inwards = dataclasses.replace(the_scene.hand.finger[0], azimuth=180.0, tilt=-20.0)
-    fingers = (inwards, *the_scene.hand.finger[1:])
-    the_scene = dataclasses.replace(
-        the_scene, hand=dataclasses.replace(the_scene.hand, finger=fingers)
-    )
-    designs = hands(the_scene, 8)
+    mounted = dataclasses.replace(the_scene.hand, finger=(inwards, *the_scene.hand.finger[1:]))
+    the_scene = dataclasses.replace(the_scene, hand=mounted)
+    designs = hands(the_scene, 6)
 
     @jax.jit
-    def depths(designs):
+    def of_engines(designs):
         fields = jax.vmap(lambda p: model.model_fields(the_scene, p, still()))(designs)
-        return start.depth_in_palm(the_scene, fields), start.invalid_start(the_scene, fields)
+        tests = start.depth_between, start.depth_in_palm, start.invalid_start
+        return fields.start, *(test(the_scene, fields) for test in tests)
 
     with jax.enable_x64(True):
-        exact, invalid = depths(designs)
-    np.testing.assert_allclose(clearance.in_palm(the_scene, designs), exact, atol=1e-12)
-    exact, invalid = np.asarray(exact), np.asarray(invalid)
-    np.testing.assert_array_equal(invalid != 0, exact > 0.002)
-    report = preflight.check(the_scene, designs)
-    refused = sum("inside the palm" in line for line in report.refusals)
-    assert refused == (exact > 0.002).sum() > 0
+        places, between, palm, invalid = map(np.asarray, of_engines(designs))
+    for i, one in enumerate(zip(*designs, strict=True)):
+        compiled = model.compile_model(the_scene, Params(*one), still())
+        data = mujoco.MjData(compiled)
+        data.qpos[:] = places[i]
+        mujoco.mj_kinematics(compiled, data)
+        name = "finger_{}_sphere_{}_0".format
+        fingers = [[compiled.geom(name(f, k)).id for k in (1, 2, 3)] for f in range(4)]
+        pairs = itertools.combinations(fingers, 2)
+        # MuJoCo's own iteration for a sphere and a cylinder ends at 1e-6.
+        found = max(deepest(compiled, data, a, b) for a, b in pairs)
+        assert between[i] == pytest.approx(found, abs=1e-6)
+        first = first_on_palm(3) - 1
+        disc = [compiled.geom("palm_disc").id]
+        found = max(deepest(compiled, data, links[first:], disc) for links in fingers)
+        assert palm[i] == pytest.approx(found, abs=1e-6)
+    deep = np.maximum(between, palm) > 0.002
+    assert 0 < deep.sum() and palm.max() > 0.002
+    np.testing.assert_array_equal(invalid != 0, deep)
+    refused = {line.split(":")[0] for line in preflight.check(the_scene, designs).refusals}
+    assert refused == {f"design {i}" for i in np.flatnonzero(deep)}
 
 
-def test_an_ordinary_start_needs_no_program(monkeypatch):
-    def never(*arguments):
-        raise AssertionError("a program was compiled")
-
-    monkeypatch.setattr(clearance, "depths", never)
-    for preset in ("2d", "full"):
-        scene = pinch()
-        space = parameters.design_space(scene.hand, preset)
-        ends = jax.vmap(space.params)(np.array([space.default(), space.low, space.high]))
-        report = preflight.check(scene, ends._replace(pressure=0 * ends.pressure))
-        assert report.refusals == []
+def test_starts_inside_table_or_object_are_refused():
+    """Straight fingers of 180 mm, 75 degrees down from 150 mm, as deep as `test_containment` has."""
+    the_scene = pinch(arm__start_height=0.15)
+    worlds = [hand_world(the_scene, length=length)[0] for length in (0.08, 0.18)]
+    designs = Params(*(np.stack(v) for v in zip(*worlds, strict=True)))
+    [refusal] = preflight.check(the_scene, designs).refusals
+    assert refusal.startswith("design 1: starts 17 mm inside the table or object 'box'")
+    assert refusal.endswith("raise arm.start_height = 0.15 m")
 
 
 @pytest.mark.parametrize(

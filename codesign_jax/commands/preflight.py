@@ -3,13 +3,16 @@
 The scene's own checks look at one number at a time; these look at what a design makes of them.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.commands import clearance
-from codesign_jax.scene import Scene
+from codesign_jax import model, rollout, start
+from codesign_jax.scene import Constants, Scene
 from codesign_jax.types import Params
 
 SHAKE_STEPS = 20
@@ -31,7 +34,7 @@ class Findings(NamedTuple):
 
 
 def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Findings:
-    """Checks designs against the scene's limits; costs milliseconds and simulates nothing.
+    """Checks designs against the scene's limits; simulates nothing.
 
     Args:
       scene: The scene.
@@ -133,29 +136,49 @@ def _reach(scene: Scene, one: Params, name: str) -> list[str]:
 
 def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     """Refuses designs that start deep inside the table, an object or themselves, without noise."""
-    found, limit = [], scene.limits.penetration
-    depths = clearance.overlaps(scene, designs)
-    for shape, row in zip(scene.objects.object, depths, strict=True):
-        for name, deep in zip(names, row, strict=True):
-            if not deep <= limit:
-                found.append(
-                    f"{name}: starts {1e3 * deep:.0f} mm inside the table or object {shape.name!r} "
-                    f"(limits.penetration = {1e3 * limit:g} mm); raise arm.start_height = "
-                    f"{scene.arm.start_height:g} m"
-                )
-    between = clearance.between_fingers(scene, designs)
-    for name, deep in zip(names, between, strict=True):
-        if not deep <= limit:
-            found.append(
-                f"{name}: fingers start {1e3 * deep:.0f} mm inside one another "
-                f"(limits.penetration = {1e3 * limit:g} mm); spread them, mount them further "
-                "apart, or set effects.finger_finger = false"
+    numbers = jax.tree.map(np.float32, scene.constants())
+    singles = Params(*(v.astype(np.float32) for v in designs))
+    with_objects, fingers, palm = map(np.asarray, _depths(scene.structure, numbers, singles))
+    limit = scene.limits.penetration
+    found = []
+    for i, name in enumerate(names):
+        inside = [
+            (
+                deep,
+                f"starts {1e3 * deep:.0f} mm inside the table or object {shape.name!r}",
+                f"raise arm.start_height = {scene.arm.start_height:g} m",
             )
-    for name, deep in zip(names, clearance.in_palm(scene, designs), strict=True):
-        if not deep <= limit:
-            found.append(
-                f"{name}: a finger starts {1e3 * deep:.0f} mm inside the palm "
-                f"(limits.penetration = {1e3 * limit:g} mm); mount it further out or tilt it "
-                "further down, or set effects.finger_palm = false"
-            )
+            for shape, deep in zip(scene.objects.object, with_objects[:, i], strict=True)
+        ]
+        inside += [
+            (
+                fingers[0, i],
+                f"fingers start {1e3 * fingers[0, i]:.0f} mm inside one another",
+                "spread them, mount them further apart, or set effects.finger_finger = false",
+            ),
+            (
+                palm[0, i],
+                f"a finger starts {1e3 * palm[0, i]:.0f} mm inside the palm",
+                "mount it further out or tilt it further down, or set effects.finger_palm = false",
+            ),
+        ]
+        found += [
+            f"{name}: {what} (limits.penetration = {1e3 * limit:g} mm); {remedy}"
+            for deep, what, remedy in inside
+            if not deep <= limit
+        ]
     return found
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _depths(scene: Scene, numbers: Constants, designs: Params) -> tuple[jax.Array, ...]:
+    """What `start.invalid_start` judges by, each of shape (object, design); one program for all."""
+    own = scene.with_constants(numbers)
+
+    def of_shape(index: jax.Array) -> tuple[jax.Array, ...]:
+        trial = rollout.nominal_trial(scene)._replace(shape=index)
+        fields = jax.vmap(lambda p: model.model_fields(own, p, trial))(designs)
+        tests = start.depth, start.depth_between, start.depth_in_palm
+        return tuple(test(scene, fields) for test in tests)
+
+    return jax.lax.map(of_shape, jnp.arange(len(scene.objects.object)))

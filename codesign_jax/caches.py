@@ -1,4 +1,4 @@
-"""What can be computed again, kept on disk: compiled programs, kernels, grids of meshes, rates.
+"""What can be computed again, kept on disk: compiled programs, kernels, grids of meshes.
 
 Environment variables, which the commands check before they do anything:
 

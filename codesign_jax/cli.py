@@ -103,7 +103,7 @@ class Optimize(Command):
     fresh: Flag = False
     """Delete an earlier run in the folder and start anew."""
     dry_run: Flag = False
-    """Print the resolved scene, the number of grasps and an estimate; write nothing."""
+    """Print the resolved scene and the number of grasps; write nothing."""
 
 
 @dataclasses.dataclass
@@ -121,7 +121,23 @@ class Evaluate(Command, RunOrDesign):
     render: File = None
     """Draw the first trial of each object: an animation (.gif) or a film strip (.png)."""
     dry_run: Flag = False
-    """Print the number of grasps and an estimate of the time; simulate nothing."""
+    """Print the number of grasps; simulate nothing."""
+
+
+@dataclasses.dataclass
+class Check(Command, RunOrDesign):
+    """Measure on this machine, in about a minute, how fast and how exact a scene is.
+
+    Simulates a batch of grasps at the scene's accuracy, and as many of them at accuracy reference
+    as there is time for: grasps a second, verdicts that differ, and how long a search takes. The
+    designs are those that a run ended with, one that is given, or a mixture of random and better
+    ones.
+    """
+
+    grasps: Count = None
+    """Grasps of the batch; default: those of an episode of a search."""
+    seconds: float = 30.0
+    """Time for the grasps at accuracy reference, as far as it can be known before [s]."""
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -184,7 +200,7 @@ class Landscape(Command, RunOrDesign):
     out: File = None
     """Folder of the files; default: the run folder, or landscape."""
     dry_run: Flag = False
-    """Print the number of grasps and an estimate of the time; simulate and write nothing."""
+    """Print the number of grasps; simulate and write nothing."""
 
 
 @dataclasses.dataclass
@@ -259,7 +275,7 @@ class Sample(Command):
     """Simulate and keep the outcomes alone, in the folder FILE.part; the same command without this
     flag writes the file, here or where that folder was copied to."""
     dry_run: Flag = False
-    """Print the number of grasps and an estimate of time and size; simulate and write nothing."""
+    """Print the number of grasps and the size; simulate and write nothing."""
 
 
 @dataclasses.dataclass
@@ -315,7 +331,17 @@ class Finger(Command, flags.Subject):
 
 
 COMMANDS = (
-    Optimize | Evaluate | Landscape | Sample | Report | Replay | Render | Export | Finger | Scenes
+    Optimize
+    | Evaluate
+    | Check
+    | Landscape
+    | Sample
+    | Report
+    | Replay
+    | Render
+    | Export
+    | Finger
+    | Scenes
 )
 """The commands, in the order of the help text."""
 

@@ -15,7 +15,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from codesign_jax import archives, caches, cli, files, kept_programs
 from codesign_jax.archives import Store
 from codesign_jax.compiler import cache
-from codesign_jax.runs import failures, rates
+from codesign_jax.runs import failures
 from codesign_jax.scene.meshes import grid
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
@@ -69,22 +69,19 @@ def use_all(monkeypatch):
     cache.kept("kernel", lambda: b"code")
     monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
     grid.cached("cube", *cube(), 1e-3)
-    work = rates.Work("structured", "cpu x2", "hull", 1, 1, 1)
-    rates.keep(work, 1.0, 1.0)
-    return [r.work for r in rates.measured()] == [work]
 
 
 def test_one_switch_turns_all_caches_off(place, monkeypatch):
     monkeypatch.setenv(caches.SWITCH, "off")
-    assert not use_all(monkeypatch)
+    use_all(monkeypatch)
     assert not place.exists() and not jax.config.jax_enable_compilation_cache
 
 
 def test_caches_are_on_by_default(place, monkeypatch):
     monkeypatch.setenv(caches.SWITCH, "on")
-    assert use_all(monkeypatch)
+    use_all(monkeypatch)
     found = {p.suffix or "-cache" for p in place.rglob("*") if p.is_file()}
-    assert found >= {"-cache", ".kernel", ".npz", ".json"}
+    assert found >= {"-cache", ".kernel", ".npz"}
 
 
 def test_the_oldest_go_first(tmp_path):

@@ -1,4 +1,4 @@
-"""The command line: wrong input is said in words and creates nothing; estimates; Ctrl-C."""
+"""The command line: wrong input is said in words and creates nothing; Ctrl-C."""
 
 import gc
 import os
@@ -14,7 +14,6 @@ import pytest
 
 from codesign_jax import cli, codesign
 from codesign_jax.commands import preflight, status
-from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.scene import effects
 from tests.helpers.command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -149,24 +148,8 @@ def test_dry_run_writes_nothing(workplace, capsys):
     assert command(*RUN, "--out", "run", "--dry-run") == 0
     output = capsys.readouterr().out
     assert "timestep = 0.02  # s" in output and f"grasps: {EPISODES * 8 + 16}" in output
-    assert "MB" in output and "time: about" in output
-    assert "grasps/s (measured on another machine, docs/performance.md" in output
+    assert "MB" in output
     assert list(workplace.iterdir()) == []
-
-
-def test_dry_run_estimates_from_earlier_runs_and_simulates_nothing(workplace, monkeypatch, capsys):
-    short = [*RUN, "--episodes", "2", "--test-trials", "0"]
-    assert command(*short, "--out", "run") == 0
-
-    def never(*arguments):
-        raise AssertionError("something was simulated")
-
-    monkeypatch.setattr(MujocoEngine, "rollout", never)
-    capsys.readouterr()
-    assert command(*RUN, "--out", "other", "--dry-run") == 0
-    output = capsys.readouterr().out
-    assert "grasps/s (measured on this machine on" in output and "scaled" not in output
-    assert "60 steps, 6 links, 8 grasps at once" in output
 
 
 def test_conflicts_are_told_before_the_preflight(finished, monkeypatch, capsys):

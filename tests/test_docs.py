@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from codesign_jax import cli
-from codesign_jax.commands import evaluate, export, finger, landscape, render, replay, report
+from codesign_jax.commands import check, evaluate, export, finger, landscape, render, replay, report
 from tests.helpers import tiny_run
 from tests.helpers.toy_engine import TINY
 
@@ -83,6 +83,9 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
         kept = SimpleNamespace(status=np.zeros(1, int))  # of which the exit code is made
         for name in ("simulate", "draw"):
             monkeypatch.setattr(evaluate, name, lambda *rest: reached.append(rest) or kept)
+    elif arguments[0] == "check":
+        monkeypatch.setattr(check, "simulate", lambda *rest: ())
+        monkeypatch.setattr(check, "tell", lambda *rest: reached.append(rest) or 0)
     elif arguments[0] == "export":
         monkeypatch.setattr(export, "write_files", lambda *rest: reached.append(rest))
     elif arguments[0] == "finger":

@@ -1,4 +1,4 @@
-"""`--dry-run`: how many grasps and how long, with nothing simulated and nothing written."""
+"""`--dry-run`: how many grasps, with nothing simulated and nothing written."""
 
 import dataclasses
 import re
@@ -7,7 +7,6 @@ import pytest
 
 from codesign_jax import cli, objects, scene
 from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.runs import rates
 from tests.helpers.toy_engine import TINY
 
 SUBJECT = ("--scene", str(TINY), "--engine", "mujoco", "--dry-run")
@@ -15,7 +14,7 @@ SUBJECT = ("--scene", str(TINY), "--engine", "mujoco", "--dry-run")
 
 @pytest.fixture(autouse=True)
 def workplace(tmp_path, monkeypatch):
-    """An empty working directory, no measured rates, and an engine that must not simulate."""
+    """An empty working directory, and an engine that must not simulate."""
 
     def never(*arguments, **flags):
         raise AssertionError("something was simulated")
@@ -41,14 +40,8 @@ def test_optimize_says_that_the_test_has_whole_rounds(workplace, capsys):
 
 
 def test_optimize_counts_the_test_at_reference(workplace, capsys):
-    """Its grasps are of another program, of 20 times as many steps and more links."""
     output = dry_run(capsys, "optimize", "--reference-trials", 70)
     assert "reference test: 70 grasps at accuracy reference" in output
-    [(minutes, seconds)] = re.findall(r", (\d+):(\d+) for the test at accuracy ref", output)
-    finer = scene.with_accuracy(scene.load(TINY), "reference")
-    assert finer == scene.load(TINY, accuracy="reference") and finer != scene.load(TINY)
-    rate = rates.estimate(rates.batch_work(finer, "mujoco", 70)).grasps_per_second
-    assert 60 * int(minutes) + int(seconds) == round(70 / rate) > 1
     output = dry_run(capsys, "optimize")  # this engine has no such test by default
     assert "reference" not in output.split("---- settings")[1]
     assert list(workplace.iterdir()) == []
@@ -65,9 +58,9 @@ def test_robust_widens_the_noise_of_the_scene_and_set_still_holds(workplace, cap
 
 def test_evaluate_and_landscape(workplace, capsys):
     output = dry_run(capsys, "evaluate", "--trials", 50, "--render", "grasp.png")
-    assert "grasps: 50\n" in output and "time: about 0:" in output and "picture" in output
+    assert "grasps: 50\n" in output
     output = dry_run(capsys, "landscape", "--points", 30, "--trials", 6)
     # 85 points of 6 grasps are at most 512 worlds; 900 points are 11 calls of equal size.
-    assert "grasps: 5400 in 11 calls" in output and "based on" in output
+    assert "grasps: 5400 in 11 calls" in output
     assert list(workplace.iterdir()) == []
     assert cli.main(["landscape", *SUBJECT, "--points", "1"]) == 2

@@ -16,7 +16,7 @@ from rich.progress import Progress, TimeRemainingColumn
 from codesign_jax import archives, batch, codesign
 from codesign_jax.codesign import Task
 from codesign_jax.engines import Engine
-from codesign_jax.runs import outcomes, rates
+from codesign_jax.runs import outcomes
 from codesign_jax.runs.progress import Live, duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
@@ -91,11 +91,6 @@ def in_turn(
         running.append((len(part), task.evaluate(*given)))
     while running:
         yield arrived()
-
-
-def work(trials: Trials, size: int) -> rates.Work:
-    """What a call of so many designs is, for estimates."""
-    return rates.batch_work(trials.scene, trials.engine, size * trials.count, devices=1)
 
 
 class Meter(Live):
@@ -182,7 +177,7 @@ class Calls:
         kept = [Outcome(**arrays) for arrays in found]  # a part has no fields that are None
         self._kept = joined(kept) if kept else None
         self.found = sum(len(outcome.cost) for outcome in kept)
-        self._next, self._seconds = 0, []
+        self._next, self._simulated = 0, False
         self._task = Task(trials.scene, trials.space, trials.count, engine)
         self._devices = devices
 
@@ -193,25 +188,15 @@ class Calls:
         if done:
             meter.found(done * count)
             parts.append(jax.tree.map(lambda v: v[first : first + done], self._kept))
-        start = time.perf_counter()
         left = self._trials.key, designs[done:], self._size
         for outcome in in_turn(self._task, *left, devices=self._devices):
             self._part.append(outcome._asdict())
-            self._seconds.append(time.perf_counter() - start)
             parts.append(outcome)
             meter.advance(outcome.cost.size)
-            if len(self._seconds) == 1:
+            if not self._simulated:
                 meter.compiled()
-            start = time.perf_counter()
+            self._simulated = True
         return joined(parts)
-
-    def record_rate(self) -> None:
-        """Keeps what was measured for estimates, if a call compiled and others did not."""
-        if len(self._seconds) > 1:
-            first, *others = self._seconds
-            each = sum(others) / len(others)
-            rate = self._size * self._trials.count / each
-            rates.keep(work(self._trials, self._size), rate, max(first - each, 0.0))
 
 
 def joined(parts: list[Outcome]) -> Outcome:

@@ -53,7 +53,6 @@ def simulate(
             return tolerance.shares(run(planned.designs[asked.designs], meter))
 
         found = answer(tolerance.search(planned, size), reply)
-    run.record_rate()
     known = found[0].value >= tolerance.WANTED
     rows = tolerance.tolerances(planned, found) if known else []
     fixed = sum(source < 0 for source in planned.space.source)

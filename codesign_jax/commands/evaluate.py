@@ -10,12 +10,11 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, rollout, runs, types
-from codesign_jax.commands import common, time_needed
+from codesign_jax.commands import common
 from codesign_jax.commands.case import Case, find_case
-from codesign_jax.commands.time_needed import TimedPart
 from codesign_jax.engines import make_engine
 from codesign_jax.report import verdicts
-from codesign_jax.runs import choice, rates, tables
+from codesign_jax.runs import choice, tables
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
@@ -49,7 +48,7 @@ def main(options: "Evaluate") -> int:
     for note in [*_untried(case, options), *notes, *common.mesh_notes(case.scene)]:
         console.print(note, markup=False)
     if options.dry_run:
-        _dry_run(case, options, console)
+        console.print(f"grasps: {options.trials}")
         return 0
     one = simulate(case, engine, options, console)
     if options.render:
@@ -91,27 +90,13 @@ def _check(options: "Evaluate", engine: str) -> None:
             common.check_place(flag, path)
 
 
-def _dry_run(case: Case, options: "Evaluate", console: Console) -> None:
-    def part(name: str, grasps: int) -> TimedPart:
-        return TimedPart(name, rates.batch_work(case.scene, case.engine, grasps, devices=1), grasps)
-
-    console.print(f"grasps: {options.trials}")
-    parts = [part("", options.trials)]
-    if options.render:
-        drawn = min(options.trials, len(case.scene.objects.object))
-        parts.append(part("the grasps of the picture, without drawing it", drawn))
-    console.print(time_needed.text(parts), markup=False)
-
-
 def simulate(
     case: Case, engine: engines.Engine, options: "Evaluate", console: Console
 ) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
     task = codesign.Task(case.scene, case.space, options.trials, engine)
     population = jnp.asarray(case.design, jnp.float32)[None]
-    work = rates.batch_work(case.scene, case.engine, options.trials, devices=1)
-    many = common.counted(options.trials, "grasp")
-    with Busy(console, f"simulating {many}", rates.seconds(work)):
+    with Busy(console, f"simulating {common.counted(options.trials, 'grasp')}"):
         found = interruptible(task.evaluate, population, jax.random.key(options.seed))
     outcomes = jax.tree.map(np.asarray, found)
     one = jax.tree.map(lambda v: v[0], outcomes)

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import calls, common, time_needed
+from codesign_jax.commands import calls, common
 from codesign_jax.commands.calls import Calls, Meter, Trials
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.cost import particle_cost
@@ -167,7 +167,6 @@ def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Conso
     size = calls.equal(len(designs), calls.most_designs(trials))
     grasps = len(designs) * trials.count
     console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
-    console.print(time_needed.text([time_needed.TimedPart("", calls.work(trials, size), grasps)]))
 
 
 def _trials(case: Case, options: "Options") -> Trials:
@@ -194,7 +193,6 @@ def simulated_designs(
         console.print(f"going on after {common.counted(done, 'call')}, from {part}", markup=False)
     with Meter("landscape", grasps, console) as meter:
         found = simulate(designs, meter)
-    simulate.record_rate()
     return found
 
 

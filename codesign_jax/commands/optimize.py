@@ -13,11 +13,10 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import asked, common, hosts, reference, seeds, status, time_needed
-from codesign_jax.commands.time_needed import TimedPart
+from codesign_jax.commands import asked, common, hosts, reference, seeds, status
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import Plan, RunResult, Settings, rates
+from codesign_jax.runs import Plan, RunResult, Settings
 from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
@@ -58,7 +57,6 @@ def main(options: "Optimize") -> int:
     after = trials * reference.steps_and_links(scene)
     opened = {"fresh": options.fresh, "sources": sources, "after": after}
     found = runs.optimize(plans, sys.argv, **opened, devices=devices, chunk=chunk)
-    _record_rate(plan, found, devices)
     results: dict[Path, RunResult | None] = {}
     called = runs.run_names(every) if asked.several(options) else {}
     for folder, result in found.runs.items():
@@ -89,7 +87,7 @@ def _distributed(options: "Optimize") -> int:
     if options.seeds is None:
         problems.append("--distributed needs --seeds: the hosts share the runs of several seeds")
     if options.dry_run:
-        problems.append("--dry-run knows one host: leave out --distributed to have its estimate")
+        problems.append("--dry-run knows one host: leave out --distributed")
     if problems:
         raise InputError(problems)
     code, here = hosts.run(options)
@@ -149,14 +147,6 @@ def _tell(
         _say_places(result, folder, console)
 
 
-def _record_rate(plan: Plan, found: runs.Results, devices: int | None) -> None:
-    """Keeps what was measured, for estimates."""
-    timing = found.timing
-    if timing.grasps and timing.compile_seconds and plan.task.cost is None:
-        work = rates.work(plan.scene, plan.settings, runs=timing.runs, devices=devices)
-        rates.keep(work, timing.grasps / timing.seconds, timing.compile_seconds)
-
-
 def _preflight(scene: Scene, settings: Settings) -> list[str]:
     """Checks the ends of the design space, as every particle lies between them.
 
@@ -175,7 +165,7 @@ def _preflight(scene: Scene, settings: Settings) -> list[str]:
 
 
 def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
-    """Prints scene, settings, grasps and what this many runs will take; see `runs.rates`."""
+    """Prints scene, settings, grasps and and disk of this many runs."""
     scene, settings = plan.scene, plan.settings
     for name, text in scene_texts(scene).items():
         print(f"# ---- {name}\n{text}")
@@ -194,12 +184,9 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     row = 40 + 12 * space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
-    work = rates.work(scene, settings, runs=count, devices=options.devices)
-    parts = [TimedPart("", work, count * (plan.grasps + seed))]
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
-        parts.append(reference.part(scene, settings, trials, count))
-    print(time_needed.text(parts))
+    print("time: `codesign check` measures it on this machine")
 
 
 def _summarize(plan: Plan, result: RunResult, console: Console) -> None:

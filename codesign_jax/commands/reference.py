@@ -16,10 +16,9 @@ from codesign_jax import codesign, engines, rollout
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.common import counted
 from codesign_jax.commands.flags import Subject
-from codesign_jax.commands.time_needed import TimedPart
 from codesign_jax.engines import make_engine
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import RunResult, Settings, columns, outcomes, rates, read_run, tables
+from codesign_jax.runs import RunResult, Settings, columns, outcomes, read_run, tables
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene, with_accuracy
@@ -47,20 +46,6 @@ def number_of_trials(asked: int | None, settings: Settings) -> int:
     return TRIALS if settings.engine == engines.DEFAULT and settings.test_trials else 0
 
 
-def part(scene: Scene, settings: Settings, trials: int, runs: int) -> TimedPart:
-    """What the test takes, for an estimate.
-
-    Args:
-      scene: Scene of the runs.
-      settings: Their settings.
-      trials: Fresh trials of each run.
-      runs: Runs, whose tests come one after the other.
-    """
-    finer = with_accuracy(scene, ACCURACY)
-    work = rates.batch_work(finer, settings.engine, trials, devices=1)
-    return TimedPart(f"the test at accuracy {ACCURACY}", work, trials * runs)
-
-
 def test(folder: Path, settings: Settings, trials: int, console: Console) -> Outcome:
     """Simulates the best particle of a run in fresh trials at `reference`.
 
@@ -80,9 +65,7 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
     if found is None:
         if why:
             console.print(f"{folder / FILE} {why}: simulated again", markup=False)
-        work = rates.batch_work(case.scene, case.engine, trials, devices=1)
-        words = f"reference test, {counted(trials, 'grasp')}"
-        with Busy(console, words, rates.seconds(work)):
+        with Busy(console, f"reference test, {counted(trials, 'grasp')}"):
             found = simulate(case, settings, trials)
             outcomes.save(folder / FILE, found, key)
             drawn = rollout.sample_trials(case.scene, _noise(settings), trials)

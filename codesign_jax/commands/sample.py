@@ -1,7 +1,6 @@
 """`codesign sample`."""
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,10 +10,10 @@ from rich.console import Console
 
 from codesign_jax import batch, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
-from codesign_jax.commands import calls, common, time_needed
+from codesign_jax.commands import calls, common
 from codesign_jax.commands.calls import Meter
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.runs import dataset, parquet, rates
+from codesign_jax.runs import dataset, parquet
 from codesign_jax.runs.dataset import Question, Shards
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.scene import Scene
@@ -135,12 +134,6 @@ def _finished(options: "Sample", question: Question) -> bool:
 
 
 def _dry_run(options: "Sample", question: Question, console: Console) -> None:
-    work = rates.batch_work(
-        question.scene, options.engine, question.chunk * options.trials, devices=1
-    )
-    console.print(
-        time_needed.text([time_needed.TimedPart("", work, _grasps(options))]), markup=False
-    )
     size = dataset.most_bytes(question, options.designs)
     console.print(f"size: at most about {size / 1e6:.1f} MB")
 
@@ -174,7 +167,7 @@ def _simulate(
     """
     simulate = sampling.make_simulate(question.scene, engine, question.space)
     tally, missing = _Tally(np.zeros(len(VERDICTS), int)), []
-    total, seconds = question.shards(designs), []
+    total = question.shards(designs)
     with Meter("sample", designs * question.trials, console) as meter:
         for shard in range(total):
             kept = shards.load(shard)
@@ -189,25 +182,13 @@ def _simulate(
             )
             console.print(words, markup=False)
         for shard in missing:
-            start = time.perf_counter()
             found = interrupts.call(lambda s=shard: simulate(*question.drawn(s)))
             outcome = jax.tree.map(np.asarray, found)
             shards.save(shard, outcome)
-            seconds.append(time.perf_counter() - start)
             meter.advance(tally.add(question, shard, designs, outcome))
-            if len(seconds) == 1:
+            if shard == missing[0]:
                 meter.compiled()
-    _record_rate(question, seconds)
     return tally
-
-
-def _record_rate(question: Question, seconds: list[float]) -> None:
-    """Keeps what was measured for estimates, if a call compiled and others did not."""
-    if len(seconds) > 1:
-        first, *others = seconds
-        each, grasps = sum(others) / len(others), question.chunk * question.trials
-        work = rates.batch_work(question.scene, question.engine, grasps, devices=1)
-        rates.keep(work, grasps / each, max(first - each, 0.0))
 
 
 def _report(path: Path, found: _Tally, console: Console) -> None:

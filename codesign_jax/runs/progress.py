@@ -29,7 +29,7 @@ class Ticker:
     def __init__(self, *, disable: bool = False):
         """Starts nothing yet; with `disable` it never says anything."""
         self._disable, self._stop = disable, threading.Event()
-        self._text, self._about = "", ""
+        self._text = ""
         self._since, self._spoken = 0.0, 0.0
 
     def __enter__(self) -> "Ticker":
@@ -42,10 +42,9 @@ class Ticker:
         """Stops."""
         self._stop.set()
 
-    def begin(self, text: str, expected: float | None = None) -> None:
-        """Something else goes on from now, for about so many seconds if that is known."""
+    def begin(self, text: str) -> None:
+        """Something else goes on from now."""
         self._text, self._since = text, time.monotonic()
-        self._about = "" if expected is None else f" of about {duration(expected)}"
         self.spoke()
 
     def rename(self, text: str) -> None:
@@ -61,7 +60,7 @@ class Ticker:
         now = time.monotonic()
         if self._text and now - self._spoken >= self.SILENCE:
             self._spoken = now
-            words = f"{self._text}: {duration(now - self._since)}{self._about}"
+            words = f"{self._text}: {duration(now - self._since)}"
             print(words, file=sys.stderr, flush=True)
 
     def _run(self) -> None:
@@ -94,13 +93,12 @@ class Live:
 class Busy(Live):
     """Shows that something of unknown progress goes on, and for how long; a context manager."""
 
-    def __init__(self, console: rich.console.Console, text: str, expected: float | None = None):
-        """Takes what goes on, and how long that is expected to take [s], if it is known."""
+    def __init__(self, console: rich.console.Console, text: str):
+        """Takes what goes on."""
         columns = rich.progress.SpinnerColumn(), rich.progress.TextColumn("{task.description}")
         super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
-        self._ticker.begin(text, expected)
-        about = "" if expected is None else f" (about {duration(expected)})"
-        self._task = self._bar.add_task(text + about, total=None)
+        self._ticker.begin(text)
+        self._task = self._bar.add_task(text, total=None)
 
     def say(self, text: str) -> None:
         """Says more precisely what goes on; its time goes on as well."""

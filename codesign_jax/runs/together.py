@@ -37,13 +37,11 @@ class Timing(NamedTuple):
       compile_seconds: Compiling the episode; 0 if there was nothing to simulate.
       seconds: Simulations with the saving in between.
       grasps: Grasps of these.
-      runs: Runs that were simulated at once.
     """
 
     compile_seconds: float = 0.0
     seconds: float = 0.0
     grasps: int = 0
-    runs: int = 1
 
 
 class Results(NamedTuple):
@@ -214,7 +212,7 @@ class _Together:
         self.progress.compiled()
         for folder in self.waiting:
             self.loops[folder].run_directory.log(message)
-        self.timing = Timing(watch.seconds, runs=len(self.waiting))
+        self.timing = Timing(watch.seconds)
 
     def _test(self, request: Request) -> Request | None:
         """What the final test will ask for, if that is another program than an episode's."""

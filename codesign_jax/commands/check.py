@@ -1,0 +1,239 @@
+"""`codesign check`: how fast and how exact a scene is on this machine, by simulating it."""
+
+import importlib.metadata
+import os
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from codesign_jax import codesign, optimize, runs, sampling
+from codesign_jax.commands import common, reference
+from codesign_jax.commands.case import PRESET, Case, find_case
+from codesign_jax.engines import Engine, make_engine
+from codesign_jax.report.statistics import wilson
+from codesign_jax.runs import Settings, choice
+from codesign_jax.runs.interrupts import interruptible
+from codesign_jax.runs.progress import Busy, duration
+from codesign_jax.scene import Scene, with_accuracy
+from codesign_jax.scene.schema import InputError
+from codesign_jax.types import Outcome, Trial, failed
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Check
+
+_ROUNDS = 4
+"""Batches of random designs of which a mixed sample takes the best."""
+_LEAST = 4
+"""Designs that are simulated at accuracy reference, however long that takes."""
+
+
+class Measured(NamedTuple):
+    """A batch of grasps.
+
+    Attributes:
+      scene: What was simulated.
+      outcomes: Arrays of shape (design, trial).
+      seconds: Wall time of the batch, compiled before.
+      compiling: Time to compile the program, or to load it [s].
+    """
+
+    scene: Scene
+    outcomes: Outcome
+    seconds: float
+    compiling: float
+
+    @property
+    def rate(self) -> float:
+        """Grasps a second."""
+        return self.outcomes.cost.size / self.seconds
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Whether each grasp kept its object, shape (design, trial)."""
+        return codesign.verdicts(self.outcomes) == codesign.VERDICTS.index("kept")
+
+    def __str__(self) -> str:
+        """Rate and sizes in a line."""
+        size, count = self.scene.discretization, self.outcomes.cost.size
+        return (
+            f"steps of {1e3 * size.timestep:g} ms, {size.links} links a finger: {self.rate:.3g} "
+            f"grasps/s ({count} grasps in {self.seconds:.3g} s; compiled or loaded in "
+            f"{self.compiling:.1f} s)"
+        )
+
+
+def main(options: "Check") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      InputError: If something is wrong with the input.
+    """
+    common.use_compilation_cache()
+    load = os.getloadavg()[0]
+    case = find_case(options)
+    finer = with_accuracy(case.scene, reference.ACCURACY)
+    _refuse(options, case, finer)
+    console = Console(highlight=False, soft_wrap=True)
+    for line in _head(case, load):
+        console.print(line, markup=False)
+    settings = _settings(options, case)
+    return tell(case, settings, *simulate(case, settings, finer, options, console), console)
+
+
+def simulate(
+    case: Case, settings: Settings, finer: Scene, options: "Check", console: Console
+) -> tuple[str, Measured, Measured]:
+    """What the designs are, and their grasps in the scene and in the finer one.
+
+    The second are the first of the first ones: the same designs and trials.
+    """
+    engines = [make_engine(case.engine, scene) for scene in (case.scene, finer)]
+    trials = len(case.scene.objects.object)
+    count = max(_LEAST, (options.grasps or settings.particles * settings.trials) // trials)
+    with Busy(console, "compiling") as busy:
+        run, compiling = _compiled(case.scene, engines[0], case, count)
+        busy.say("simulating at the scene's accuracy")
+        designs, words = _sample(options, case, run, count)
+        drawn = _draw(case, 1, 0, count).trials
+        outcomes, seconds = min((_timed(run, designs, drawn) for _ in range(2)), key=lambda m: m[1])
+        usual = Measured(case.scene, outcomes, seconds, compiling)
+        few = options.seconds * usual.rate / reference.steps_and_links(case.scene) / trials
+        few = int(np.clip(few, _LEAST, count))
+        busy.say(f"compiling at accuracy {reference.ACCURACY}")
+        run, compiling = _compiled(finer, engines[1], case, few)
+        busy.say(f"simulating {few * trials} grasps at accuracy {reference.ACCURACY}")
+        some = designs[:few], jax.tree.map(lambda v: v[:few], drawn)
+        fine = Measured(finer, *_timed(run, *some), compiling)
+    return words, usual, fine
+
+
+def _refuse(options: "Check", case: Case, finer: Scene) -> None:
+    problems = common.number_problems(
+        ("--grasps", options.grasps, 1, 1_000_000), ("--seconds", options.seconds, 1, 86_400)
+    )
+    problems += common.engine_problems(case.engine, options.overrides)
+    if finer == case.scene:
+        problems.append(
+            f"accuracy {reference.ACCURACY} is what others are compared with: choose another by "
+            "--accuracy"
+        )
+    if problems:
+        raise InputError(problems)
+
+
+def _head(case: Case, load: float) -> list[str]:
+    """What is checked and where; warnings."""
+    device = jax.devices()[0]
+    where = f"{os.cpu_count()} CPU cores"
+    if hasattr(os, "sched_getaffinity"):
+        where = f"{len(os.sched_getaffinity(0))} CPU cores"
+    if device.platform != "cpu" and case.engine != "mujoco":
+        where = f"one {device.device_kind}"
+    versions = (f"{name} {importlib.metadata.version(name)}" for name in ("jax", "mujoco"))
+    lines = [f"scene {case.scene.name}, engine {case.engine}; {where}; {', '.join(versions)}"]
+    if load > 0.5:
+        lines.append(
+            f"warning: the machine is busy (load {load:.1f}), so that rates are lower than they "
+            "could be"
+        )
+    lines += common.preflight_warnings(case.scene, case.space, {"the design": case.design})
+    return lines + common.mesh_notes(case.scene)
+
+
+def _settings(options: "Check", case: Case) -> Settings:
+    """Of the run, or of a search with the default optimiser."""
+    if options.run_folder:
+        return runs.read_run(options.run_folder)[1]
+    objects = len(case.scene.objects.object)
+    how = {"optimizer": optimize.DEFAULT, "objects": objects}
+    preset = options.preset or PRESET
+    return runs.make_settings(preset, "concurrent", "morphology", case.engine, 0, **how)
+
+
+Run = Callable[[jax.Array, Trial], Outcome]
+
+
+def _compiled(scene: Scene, engine: Engine, case: Case, count: int) -> tuple[Run, float]:
+    """A program for so many designs, each with a trial of every object, and its compile time."""
+    program, like = sampling.make_simulate(scene, engine, case.space), _draw(case, 0, 0, count)
+    begin = time.perf_counter()
+    return interruptible(program.compile, *like), time.perf_counter() - begin
+
+
+def _draw(case: Case, stream: int, first: int, count: int) -> sampling.Drawn:
+    """Random designs, each with a trial of every object."""
+    key = jax.random.fold_in(jax.random.key(0), stream)
+    sizes = {"first": first, "n": count, "num_trials": len(case.scene.objects.object)}
+    return sampling.draw(case.scene, case.space, key, **sizes)
+
+
+def _timed(run: Run, designs: jax.Array, trials: Trial) -> tuple[Outcome, float]:
+    """Outcomes on the host, and seconds."""
+    begin = time.perf_counter()
+    found = jax.tree.map(np.asarray, interruptible(run, designs, trials))
+    return found, time.perf_counter() - begin
+
+
+def _sample(options: "Check", case: Case, run: Run, count: int) -> tuple[jax.Array, str]:
+    """Designs of shape (count, parameter), repeated where there are fewer, and what they are."""
+    if options.run_folder:
+        particles = choice.read_record(options.run_folder).state.particles
+        found = np.unique(np.asarray(particles), axis=0)
+        words = f"the {common.counted(len(found), 'final particle')} of {options.run_folder} "
+        words += "that differ"
+    elif options.design:
+        found, words = np.asarray(case.design)[None], runs.describe(case.space, case.design)
+    else:
+        found, words = _mixed(options, case, run, count)
+    return jnp.asarray(np.resize(found, (count, found.shape[1])), jnp.float32), words
+
+
+def _mixed(options: "Check", case: Case, run: Run, count: int) -> tuple[np.ndarray, str]:
+    """In turn random designs and the best of several batches of them."""
+    begin, designs, costs = time.perf_counter(), [], []
+    while len(designs) < _ROUNDS and time.perf_counter() - begin < options.seconds / _ROUNDS:
+        drawn = _draw(case, 0, count * len(designs), count)
+        outcomes, _ = _timed(run, *drawn)
+        designs.append(np.asarray(drawn.designs))
+        costs.append(np.where(failed(outcomes.status), np.inf, outcomes.cost).mean(1))
+    every = np.concatenate(designs)
+    half = (count + 1) // 2
+    best = every[np.concatenate(costs).argsort(kind="stable")[:half]]
+    mixed = np.stack([best, every[-half:]], 1).reshape(-1, best.shape[1])[:count]
+    words = (
+        f"half of them random, half the best of {len(every)} random ones; those that a search "
+        "ends with take longer (--run FOLDER measures them)"
+    )
+    return mixed, words
+
+
+def tell(
+    case: Case, settings: Settings, words: str, usual: Measured, fine: Measured, console: Console
+) -> int:
+    """Prints what `simulate` found; the exit status."""
+    ours, theirs = usual.kept[: len(fine.kept)], fine.kept
+    differ = int((ours != theirs).sum())
+    share = wilson(differ, theirs.size)
+    grasps = runs.prepare(case.scene, settings).grasps
+    tested = reference.number_of_trials(None, settings)
+    test = f", and {duration(tested / fine.rate)} for its test at accuracy {reference.ACCURACY}"
+    causes = runs.failure_counts(usual.outcomes.status)
+    lines = [
+        f"designs: {words}",
+        str(usual),
+        f"accuracy {reference.ACCURACY}, {fine}",
+        *([f"failed: {causes}"] if causes else []),
+        f"kept: {ours.sum()} of {ours.size} grasps, at accuracy {reference.ACCURACY} "
+        f"{theirs.sum()}; verdicts differ in {differ}: {100 * share.value:.2g} % "
+        f"(95 % interval {100 * share.low:.2g} to {100 * share.high:.2g} %)",
+        f"a search ({settings.optimizer}, preset {settings.preset}, {grasps} grasps): about "
+        f"{duration(usual.compiling + grasps / usual.rate)}{test if tested else ''}",
+    ]
+    for line in lines:
+        console.print(line, markup=False)
+    return int(any(failed(m.outcomes.status).all() for m in (usual, fine)))

@@ -21,7 +21,7 @@ unexport PYTHONDONTWRITEBYTECODE
 help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
-	@echo "make quick       a minute of them, for another Python: PYTHON=python3.13 VENV=.venv-python3.13"
+	@echo "make quick       a minute of them, for another Python: PYTHON=python3.13 VENV=.venv-other MUJOCO='mujoco<4'"
 	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
 	@echo "make test-ptx    kernels for GPUs, assembled without one"
 	@echo "make test-browser  the report in a headless Chromium"
@@ -40,7 +40,7 @@ demo: $(DEMO)
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
 
-# The quick core: a minute for another Python, make quick PYTHON=python3.13 VENV=.venv-python3.13
+# The quick core: a minute for another Python and MuJoCo, in an environment of its own.
 CORE := layers scene parameters schedule optimizers compiler planted_faults codesign run_folder
 quick: $(QUICK)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(CORE:%=tests/test_%.py)
@@ -113,7 +113,7 @@ define install
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found: apt-get install python3 python3-venv" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
 		{ echo "No venv module: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -e '.[$(1)]'
+	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -e '.[$(1)]' $(MUJOCO:%='%')
 endef
 
 $(STAMP): pyproject.toml

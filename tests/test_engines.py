@@ -1,7 +1,5 @@
 """Stock MJX against MuJoCo C: single steps in float64, whole short grasps, and failing worlds."""
 
-import sys
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -297,15 +295,6 @@ def test_batches_do_not_depend_on_order_or_size(hurried):
 def test_unknown_engine_names_the_nearest():
     with pytest.raises(schema.InputError, match="did you mean 'mujoco'"):
         make_engine("mujocco", pinch())
-
-
-def test_stock_mjx_is_an_extra(monkeypatch):
-    """Without its package the engine says how to get it, and the others do without."""
-    monkeypatch.setitem(sys.modules, "codesign_jax.engines.mjx", None)
-    the_scene = pinch("sphere", links=2)
-    with pytest.raises(schema.InputError, match="needs mujoco-mjx: pip install"):
-        make_engine("mjx", the_scene)
-    assert make_engine("structured", the_scene).name == "structured"
 
 
 def test_mujocos_solver_table_is_refused_where_it_has_no_effect():

@@ -25,7 +25,7 @@ def make_engine(name: str, scene: Scene) -> Engine:
     Raises:
       InputError: If there is no such engine, if `scene` is not a `Scene`, or if the engine does not
         do what the scene asks for: effects, meshes, or a [solver] table that the engine does not
-        read, see `solver_problems`, or if the engine's package is missing.
+        read, see `solver_problems`.
 
     >>> from codesign_jax import make_engine, scene
     >>> grasping = scene.load("paper")
@@ -39,11 +39,8 @@ def make_engine(name: str, scene: Scene) -> Engine:
         words = f"scene is {scene!r}, not a Scene; scene.load({scene!r}) reads it"
         raise schema.InputError([words])
     if name == "mjx":
-        try:
-            from codesign_jax.engines.mjx import MjxEngine
-        except ImportError as error:
-            words = "engine mjx needs mujoco-mjx: pip install '.[mjx]' in the checkout"
-            raise schema.InputError([words]) from error
+        from codesign_jax.engines.mjx import MjxEngine
+
         return MjxEngine(scene)
     if name == "mujoco":
         from codesign_jax.engines.mujoco import MujocoEngine

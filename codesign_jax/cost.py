@@ -76,25 +76,11 @@ def particle_cost(scene: Scene, outcomes: Outcome) -> jax.Array:
       Costs without the trial axis.
     """
     good = ~failed(outcomes.status)
-    if _failures_count(scene):
+    if scene.cost.failure == "worst":
         return jnp.where(good, outcomes.cost, scene.cost.maximum).mean(-1)
     count = good.sum(-1)
     mean = jnp.where(good, outcomes.cost, 0.0).sum(-1) / jnp.maximum(count, 1)
     return jnp.where(count > 0, mean, scene.cost.maximum)
-
-
-def counts(scene: Scene, status: Any) -> Any:
-    """Which trials `particle_cost` averages, bool; failed ones where the scene's rule is "worst".
-
-    Args:
-      scene: The scene.
-      status: Bits of `Status`, int or integer array of any shape.
-    """
-    return ~failed(status) | _failures_count(scene)
-
-
-def _failures_count(scene: Scene) -> bool:
-    return scene.cost.failure == "worst"
 
 
 def shown(trace: Trace, record_qpos: bool, stop_when_lost: bool | None) -> Trace:

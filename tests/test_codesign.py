@@ -222,7 +222,7 @@ def test_success_needs_a_mean_below_a_hundredth():
     status = np.zeros((4, 42), int)
     status[3] = 1
     result = codesign.summarize_test(the_scene, outcomes(cost, status))
-    np.testing.assert_array_equal(result.success, [True, True, False, False])
+    np.testing.assert_array_equal(result.paper_success, [True, True, False, False])
     assert float(result.cost[3]) == the_scene.cost.maximum, "all trials failed"
 
 

@@ -35,7 +35,7 @@ def test_report_shows_the_best_tested_particle_with_its_interval(run, text):
     chosen = choice.choose(the_scene, choice.read_record(run))
     kept = int(((chosen.outcomes.cost < 0.01) & ~failed(chosen.outcomes.status)).sum())
     low, high = stats.binomtest(kept, int(best["trials"])).proportion_ci(0.95, method="wilson")
-    share = f"{100 * low:.0f} to {100 * high:.0f} % of grasps (95 % interval"
+    share = f"grasps of its final test ({100 * low:.0f} to {100 * high:.0f} %): not good"
     assert f"kept {kept} of {best['trials']}, " in text and share in text
     assert f"Particle {best['particle']}, chosen as the best by the final test" in text
     assert f"; mean cost {float(best['test_cost']):.4f}" in text
@@ -107,7 +107,8 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
     copy = shutil.copytree(run, tmp_path / "run")
     settings, trials = runs.read_run(copy)[1], 5
     cost, status = np.array([0.0, 0.0, 0.0, 2.0, 3.0]), np.array([0, 0, 0, 0, int(Status.STUCK)])
-    found = Outcome(cost, status, np.full(trials, np.inf), np.full(trials, -1))
+    lost = np.where(cost == 2.0, 5.0, np.inf)
+    found = Outcome(cost, status, lost, np.full(trials, -1))
     for design, words in (("own", True), ("other", False)):
         case, key = reference._case(copy, settings, trials)
         other = outcomes.key(case.scene, case.engine, case.design[None] + 1, trials, settings.seed)
@@ -116,9 +117,9 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
         assert cli.main(["report", str(copy), "--no-replay", "--out", str(page)]) == 0
         low, high = stats.binomtest(3, 5).proportion_ci(0.95, method="wilson")
         text = page.read_text(encoding="utf-8")
-        share = f"it keeps {100 * low:.0f} to {100 * high:.0f} % of grasps (95 % interval"
+        share = f"keeps 60 % of 5 fresh grasps ({100 * low:.0f} to {100 * high:.0f} %): not good"
         assert (share in text) == words
-        assert ("kept 3 of 5, 1 lost, 1 stuck (accuracy reference" in text) == words
+        assert ("; accuracy reference, steps of " in text) == words
         assert ("1 of 5 trials failed (STUCK 1)" in text) == words
 
 

@@ -175,11 +175,12 @@ def test_row_groups_end_where_memory_would_grow(place, monkeypatch):
     assert [found.row_group(k).num_rows for k in range(found.num_row_groups)] == [16, 4]
 
 
-def test_verdicts_are_the_costs_and_the_status():
-    """A warning fails no trial, and a loss that costs next to nothing is none."""
+def test_verdicts_are_the_losses_and_the_status():
+    """A warning fails no trial, and a loss that costs next to nothing is one."""
     status = np.array([Status.OK, Status.SOLVER_CAP, Status.OK, Status.STUCK, Status.SPEED])
-    cost = np.array([0.0, 0.009, 0.011, 3.0, 3.0])
-    found = codesign.verdicts(Outcome(cost, status, cost, status))
+    cost = np.array([0.0, 0.0, 0.007, 3.0, 3.0])
+    lost = np.array([np.inf, np.inf, 7.99, np.inf, np.inf])
+    found = codesign.verdicts(Outcome(cost, status, lost, status))
     assert [codesign.VERDICTS[k] for k in found] == ["kept", "kept", "lost", "stuck", "failed"]
 
 

@@ -20,7 +20,8 @@ STREAM_TEST = 0x74657374
 """Stream of the noise of the final test ("test")."""
 
 SUCCESS_COST = 0.01
-"""Mean test cost below which a particle has solved the task (section VI.4)."""
+"""Mean test cost below which a particle has solved the task by the paper's rule (section VI.4); the
+verdict of a run is `report.verdicts.judge`."""
 CONVERGED_COST = 1.0
 """Mean particle cost of an episode below which a run counts as converged (section VI.4)."""
 SEED_COST = 2.0
@@ -35,12 +36,12 @@ class FinalTest(NamedTuple):
     Attributes:
       outcomes: Arrays of shape (particle, trial).
       cost: Mean cost of each particle by the scene's failure rule, shape (particle,).
-      success: Whether the cost is below `SUCCESS_COST`, bool, shape (particle,).
+      paper_success: Whether the cost is below `SUCCESS_COST`, bool, shape (particle,).
     """
 
     outcomes: Outcome
     cost: jax.Array
-    success: jax.Array
+    paper_success: jax.Array
 
 
 def seed_search(
@@ -107,7 +108,7 @@ def testing(
 
 
 def summarize_test(scene: Scene, outcomes: Outcome) -> FinalTest:
-    """Returns cost and success of particles from the outcomes of their test.
+    """Returns cost and the paper's success of particles from the outcomes of their test.
 
     Args:
       scene: The scene.
@@ -120,8 +121,9 @@ def summarize_test(scene: Scene, outcomes: Outcome) -> FinalTest:
 def verdicts(outcomes: Outcome) -> np.ndarray:
     """How trials ended, as indices of `VERDICTS`: the one rule of tables, reports and commands.
 
-    Kept is what did not fail and costs less than `SUCCESS_COST`.  Of the trials that failed, stuck
-    are those in which the hand did not let go; the others are faults of the simulation.
+    Lost is what did not fail and lost its object within the window of the scene's cost, whatever
+    a cost of one's own says.  Of the trials that failed, stuck are those in which the hand did not
+    let go; the others are faults of the simulation.
 
     Args:
       outcomes: Outcomes, arrays of any shape.
@@ -130,7 +132,7 @@ def verdicts(outcomes: Outcome) -> np.ndarray:
       Indices, of the same shape.
     """
     status = np.asarray(outcomes.status)
-    lost = ~(np.asarray(outcomes.cost) < SUCCESS_COST)
+    lost = np.isfinite(outcomes.lost_time)
     bad = np.where(status & Status.STUCK, VERDICTS.index("stuck"), VERDICTS.index("failed"))
     return np.where(failed(status), bad, lost.astype(int))
 

@@ -103,9 +103,10 @@ def simulate(
     names = [shape.name for shape in case.scene.objects.object]
     for k, name in enumerate(names[: options.trials]):
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
-        console.print(f"{name:>12}: {verdicts.of_object(case.scene, own)}", markup=False)
+        console.print(f"{name:>12}: {verdicts.of_trials(case.scene, own)}", markup=False)
     judged = verdicts.Judged(case.scene, one, options.accuracy)
-    for line in [f"{'all':>12}: {judged}", *verdicts.solver(one), *verdicts.warnings(judged)]:
+    lines = [f"{'all':>12}: {judged.details}", *verdicts.solver(one), *verdicts.warnings(judged)]
+    for line in [*lines, f"verdict: {judged}"]:
         console.print(line, markup=False)
     if options.out:
         drawn = rollout.sample_trials(case.scene, jax.random.key(options.seed), options.trials)

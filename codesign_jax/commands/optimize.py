@@ -222,16 +222,17 @@ def _judge(
     count = len(np.unique(np.asarray(result.record.state.particles), axis=0))
     chosen = f"chosen as the best of {count} final particles"
     if fresh is None:
-        lines = [f"verdict: {test}", f"{chosen} by these very trials, which flatters it"]
+        lines = [f"{chosen} by these very trials, which flatters it: {test.details}"]
     else:
         lines = [
             f"{chosen}, by a test that flatters it: {verdicts.tally(test.outcomes)}",
-            f"verdict, on fresh trials: {fresh}",
+            f"its fresh grasps: {fresh.details}",
         ]
     flags = ["--run", str(folder), "--trials", "150", "--accuracy", reference.ACCURACY]
     again = shlex.join(["codesign", "evaluate", *flags])
     judged = test if fresh is None else fresh
-    for line in [*lines, *verdicts.warnings(judged), f"more fresh trials: {again}"]:
+    last = [f"verdict: {judged}", f"more fresh trials: {again}"]
+    for line in [*lines, *verdicts.warnings(judged), *last]:
         console.print(line, markup=False)
 
 

@@ -80,11 +80,11 @@ def of_test(scene: Scene, result: RunResult) -> Judged:
     assert result.test is not None
     best = int(np.asarray(result.test.cost).argmin())
     trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.outcomes)
-    return Judged(scene, trials)
+    return Judged(scene, trials, grasps="grasps of its final test")
 
 
 def compare(scene: Scene, every: Mapping[Path, Compared], console: Console) -> None:
-    """Prints a row for each run and for each strategy the share of successful ones.
+    """Prints a row for each run and for each strategy the share of those with a good design.
 
     Args:
       scene: Scene of the runs.
@@ -92,7 +92,7 @@ def compare(scene: Scene, every: Mapping[Path, Compared], console: Console) -> N
       console: Where to print.
     """
     strategies = list(dict.fromkeys(run.settings.schedule for run in every.values()))
-    head = ("seed", "converged", "judged by", "kept", "lost", "stuck", "failed", "cost", "success")
+    head = ("seed", "converged", "judged by", "kept", "lost", "stuck", "failed", "verdict")
     rows = []
     for run in every.values():
         own = [run.settings.schedule] if len(strategies) > 1 else []
@@ -100,15 +100,13 @@ def compare(scene: Scene, every: Mapping[Path, Compared], console: Console) -> N
     console.print(_table((*(["strategy"] * (len(strategies) > 1)), *head), rows))
     rows = [_summary(scene, name, every) for name in strategies]
     if len(strategies) > 1:
-        head = ("strategy", "converged", "grasps until then, median", "successful", "95 % interval")
+        head = ("strategy", "converged", "grasps until then, median", "good", "95 % interval")
         console.print(_table(head, rows))
     name, _, _, good, interval = rows[0]
     if good and len(strategies) == 1:
-        console.print(
-            f"{good} runs found a design that {_SUCCESS}: {interval} of such runs (95 % interval)"
-        )
-    elif good:
-        console.print(f"successful: the run found a design that {_SUCCESS}")
+        console.print(f"{good} runs found a good design: {interval} of such runs (95 % interval)")
+    if good:
+        console.print(verdicts.RULE)
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
@@ -118,12 +116,6 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
     for row in rows:
         table.add_row(*row)
     return table
-
-
-_SUCCESS = (
-    f"keeps at least {100 * verdicts.RELIABLE:.0f} % of all trials at a mean cost below "
-    f"{codesign.SUCCESS_COST}"
-)
 
 
 def _summary(scene: Scene, strategy: str, every: Mapping[Path, Compared]) -> tuple[str, ...]:
@@ -138,7 +130,7 @@ def _summary(scene: Scene, strategy: str, every: Mapping[Path, Compared]) -> tup
     found = [judged for run in own if (judged := run.judged(scene)) is not None]
     if not found:
         return strategy, converged, grasps, "", ""
-    good = sum(bool(verdicts.success(judged.scene, judged.outcomes)) for judged in found)
+    good = sum(judged.verdict.word == "good" for judged in found)
     share = statistics.wilson(good, len(found))
     interval = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
     return strategy, converged, grasps, f"{good} of {len(found)}", interval
@@ -192,15 +184,16 @@ def _values(scene: Scene, run: Compared) -> dict[str, object]:
     test = run.result.test
     costs = np.asarray(test.cost)
     best = int(costs.argmin())
-    own = jax.tree.map(lambda v: np.asarray(v)[best], test.outcomes)
-    counted = cost.counts(scene, own.status)
+    own = verdicts.tally(jax.tree.map(lambda v: np.asarray(v)[best], test.outcomes))
+    first = np.unique(np.asarray(run.result.record.state.particles), axis=0, return_index=True)[1]
+    judged = run.judged(scene)
     return found | {
         "best_test_cost": f"{costs[best]:.9g}",
-        "kept_trials": verdicts.tally(own).kept,
-        "counted_trials": int(counted.sum()),
-        "trials": counted.size,
-        "successful_particles": int(np.asarray(test.success).sum()),
-        "particles": costs.size,
+        "kept_trials": own.kept,
+        "trials": own.total,
+        "paper_successes": int(np.asarray(test.paper_success)[first].sum()),
+        "particles": first.size,
+        "verdict": judged and judged.verdict.word,
     }
 
 
@@ -217,17 +210,15 @@ def _fresh_values(judged: Judged | None) -> dict[str, object]:
 def _row(scene: Scene, run: Compared) -> tuple[str, ...]:
     """Convergence of a run, and how its design did."""
     if run.result is None or run.result.record is None:
-        return ("failed", *[""] * 7)
+        return ("failed", *[""] * 6)
     converged = f"episode {run.converged}" if run.converged else "no"
     judged = run.judged(scene)
     if judged is None:
-        return (converged, *[""] * 7)
+        return (converged, *[""] * 6)
     where = "final test" if run.fresh is None else f"{judged.accuracy}"
     found = verdicts.tally(judged.outcomes)
-    mean = float(cost.particle_cost(judged.scene, judged.outcomes))
-    word = "yes" if verdicts.success(judged.scene, judged.outcomes) else "no"
-    numbers = f"{found.kept} of {found.total}", *map(str, found[1:]), f"{mean:.4f}"
-    return (converged, where, *numbers, word)
+    numbers = f"{found.kept} of {found.total}", *map(str, found[1:])
+    return (converged, where, *numbers, judged.verdict.word)
 
 
 def read(scene: Scene, folder: Path) -> RunResult | None:

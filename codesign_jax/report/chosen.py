@@ -13,18 +13,14 @@ def design(run: Run) -> str:
     """The verdict on the design, its parameters within their ranges, and its trials by object."""
     chosen, judged = run.chosen, run.judged
     source = "the final test" if chosen.tested else "its last episode (there was no final test)"
-    tested = Judged(run.scene, chosen.outcomes)
     note = (
         f"Particle {chosen.particle}, chosen as the best by {source}, which flatters it: "
-        f"{verdicts.tally(chosen.outcomes)}; {verdicts.mean_cost(run.scene, chosen.outcomes)}. "
+        f"{verdicts.of_trials(run.scene, chosen.outcomes)}. "
     )
-    if run.reference is None:
-        trials = f"Verdict, in the trials of {source}: {tested}."
-    else:
-        trials = f"Verdict, in fresh trials, which had no part in the choice: {judged}."
     again = ["evaluate", "--run", str(run.folder), "--trials", "150", "--accuracy", "reference"]
     parts = [
-        markup.paragraph(trials, "key"),
+        markup.paragraph(f"Verdict: {judged}", "key"),
+        markup.paragraph(f"{judged.details}. Rule: {verdicts.RULE}."),
         *(markup.paragraph(words, "warning") for words in verdicts.warnings(judged)),
         *(markup.paragraph(words, "note") for words in verdicts.solver(judged.outcomes)),
         markup.paragraph(note + "More fresh trials: ", "note", again),

@@ -39,7 +39,8 @@ class Run(NamedTuple):
     @property
     def judged(self) -> Judged:
         """The trials that judge the design: the fresh ones, or else those that chose it."""
-        return self.reference or Judged(self.scene, self.chosen.outcomes)
+        own = "grasps of " + ("its final test" if self.chosen.tested else "its last episode")
+        return self.reference or Judged(self.scene, self.chosen.outcomes, grasps=own)
 
     @property
     def space(self) -> DesignSpace:

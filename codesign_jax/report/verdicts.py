@@ -1,32 +1,93 @@
-"""What simulated trials say about a design, in words: one verdict, with failed trials in it.
+"""What simulated trials say about a design, in words: one verdict (`judge`), by one rule.
 
 Trials are kept, lost, stuck (the hand did not let go) or failed otherwise, and all of them are
 counted: shares and intervals are of all trials, so that a trial that failed is one that did not
 keep its object.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from codesign_jax import codesign, cost, runs
 from codesign_jax.report import statistics
+from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, failed
 
 RELIABLE = 0.95
-"""Share of all trials that a successful design keeps at least: the mean cost alone lets a design
-pass that loses a sixth of its objects late, as such losses cost little."""
-_RELIABLE = f"{100 * RELIABLE:.0f} %"
+"""Share of its grasps that a good design keeps at least."""
+UNRELIABLE = 0.85
+"""Share that the interval of a good design leaves out: 22 grasps without a loss do."""
+RULE = (
+    "good: at least 95 % kept, and the 95 % interval (Wilson's) above 85 %; not good: the interval "
+    "below 95 %; otherwise not enough trials"
+)
+"""The rule of `judge` in words."""
+_MOST = 10_000
+_SQUARE = 1.959963984540054**2  # of the normal distribution's 97.5 % point
 MANY = 0.1
 """Share of failed trials from which on a verdict comes with a warning."""
+
+
+class Verdict(NamedTuple):
+    """Whether a design is good; as a string a sentence without its subject.
+
+    Attributes:
+      share: Share of its grasps that it kept, with the 95 % interval.
+      total: Number of the grasps.
+      word: "good", "not good" or "not enough trials".
+      more: Further grasps after which the share, if it stays, is good or not good; 0 if it is.
+    """
+
+    share: Interval
+    total: int
+    word: str
+    more: int
+
+    def sentence(self, grasps: str = "fresh grasps") -> str:
+        """Such as "keeps 97 % of 150 fresh grasps (93 to 99 %): good"."""
+        share, low, high = (_percent(v) for v in self.share)
+        text = f"keeps {share} % of {self.total} {grasps} ({low} to {high} %): {self.word}"
+        if not self.more:
+            return text
+        some = f"{self.more:,}" if self.more <= _MOST else f"more than {_MOST:,}"
+        return f"{text}, {some} more at this share would decide"
+
+
+def judge(kept: int, total: int) -> Verdict:
+    """The verdict on a design, by `RULE`: this function is the only place that decides it.
+
+    Wilson's interval leaves out a share p_0 where the score test rejects it, that is from
+    z^2 p_0 (1 - p_0) / (p - p_0)^2 grasps on: the number that decides has a closed form.  A kept
+    grasp more never makes a verdict worse, a lost one never better, and at a constant share a
+    decision stays.
+
+    Args:
+      kept: Grasps that it kept.
+      total: All grasps, at least one.
+    """
+    good = kept / total > RELIABLE - 1e-9
+    limit = UNRELIABLE if good else RELIABLE
+    needed = _SQUARE * limit * (1 - limit) / (kept / total - limit) ** 2
+    more = max(math.floor(needed) + 1 - total, 0)
+    word = "not enough trials" if more else "good" if good else "not good"
+    return Verdict(statistics.wilson(kept, total), total, word, more)
+
+
+def _percent(share: float) -> str:
+    """Percent, with a decimal where rounding would lift a share to 95 or 100."""
+    text = f"{100 * share:.0f}"
+    lifted = text in ("95", "100") and 100 * share < float(text)
+    return f"{math.floor(1000 * share) / 10:.1f}" if lifted else text
 
 
 class Tally(NamedTuple):
     """How trials ended, numbers of them; the four add up to all.
 
     Attributes:
-      kept: Neither lost nor failed: a cost below the limit of success.
+      kept: Neither lost nor failed.
       lost: The object left the hand within the window of the cost.
       stuck: The hand did not let go of the object.
       failed: Those that failed otherwise: faults of the simulation.
@@ -54,74 +115,57 @@ def tally(outcomes: Outcome) -> Tally:
     return Tally(*np.bincount(ends, minlength=len(codesign.VERDICTS)).tolist())
 
 
-def success(scene: Scene, outcomes: Outcome) -> Any:
-    """Whether designs are successful: `RELIABLE`, with a mean cost below the limit of success.
-
-    Args:
-      scene: The scene, with its rule for failed trials.
-      outcomes: Outcomes with the trial as the last axis.
-
-    Returns:
-      Bools without the trial axis.
-    """
-    low = np.asarray(cost.particle_cost(scene, outcomes)) < codesign.SUCCESS_COST
-    return low & (_kept(outcomes).mean(-1) >= RELIABLE)
-
-
-def _kept(outcomes: Outcome) -> np.ndarray:
-    return codesign.verdicts(outcomes) == codesign.VERDICTS.index("kept")
+def good(outcomes: Outcome) -> np.ndarray:
+    """Which designs are good, bool; of outcomes with the trial as the last axis."""
+    kept = codesign.verdicts(outcomes) == codesign.VERDICTS.index("kept")
+    found = [judge(int(n), kept.shape[-1]).word == "good" for n in kept.sum(-1).ravel()]
+    return np.array(found).reshape(kept.shape[:-1])
 
 
 class Judged(NamedTuple):
-    """Trials by which a design is judged; as a string the verdict, in a line.
+    """Trials by which a design is judged; as a string the verdict, in a sentence.
 
     Attributes:
       scene: The scene that was simulated, with its rule for failed trials.
       outcomes: Outcomes of the trials, NumPy arrays of shape (trial,).
       accuracy: Name of the accuracy's preset, if one was asked for.
+      grasps: What the trials are called.
     """
 
     scene: Scene
     outcomes: Outcome
     accuracy: str | None = None
+    grasps: str = "fresh grasps"
 
     @property
-    def at(self) -> str:
-        """The accuracy in words."""
+    def verdict(self) -> Verdict:
+        """The verdict; failed trials count as not kept."""
+        found = tally(self.outcomes)
+        return judge(found.kept, found.total)
+
+    @property
+    def details(self) -> str:
+        """How the trials ended and at what accuracy, in a line."""
         size = self.scene.discretization
         named = f"accuracy {self.accuracy}, " if self.accuracy else ""
-        return f"{named}steps of {1e3 * size.timestep:g} ms, {size.links} links a finger"
+        how = f"{named}steps of {1e3 * size.timestep:g} ms, {size.links} links a finger"
+        return f"{of_trials(self.scene, self.outcomes)}; {how}"
 
     def __str__(self) -> str:
-        """How the design did, at what accuracy, how sure that is, and whether it is a success."""
+        """The verdict in a sentence; that there is none if every trial failed."""
         found = tally(self.outcomes)
         if found.failed == found.total:
             causes = runs.failure_counts(self.outcomes.status)
-            return f"every trial failed ({causes}): none counts as kept or lost ({self.at})"
-        share = statistics.wilson(found.kept, found.total)
-        bad = ", failed trials count as not kept" if found.stuck or found.failed else ""
-        return (
-            f"{found} ({self.at}): it keeps {100 * share.low:.0f} to {100 * share.high:.0f} % of "
-            f"grasps (95 % interval{bad}); {mean_cost(self.scene, self.outcomes)}; {self._words}"
-        )
-
-    @property
-    def _words(self) -> str:
-        """Whether that is a success."""
-        if success(self.scene, self.outcomes):
-            limit = codesign.SUCCESS_COST
-            return f"a success in these trials: at least {_RELIABLE} kept, mean cost below {limit}"
-        if _kept(self.outcomes).mean() < RELIABLE:
-            return f"no success: less than {_RELIABLE} kept"
-        return f"no success: the mean cost is not below {codesign.SUCCESS_COST}"
+            return f"no verdict: every trial failed ({causes})"
+        return self.verdict.sentence(self.grasps)
 
 
-def of_object(scene: Scene, outcomes: Outcome) -> str:
-    """Says how a design did with one object, shorter than a verdict.
+def of_trials(scene: Scene, outcomes: Outcome) -> str:
+    """Says how trials ended: numbers of them, mean cost, warnings.
 
     Args:
       scene: The scene, with its rule for failed trials.
-      outcomes: Outcomes of trials with the object, NumPy arrays of shape (trial,).
+      outcomes: Outcomes, NumPy arrays of shape (trial,).
     """
     warnings = runs.warning_counts(outcomes.status)
     found = tally(outcomes)
@@ -131,7 +175,7 @@ def of_object(scene: Scene, outcomes: Outcome) -> str:
 
 
 def mean_cost(scene: Scene, outcomes: Outcome) -> str:
-    """The mean cost of trials and what failed ones count in it; arguments as of `of_object`."""
+    """The mean cost of trials and what failed ones count in it; arguments as of `of_trials`."""
     count = int(failed(np.asarray(outcomes.status)).sum())
     if count == np.size(outcomes.status) and scene.cost.failure == "exclude":
         return "no mean cost"

@@ -103,7 +103,8 @@ TABLES = {
             "than the particle filter the test's alone, as a particle among the best so far was "
             "chosen by its earlier ones",
             "failed_trials": _FAILED,
-            "success": f"1 if the test's cost is below {SUCCESS_COST}, else 0",
+            "paper_success": "by the paper's rule: 1 if the test's cost is below "
+            f"{SUCCESS_COST}, else 0; `success` in older runs",
         },
         "",
         "the particle",
@@ -122,13 +123,15 @@ MORE = {
             "finished": "1 if the run ended without an error, else 0",
             "converged_episode": "number of the episode, from 1, from which on the mean cost stays "
             f"below {CONVERGED_COST:g}; empty if there is none",
-            "best_test_cost": "lowest test cost of its final particles; this and the next five "
+            "best_test_cost": "lowest test cost of its final particles; this and the next four "
             "are empty without a final test",
-            "kept_trials": f"trials of that particle's test with a cost below {SUCCESS_COST}",
-            "counted_trials": "trials of that test that count by the scene's rule for failed ones",
+            "kept_trials": "trials of that particle's test that kept the object",
             "trials": "trials of that test",
-            "successful_particles": f"final particles with a test cost below {SUCCESS_COST}",
-            "particles": "final particles",
+            "paper_successes": "final particles with a test cost below "
+            f"{SUCCESS_COST}, the paper's rule; copies count once",
+            "particles": "final particles; copies count once",
+            "verdict": "good, not good, or not enough trials, of the best particle's fresh trials, "
+            "or without them of its final test",
             "fresh_kept_trials": "of the best particle's fresh trials at accuracy `reference`, had "
             "no part in the choice, those that kept the object; empty without them",
             "fresh_lost_trials": "those that lost it",
@@ -143,7 +146,7 @@ MORE = {
         "in the hand file's units, such as `length_mm` and `arm_z_mm`",
         {
             "mean_cost": "mean cost of its trials by the scene's rule for failed ones",
-            "kept_trials": f"trials that did not fail, with a cost below {SUCCESS_COST}",
+            "kept_trials": "trials that did not fail, nor lose the object",
             "counted_trials": "trials that did not fail",
             "trials": "trials; all points have the same ones",
         },
@@ -169,8 +172,8 @@ GRASPS = {
     "verdict": (
         "name",
         "",
-        f"kept (it did not fail, and costs less than {SUCCESS_COST}), lost, stuck (it failed: the "
-        "hand did not let go), or failed in another way, see `status`",
+        "kept, lost (`lost_time_s`), stuck (it failed: the hand did not let go), or failed in "
+        "another way, see `status`",
     ),
     "cost": ("float32", "", TABLES["trials.csv"].columns["cost"]),
     "lost_time_s": ("float32", "s", TABLES["trials.csv"].columns["lost_time_s"]),

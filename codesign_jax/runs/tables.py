@@ -251,7 +251,7 @@ def _of_test(space: DesignSpace, particles: np.ndarray, test: FinalTest) -> Iter
             "test_cost": _number(test.cost[i]),
             "trials": failed.shape[1],
             "failed_trials": failed[i].sum(),
-            "success": int(test.success[i]),
+            "paper_success": int(test.paper_success[i]),
             **design,
         }
 

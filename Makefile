@@ -26,11 +26,11 @@ help:
 	@echo "make test-ptx    kernels for GPUs, assembled without one"
 	@echo "make test-browser  the report in a headless Chromium"
 	@echo "make stability   the hard cases and their margins, docs/notes/stability.md"
-	@echo "make faults      kills, full disks, damage, hostile input, counted: docs/faults.md"
+	@echo "make faults      kills, full disks, damage, hostile input: FAULTS=100"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
 	@echo "make effects     what each effect costs and decides: docs/notes/effects.md"
-	@echo "make accuracy    what accuracy costs in time: ACCURACY=docs/data/accuracy_cpu.json, SIZE=full"
+	@echo "make accuracy    what accuracy costs in time, and what moves a verdict"
 	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make format      ruff format          make clean       remove what make built"
 
@@ -67,10 +67,10 @@ test-slow: $(STAMP)
 stability: $(STAMP)
 	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
 
-# Needs Linux and a C compiler; goes on where it stopped. FAULTS is its folder.
-FAULTS ?= runs/faults
+# Needs Linux and a C compiler. FAULTS is about the number of cases of each kind.
+FAULTS ?= 10
 faults: $(STAMP)
-	nice -n 5 $(BIN)/python -m scripts.faults --store $(FAULTS)/store.jsonl --work $(FAULTS)/work --page $(ARGS)
+	FAULTS=$(FAULTS) nice -n 5 $(BIN)/python -m pytest -q scripts/faults.py $(ARGS)
 
 notebooks: $(STAMP)
 	$(BIN)/python -m scripts.run_notebooks
@@ -84,11 +84,9 @@ benchmark: $(STAMP)
 effects: $(STAMP)
 	$(BIN)/python -m scripts.effects $(ARGS)
 
-# An hour on two cores at the quick size, hours of a GPU and its host at the full one; goes on where it stopped.
-ACCURACY ?= runs/accuracy_cpu.json
-SIZE ?= quick
+# Hours of a GPU and its host; goes on where it stopped. Then ARGS="--merge FILE", "--merge FILE --report".
 accuracy: $(STAMP)
-	$(BIN)/python -m scripts.accuracy --json $(ACCURACY) --size $(SIZE) $(ARGS)
+	$(BIN)/python -m scripts.accuracy $(ARGS)
 
 # With --quiet a broken link would not be an error.  NO_MKDOCS_2_WARNING: a notice of mkdocs-material.
 docs: $(STAMP)

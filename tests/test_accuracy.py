@@ -1,4 +1,4 @@
-"""The study of accuracy: presets, settings, oracles and the file of its records."""
+"""Accuracy: presets, the study's variants and tips, and its tables of verdicts that are known."""
 
 import dataclasses
 import json
@@ -11,43 +11,28 @@ import pytest
 
 from codesign_jax import cli, model, scene
 from codesign_jax.commands import asked
+from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import parameters, schema
-from codesign_jax.scene.effects import ENGINES
-from scripts.accuracy import beam, decision, impulse, oracle, study, tip, worlds
-from scripts.accuracy.settings import PRESETS, STANDARD, Setting, one_at_a_time
-from scripts.accuracy.store import Case, Store, merge
-from scripts.accuracy.timing import name
-from scripts.shared import peers
+from scripts.accuracy import budget, report, tip
+from scripts.shared import figures, work
 from tests.helpers.grasps import pinch, still
 
-ROOT = Path(__file__).parents[1]
+DATA = Path(__file__).parents[1] / "docs" / "data" / "experiments"
 
 
 # --- presets -------------------------------------------------------------------------------------
 
 
-def test_the_standard_preset_is_the_scene_and_the_study_s_default():
-    assert scene.load("paper", accuracy="standard") == scene.load("paper")
-    off = {"effects.finger_finger": False, "effects.finger_palm": False}
-    assert STANDARD.scene() == scene.load("paper", overrides=off)
-
-
 def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
+    assert scene.load("paper", accuracy="standard") == scene.load("paper")
     fine = scene.load("paper_spheres", accuracy="reference")
     assert fine.discretization == scene.Discretization(0.001, 20, 1, spring_damping="least")
-    for preset_name, setting in PRESETS.items():
-        preset = scene.load("paper", accuracy=preset_name).discretization
-        mine = setting.scene().discretization
-        # The study varies no spheres where the hull is the surface.
-        assert dataclasses.replace(preset, spheres_per_link=1) == mine
-        assert setting in one_at_a_time("structured")
     fast = scene.load("paper_spheres", accuracy="fast", overrides={"discretization": {"links": 7}})
     assert (fast.discretization.links, fast.newton.iterations) == (7, 4)
-    for preset_name in ("fast", "fine"):
-        found = scene.load("paper", accuracy=preset_name)
-        assert StructuredEngine(found).limits.iterations == PRESETS[preset_name].iterations
+    for name, iterations in {"fast": 4, "fine": 6}.items():
+        found = scene.load("paper", accuracy=name)
+        assert StructuredEngine(found).limits.iterations == iterations
 
 
 def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
@@ -72,118 +57,18 @@ def test_the_command_line_takes_a_preset(capsys):
     assert "'fastest' unknown; did you mean 'fast'" in capsys.readouterr().err
 
 
-# --- settings ------------------------------------------------------------------------------------
-
-
-def test_settings_change_what_they_say_and_no_two_have_the_same_name():
-    every = one_at_a_time("structured")
-    assert len({s.label for s in every}) == len(every)
-    changed = Setting(timestep=2.0, links=5, axes=2, surface="spheres 2", damping="least").scene()
-    assert changed.discretization == scene.Discretization(0.002, 5, 2, spring_damping="least")
-    assert changed.effects.surface == "spheres"
-    dense = Setting(surface="hull 4 x 16").scene()
-    assert (dense.discretization.hull_rings, dense.discretization.hull_points) == (4, 16)
-    assert changed.effects.lateral_bending and not changed.effects.twist
-
-
 def test_a_long_step_needs_a_longer_contact_time_constant():
     """The scene refuses 20 ms as it is; with a longer constant the stiffness stays the same."""
     with pytest.raises(schema.InputError, match="time_constant"):
-        Setting(timestep=20.0, keep_contact=True).scene()
-    stiffness = []
-    for setting in (STANDARD, Setting(timestep=20.0)):
-        c = setting.scene().contact
+        scene.load("paper", overrides={"discretization.timestep": 0.02})
+    long = {"discretization.timestep": 0.02, "contact.time_constant": 0.04}
+    for overrides in ({}, long):
+        found = scene.load("paper", overrides=overrides)
+        c = found.contact
         # k_n of model.contact_invweight's docstring, from what MuJoCo is given.
         k = c.impedance / (c.impedance * c.time_constant) ** 2
-        w = 2 * model.contact_invweight(setting.scene())
-        stiffness.append(k * c.impedance / ((1 - c.impedance) * w))
-    assert stiffness[0] == pytest.approx(stiffness[1], rel=1e-12)
-    assert stiffness[0] == pytest.approx(4000.0, rel=1e-12)
-
-
-# --- oracles -------------------------------------------------------------------------------------
-
-
-def test_closed_forms():
-    """The elastica against Mattiasson's table (1981), the arc against the circle's coordinates."""
-    table = {1.0: (0.301720770, 0.056433236), 10.0: (0.810609020, 0.554995600)}
-    for load, expected in table.items():
-        np.testing.assert_allclose(beam.elastica(load), expected, atol=5e-9)
-    assert beam.arc(np.pi) == pytest.approx((2 / np.pi, 1.0))
-
-
-def test_the_chain_s_error_falls_with_the_square_of_the_links():
-    errors = [beam.errors(n, (1.0,), (90.0,)) for n in (5, 10)]
-    for load in errors[0]:
-        # Second order up to terms of the fourth: 1 / 4 N^2 at five links is 1 %.
-        assert errors[0][load] / errors[1][load] == pytest.approx(4.0, rel=0.02)
-
-
-@pytest.fixture(scope="module")
-def grasp():
-    """A pinch of two fingers in float64: scene, fields and controls of one world."""
-    small = pinch("box", links=2)
-    with worlds.floats(True) as dtype:
-        space = parameters.design_space(small.hand)
-        params = jax.tree.map(lambda x: np.asarray(x)[None], space.params(space.default()))
-        trial = jax.tree.map(lambda x: np.asarray(x)[None], still())
-        fields, ctrl = worlds.inputs(small, worlds.Worlds(params, trial), dtype)
-    return small, fields, ctrl
-
-
-def test_tips_lie_a_segment_behind_the_last_joint(grasp):
-    """A straight finger's tip is its length away from its root."""
-    small, fields, _ = grasp
-    m = oracle.model_of(small, fields, 0)
-    data = mujoco.MjData(m)
-    data.qpos[:] = fields.start[0]
-    mujoco.mj_kinematics(m, data)
-    roots = data.xpos[model.layout(small).stubs]
-    away = np.linalg.norm(oracle.tips(small, m, data) - roots, axis=1)
-    space = parameters.design_space(small.hand)
-    # The default lengths are float32 of the table's millimetres.
-    np.testing.assert_allclose(away, space.params(space.default()).length, rtol=1e-6)
-
-
-def test_grip_is_the_force_that_the_object_feels(grasp):
-    """Of states along a pinch: MuJoCo C's own contact forces, and those of the structured step."""
-    small, fields, ctrl = grasp
-    exact = dataclasses.replace(small, solver=scene.Solver(300, 100, 1e-15))
-    found = []
-
-    def visit(m, d, k):
-        force, expected = np.zeros(6), 0.0
-        for i in range(d.ncon):
-            names = [m.geom(g).name for g in d.contact[i].geom]
-            mujoco.mj_contactForce(m, d, i, force)
-            if "table" not in names and any(n.startswith("object") for n in names):
-                expected += force[0]
-        assert oracle.grip(exact, m, d) == pytest.approx(expected, abs=1e-12)
-        found.append((d.qpos.copy(), d.qvel.copy(), d.ctrl.copy(), d.qacc.copy(), expected))
-
-    m = oracle.model_of(exact, fields, 0)
-    oracle.advance(m, fields.start[0], ctrl[0], range(10, 400, 30), visit)
-    qpos, qvel, u, qacc, expected = (np.array(column) for column in zip(*found, strict=True))
-    assert max(expected) > 0.1, "never touched"
-    with worlds.floats(True):
-        engine = StructuredEngine(small, iterations=100, evaluations=20, tolerance=1e-18)
-        batch = jax.tree.map(lambda x: np.repeat(np.asarray(x), len(qpos), 0), fields)
-
-        @jax.jit
-        def run(batch, qpos, qvel, ctrl):
-            hand = world_constants(small, batch)
-            state = engine.place(engine.reset(batch), qpos, qvel)
-            acc = engine.step(hand, state, ctrl)[1].acc
-            grip = impulse.grip(small, hand, state._replace(acc=acc), ctrl)
-            return acc.wrist[:, 0].T, acc.object[3:, 0].T, grip
-
-        wrist, linear, grip = (np.asarray(v) for v in run(batch, qpos, qvel, u.T))
-    # As in test_structured: both solvers stop at rounding of their own.
-    for got, mine in ((wrist, qacc[:, :6]), (linear, qacc[:, -6:-3])):
-        scale = np.maximum(np.linalg.norm(qacc, axis=1), 100.0)  # ten g: an object may be at rest
-        assert (np.linalg.norm(got - mine, axis=1) / scale).max() < 1e-8
-    # Accelerations agree to 1e-8 of 100 or more; a link of some grams makes 1e-8 N of that.
-    np.testing.assert_allclose(grip, expected, rtol=1e-8, atol=1e-7)
+        stiffness = k * c.impedance / ((1 - c.impedance) * 2 * model.contact_invweight(found))
+        assert stiffness == pytest.approx(4000.0, rel=1e-12)
 
 
 def test_mujoco_converges_with_the_scene_s_own_limits():
@@ -192,129 +77,197 @@ def test_mujoco_converges_with_the_scene_s_own_limits():
     Of 480 states in contact the largest error is 1.6e-4 with the scene's limits; with 20
     iterations of the line search a tenth of them errs by 0.04 and more.
     """
-    base = Setting("mujoco", links=4, surface="spheres 1", precision="float64").scene()
-    exact = dataclasses.replace(base, solver=scene.Solver(**peers.REFERENCE))
-    with worlds.floats(True) as dtype:
-        chosen = worlds.paired(worlds.designs(exact, 4), worlds.trials(exact, 6))
-        fields, ctrl = worlds.inputs(exact, chosen, dtype)
+    plain = {"links": 4, "spheres_per_link": 1}, {"surface": "spheres", "finger_finger": False}
+    overrides = dict(zip(("discretization", "effects"), plain, strict=True))
+    base = scene.load("paper", overrides=overrides)
+    exact = dataclasses.replace(base, solver=scene.Solver(300, 100, 1e-15))
     few = dataclasses.replace(base, solver=dataclasses.replace(base.solver, ls_iterations=20))
+    with jax.enable_x64(True):
+        worlds = jax.tree.map(np.asarray, work.make_worlds(exact, 4))
+        fields, ctrl = jax.tree.map(np.asarray, work.inputs(exact, worlds))
     errors = ([], [])
-    ends = tuple(round(t / 0.01) for t in (exact.phases.approach, exact.phases.disturb))
+    first, last = (round(t / 0.01) for t in (exact.phases.approach, exact.phases.disturb))
     for w in range(4):
-        models = [oracle.model_of(s, fields, w) for s in (base, few)]
-
-        def visit(m, d, k, models=models):
-            for other, found in zip(models, errors, strict=True):
-                data = mujoco.MjData(other)
-                data.qpos[:], data.qvel[:], data.ctrl[:] = d.qpos, d.qvel, d.ctrl
-                mujoco.mj_forward(other, data)
-                away = np.linalg.norm(data.qacc - d.qacc)
-                found.append(away / max(np.linalg.norm(d.qacc), 100.0))
-
-        oracle.advance(
-            oracle.model_of(exact, fields, w), fields.start[w], ctrl[w], range(*ends, 30), visit
-        )
+        of_world = jax.tree.map(lambda x, w=w: x[w], fields)
+        truth, *others = (world_model(s, of_world) for s in (exact, base, few))
+        d, datas = mujoco.MjData(truth), [mujoco.MjData(m) for m in others]
+        d.qpos[:] = of_world.start
+        for k in range(last):
+            d.ctrl[:] = ctrl[w, k]
+            if k >= first and k % 30 == 0:
+                mujoco.mj_forward(truth, d)
+                for m, data, found in zip(others, datas, errors, strict=True):
+                    data.qpos[:], data.qvel[:], data.ctrl[:] = d.qpos, d.qvel, d.ctrl
+                    mujoco.mj_forward(m, data)
+                    away = np.linalg.norm(data.qacc - d.qacc)
+                    found.append(away / max(np.linalg.norm(d.qacc), 100.0))
+            mujoco.mj_step(truth, d)
     assert max(errors[0]) < 1e-3 and max(errors[1]) > 1e-2
 
 
-@pytest.mark.slow  # quick: a tiny study of them (test_accuracy_report)
+# --- finger tips ---------------------------------------------------------------------------------
+
+
+def test_tips_lie_a_segment_behind_the_last_joint():
+    """A straight finger's tip is its length away from its root."""
+    small = pinch("box", links=2)
+    space = parameters.design_space(small.hand)
+    params = space.params(space.default())
+    fields = jax.tree.map(np.asarray, model.model_fields(small, params, still()))
+    compiled = world_model(small, fields)
+    data = mujoco.MjData(compiled)
+    data.qpos[:] = fields.start
+    mujoco.mj_kinematics(compiled, data)
+    roots = data.xpos[model.layout(small).stubs]
+    away = np.linalg.norm(tip.tips(small, compiled, fields.start) - roots, axis=1)
+    # The default lengths are float32 of the table's millimetres.
+    np.testing.assert_allclose(away, params.length, rtol=1e-6)
+
+
+@pytest.mark.slow  # quick: the variants' settings, below; MuJoCo's step is MuJoCo's
 def test_tips_of_a_shorter_step_come_closer_to_the_reference():
-    """The error of the implicit Euler step falls at first order."""
-    reference = tip.motion(Setting("mujoco", timestep=0.5, links=2, iterations=0), 1, 0.4)
-    errors = []
-    for step in (5.0, 10.0):
-        found = tip.motion(Setting("mujoco", timestep=step, links=2), 1, 0.4)
-        errors.append(tip.compare(found, reference)["tip_rms_mm"])
+    """The error of the implicit Euler step falls at first order; both engines err alike."""
+    exact = tip.motion((5e-4, 2, "least"), "mujoco", 1, 0.4)
+    found = {s: tip.motion((s, 2, "added"), "mujoco", 1, 0.4) for s in (0.005, 0.01)}
+    errors = [tip.error(tips, exact) for tips in found.values()]
     # The reference's own step is a tenth of the smaller one: the ratio is 9.5 / 4.5 at first order.
     assert errors[1] / errors[0] == pytest.approx(9.5 / 4.5, rel=0.2)
+    ours = tip.motion((0.01, 2, "added"), "structured", 1, 0.4)
+    assert tip.error(ours, found[0.01]) < 0.05 * errors[1]  # float32, and a solver's tolerance
 
 
-def test_populations_are_distinct_final_particles_of_every_quality():
-    data = ROOT / "docs" / "data" / "experiments"
-    found = decision.populations(data, 60)
-    with np.load(data / "23d.npz") as file:
-        final, cost = file["final_particles"], file["test_exclude"].ravel()
-    every = final.reshape(-1, 23)
-    index = [int(np.flatnonzero((every == p).all(1))[0]) for p in found["spread"]]
-    assert cost[index].max() > 2.0 and cost[index].min() < 0.05
-    assert len(np.unique(found["late"], axis=0)) == 60
-    runs = [[(run == p).all(1).any() for run in final[-1]] for p in found["late"]]
-    assert np.all(np.sum(runs, 0) >= 2)  # two of each run
+# --- verdicts ------------------------------------------------------------------------------------
+
+
+def test_designs_are_distinct_final_particles_two_of_each_run():
+    found = budget.late_designs(DATA, 60)
+    with np.load(DATA / "23d.npz") as file:
+        final = file["final_particles"][-1]
+    assert len(np.unique(found, axis=0)) == 60
+    runs = [[(run == p).all(1).any() for run in final] for p in found]
+    assert np.all(np.sum(runs, 0) >= 2)
     with pytest.raises(ValueError, match="distinct"):
-        decision.populations(data, 10_000)
+        budget.late_designs(DATA, 10_000)
 
 
 def test_costs_come_back_from_their_text():
-    the_scene = Setting().scene()
+    the_scene = scene.load("paper")
     start, end = the_scene.window
     lost = np.array([[np.inf, start, end - 1e-3], [0.5 * (start + end), np.inf, np.inf]])
     bad = np.array([[False, False, False], [False, True, False]])
-    record = {"lost": decision.encode(lost, bad, the_scene.window), "particles": 2, "trials": 3}
+    record = {"lost": budget.encode(lost, bad, the_scene.window), "particles": 2, "trials": 3}
     expected = [[0.0, 3.0, 0.0], [1.5, np.nan, 0.0]]
     # A byte counts 250th parts of the time in which a loss costs: half of one, times 3.
-    np.testing.assert_allclose(decision.costs(the_scene, record), expected, atol=0.0061)
+    np.testing.assert_allclose(budget.costs(the_scene, record), expected, atol=0.0061)
 
 
-# --- the file ------------------------------------------------------------------------------------
+def test_every_variant_is_a_scene_and_every_row_has_its_variants(tmp_path):
+    scenes = {name: variant.scene() for name, variant in budget.VARIANTS.items()}
+    fine = scenes["truth"].discretization
+    assert (fine.timestep, fine.links, fine.hull_rings, fine.hull_points) == (0.002, 20, 4, 16)
+    assert scenes["1e-3"].newton.decrement == 1e-3 and scenes["4 iterations"].newton.iterations == 4
+    named = {n for c in report.CHANGES for n in (c.of, c.to)}
+    named |= {*report.PRESETS, *report.CANDIDATES, *budget.TIMED, *report.WORDS}
+    assert named <= set(budget.VARIANTS)
+    assert len({budget.path_of(tmp_path, name) for name in budget.VARIANTS}) == len(scenes)
+    json.dumps(budget.merged(tmp_path))
 
 
-def test_a_study_goes_on_where_it_stopped_and_keeps_failures(tmp_path):
-    path, calls = tmp_path / "a.json", []
-
-    def case(label, run):
-        return Case("tip", Setting(extra=(label,)), (), run)
-
-    good = case("cost.maximum=1", lambda: calls.append(1) or {"value": 2})
-    broken = case("cost.maximum=2", lambda: 1 / 0)
-    store = Store(path, size="tiny")
-    store.measure(good)
-    assert "ZeroDivisionError" in store.measure(broken)["failed"]
-    again = Store(path, size="tiny")
-    assert again.done(good) and again.done(broken) and calls == [1]
-    with pytest.raises(ValueError, match="tiny"):
-        Store(path, size="full")
+def test_constants_are_those_of_sets_that_no_target_ruled_out():
+    drawn = budget.calibrated(scene.load("paper"), 5, 2)
+    masses = np.asarray(drawn.objects.object[0].mass)
+    assert masses.shape == (10,) and np.array_equal(masses[:5], masses[5:])
+    assert len(np.unique(masses)) == 5 and masses.max() < 0.3
 
 
-def test_a_case_that_kills_its_process_counts_as_failed_after_two_attempts(tmp_path):
-    class Killed(BaseException):
-        pass
-
-    def die():
-        raise Killed
-
-    path, case = tmp_path / "a.json", Case("tip", Setting(), (), die)
-    for _ in range(2):
-        store = Store(path, size="tiny")
-        assert not store.done(case)
-        with pytest.raises(Killed):
-            store.measure(case)
-    store = Store(path, size="tiny")
-    assert store.done(case)
-    assert "two runs" in json.loads(path.read_text())["records"][case.key]["failed"]
+def test_comparing_a_variant_with_itself_and_with_its_opposite():
+    cost = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0], [1.0, 0.0], [2.0, 2.0], [0.5, 0.0]])
+    same = report.compare(cost, cost)
+    assert same["flipped"].value == 0.0 and same["rank"].value == pytest.approx(1.0)
+    assert report.compare(3.0 - cost, cost)["rank"].value == pytest.approx(-1.0)
+    failed = cost.copy()
+    failed[0, 0] = np.nan
+    assert report.compare(failed, cost)["flipped"].value == pytest.approx(1 / 12), "not kept"
+    alike = report.compare(np.ones((6, 2)), np.zeros((6, 2)))
+    assert np.isnan(alike["rank"]).all() and alike["flipped"] == (1.0, 1.0, 1.0)
 
 
-def test_cases_have_names_of_their_own():
-    data = ROOT / "docs" / "data" / "experiments"
-    for size in study.SIZES.values():
-        every = study.cases(size, study.PARTS, ENGINES, data, gpu=True)
-        assert len({c.key for c in every}) == len(every)
-        assert {c.part for c in every} == {*study.PARTS, "beam"}
+WINDOW = scene.load("paper").window
 
 
-def test_files_of_several_processes_become_one(tmp_path):
-    for number in range(2):
-        store = Store(tmp_path / f"{number}.json", size="tiny", commit=f"c{number}")
-        label = f"cost.maximum={number}"
-        store.measure(Case("tip", Setting(extra=(label,)), (), lambda n=number: {"value": n}))
-    Store(tmp_path / "2.json", size="full").write()
-    merge([tmp_path / "0.json", tmp_path / "1.json"], tmp_path / "all.json")
-    found = json.loads((tmp_path / "all.json").read_text())
-    made = {r["value"]: found["runs"][r["run"]]["commit"] for r in found["records"].values()}
-    assert made == {0: "c0", 1: "c1"}
-    with pytest.raises(ValueError, match="full, tiny"):
-        merge([tmp_path / "0.json", tmp_path / "2.json"], tmp_path / "all.json")
+def record(kept):
+    lost = np.where(kept, np.inf, WINDOW[0])
+    text = budget.encode(lost, np.zeros(kept.shape, bool), WINDOW)
+    return {"particles": kept.shape[0], "trials": kept.shape[1], "lost": text, "status": {}}
 
 
-def test_names_of_timed_engines():
-    assert name(Setting("mujoco")) == "mujoco"
-    assert name(Setting(precision="float64")) == "structured float64"
+def rate(value):
+    return {"grasps": 240, "seconds": 240 / value, "grasps_per_s": value}
+
+
+@pytest.fixture
+def found():
+    """20 designs in 12 trials: the truth loses 30 of 240, standard 18 of these alone."""
+    truth = np.ones((20, 12), bool)
+    truth[:15, :2] = False
+    standard = truth.copy()
+    standard[:6, :2] = True
+    moved = standard.copy()
+    moved[0, :6] = False
+    variants = {"truth": truth, "standard": standard, "standard, moved": moved}
+    every = {name: record(kept) for name, kept in variants.items()}
+    return {"variants": every | {"spheres": {"refused": "no"}}, "rates": {}}
+
+
+def test_biases_and_flips_are_those_that_were_planted(found):
+    made = report.Budget(found)
+    row = made.row("standard", "`standard`")
+    assert row[1].startswith("+5.0 [") and row[2].startswith("5.0% [")  # 12 of 240
+    assert row[4] == "2.5%" and row[5:] == ["–"] * 3
+    rows = {cells[0]: cells for cells in report.budget_table(made)}
+    assert rows["object moved by a micrometre, `standard`"][2].startswith("-2.5 [")
+    assert rows["step, links and skin at once: the truth"][2].startswith("-5.0 [")
+    assert "spheres in place of the skin" not in rows, "refused"
+    assert len(report.presets_table(made)[0]) == 6, "no rates"
+
+
+def test_tables_and_figures_have_what_was_planted(found, tmp_path):
+    """A setting without rate or without error is no mark; nothing stands for what is not there."""
+    found["variants"]["spheres, MuJoCo C"] = found["variants"]["standard"]
+    found["rates"] = {
+        "gpu": {"rates": {"standard": rate(500), "fast": rate(600)}},  # fast has no verdicts
+        "cpu": {"rates": {"standard": rate(50), "truth": rate(1), "spheres, MuJoCo C": rate(3)}},
+    }
+    found["tips"] = {"tip_rms_mm": {"standard": 5.0, "fast": 2.0, "least, 1e-3": 2.0}}
+    made = report.Budget(found)
+    head, *rows = report.presets_table(made)
+    assert head[6:] == ["grasps/s, one H100", "grasps/s, 2 CPU cores"]
+    assert {row[0]: row[6:] for row in rows}["`standard`"] == ["500", "50"]
+    left, right = report.marks(made)
+    ours, c = "this engine", ("MuJoCo C, 2 CPU cores", "spheres, no skin", 3)
+    of_standard = {(f"{ours}, one H100", "standard", 500), (f"{ours}, 2 CPU cores", "standard", 50)}
+    assert {m[:3] for m in left} == of_standard | {c}
+    assert all(m.error.value == 0.05 and m.error.low < 0.05 < m.error.high for m in left)
+    assert {m[:3] for m in right} == of_standard | {(f"{ours}, one H100", "fast", 600)}
+    assert report.draw_against_time(made, tmp_path / "time.png").stat().st_size > 5000
+    assert report.draw_budget(made, tmp_path / "budget.png").stat().st_size > 5000
+
+
+def test_names_that_would_meet_are_moved_apart():
+    axis = figures.new(4, 3).subplots()
+    axis.set(xlim=(1, 10), ylim=(0, 1), xscale="log")
+    heights = report._apart(axis, [(2, 0.5), (3, 0.51), (2, 0.9), (4, 0.5)], least=0.1)
+    assert heights == pytest.approx([0.405, 0.605, 0.9, 0.505], abs=0.02)
+
+
+def test_the_page_has_the_tables_of_its_data(monkeypatch):
+    monkeypatch.setattr(report, "RESAMPLES", 2)  # intervals are left out of the comparison
+    made = report.Budget(json.loads((DATA.parent / "budget.json").read_text()))
+    page = (DATA.parents[1] / "accuracy.md").read_text()
+    for mark, text in made.tables().items():
+        shown = page.split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
+        assert _without_intervals(shown.strip()) == _without_intervals(text), mark
+
+
+def _without_intervals(text):
+    return [part.split("]")[-1] for part in text.split("[")]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import linalg, special
 
-from scripts.accuracy import beam
+from tests.helpers import beams
 from tests.helpers.beams import Finger
 
 # --- statics -------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ def test_convergence_is_of_second_order():
 )
 def test_elastica(alpha, continuum, chain):
     """Large deflection at ten links: the table of docs/physics.md, recomputed here."""
-    np.testing.assert_allclose(beam.elastica(alpha), continuum, atol=5e-9)
+    np.testing.assert_allclose(beams.elastica(alpha), continuum, atol=5e-9)
     finger = Finger(10, timestep=0.002)  # the dead load's own stiffness is explicit
     load = alpha * finger.beam.bending / finger.length**2
     position, _ = finger.settle(force=(0, 0, -load))

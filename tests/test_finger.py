@@ -7,7 +7,6 @@ from scipy import integrate, optimize
 from codesign_jax import cli, finger, scene
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
-from scripts.accuracy import beam
 from tests.helpers import beams
 
 
@@ -42,7 +41,7 @@ def test_a_large_load_gives_the_elastica(alpha):
     mine = made(40)
     load = alpha * mine.stiffness * mine.segment / mine.length**2
     rest = finger.Rest.of(mine, 0.0, load)
-    assert -rest.height / mine.length == pytest.approx(beam.elastica(alpha)[0], rel=3e-4)
+    assert -rest.height / mine.length == pytest.approx(beams.elastica(alpha)[0], rel=3e-4)
 
 
 def test_neo_hookean_bending_is_the_law_s_quadrature():

@@ -6,6 +6,7 @@ import json
 import os
 import zipfile
 
+import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,10 +15,11 @@ import trimesh
 
 from codesign_jax import engines, make_engine, rollout, scene
 from codesign_jax.engines.structured.laws import meshes as lanes
+from codesign_jax.runs import scene_files
 from codesign_jax.scene import InputError, constants, library, meshes, objects, reach
 from codesign_jax.scene.meshes import reading, surface
 from codesign_jax.scene.parameters import design_space
-from scripts.faults import fuzz
+from scripts import faults
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401  (a fixture)
 from tests.helpers.solids import box, object_file
 
@@ -194,7 +196,7 @@ def test_a_run_has_the_bytes_that_were_read(tmp_path):
     loaded = scene.load("paper_spheres", object_set=object_file(tmp_path, entry))
     box(41, 51, 61).export(tmp_path / "box.stl")
     (tmp_path / "run").mkdir()
-    fuzz.scene_files.write_scene(loaded, tmp_path / "run")
+    scene_files.write_scene(loaded, tmp_path / "run")
     assert scene.load(tmp_path / "run" / "scene.toml") == loaded
 
 
@@ -288,18 +290,26 @@ def test_arguments_that_are_refused(arguments, workplace, capsys):
 # --- a few of what `make faults` tries in thousands ----------------------------------------------
 
 
-@pytest.mark.parametrize(("kind", "count"), [("toml", 40), ("commands", 12), ("mesh", 12)])
-def test_some_mutated_input(kind, count, tmp_path):
-    found = [fuzz.CASES[kind](number, tmp_path) for number in range(count)]
-    assert "refused" in found and {*found} <= {"refused", "accepted"}, found
+@pytest.mark.parametrize(
+    ("strategy", "count", "trial"),
+    [
+        (faults.toml_files(), 30, faults.try_toml),
+        (faults.command_lines().map(lambda line: (line,)), 10, faults.try_command),
+        (faults.mesh_files(), 10, faults.try_mesh),
+    ],
+    ids=["toml", "commands", "mesh"],
+)
+def test_some_mutated_input(strategy, count, trial, tmp_path):
+    refused, place = [], tmp_path / "place"
+    place.mkdir()
 
+    @faults.often(count)
+    @hypothesis.given(strategy)
+    def tried(case):
+        refused.append(trial(*case, place))
 
-def test_a_case_is_the_same_at_any_time(tmp_path):
-    twice = []
-    for _ in range(2):
-        fuzz.try_mesh(7, tmp_path)
-        twice.append({p.name: p.read_bytes() for p in tmp_path.glob("mutated.*")})
-    assert twice[0] == twice[1] and len(twice[0]) == 1
+    tried()
+    assert any(refused)
 
 
 def test_objects_are_loaded_without_a_hand(tmp_path):

@@ -1,1 +1,1 @@
-"""What accuracy costs in time: errors and times of settings against a converged reference."""
+"""Accuracy against time in the default scene, and its error budget."""

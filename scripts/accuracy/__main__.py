@@ -1,96 +1,63 @@
-"""Measures what accuracy costs in time, and draws it.
+"""Accuracy against time in the default scene, and what moves a verdict.
 
-python -m scripts.accuracy --json docs/data/accuracy_cpu.json --quick    # an hour on two cores
-python -m scripts.accuracy --json docs/data/accuracy_h200.json           # on a GPU
-python -m scripts.accuracy --report                # figures, pages and presets from data
-python -m scripts.accuracy --share 2/4 --json b.json                     # beside three others
-python -m scripts.accuracy --json docs/data/accuracy_h200.json --merge a.json b.json c.json d.json
+python -m scripts.accuracy --out runs/budget                    # verdicts; again to go on
+python -m scripts.accuracy --out runs/budget --share 1/8        # beside 7 other processes
+python -m scripts.accuracy --out runs/budget --time             # then: rates, alone on the machine
+python -m scripts.accuracy --out runs/budget --tip              # errors of the finger tip
+python -m scripts.accuracy --out runs/budget --merge docs/data/budget.json
+python -m scripts.accuracy --merge docs/data/budget.json --report     # page and figures
 
-Every finished case is kept: the same command goes on where the last one stopped, and exits with 3
-if cases are left.  --parts and --engines choose among the cases.
+All variants have the same designs, in which the concurrent 23D runs of --data ended, one of each,
+and the same trials.  The truth has the finer step, links and mesh; `finer` refines all three again.
+A variant has a file of its own, so that several processes share the work.
 """
 
-import argparse
+import json
 import sys
-import time
 from pathlib import Path
 
-import jax
-
-import codesign_jax
-from codesign_jax.scene.effects import ENGINES
-from scripts.accuracy import study
-from scripts.accuracy.store import Store, merge
-from scripts.shared import provenance
-
-SCENES = Path(codesign_jax.__file__).parent / "scenes" / "accuracy"
-
-
-def parse() -> argparse.Namespace:
-    """Reads the command line."""
-    parser = provenance.parser(__doc__)
-    parser.add_argument("--json", type=Path, default=Path("runs/accuracy.json"))
-    parser.add_argument("--parts", type=lambda s: s.split(","), default=list(study.PARTS))
-    parser.add_argument("--engines", type=lambda s: s.split(","), default=["structured", "mujoco"])
-    parser.add_argument("--size", choices=list(study.SIZES), default="full")
-    parser.add_argument("--quick", dest="size", action="store_const", const="quick")
-    parser.add_argument("--only", default="", help="cases whose name contains this")
-    parser.add_argument("--without", help="cases whose name does not contain this")
-    parser.add_argument(
-        "--share", default="1/1", metavar="I/N", help="every N-th case from the I-th on, of several"
-    )
-    parser.add_argument("--budget", type=float, default=1e9, help="seconds to begin cases in")
-    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
-    parser.add_argument("--merge", type=Path, nargs="+", help="write these files into one and stop")
-    parser.add_argument("--list", action="store_true", help="print the cases and stop")
-    parser.add_argument("--report", action="store_true", help="draw what docs/data holds and stop")
-    parser.add_argument("--docs", type=Path, default=Path("docs"))
-    args = parser.parse_args()
-    for name, known in (("parts", study.PARTS), ("engines", ENGINES)):
-        unknown = set(getattr(args, name)) - set(known)
-        if unknown:
-            parser.error(f"--{name}: {', '.join(sorted(unknown))} unknown; valid: {known}")
-    return args
+from codesign_jax import use_compilation_cache
+from scripts.accuracy import budget, report, tip
+from scripts.shared import output, provenance, tables
 
 
 def main() -> int:
-    """Runs the cases that are left and returns the exit status."""
-    args, begin = parse(), time.monotonic()
+    """Runs the command and returns the exit status."""
+    parser = provenance.parser(__doc__)
+    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
+    parser.add_argument("--out", type=Path, default=Path("runs/budget"), help="folder of the files")
+    parser.add_argument("--designs", type=int, default=budget.DESIGNS)
+    parser.add_argument("--trials", type=int, default=budget.TRIALS)
+    parser.add_argument("--share", default="1/1", metavar="I/N", help="every N-th variant")
+    parser.add_argument("--only", default="", help="these variants, with ; between")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--time", action="store_true", help="measure rates")
+    parser.add_argument("--tip", action="store_true", help="measure errors of the finger tip")
+    parser.add_argument("--merge", type=Path, help="write the files into this one and stop")
+    parser.add_argument("--report", action="store_true", help="draw what --merge holds and stop")
+    parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder that is drawn into")
+    args = parser.parse_args()
+    use_compilation_cache()
     if args.report:
-        from scripts.accuracy import report
-
-        found = report.studies(args.docs)
-        print(report.make(args.docs, found))
-        note = args.docs / "notes" / "accuracy.md"
-        report.make_summary(note, SCENES, found)
+        found = report.Budget(json.loads(args.merge.read_text()))
+        for mark, text in found.tables().items():
+            print(f"{text}\n")
+            tables.fill(args.docs / "accuracy.md", text, mark)
+        print(report.draw_budget(found, args.docs / "figures" / "budget.png"))
+        print(report.draw_against_time(found, args.docs / "figures" / "accuracy_time.png"))
         return 0
     if args.merge:
-        merge(args.merge, args.json)
+        output.write_json(args.merge, budget.merged(args.out), indent=None)
         return 0
-    gpu = jax.default_backend() == "gpu"
-    every = study.cases(study.SIZES[args.size], args.parts, args.engines, args.data, gpu=gpu)
-    every = [case for case in every if args.only in case.key]
-    every = [case for case in every if not args.without or args.without not in case.key]
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.tip:
+        tip.measure(args.out, args.commit)
+        return 0
+    study = budget.Study(args.data, args.designs, args.trials, tuple(args.set))
     first, count = (int(n) for n in args.share.split("/"))
-    every = every[first - 1 :: count]
-    if args.list:
-        print("\n".join(case.key for case in every))
-        return 0
-    store = Store(args.json, size=args.size, commit=args.commit)
-    left = [case for case in every if not store.done(case)]
-    print(f"{len(every)} cases, {len(left)} to do", flush=True)
-    longest = 0.0
-    for number, case in enumerate(left, 1):
-        if time.monotonic() - begin + longest > args.budget:
-            print(f"no time left for {len(left) - number + 1} cases; the same command goes on")
-            return 3
-        record = store.measure(case)
-        longest = min(max(longest, record["took_s"]), 120.0)
-        bad = record.get("failed") or record.get("refused")
-        print(
-            f"[{number}/{len(left)}] {case.key}: {bad or ''} {record['took_s']:.1f} s", flush=True
-        )
-        jax.clear_caches()
+    chosen = args.only.split(";") if args.only else budget.TIMED if args.time else budget.VARIANTS
+    run = budget.measure if args.time else budget.simulate
+    run(study, [*chosen][first - 1 :: count], args.out, args.commit)
     return 0
 
 

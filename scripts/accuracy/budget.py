@@ -1,26 +1,11 @@
-"""What moves a verdict in the default scene: numerics, models, constants; presets beside the truth.
+"""The same designs in the same trials by every variant of the default scene: verdicts and rates."""
 
-python -m scripts.accuracy.budget --data runs/paper --out runs/budget              # again to resume
-python -m scripts.accuracy.budget --data runs/paper --out runs/budget --share 1/8  # beside 7 others
-python -m scripts.accuracy.budget --data runs/paper --out runs/budget --time  # then: rates, alone
-python -m scripts.accuracy.budget --out runs/budget --tip              # errors of the finger tip
-python -m scripts.accuracy.budget --out runs/budget --merge docs/data/budget.json
-python -m scripts.accuracy.budget --merge docs/data/budget.json --report
-
-With --page docs/accuracy.md and --figure docs/figures/budget.png the report fills in the page's
-tables and draws that figure, and beside it accuracy_time.png.
-
-All variants have the same designs, in which the concurrent runs of --data ended, one of each, and
-the same trials.  The truth has the finer step, links and mesh; `finer` refines all three again.  A
-variant has a file of its own, so that several processes share the work; each compiles its own
-program, which is the host's work.
-"""
-
-import argparse
+import base64
 import dataclasses
 import json
-import sys
 import time
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +13,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import rollout, scene, use_compilation_cache
+from codesign_jax import rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.types import Status, Trial, failed
-from scripts.accuracy import decision, study, tip, worlds
-from scripts.accuracy.settings import Setting
-from scripts.shared import output, provenance, sets, work
+from scripts import calibration
+from scripts.shared import output, provenance, work
 
 DESIGNS, TRIALS, FEW = 30, 40, 16
 """Designs, trials of each, and trials of the dearest variants: the first ones."""
 BITS = {str(b.name): b.value for b in Status if b.value}
-CALIBRATED = Path("docs/data/calibration/palm_scores.npz")
-"""Sets of constants, of which those that no target ruled out are drawn."""
+SEED = 5
+"""Seed of the trials and of the choice of designs; no run of the experiments tested on it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,22 +52,9 @@ class Variant:
         overrides = keypaths.parse([*self.changes, *more])
         return scene.load("paper", accuracy=self.accuracy, overrides=overrides)
 
-    def in_the_air(self) -> Setting:
-        """Step, links and damping; without contact skin, solver and engine do not matter."""
-        found = self.scene().discretization
-        step = round(1e3 * found.timestep, 6)
-        return Setting(timestep=step, links=found.links, damping=found.spring_damping)
-
 
 def discretized(step: float, links: int, rings: int, points: int) -> tuple[str, ...]:
-    """Changes to a time step [ms], links of a finger and the mesh of a link, springs damped least.
-
-    Args:
-      step: Time step [ms].
-      links: Links of a finger.
-      rings: Rings of vertices a link.
-      points: Vertices of a ring.
-    """
+    """Changes to a time step [ms], links of a finger and mesh of a link, springs damped least."""
     table = {"timestep": step * 1e-3, "links": links, "hull_rings": rings, "hull_points": points}
     found = [f"discretization.{key}={value:g}" for key, value in table.items()]
     return (*found, "discretization.spring_damping=least")
@@ -142,17 +113,15 @@ DEAR = ("reference", "spheres, MuJoCo C")
 class Study:
     """Designs and trials, and what variants make of them."""
 
-    def __init__(self, args: argparse.Namespace):
-        """Reads the designs."""
-        self.args, self.more = args, tuple(args.set)
-        self.designs = decision.populations(args.data, args.designs)["late"]
-        self.compiled: dict[str, Any] = {}
+    def __init__(self, data: Path, designs: int, trials: int, more: tuple[str, ...] = ()):
+        """Reads the designs from 23d.npz of a folder; `more` changes every variant."""
+        self.trials, self.more, self.designs = trials, more, late_designs(data, designs)
 
-    def run(self, name: str) -> dict[str, Any]:
+    def run(self, name: str, commit: str | None = None) -> dict[str, Any]:
         """Simulates a variant; what its file holds."""
         variant = VARIANTS[name]
         the_scene = variant.scene(self.more)
-        call, took = self._call(name, variant, the_scene)
+        call, took = self._call(variant, the_scene)
         start = time.perf_counter()
         outcome = jax.tree.map(np.asarray, call())
         seconds = time.perf_counter() - start
@@ -163,18 +132,18 @@ class Study:
             "variant": dataclasses.asdict(variant),
             "particles": shape[0],
             "trials": shape[1],
-            "lost": decision.encode(lost, failed(status), the_scene.window),
+            "lost": encode(lost, failed(status), the_scene.window),
             "status": {n: count for n, count in bits.items() if count},
             "residual_quantiles": np.quantile(outcome.residual, [0.5, 0.9, 0.99]).tolist(),
             "compile_seconds": round(took, 1),
             "seconds": round(seconds, 2),
-            "made": provenance.measurement(self.args.commit),
+            "made": provenance.measurement(commit),
         }
 
     def rate(self, name: str) -> dict[str, float]:
         """Grasps a second of a variant, the best of some calls, compiled before."""
         variant = VARIANTS[name]
-        call, _ = self._call(name, variant, variant.scene(self.more))
+        call, _ = self._call(variant, variant.scene(self.more))
         seconds = []
         for _ in range(1 if name in DEAR else 3):
             start = time.perf_counter()
@@ -184,13 +153,13 @@ class Study:
         return {"grasps": count, "seconds": min(seconds), "grasps_per_s": count / min(seconds)}
 
     def _trials(self, variant: Variant) -> int:
-        return min(FEW, self.args.trials) if variant.few else self.args.trials
+        return min(FEW, self.trials) if variant.few else self.trials
 
-    def _call(self, name: str, variant: Variant, the_scene: Scene) -> tuple[Any, float]:
+    def _call(self, variant: Variant, the_scene: Scene) -> tuple[Callable[[], Any], float]:
         """A function that simulates, compiled, and the time that this took [s]."""
         space = parameters.design_space(the_scene.hand)
         engine, count = make_engine(variant.engine, the_scene), self._trials(variant)
-        drawn = worlds.trials(the_scene, count, seed=decision.SEED)
+        drawn = rollout.sample_trials(the_scene, jax.random.key(SEED), count)
         drawn = work.nudged(drawn) if variant.moved else drawn
         designs, trials = crossed(self.designs, drawn)
         constants = calibrated(the_scene, count, len(self.designs)) if variant.drawn else None
@@ -206,124 +175,98 @@ class Study:
         return lambda: program(*arguments), time.perf_counter() - start
 
 
+def late_designs(data: Path, count: int) -> np.ndarray:
+    """Distinct final particles of the concurrent 23D runs in turn, (design, 23) in SI units."""
+    with np.load(data / "23d.npz", allow_pickle=False) as file:
+        runs = file["final_particles"][-1]
+    rng = np.random.default_rng(SEED)
+    every = [rng.permutation(np.unique(run, axis=0)) for run in runs]
+    depth = max(len(run) for run in every)
+    chosen = [run[i] for i in range(depth) for run in every if i < len(run)][:count]
+    if len(chosen) < count:
+        raise ValueError(f"{count} designs asked for, the runs end with {len(chosen)} distinct")
+    return np.array(chosen)
+
+
 def crossed(designs: np.ndarray, drawn: Trial) -> tuple[np.ndarray, Trial]:
     """Every design in every trial, design by design."""
     count = drawn.yaw.shape[0]
     index = np.arange(len(designs) * count)
-    return designs[index // count], jax.tree.map(lambda x: x[index % count], drawn)
+    return designs[index // count], jax.tree.map(lambda x: np.asarray(x)[index % count], drawn)
 
 
 def calibrated(the_scene: Scene, trials: int, designs: int) -> Any:
-    """Constants of each world: a set for each trial, drawn from those that no target ruled out.
-
-    Args:
-      the_scene: The scene, which has the other numbers.
-      trials: Trials of a design.
-      designs: Designs, which meet the same sets.
-    """
-    with np.load(CALIBRATED) as file:
-        left = file["units"][sets.plausible(file["distances"])]
-    rows = np.random.default_rng(decision.SEED).permutation(len(left))[
-        np.arange(trials) % len(left)
-    ]
-    numbers = sets.numbers(the_scene, sets.values(left[rows]))
+    """Constants of each world: a set for each trial, of those that no target ruled out."""
+    left = calibration.left()
+    rows = np.random.default_rng(SEED).permutation(len(left))[np.arange(trials) % len(left)]
+    numbers = calibration.numbers(the_scene, calibration.values(left[rows]))
     index = np.tile(np.arange(trials), designs)
     return jax.tree.map(lambda v: jnp.asarray(v[index] if np.ndim(v) else v, jnp.float32), numbers)
 
 
+KEPT, FAILED, _PARTS = 255, 254, 250
+"""Marks in place of the time of loss: kept to the end, and failed; parts of the time."""
+
+
+def encode(lost: np.ndarray, bad: np.ndarray, window: tuple[float, float]) -> str:
+    """Times of loss as text: a byte a trial, compressed, in base 64.
+
+    Args:
+      lost: Times of loss [s], infinite where the object is kept, shape (design, trial).
+      bad: Whether the trial failed, same shape.
+      window: Start and end of the time in which a loss costs [s]; a byte counts its 250th parts.
+    """
+    start, end = window
+    share = np.clip((np.where(np.isfinite(lost), lost, end) - start) / (end - start), 0, 1)
+    code = np.where(np.isfinite(lost), np.round(_PARTS * share), KEPT)
+    code = np.where(bad, FAILED, code).astype(np.uint8)
+    return base64.b64encode(zlib.compress(code.tobytes(), 9)).decode()
+
+
+def costs(the_scene: Scene, record: dict[str, Any]) -> np.ndarray:
+    """Costs of a record's trials, shape (design, trial); NaN where a trial failed."""
+    code = np.frombuffer(zlib.decompress(base64.b64decode(record["lost"])), np.uint8)
+    code = code.reshape(record["particles"], record["trials"])
+    cost = np.where(code == KEPT, 0.0, the_scene.cost.maximum * (1 - code / _PARTS))
+    return np.where(code == FAILED, np.nan, cost)
+
+
 def path_of(folder: Path, name: str) -> Path:
     """File of a variant."""
-    words = "".join(c if c.isalnum() or c in ".-" else "_" for c in name)
-    return folder / f"{words}.json"
+    return folder / f"{''.join(c if c.isalnum() or c in '.-' else '_' for c in name)}.json"
 
 
-def simulate(args: argparse.Namespace) -> None:
-    """Simulates the variants of this process that have no file yet."""
-    first, count = (int(n) for n in args.share.split("/"))
-    names = [n for n in VARIANTS if not args.only or n in args.only.split(";")][first - 1 :: count]
-    left, the_study = [n for n in names if not path_of(args.out, n).exists()], None
-    for name in left:
-        the_study = the_study or Study(args)
+def simulate(study: Study, names: list[str], folder: Path, commit: str | None) -> None:
+    """Simulates the variants that have no file yet."""
+    for name in [n for n in names if not path_of(folder, n).exists()]:
         try:
-            found = the_study.run(name)
+            found = study.run(name, commit)
         except InputError as error:  # an effect that the surface does not have: a result as well
             found = {"variant": dataclasses.asdict(VARIANTS[name]), "refused": str(error)}
-        output.write_json(path_of(args.out, name), {"name": name, **found})
-        print(f"{name}: {found.get('seconds', found.get('refused'))} s, ", end="")
-        print(f"compiled in {found.get('compile_seconds', 0)} s", flush=True)
+        output.write_json(path_of(folder, name), {"name": name, **found})
+        print(f"{name}: {found.get('seconds', found.get('refused'))} s", flush=True)
         jax.clear_caches()
 
 
-def measure(args: argparse.Namespace) -> None:
-    """Measures rates, one variant after another; a machine has a file of its own."""
-    the_study, name = Study(args), jax.devices()[0].platform
-    path = args.out / f"times_{name}.json"
+def measure(study: Study, names: list[str], folder: Path, commit: str | None) -> None:
+    """Measures rates, one variant after another; a kind of device has a file of its own."""
+    path = folder / f"times_{jax.devices()[0].platform}.json"
     found = json.loads(path.read_text()) if path.exists() else {"rates": {}}
-    for variant in args.only.split(";") if args.only else TIMED:
-        if variant not in found["rates"]:
-            found["rates"][variant] = the_study.rate(variant)
-            found["made"] = provenance.measurement(args.commit)
-            output.write_json(path, found)
-            print(f"{variant}: {found['rates'][variant]['grasps_per_s']:.0f} grasps/s", flush=True)
-
-
-def measure_tips(args: argparse.Namespace) -> None:
-    """Measures errors of the finger tip in a fast motion in the air, against MuJoCo C."""
-    size, settings = study.SIZES["full"], {n: v.in_the_air() for n, v in VARIANTS.items()}
-    exact = tip.motion(study.reference(size), size.hands, size.seconds)
-    found = {s: tip.motion(s, size.hands, size.seconds) for s in dict.fromkeys(settings.values())}
-    errors = {s: tip.compare(tips, exact)["tip_rms_mm"] for s, tips in found.items()}
-    named = {name: errors[setting] for name, setting in settings.items()}
-    made = provenance.measurement(args.commit)
-    output.write_json(args.out / "tips.json", {"tip_rms_mm": named, "made": made})
+    for name in [n for n in names if n not in found["rates"]]:
+        found["rates"][name] = study.rate(name)
+        found["made"] = provenance.measurement(commit)
+        output.write_json(path, found)
+        print(f"{name}: {found['rates'][name]['grasps_per_s']:.0f} grasps/s", flush=True)
 
 
 def merged(folder: Path) -> dict[str, Any]:
     """The files of all variants in one."""
     every = {name: path_of(folder, name) for name in VARIANTS}
+    times = {p.stem.split("_")[1]: json.loads(p.read_text()) for p in folder.glob("times_*.json")}
     found: dict[str, Any] = {
         "variants": {n: json.loads(p.read_text()) for n, p in every.items() if p.exists()},
-        "rates": {
-            p.stem.split("_")[1]: json.loads(p.read_text()) for p in folder.glob("times_*.json")
-        },
+        "rates": times,
     }
     if (path := folder / "tips.json").exists():
         found["tips"] = json.loads(path.read_text())
     return found
-
-
-def main() -> int:
-    """Runs the command and returns the exit status."""
-    parser = provenance.parser(__doc__)
-    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
-    parser.add_argument("--out", type=Path, default=Path("runs/budget"), help="folder of the files")
-    parser.add_argument("--designs", type=int, default=DESIGNS)
-    parser.add_argument("--trials", type=int, default=TRIALS)
-    parser.add_argument("--share", default="1/1", metavar="I/N", help="every N-th variant")
-    parser.add_argument("--only", default="", help="these variants, with ; between")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--time", action="store_true", help="measure rates")
-    parser.add_argument("--tip", action="store_true", help="measure errors of the finger tip")
-    parser.add_argument("--merge", type=Path, help="write the files into this one and stop")
-    parser.add_argument("--report", action="store_true", help="show the tables of --merge and stop")
-    parser.add_argument("--page", type=Path, help="page whose tables are filled in")
-    parser.add_argument("--figure", type=Path, help="file of the first figure")
-    args = parser.parse_args()
-    use_compilation_cache()
-    if args.report:
-        from scripts.accuracy import against_time, budget_report
-
-        found = budget_report.Budget(json.loads(args.merge.read_text()))
-        if args.figure:
-            print(against_time.make(found, args.figure.with_name("accuracy_time.png")))
-        return budget_report.make(found, args.page, args.figure)
-    if args.merge:
-        output.write_json(args.merge, merged(args.out), indent=None)
-        return 0
-    args.out.mkdir(parents=True, exist_ok=True)
-    (measure_tips if args.tip else measure if args.time else simulate)(args)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

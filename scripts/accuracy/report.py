@@ -1,105 +1,356 @@
-"""From committed records to figures, tables and CSV."""
+"""Tables and figures of the variants' verdicts, finger tips and rates, from one file."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from scripts.accuracy import analysis, figures, presets, tables
-from scripts.accuracy.results import ERRORS, Study
-from scripts.shared import output
-from scripts.shared.tables import fill, markdown
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
-MACHINES = {"h200": "NVIDIA H200 and CPU cores of its host", "cpu": "2 CPU cores"}
-SHORT = {"h200": "one H200", "cpu": "2 CPU cores"}
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.report.statistics import Interval
+from codesign_jax.scene import load
+from scripts.accuracy import budget
+from scripts.shared import figures, tables
+from scripts.shared.statistics import spearman, two_way
+
+RESAMPLES = 500
+PRESETS = ("fast", "standard", "fine", "reference")
+CANDIDATES = {
+    "least": "`standard` with least damping",
+    "least, 1e-3": "`standard` with least damping, a tolerance of 1e-3",
+    "4 x 16, least, 1e-3": "the same and a skin of 4 × 16 points a link",
+    "5 ms, least, 1e-3": "`fine` with a tolerance of 1e-3 and 24 iterations",
+    "5 ms, 3 x 12, least, 1e-3": "the same and a skin of 3 × 12 points a link",
+}
+RATED = {"gpu": "one H100", "cpu": "2 CPU cores"}
+"""Machines whose rates the file has, in words."""
 
 
-def studies(docs: Path) -> dict[str, Study]:
-    """The studies that docs/data holds, by the machine's name."""
-    files = {n: sorted((docs / "data").glob(f"accuracy_{n}*.json")) for n in MACHINES}
-    return {n: Study(found) for n, found in files.items() if found}
+class Change(NamedTuple):
+    """A row of the budget: what is changed, from which variant to which, and of what kind."""
+
+    words: str
+    of: str
+    to: str
+    kind: str
 
 
-def make(docs: Path, found: dict[str, Study] | None = None) -> str:
-    """Draws figures, writes CSV and fills in docs/notes/accuracy.md from docs/data.
+CHANCE, NUMERICS, MODELS = "chance", "numerics", "models"
+COLORS = {CHANCE: "tab:gray", NUMERICS: "tab:blue", MODELS: "tab:orange"}
+CPUS = "standard, on CPUs"
+CHANGES = (
+    Change("object moved by a micrometre, `standard`", "standard", "standard, moved", CHANCE),
+    Change("the same, the truth", "truth", "truth, moved", CHANCE),
+    Change("CPUs in place of a GPU, `standard`", "standard", CPUS, CHANCE),
+    Change("time step of 5 ms", "standard", "5 ms", NUMERICS),
+    Change("time step of 2 ms", "standard", "2 ms", NUMERICS),
+    Change("20 links", "standard", "20 links", NUMERICS),
+    Change("skin of 4 × 16 points a link", "standard", "4 x 16", NUMERICS),
+    Change("four Newton iterations", "standard", "4 iterations", NUMERICS),
+    Change("tolerance of 1e-3", "standard", "1e-3", NUMERICS),
+    Change("least damping alone", "standard", "least", NUMERICS),
+    Change("step, links and skin at once: the truth", "standard", "truth", NUMERICS),
+    Change("the truth refined again", "truth", "finer", NUMERICS),
+    Change("the palm acts once a finger is in it", CPUS, "palm once inside", NUMERICS),
+    Change(
+        "MuJoCo C in place of this engine, with spheres", "spheres", "spheres, MuJoCo C", NUMERICS
+    ),
+    Change("fingers creep on one another", CPUS, "fingers creep", MODELS),
+    Change("soft touch", CPUS, "soft touch", MODELS),
+    Change("pressure resists sideways bending", CPUS, "lateral threshold", MODELS),
+    Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
+    Change("spheres in place of the skin", "standard", "spheres", MODELS),
+    Change("fingers pass one another", "standard", "fingers pass each other", MODELS),
+    Change("fingers pass the palm", "standard", "fingers pass the palm", MODELS),
+    Change("another of the calibrated sets of constants in each trial", CPUS, "constants", MODELS),
+)
+
+
+def mean_costs(cost: np.ndarray) -> np.ndarray:
+    """Mean cost of every design over the trials that did not fail, the maximum if all did."""
+    good = np.isfinite(cost)
+    total = np.where(good, cost, 0.0).sum(-1)
+    return np.where(good.any(-1), total / np.maximum(good.sum(-1), 1), 3.0)
+
+
+def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Interval]:
+    """A variant beside another one over the same designs and trials, of which b may have more.
 
     Args:
-      docs: The folder of the documentation.
-      found: See `studies`, if they were read already.
+      a: Costs, shape (design, trial), NaN where a trial failed.
+      b: The other's.
 
     Returns:
-      The text between the page's marks.
+      The difference of success, the share of verdicts that flip and the rank correlation of mean
+      costs, each with its interval of 95 % over designs and trials.
     """
-    found = studies(docs) if found is None else found
-    parts = []
-    for name, study in found.items():
-        parts.append(_section(study, name, docs))
-        table(study, docs / "data" / f"accuracy_{name}.csv")
-    text = "\n\n".join(parts) or "Not measured yet."
-    fill(docs / "notes" / "accuracy.md", text, "results")
-    return text
+    trials = min(a.shape[1], b.shape[1])
+
+    def values(a: np.ndarray, b: np.ndarray) -> list[float]:
+        kept, expected = a < SUCCESS_COST, b < SUCCESS_COST
+        rank = float(spearman(mean_costs(a), mean_costs(b)))
+        return [kept.mean() - expected.mean(), (kept != expected).mean(), rank]
+
+    found = two_way(values, a[:, :trials], b[:, :trials], resamples=RESAMPLES)
+    return dict(zip(("success_difference", "flipped", "rank"), found, strict=True))
 
 
-def make_summary(note: Path, scenes: Path, found: dict[str, Study]) -> None:
-    """Fills in the tables of the presets and of the errors wanted, and the comments of their files.
+class Budget:
+    """Costs of all variants that a file has, and their comparisons."""
+
+    def __init__(self, found: dict[str, Any]):
+        """Decodes the file."""
+        scene = load("paper")
+        records = {n: r for n, r in found["variants"].items() if "lost" in r}
+        self.costs = {n: budget.costs(scene, r) for n, r in records.items()}
+        self.rates = {n: r["rates"] for n, r in found.get("rates", {}).items()}
+        self.tips: dict[str, float] = found.get("tips", {}).get("tip_rms_mm", {})
+        self._compared: dict[tuple[str, str], dict[str, Interval]] = {}
+
+    def compared(self, of: str, to: str) -> dict[str, Interval] | None:
+        """`compare` of a variant with another one, None if either was not run."""
+        if of not in self.costs or to not in self.costs:
+            return None
+        if (of, to) not in self._compared:  # tables and figures ask for the same ones
+            self._compared[of, to] = compare(self.costs[of], self.costs[to])
+        return self._compared[of, to]
+
+    def row(self, name: str, words: str) -> list[str]:
+        """A setting beside the truth."""
+        beside, moved = self.compared(name, "truth"), self.compared(name, f"{name}, moved")
+        rates = [self.rates.get(machine, {}).get(name) for machine in RATED]
+        cells = [words, *["–"] * 5]
+        if beside:
+            cells[1] = points(beside["success_difference"])
+            cells[2], cells[3] = interval(beside["flipped"]), interval(beside["rank"], ".2f")
+        if moved:
+            cells[4] = f"{moved['flipped'].value:.1%}"
+        if name in self.tips:
+            cells[5] = f"{self.tips[name]:.2g} mm"
+        return cells + [f"{r['grasps_per_s']:,.0f}" if r else "–" for r in rates]
+
+    def tables(self) -> dict[str, str]:
+        """Markdown by the name of its marks on docs/accuracy.md."""
+        found = {"budget": f"{tables.markdown(budget_table(self))}\n\n{luck(self)}"}
+        if "truth" in self.costs:
+            found["against-truth"] = tables.markdown(presets_table(self))
+        return found
+
+
+def interval(value: Interval, form: str = ".1%") -> str:
+    """A value with its interval; a dash where it is not defined."""
+    if not np.isfinite(value.value):
+        return "–"
+    return f"{value.value:{form}} [{value.low:{form}}, {value.high:{form}}]"
+
+
+def points(value: Interval) -> str:
+    """A difference of success in points, with its interval."""
+    middle, low, high = (100 * v for v in value)
+    return f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def presets_table(found: Budget) -> list[list[str]]:
+    """Presets and candidates beside the truth."""
+    head = ["setting", "success, points from the truth", "verdicts that flip", "rank correlation"]
+    head += ["flips by a micrometre", "finger tip in the air"]
+    rows = [[*head, *(f"grasps/s, {m}" for m in RATED.values())]]
+    rows += [found.row(name, f"`{name}`") for name in PRESETS]
+    rows += [found.row(n, words) for n, words in CANDIDATES.items() if n in found.costs]
+    return rows if found.rates else [row[: -len(RATED)] for row in rows]
+
+
+def budget_table(found: Budget) -> list[list[str]]:
+    """What each change moves."""
+    rows = [["change", "verdicts that flip", "success, points", "rank correlation", "of"]]
+    for change in CHANGES:
+        if beside := found.compared(change.to, change.of):
+            cells = interval(beside["flipped"]), points(beside["success_difference"])
+            rows.append([change.words, *cells, f"{beside['rank'].value:.2f}", change.kind])
+    return rows
+
+
+def luck(found: Budget) -> str:
+    """What six trials tell of a design: a sentence."""
+    cost = found.costs["truth" if "truth" in found.costs else "standard"]
+    kept = (cost < SUCCESS_COST).astype(float)
+    six = np.sqrt((kept.mean(1) * (1 - kept.mean(1))).mean() / 6)
+    blocks = [mean_costs(cost[:, i : i + 6]) for i in range(0, cost.shape[1] - 5, 6)]
+    ranks = [spearman(a, b) for a, b in zip(blocks, blocks[1:], strict=False)]
+    told = f"{np.mean(ranks):.2f}" if ranks else "none"
+    return (
+        f"Luck of six trials: a design's success has a standard error of {100 * six:.0f} points; "
+        f"ranks by six trials and by six others correlate by {told}."
+    )
+
+
+def draw_budget(found: Budget, path: Path) -> Path:
+    """The budget as bars with their intervals, by kind."""
+    shown = [(c, r) for c in CHANGES if (r := found.compared(c.to, c.of))]
+    figure = figures.new(7.5, 0.28 * len(shown) + 1.0)
+    axes = figure.subplots()
+    for place, (change, result) in enumerate(shown):
+        middle, low, high = (100 * v for v in result["flipped"])
+        axes.barh(-place, middle, color=COLORS[change.kind], alpha=0.8)
+        error = [[middle - low], [high - middle]]
+        axes.errorbar(middle, -place, xerr=error, fmt="none", color="black", capsize=2)
+    words = [c.words.replace("`", "") for c, _ in shown]
+    axes.set_yticks([-k for k in range(len(shown))], words, fontsize=8)
+    handles = [Patch(color=color, alpha=0.8) for color in COLORS.values()]
+    axes.legend(handles, list(COLORS), frameon=False, fontsize=8, loc="upper right")
+    axes.set(xlabel="verdicts that flip [%]", xlim=(0, None))
+    return figures.save(figure, path)
+
+
+# --- accuracy against time ------------------------------------------------------------------------
+
+C = "MuJoCo C"
+LOOKS = {
+    "this engine, one H100": ("tab:blue", "o"),
+    "this engine, 2 CPU cores": ("tab:orange", "o"),
+    "MuJoCo C, 2 CPU cores": ("tab:green", "s"),
+}
+"""Color and marker of an engine on a machine, the same in both panels."""
+WORDS = {
+    "fast": "fast",
+    "standard": "standard",
+    "fine": "fine",
+    "reference": "reference",
+    "least, 1e-3": "10 ms, tolerance 1e-3",
+    "4 x 16, least, 1e-3": "10 ms, 1e-3, finer skin",
+    "5 ms, least, 1e-3": "5 ms, tolerance 1e-3",
+    "spheres": "spheres, no skin",
+    "spheres, MuJoCo C": "spheres, no skin",
+}
+"""Variants that are shown where their rate is known, and what they are called."""
+IN_THE_AIR = ("fast", "standard", "fine", "reference", "spheres", "spheres, MuJoCo C")
+"""Those of which the finger tip is shown."""
+
+
+class Place(NamedTuple):
+    """A mark of the figure.
+
+    Attributes:
+      who: Engine and machine, one of `LOOKS`.
+      setting: What the setting is called; marks of one name are joined.
+      rate: Grasps a second, whole ones in the default scene.
+      error: Error with its interval; one without width has no bar.
+    """
+
+    who: str
+    setting: str
+    rate: float
+    error: Interval
+
+
+def marks(found: Budget) -> tuple[list[Place], list[Place]]:
+    """Marks of verdicts and of finger tips, one for each machine whose rate is known.
+
+    In the air engines solve the same equations, so that MuJoCo C has this engine's error there.
+    """
+
+    def places(errors: dict[str, Interval]) -> list[Place]:
+        every = []
+        for (name, error), (machine, rates) in (
+            (e, r) for e in errors.items() for r in found.rates.items()
+        ):
+            if rate := rates.get(name):
+                who = f"{C if C in name else 'this engine'}, {RATED[machine]}"
+                every.append(Place(who, WORDS[name], rate["grasps_per_s"], error))
+        return every
+
+    beside = {name: found.compared(name, "truth") for name in WORDS}
+    flipped = {name: c["flipped"] for name, c in beside.items() if c}
+    tips = {n: Interval(*[found.tips[n]] * 3) for n in IN_THE_AIR if n in found.tips}
+    return places(flipped), places(tips)
+
+
+def draw_against_time(found: Budget, path: Path) -> Path:
+    """Errors of verdicts and of finger tips against grasps a second, side by side."""
+    left, right = marks(found)
+    figure = figures.new(12.5, 5.8)
+    verdict, tip = figure.subplots(1, 2)
+    words = "grasps a second: whole grasps of designs that hold"
+    _marks(verdict, [p._replace(error=Interval(*(100 * v for v in p.error))) for p in left])
+    verdict.set(
+        title="Verdicts in the default scene, paper",
+        xlabel=words,
+        ylabel="verdicts that flip against the truth [%]",
+        ylim=(0, None),
+    )
+    _marks(tip, right)
+    tip.set(
+        title="Finger tip in a fast motion in the air, no contact",
+        xlabel=words,
+        ylabel="root mean square error [mm]",
+        yscale="log",
+    )
+    _names(verdict, left, 100)
+    _names(tip, right)
+    for axis in (verdict, tip):
+        axis.set_xlim(axis.get_xlim()[0] / 2)  # room for the name of a mark at the edge
+    if moved := found.compared("truth, moved", "truth"):
+        floor = 100 * moved["flipped"].value
+        verdict.axhline(floor, color="0.4", ls=":", lw=1)
+        verdict.text(
+            0.99, floor, "a micrometre flips this share of the truth's own", fontsize=8,
+            color="0.3", ha="right", va="top", transform=verdict.get_yaxis_transform(),
+        )  # fmt: skip
+    shown = {p.who for p in (*left, *right)}
+    key = [
+        Line2D([], [], ls="none", label=who, color=color, marker=marker)
+        for who, (color, marker) in LOOKS.items()
+        if who in shown
+    ]
+    figure.legend(handles=key, loc="outside lower center", ncols=4, frameon=False)
+    return figures.save(figure, path)
+
+
+def _marks(axis: Axes, places: list[Place]) -> None:
+    for place in places:
+        color, marker = LOOKS[place.who]
+        middle, low, high = place.error
+        error = [[middle - low], [high - middle]] if high > low else None
+        axis.errorbar(
+            place.rate, middle, yerr=error, color=color, marker=marker, ms=7, ls="none",
+            zorder=3, elinewidth=0.8, capsize=2,
+        )  # fmt: skip
+    axis.set_xscale("log")
+    axis.grid(alpha=0.3, which="both", lw=0.4)
+
+
+def _names(axis: Axes, places: list[Place], unit: float = 1) -> None:
+    """Joins the marks of a setting by a line, with its name in the widest gap.
 
     Args:
-      note: The note of the study.
-      scenes: Folder of the presets.
-      found: See `studies`; the full size comes first.
+      axis: Axis whose scales and limits are final.
+      places: Marks.
+      unit: What the axis shows of an error of one.
     """
-    named = {SHORT[n]: study for n, study in found.items()}
-    full, *rest = named.values()
-    fill(note, markdown(tables.wanted_here(full, rest[0] if rest else None)), "wanted")
-    text = "\n\n".join(markdown(t) for t in (presets.presets_table(named), presets.standing(full)))
-    fill(note, text, "presets")
-    presets.annotate(scenes, named)
+    names = sorted({p.setting for p in places})
+    rows = [sorted((p.rate, unit * p.error.value) for p in places if p.setting == n) for n in names]
+    heights = _apart(axis, [row[0] for row in rows])
+    for name, row, height in zip(names, rows, heights, strict=True):
+        rates = [rate for rate, _ in row]
+        gaps = list(zip(rates, rates[1:], strict=False))
+        low, high = max(gaps, key=lambda g: g[1] / g[0], default=(rates[0] / 10, rates[0]))
+        x = np.sqrt(low * high)
+        axis.plot(*zip(*sorted([*row, (x, height)]), strict=True), color="0.6", lw=0.7, zorder=1)
+        box = {"fc": "white", "ec": "none", "pad": 0.5}
+        axis.text(x, height, name, fontsize=8, ha="center", va="center", zorder=4, bbox=box)
 
 
-def _section(study: Study, name: str, docs: Path) -> str:
-    size = "the study's full size" if name == "h200" else "the quick size, see above"
-    parts = [f"### {MACHINES[name]}", f"{study.machine()}; {size}."]
-
-    def add(title: str, rows: list[list[str]]) -> None:
-        if len(rows) > 1:
-            parts.append(f"**{title}**\n\n" + markdown(rows))
-
-    panels = {ERRORS[p][0]: study.points(p) for p in ERRORS}
-    panels = {k: v for k, v in panels.items() if v}
-    if panels:
-        figures.diagram(panels, docs / "figures" / f"accuracy_{name}.png", study.machine())
-        parts.append(f"![Error against time](../figures/accuracy_{name}.png)")
-        add("Error wanted, cheapest setting, cost", tables.wanted(study))
-    lines = tables.lines(study.records)
-    if any(lines.values()):
-        figures.convergence(lines, docs / "figures" / f"convergence_{name}.png")
-        parts.append(f"![Orders of convergence](../figures/convergence_{name}.png)")
-        add("The reference and the orders", tables.confirmed(study.records))
-    for part in ("tip", "impulse"):
-        add(ERRORS[part][0], tables.errors_table(study, part))
-    for population, words in tables.POPULATIONS.items():
-        add(f"Decisions: {words}", tables.decisions_table(study, population))
-    add("From preset to preset", tables.preset_to_preset(study))
-    add("Each knob alone, against its own limit", tables.alone(study))
-    add("The winner's curse: the best by a coarse setting, tested again", tables.curse(study))
-    add("What a micrometre and other trials do", tables.floors(study))
-    add("Trials that failed or met the solver's limit", tables.warnings(study))
-    return "\n\n".join(parts)
-
-
-def table(study: Study, path: Path) -> None:
-    """Writes every setting's errors and cost as CSV."""
-    values: dict[tuple[str, str], dict[str, Any]] = {}
-    for part, (_, key) in ERRORS.items():
-        for r in study.errors(part):
-            setting = r["of"]
-            row = values.setdefault((setting.engine, setting.label), {})
-            row |= {"engine": setting.engine, "timestep_ms": setting.timestep}
-            row |= {
-                n: getattr(setting, n)
-                for n in ("links", "axes", "surface", "damping", "iterations")
-            }
-            row |= {"precision": "float64" if setting.engine == "mujoco" else setting.precision}
-            row |= {"wall_s_per_simulated_s": study.cost(setting.engine, setting)}
-            row |= {"not_measured": analysis.bad(r), key: r.get(key)}
-    names = list(dict.fromkeys(k for row in values.values() for k in row))
-    rows = ({"label": label, **row} for (_, label), row in values.items())
-    output.write_csv(path, ["label", *names], rows)
+def _apart(axis: Axes, points: list[tuple[float, float]], least: float = 0.04) -> list[float]:
+    """Heights near those of points, so that names do not meet: `least` of the axis apart."""
+    axis.get_ylim()  # finds the limits
+    scale = axis.transScale + axis.transLimits
+    height = scale.transform(np.reshape(points, (-1, 2)))[:, 1]
+    order = np.argsort(height, kind="stable")
+    steps = least * np.arange(len(order))
+    wanted = height[order] - steps
+    # Between the lowest heights of which none is too low and the highest of which none too high.
+    up, down = np.maximum.accumulate(wanted), np.minimum.accumulate(wanted[::-1])[::-1]
+    height[order] = (up + down) / 2 + steps
+    return [float(y) for _, y in scale.inverted().transform([(0.0, h) for h in height])]

@@ -1,94 +1,117 @@
-"""Finger tips before first contact: against the elastica, and in motion against the reference."""
+"""Finger tips in a fast motion in the air, against MuJoCo C with a short step and many links."""
 
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 
-from scripts.accuracy import oracle, worlds
-from scripts.accuracy.settings import Setting
+from codesign_jax import model, rollout
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.scene import Scene, load, parameters
+from scripts.accuracy.budget import VARIANTS
+from scripts.shared import output, provenance, work
 
 # A quick grasp in the air: the arm comes down in 0.3 s, the fingers are inflated in the next 0.3 s,
 # and the hand is shaken. Nothing touches, and no world ends early.
 IN_THE_AIR = {
     "effects": {
-        "finger_object": False,
-        "finger_table": False,
-        "palm_object": False,
-        "palm_table": False,
-        "ungrasp": False,
+        **dict.fromkeys(("finger_finger", "finger_palm", "finger_object", "finger_table"), False),
+        **dict.fromkeys(("palm_object", "palm_table", "ungrasp"), False),
     },
     "phases": {"approach": 0.3, "inflate": 0.6, "lift": 0.9, "disturb": 2.4, "ungrasp": 3.0},
     "cost": {"lost_distance": 1.0},
 }
 EVERY = 0.02
 """Time between compared states [s]: a multiple of every time step."""
+HANDS, SECONDS = 12, 2.4
+REFERENCE = (1e-4, 40, "least")
+"""Time step [s], links and damping of the motion that stands for the truth, by MuJoCo C."""
 
 
-def _inputs(setting: Setting, hands: int, seconds: float, dtype: type):
-    """Scene in the air, fields and controls of its first seconds."""
-    scene = setting.scene(IN_THE_AIR)
-    chosen = worlds.paired(worlds.designs(scene, hands), worlds.trials(scene, 6))
-    fields, ctrl = worlds.inputs(scene, chosen, dtype)
-    return scene, fields, ctrl[:, : round(seconds / scene.discretization.timestep)]
-
-
-def exact(setting: Setting, hands: int, seconds: float) -> np.ndarray:
-    """Tips by MuJoCo C; see `motion`."""
-    with worlds.floats(True) as dtype:
-        scene, fields, ctrl = _inputs(setting, hands, seconds, dtype)
-    stride = round(EVERY / scene.discretization.timestep)
-    shown = range(0, ctrl.shape[1], stride)
-
-    def run(world: int) -> np.ndarray:
-        found: list[np.ndarray] = []
-        model = oracle.model_of(scene, fields, world)
-        # The object on the table is the only contact: without it there is nothing to solve.
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        visit = lambda m, d, _k: found.append(oracle.tips(scene, m, d))  # noqa: E731
-        oracle.advance(model, fields.start[world], ctrl[world], shown, visit)
-        return np.array(found)
-
-    return np.array(oracle.each_world(run, hands))
-
-
-def motion(setting: Setting, hands: int, seconds: float) -> np.ndarray:
+def motion(
+    setting: tuple[float, int, str], engine: str = "structured", hands: int = HANDS,
+    seconds: float = SECONDS,
+) -> np.ndarray:  # fmt: skip
     """Tips of hands in the air [m], shape (hand, time, finger, 3), every `EVERY` from the start.
 
     Args:
-      setting: The setting.
+      setting: Time step [s], links and `discretization.spring_damping`.
+      engine: "structured", or "mujoco", which is MuJoCo C step by step in float64.
       hands: Number of hands, in turn random and good ones.
       seconds: Simulated time.
     """
-    if setting.engine == "mujoco":
-        return exact(setting, hands, seconds)
-    import jax
+    step, links, damping = setting
+    sizes = {"timestep": step, "links": links, "spring_damping": damping}
+    scene = load("paper", overrides={**IN_THE_AIR, "discretization": sizes})
+    stride, count = round(EVERY / step), round(seconds / step)
+    vectors = np.asarray(work.designs(scene, hands))
+    drawn = rollout.sample_trials(scene, jax.random.key(work.SEED), work.TRIALS)
+    with jax.enable_x64(engine == "mujoco"):
+        float_type = np.float64 if engine == "mujoco" else np.float32
+        params = jax.vmap(lambda v: parameters.unflatten(scene.hand, v))(vectors)
+        trials = jax.tree.map(lambda x: np.asarray(x)[np.arange(hands) % work.TRIALS], drawn)
+        cast = lambda x: np.asarray(x).astype(float_type) if x.dtype.kind == "f" else x  # noqa: E731
+        made = work.inputs(scene, work.Worlds(*jax.tree.map(cast, (params, trials))))
+        fields, ctrl = jax.tree.map(np.asarray, made)
+        ctrl = ctrl[:, :count]
+        if engine != "mujoco":
+            run = jax.jit(
+                lambda f, c: make_engine(engine, scene).rollout(f, c, trajectory=True).qpos
+            )
+            qpos = np.asarray(run(fields, ctrl)[:, ::stride], np.float64)
 
-    with worlds.floats(setting.wide) as dtype:
-        scene, fields, ctrl = _inputs(setting, hands, seconds, dtype)
-        engine = setting.make(scene)
-        run = jax.jit(lambda f, c: engine.rollout(f, c, trajectory=True).qpos)
-        stride = round(EVERY / scene.discretization.timestep)
-        qpos = np.asarray(run(fields, ctrl)[:, ::stride], np.float64)
-
-    def place(world: int) -> np.ndarray:
-        model = oracle.model_of(scene, fields, world)
-        data, found = mujoco.MjData(model), []
-        for state in qpos[world]:
-            data.qpos[:] = state
-            mujoco.mj_kinematics(model, data)
-            found.append(oracle.tips(scene, model, data))
+    def of_world(world: int) -> np.ndarray:
+        compiled = world_model(scene, jax.tree.map(lambda x: x[world], fields))
+        if engine != "mujoco":
+            return np.array([tips(scene, compiled, state) for state in qpos[world]])
+        # The object on the table is the only contact: without it there is nothing to solve.
+        compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        data, found = mujoco.MjData(compiled), []
+        data.qpos[:] = fields.start[world]
+        for k in range(ctrl.shape[1]):
+            if k % stride == 0:
+                found.append(tips(scene, compiled, data.qpos))
+            data.ctrl[:] = ctrl[world, k]
+            mujoco.mj_step(compiled, data)
         return np.array(found)
 
-    return np.array(oracle.each_world(place, hands))
+    return np.array(_each(of_world, hands))
 
 
-def compare(tips: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
-    """Distances of tips from the reference's [mm]: root mean square over all, largest, by hand."""
-    away = 1e3 * np.linalg.norm(tips - reference, axis=-1)
-    by_hand = np.sqrt((away**2).mean((1, 2)))
-    return {
-        "tip_rms_mm": float(np.sqrt((away**2).mean())),
-        "tip_max_mm": float(away.max()),
-        "tip_rms_mm_by_hand": [round(float(v), 6) for v in by_hand],
-    }
+def _each(function: Callable[[int], Any], count: int) -> list[Any]:
+    """Results of worlds in threads: MuJoCo frees Python's lock."""
+    with ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), count)) as pool:
+        return list(pool.map(function, range(count)))
+
+
+def tips(scene: Scene, compiled: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Finger tips of a state [m], shape (finger, 3), on the bottom layer."""
+    data, last = mujoco.MjData(compiled), model.layout(scene).bodies[:, -1]
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(compiled, data)
+    # A half segment follows the last joint; its centre of mass lies halfway along it.
+    along = 2 * compiled.body_ipos[last, 0]
+    return data.xpos[last] + data.xmat[last].reshape(-1, 3, 3)[:, :, 0] * along[:, None]
+
+
+def error(found: np.ndarray, exact: np.ndarray) -> float:
+    """Root mean square distance of tips [mm]."""
+    return float(1e3 * np.sqrt((np.linalg.norm(found - exact, axis=-1) ** 2).mean()))
+
+
+def measure(folder: Path, commit: str | None) -> None:
+    """Writes the error of every variant's step, links and damping to tips.json."""
+    named = {}
+    for name, variant in VARIANTS.items():
+        found = variant.scene().discretization
+        named[name] = (found.timestep, found.links, found.spring_damping)
+    exact = motion(REFERENCE, "mujoco")
+    errors = {s: error(motion(s), exact) for s in dict.fromkeys(named.values())}
+    content = {"tip_rms_mm": {n: errors[s] for n, s in named.items()}}
+    output.write_json(folder / "tips.json", content | {"made": provenance.measurement(commit)})

@@ -1,10 +1,17 @@
-"""One finger of the package that rests under loads."""
+"""One finger of the package, built as every hand is, that rests under loads; the elastica."""
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
+import mujoco
+import numpy as np
+from scipy import optimize, special
+
+from codesign_jax import model
+from codesign_jax.model import morphology
 from codesign_jax.scene import hand
-from scripts.accuracy import beam
+from codesign_jax.types import Params, Trial
 from tests.helpers.grasps import pinch
 
 
@@ -42,11 +49,104 @@ def finger_scene(
     return dataclasses.replace(the_scene, hand=one, gravity=gravity)
 
 
-class Finger(beam.Finger):
-    """The finger of `finger_scene`, waited for until even rounding has died away."""
+def elastica(load: float) -> tuple[float, float]:
+    """Tip of a cantilever under a dead transverse load (Bisshopp and Drucker 1945).
 
-    def __init__(self, links, length=0.1, **options):
-        super().__init__(finger_scene(links, **options), length)
+    Args:
+      load: alpha = P L^2 / E I.
 
-    def settle(self, force=(0, 0, 0), torque=(0, 0, 0), pressure=0.0, steps=3000):
-        return super().settle(force, torque, pressure, steps=steps, rest=1e-10)
+    Returns:
+      Transverse deflection and axial shortening, both over L.
+    """
+
+    def phi(k: float) -> float:
+        return np.arcsin(1 / (k * np.sqrt(2)))
+
+    def gap(k: float) -> float:
+        return special.ellipk(k**2) - special.ellipkinc(phi(k), k**2) - np.sqrt(load)
+
+    k = float(optimize.brentq(gap, np.sqrt(0.5) + 1e-12, 1 - 1e-12, xtol=1e-15))  # type: ignore[arg-type]
+    w = 1 - 2 / np.sqrt(load) * (special.ellipe(k**2) - special.ellipeinc(phi(k), k**2))
+    u = 1 - np.sqrt(2 * np.sin(np.arcsin(2 * k**2 - 1)) / load)
+    return float(w), float(u)
+
+
+class Finger:
+    """MuJoCo's chain of one finger; loads act at the tip's bottom layer.
+
+    Attributes:
+      scene: The scene.
+      layout: Where things are in the model.
+      model: MuJoCo's model.
+      data: Its state.
+      length: Length of the finger [m].
+      links: Number of segments.
+      beam: Its properties as a beam.
+    """
+
+    def __init__(
+        self, links: int, length: float = 0.1, height: float = 0.02, wall: float = 0.005, **options
+    ):
+        """Compiles the finger of `finger_scene`, 0.3 m above the table; dimensions in m."""
+        self.scene = scene = finger_scene(links, **options)
+        self.layout, self.length, self.links = model.layout(scene), length, links
+        one, zero = np.ones(1), np.zeros(())
+        params = Params(length * one, height * one, wall * one, zero, np.zeros(6), 0 * one)
+        trial = Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), np.ones(()), np.ones(()))
+        self.model = model.compile_model(scene, params, trial)
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[2] = self.data.ctrl[2] = 0.3
+        material = scene.hand.material
+        self.beam = morphology.beam(
+            height,
+            wall,
+            width=scene.hand.section.width,
+            shear_modulus=material.shear_modulus,
+            density=material.density,
+        )
+
+    def tip(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position [m], (3,), and orientation, (3, 3), of the tip in the frame of the root."""
+        palm, frame = (self.data.xmat[b].reshape(3, 3) for b in (1, self.layout.bodies[0, -1]))
+        return palm.T @ (self._end() - self.data.xpos[1]), palm.T @ frame
+
+    def _end(self) -> np.ndarray:
+        d, last = self.data, self.layout.bodies[0, -1]
+        return d.xpos[last] + d.xmat[last].reshape(3, 3) @ [self.length / self.links / 2, 0, 0]
+
+    def settle(
+        self,
+        force: Sequence[float] = (0, 0, 0),
+        torque: Sequence[float] = (0, 0, 0),
+        pressure: float = 0.0,
+        steps: int = 3000,
+        rest: float = 1e-10,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The tip, see `tip`, under a load of fixed direction, once even rounding has died away.
+
+        Args:
+          force: Force on the tip in the palm's frame [N], shape (3,).
+          torque: Moment on it [N m], shape (3,).
+          pressure: Pressure [Pa].
+          steps: Time steps after which it must be at rest.
+          rest: Largest speed at rest [rad/s or m/s].
+
+        Raises:
+          RuntimeError: If it is not at rest.
+        """
+        m, d, last = self.model, self.data, self.layout.bodies[0, -1]
+        d.ctrl[6] = pressure
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_comPos(m, d)
+        for _ in range(steps):
+            palm, d.qfrc_applied[:] = d.xmat[1].reshape(3, 3), 0.0
+            load = palm @ force, palm @ torque
+            mujoco.mj_applyFT(m, d, *load, self._end(), last, d.qfrc_applied)
+            mujoco.mj_step(m, d)
+            # The object, last in qvel, falls or rests; it is not what is waited for.
+            if d.time > 0.1 and np.abs(d.qvel[:-6]).max() < rest:
+                break
+        else:
+            raise RuntimeError(f"a finger of {self.links} links did not come to rest")
+        mujoco.mj_kinematics(m, d)
+        return self.tip()

@@ -10,8 +10,7 @@ from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import morphology
 from codesign_jax.types import Params
-from scripts.accuracy import beam
-from tests.helpers import grasps
+from tests.helpers import beams, grasps
 from tests.helpers.beams import Finger, finger_scene
 from tests.stability.bench import bench
 from tests.stability.table import Found, case
@@ -184,7 +183,7 @@ def elastica_error(engine, step, precision):
             load = alpha * finger.beam.bending / finger.length**2
             position, _ = finger.settle(force=(0, 0, -load), steps=40000)
             tips.append(np.array([-position[2], finger.length - position[0]]) / finger.length)
-        exact = beam.elastica(alpha)
+        exact = beams.elastica(alpha)
         ten = max(ten, np.abs(tips[0] / exact - 1).max())
         # The chain's error is of second order in the links (case 1).
         worst = max(worst, np.abs((4 * tips[1] - tips[0]) / 3 / exact - 1).max())

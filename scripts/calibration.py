@@ -1,0 +1,399 @@
+"""Which of the constants that the paper leaves open fit its 2D figures: a space-filling wave.
+
+python -m scripts.calibration wave --sets 200 --out runs/wave.npz     # again to go on
+python -m scripts.calibration score runs/wave.npz                     # writes runs/wave_scores.npz
+
+A wave simulates a coarse landscape of the 2D experiment for each set of constants, all sets by one
+compiled program.  The score runs the particle filter on these landscapes and compares them with the
+paper's text: implausibility is the distance to a statement in standard deviations, and a set beyond
+`CUTOFF` of any of them is ruled out.  No best fit is chosen; the 23D experiment is held out.
+"""
+
+import dataclasses
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import ndimage
+from scipy.stats import qmc
+
+from codesign_jax import codesign, rollout, scene
+from codesign_jax.batch import LIMIT
+from codesign_jax.codesign import stream_key
+from codesign_jax.engines import Engine, make_engine
+from codesign_jax.optimize import ParticleFilter, State, candidates, schedule
+from codesign_jax.scene import Constants, InputError, Scene, parameters
+from codesign_jax.scene import constants as checks
+from codesign_jax.scene.parameters import DesignSpace
+from codesign_jax.types import failed
+from scripts.shared import output, provenance
+
+CUTOFF = 3.0
+"""Implausibility above which a set is ruled out: three standard deviations, whatever the
+distribution as long as it has one peak (Pukelsheim 1994)."""
+CLEARANCE = 0.002
+"""Smallest gap between the sections of a pair of fingers at a spread of zero [m]."""
+DATA = Path("docs/data/calibration/palm_scores.npz")
+
+
+class Open(NamedTuple):
+    """Range of a constant that the paper does not give; evidence: docs/notes/calibration.md."""
+
+    unit: str
+    low: float
+    high: float
+    log: bool = False
+
+
+# `base_x` is the distance of the base points from the plane between the two pairs of fingers,
+# `pair_gap` that of the two base points of a pair, `half_size` that of the cuboid, with which all
+# objects grow.  Damping of the wrist follows its stiffness at the file's damping ratio.
+OPEN = {
+    "tilt": Open("deg", 30, 90),
+    "base_x": Open("mm", 15, 45),
+    "pair_gap": Open("mm", 22, 40),
+    "zero_height": Open("mm", 0, 80),
+    "shear_modulus": Open("kPa", 16, 90, log=True),
+    "width": Open("mm", 15, 30),
+    "lateral": Open("", 0.29, 1),
+    "torsion": Open("", 1, 3),
+    "half_size": Open("mm", 20, 40),
+    "mass": Open("g", 20, 300, log=True),
+    "friction": Open("", 0.5, 1.2),
+    "table_friction": Open("", 0.2, 0.6),
+    "wrist_linear": Open("N/m", 100, 2000, log=True),
+    "wrist_angular": Open("N m/rad", 1, 20, log=True),
+    "shake_amplitude": Open("deg", 10, 45),
+    "shake_frequency": Open("Hz", 0.5, 2),
+    "normal_stiffness": Open("kN/m", 1, 20, log=True),
+    "friction_ratio": Open("", 3, 100, log=True),
+    "cost_maximum": Open("", 2.2, 4),
+}
+
+
+def space_filling(count: int, seed: int) -> np.ndarray:
+    """The first points of a scrambled Sobol sequence in the unit cube, shape (set, constant)."""
+    with warnings.catch_warnings():
+        # Balanced at powers of two only; other numbers are as even as the sequence allows.
+        warnings.filterwarnings("ignore", "The balance properties", UserWarning)
+        # SciPy 1.15 renamed the argument and takes the old name as well.
+        sequence = qmc.Sobol(len(OPEN), seed=np.random.default_rng(seed))  # type: ignore
+        return sequence.random(count)
+
+
+def values(units: np.ndarray) -> dict[str, np.ndarray]:
+    """Values in the units of `OPEN`, shape (set,), of points of the unit cube, (set, constant)."""
+    found = {}
+    for (name, o), u in zip(OPEN.items(), np.asarray(units, float).T, strict=True):
+        low, high = (np.log([o.low, o.high]) if o.log else np.array([o.low, o.high])) + 0.0
+        found[name] = np.exp(low + u * (high - low)) if o.log else low + u * (high - low)
+    gap, u = OPEN["pair_gap"], np.asarray(units, float)[:, list(OPEN).index("pair_gap")]
+    least = np.maximum(gap.low, found["width"] + 1e3 * CLEARANCE)
+    return found | {"pair_gap": least + u * (gap.high - least)}
+
+
+def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Constants:
+    """The scene's numbers with those of sets in them: leaves of shape () or (set,).
+
+    Raises:
+      InputError: If a finger has no base point of its own, or a value is out of its range.
+    """
+    if any(f.base is None for f in the_scene.hand.finger):
+        raise InputError(["calibration moves base points; give each finger a base"])
+    c, v = the_scene.constants(), chosen
+    x, y = 1e-3 * v["base_x"], 0.5e-3 * v["pair_gap"]
+    hand, wrist = c.hand, c.hand.wrist
+    linear, angular = v["wrist_linear"], v["wrist_angular"]
+    hand = hand._replace(
+        finger=tuple(
+            f._replace(tilt=v["tilt"], base=(np.sign(f.base[0]) * x, np.sign(f.base[1]) * y))
+            for f in hand.finger
+        ),
+        material=hand.material._replace(
+            shear_modulus=1e3 * v["shear_modulus"],
+            lateral_factor=v["lateral"],
+            torsion_factor=v["torsion"],
+        ),
+        section=hand.section._replace(width=1e-3 * v["width"]),
+        wrist=wrist._replace(
+            linear_stiffness=linear,
+            angular_stiffness=angular,
+            linear_damping=wrist.linear_damping * np.sqrt(linear / wrist.linear_stiffness),
+            angular_damping=wrist.angular_damping * np.sqrt(angular / wrist.angular_stiffness),
+        ),
+    )
+    factor = 1e-3 * v["half_size"] / c.objects.object[0].size[0]
+    shapes = tuple(
+        shape._replace(
+            size=tuple(factor * s for s in shape.size),
+            mass=1e-3 * v["mass"],
+            friction=v["friction"],
+        )
+        for shape in c.objects.object
+    )
+    table = c.objects.table._replace(friction=v["table_friction"])
+    c = c._replace(
+        hand=hand,
+        objects=c.objects._replace(object=shapes, table=table),
+        arm=c.arm._replace(
+            zero_height=1e-3 * v["zero_height"],
+            shake_amplitude=v["shake_amplitude"],
+            shake_frequency=v["shake_frequency"],
+        ),
+        contact=c.contact._replace(
+            normal_stiffness=1e3 * v["normal_stiffness"], friction_ratio=v["friction_ratio"]
+        ),
+        cost=c.cost._replace(maximum=v["cost_maximum"]),
+    )
+    checks.check(the_scene, c)
+    return c
+
+
+def left(path: Path = DATA) -> np.ndarray:
+    """Sets that no target ruled out, of a file of scores, in the unit cube, (set, constant)."""
+    with np.load(path, allow_pickle=False) as file:
+        return file["units"][(file["distances"] <= CUTOFF).all(-1)]
+
+
+# --- a wave ---------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Wave:
+    """Landscapes of sets: all designs of a set meet the same trials, of the key (seed, set)."""
+
+    scene: Scene
+    engine: Engine
+    space: DesignSpace
+    units: np.ndarray
+    points: int = 12
+    trials: int = 6
+    seed: int = 0
+    chunk: int = LIMIT
+
+    def designs(self) -> np.ndarray:
+        """The grid, shape (points, points, 2), first parameter first."""
+        low, high = self.space.low, self.space.high
+        axes = [np.linspace(a, b, self.points) for a, b in zip(low, high, strict=True)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).astype(np.float32)
+
+    def costs(self, done: list[np.ndarray], say: Callable[[list[np.ndarray]], Any]) -> np.ndarray:
+        """Costs of every trial, (set, point, point, trial), NaN where it failed.
+
+        `done` are those of the first sets; `say` is told all costs so far after each call.
+        """
+        flat = self.designs().reshape(-1, 2)
+        each = max(1, self.chunk // (len(flat) * self.trials))
+        every = numbers(self.scene, values(self.units))
+        root = jax.random.key(self.seed)
+
+        @jax.jit
+        def simulate(constants: Constants, keys: jax.Array) -> Any:
+            draw = lambda key: rollout.sample_trials(self.scene, key, self.trials)  # noqa: E731
+            set_, design, trial = jnp.indices((each, len(flat), self.trials)).reshape(3, -1)
+            params = jax.tree.map(lambda v: v[design], jax.vmap(self.space.params)(flat))
+            drawn = jax.tree.map(lambda v: v[set_, trial], jax.vmap(draw)(keys))
+            own = jax.tree.map(lambda v: v[set_] if jnp.ndim(v) else v, constants)
+            return rollout.simulate(self.scene, self.engine, params, drawn, constants=own)[0]
+
+        for first in range(sum(len(d) for d in done), len(self.units), each):
+            # Filled up with the last set, so that every call has the compiled size.
+            index = np.minimum(np.arange(first, first + each), len(self.units) - 1)
+            part = lambda v, i=index: jnp.asarray(v[i] if np.ndim(v) else v, jnp.float32)  # noqa: E731
+            keys = jax.vmap(lambda i: stream_key(root, STREAM_WAVE, i))(jnp.asarray(index))
+            found = jax.tree.map(np.asarray, simulate(jax.tree.map(part, every), keys))
+            cost = np.where(failed(found.status), np.nan, found.cost)
+            cost = cost.reshape(each, self.points, self.points, self.trials)
+            done.append(cost[: len(self.units) - first].astype(np.float32))
+            say(done)
+        return np.concatenate(done)
+
+
+STREAM_WAVE = 0x67726964
+"""Stream of the noise of a wave's trials ("grid")."""
+
+
+# --- the particle filter on a landscape -----------------------------------------------------------
+
+STRATEGIES = ("single", "switch-4", "concurrent")
+RUNS, PARTICLES, EPISODES, TRIALS, TEST = 30, 10, 64, 6, 42
+CANDIDATES, SCREEN, FINAL = 64, 1_000_000, 1_000_001
+"""Seed candidates of a run; numbers of the draws that belong to no episode."""
+
+
+def on_landscapes(space: DesignSpace, shapes: int = 3) -> Callable[..., Any]:
+    """Returns the function (costs, shared) -> (mean cost of episodes, success) of `STRATEGIES`.
+
+    A trial of a design is one of the landscape's, drawn with the object whose turn it is, its cost
+    interpolated between the grid's points.  Costs have shape (set, point, point, trial), results
+    (set, strategy, run, episode) and (set, strategy, run); `shared`: particles of an episode meet
+    the same trials.
+    """
+    optimizer: ParticleFilter = codesign.make_filter(space)
+    domain = np.asarray(space.is_morphology)
+    first = ["morphology" if r % 2 == 0 else "control" for r in range(RUNS)]
+    masks = jnp.array([[schedule(s, domain, EPISODES, f) for f in first] for s in STRATEGIES])  # type: ignore[arg-type]
+    low, high = (jnp.asarray(v) for v in (optimizer.space.low, optimizer.space.high))
+
+    def trial_cost(landscape: jax.Array, design: jax.Array, trial: jax.Array) -> jax.Array:
+        points = jnp.array(landscape.shape[:2])
+        place = (design - low) / (high - low) * (points - 1)
+        i, j = corner = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, points - 2)
+        (a, b), at = place - corner, (i, j, trial)
+        square = jax.lax.dynamic_slice(landscape, at, (2, 2, 1))[..., 0]
+        return jnp.array([1 - a, a]) @ square @ jnp.array([1 - b, b])
+
+    def costs(landscape, particles, key, number, shared, trials):
+        own = stream_key(key, 0x6C616E64, jnp.asarray(number, jnp.int32))
+        keys = jax.vmap(lambda i: jax.random.fold_in(own, i))(
+            jnp.where(shared, 0, jnp.arange(len(particles)))
+        )
+
+        def draw(key: jax.Array) -> jax.Array:
+            turn = jax.random.randint(key, (trials,), 0, landscape.shape[-1] // shapes)
+            return turn * shapes + jnp.arange(trials) % shapes
+
+        every = jax.vmap(jax.vmap(trial_cost, (None, None, 0)), (None, 0, 0))
+        return every(landscape, particles, jax.vmap(draw)(keys)).mean(-1)
+
+    def run(landscape, key, mask, shared):
+        drawn = candidates(key, optimizer.space, np.arange(CANDIDATES))
+        poor = costs(landscape, drawn, key, SCREEN, shared, TRIALS) > codesign.SEED_COST
+        start = State(jnp.tile(drawn[jnp.argmax(poor)], (PARTICLES, 1)), jnp.int32(0), key)
+
+        def episode(state: State, mask: jax.Array) -> tuple[State, jax.Array]:
+            moved = optimizer.ask(state, mask)
+            cost = costs(landscape, moved, key, state.episode, shared, TRIALS)
+            new, info = optimizer.tell(state, moved, cost)
+            return new, info.mean_cost
+
+        end, mean = jax.lax.scan(episode, start, mask)
+        test = costs(landscape, end.particles, key, FINAL, shared, TEST)
+        return mean, (test < codesign.SUCCESS_COST).any()
+
+    over_runs = jax.vmap(run, (None, 0, 0, None))
+    over_sets = jax.vmap(jax.vmap(over_runs, (None, None, 0, None)), (0, None, None, None))
+    keys = jax.vmap(jax.random.key)(np.arange(RUNS))
+    return jax.jit(lambda landscapes, shared: over_sets(landscapes, keys, masks, shared))
+
+
+def episodes_to_converge(mean: np.ndarray, *, stays: bool) -> np.ndarray:
+    """Episodes until the mean cost stays below 1, or first is below it; or infinity."""
+    below = np.asarray(mean) < codesign.CONVERGED_COST
+    last = below.shape[-1]
+    if stays:
+        count = last - np.minimum.accumulate(below[..., ::-1], -1).sum(-1) + 1.0
+    else:
+        count = np.argmax(below, -1) + np.where(below.any(-1), 1.0, np.inf)
+    return np.where(count > last, np.inf, count)
+
+
+# --- the paper's statements -----------------------------------------------------------------------
+
+
+def saddle(cost: np.ndarray) -> float:
+    """Highest cost above which all ways between two regions of low cost rise, or 0."""
+    apart = 0.0
+    for height in np.arange(0.5, 3.01, 0.125):
+        basins, count = ndimage.label(cost < height, structure=np.ones((3, 3)))  # type: ignore[misc]
+        low = [((cost < 0.5) & (basins == k)).mean() >= 0.01 for k in range(1, count + 1)]
+        apart = float(height) if sum(low) > 1 else apart
+    return apart
+
+
+def score(costs: np.ndarray, maximum: np.ndarray, space: DesignSpace) -> dict[str, np.ndarray]:
+    """Implausibility of each set by each of the paper's statements, by name, shape (set,).
+
+    Costs are those of `Wave.costs`; `maximum` is the scale of each set's cost, shape (set,).
+    """
+    good = np.isfinite(costs)
+    mean = np.where(good, costs, 0).sum(-1) / np.maximum(good.sum(-1), 1)
+    mean = np.where(good.any(-1), mean, maximum[:, None, None])
+    filled = np.where(good, costs, mean[..., None]).astype(np.float32)
+    run, found = on_landscapes(space), {}
+    success: dict[str, np.ndarray] = {}
+    for noise in ("shared", "own"):
+        parts = [run(filled[i : i + 32], noise == "shared") for i in range(0, len(filled), 32)]
+        every, kept = (np.concatenate([np.asarray(p[k]) for p in parts]) for k in (0, 1))
+        for k, name in enumerate(STRATEGIES):
+            success[name] = kept[:, k].mean(-1)  # of "own", the last one
+            for kind in ("first", "stays"):
+                episodes = episodes_to_converge(every[:, k], stays=kind == "stays")
+                middle = np.median(np.minimum(episodes, EPISODES + 1), axis=-1)
+                found[name, kind, noise] = np.log(PARTICLES * TRIALS * middle)
+
+    def at_least(value: Any, wanted: Any, deviation: float) -> np.ndarray:
+        return np.maximum(wanted - value, 0.0) / deviation
+
+    single, some, all_at_once = (success[s] for s in STRATEGIES)
+    # Deviations: of the logarithm of a median of 30 runs 0.25; of a difference of two shares of 30
+    # runs sqrt(2 p (1 - p) / 30) = 0.12; of a mean of six trials near a cost of 1 0.3; of a share
+    # of 0.15 on a grid of 144 points 0.03.  That success "quickly increases" is read as 12 of 30.
+    readings = [np.abs(v - np.log(420.0)) for k, v in found.items() if k[0] == "concurrent"]
+    late = []
+    for kind in ("first", "stays"):
+        times = [found[s, kind, "own"] for s in reversed(STRATEGIES)]
+        gaps = [np.maximum(a - b, 0) for a, b in zip(times, times[1:], strict=False)]
+        late.append(np.max(gaps, 0))
+    heights = np.array([saddle(m) for m in mean])
+    return {
+        "420 simulations": np.min(readings, 0) / 0.25,
+        "two regions": at_least(heights, 1.0, 0.3),
+        "solutions": at_least((mean < 0.01).mean((1, 2)), 0.01, 0.005),
+        "poor seeds": at_least((mean > 2.0).mean((1, 2)), 0.15, 0.03),
+        "single is poor": np.maximum(
+            at_least(0.5 * all_at_once, single, 0.12), at_least(all_at_once - single, 0.4, 0.12)
+        ),
+        "concurrent succeeds": at_least(all_at_once, np.maximum(single, some), 0.12),
+        "switching is faster": np.min(late, 0) / 0.25,
+    }
+
+
+def main() -> int:
+    """Runs the command and returns the exit status."""
+    parser = provenance.parser(__doc__)
+    parser.add_argument("command", choices=("wave", "score"))
+    parser.add_argument("file", type=Path, nargs="?", help="file of a wave to score")
+    parser.add_argument("--out", type=Path, default=Path("runs/wave.npz"))
+    parser.add_argument("--sets", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
+    args = parser.parse_args()
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "2d")
+    if args.command == "score":
+        with np.load(args.file or args.out, allow_pickle=False) as file:
+            units, costs = file["units"], file["costs"]
+        units = units[: len(costs)]
+        found = score(costs, values(units)["cost_maximum"], space)
+        distances = np.stack([*found.values()], -1)
+        path = (args.file or args.out).with_name(f"{(args.file or args.out).stem}_scores.npz")
+        output.write_arrays(path, {"units": units, "distances": distances})
+        print(f"{path}: {len(left(path))} of {len(units)} sets are not ruled out")
+        for name, distance in found.items():
+            print(f"{name}: rules out {(distance > CUTOFF).sum()}")
+        return 0
+    units, done = space_filling(args.sets, args.seed), []
+    if args.out.exists():
+        with np.load(args.out, allow_pickle=False) as file:
+            done = [file["costs"]]
+    engine = make_engine("structured", the_scene)
+    wave = Wave(the_scene, engine, space, units, seed=args.seed, chunk=args.chunk)
+
+    def keep(parts: list[np.ndarray]) -> None:
+        output.write_arrays(args.out, {"units": units, "costs": np.concatenate(parts)})
+        print(f"{sum(len(p) for p in parts)} of {len(units)} sets", flush=True)
+
+    wave.costs(done, keep)
+    notes = provenance.results(args.commit) | {"scene_sha256": provenance.scene_hash(the_scene)}
+    output.write_json(args.out.with_suffix(".json"), notes)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,424 @@
+"""Kills, failing disks, damage and hostile input: `make faults`, pytest's module of it.
+
+A run that was killed, or met a failing disk, goes on by the same command and ends bit for bit as
+one that nothing interrupted; a damaged run does so too, or is refused in words with its files as
+they were; hostile input is refused with the project's own error.  FAULTS=N asks for about N cases
+of each kind.  It needs Linux, and a C compiler for failing disks: faults_shim.c is a library that
+is loaded before all others, counts operations on files below a folder, and lets one of them fail.
+
+Hypothesis makes the input; tests/test_hostile_input.py tries a little of it.
+"""
+
+import contextlib
+import io
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import strategies as st
+
+from codesign_jax import cli, runs
+from codesign_jax import scene as scenes
+from codesign_jax.runs import scene_files
+from codesign_jax.runs.checkpoint import digest
+from codesign_jax.runs.record import to_arrays
+from codesign_jax.scene import InputError, keypaths, library, meshes
+
+CASES = int(os.environ.get("FAULTS", "10"))
+COMMAND = (
+    *("optimize", "--preset", "2d", "--particles", "4", "--trials", "3", "--test-trials", "3"),
+    *("--scene", "paper_spheres", "--episodes", "6", "--reference-trials", "0", "--seed", "3"),
+    *("--set", "discretization.links=3"),
+)
+WHOLE = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
+SOURCES = ("scene.toml", "hand.toml", "objects.toml")
+
+
+def run(*arguments: str | Path) -> tuple[int, str]:
+    """Exit status of a command in this process, and what it says."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        try:
+            code = cli.main([str(a) for a in arguments])
+        except SystemExit as stop:  # how the parser refuses, and how --help ends
+            code = int(stop.code or 0)
+    return code, said.getvalue()
+
+
+def process(*arguments: str | Path, more: dict[str, str] | None = None) -> subprocess.Popen:
+    """Starts a command."""
+    command = [sys.executable, "-m", "codesign_jax.cli", *map(str, arguments)]
+    environment, pipe, both = os.environ | (more or {}), subprocess.PIPE, subprocess.STDOUT
+    return subprocess.Popen(command, env=environment, text=True, stdout=pipe, stderr=both)
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory) -> tuple[Path, float]:
+    """A run that nothing interrupted, and the seconds that a process takes for it."""
+    folder = tmp_path_factory.mktemp("finished")
+    code, said = run(*COMMAND, "--out", folder / "first")  # compiles
+    assert code == 0, said
+    begin = time.monotonic()
+    done = process(*COMMAND, "--out", folder / "run")
+    assert done.wait() == 0, done.stdout
+    took = time.monotonic() - begin
+    assert differences(folder / "first", folder / "run") == []
+    return folder / "run", took
+
+
+def differences(one: Path, other: Path) -> list[str]:
+    """What of two runs' results is not the same bit for bit, and temporary files that were left."""
+    content = lambda path: path.read_bytes() if path.is_file() else None  # noqa: E731
+    found = [n for n in (*WHOLE, *SOURCES) if content(one / n) != content(other / n)]
+    records = [runs.load_record(folder) for folder in (one, other)]
+    digests = [record and digest(to_arrays(record)) for record in records]
+    found += ["the record"] * (digests[0] is None or digests[0] != digests[1])
+    left = [p.name for p in one.rglob("*") if p.name.endswith((".tmp", ".part"))]
+    return found + left + [p.name for p in one.rglob("*.orbax-checkpoint-tmp*")]
+
+
+# --- kills and failing disks ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", range(CASES))
+def test_a_killed_run_goes_on_bit_for_bit(number, finished, tmp_path):
+    whole, took = finished
+    chance = random.Random(number)
+    for _ in range(1 + number % 3):
+        begun = process(*COMMAND, "--out", tmp_path / "run")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            begun.wait(chance.uniform(0.05, 1.0) * took)
+        chosen = chance.choice((signal.SIGKILL, signal.SIGINT, signal.SIGTERM))
+        begun.send_signal(chosen)
+        said = begun.communicate()[0]
+        # Before the command has its handlers, a signal ends the process as it ends any other.
+        assert begun.returncode in (0, -chosen, 128 + chosen), said
+        assert "Traceback" not in said or begun.returncode == -signal.SIGINT, said
+    code, said = run(*COMMAND, "--out", tmp_path / "run")
+    assert code == 0, said
+    assert differences(tmp_path / "run", whole) == []
+
+
+SHIM = Path(__file__).with_name("faults_shim.c")
+COMPILER = shutil.which(os.environ.get("CC", "cc"))
+MODES = {"count": 0, "killed": 1, "full": 2, "broken": 3, "read-only": 4}
+
+
+@pytest.fixture(scope="session")
+def shim(tmp_path_factory) -> Callable[[Path, int, str], dict[str, str]]:
+    """A function of a folder, the number of an operation there, and what happens at it.
+
+    It returns the variables of a process: killed within a write, a full disk from there on
+    (ENOSPC), an error once (EIO), or a disk that cannot be written from there on (EROFS).
+    """
+    if COMPILER is None:
+        pytest.skip("no C compiler: install one as `cc`, or name it in CC")
+    place = tmp_path_factory.mktemp("shim") / "shim.so"
+    flags = ["-O1", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([COMPILER, *flags, "-o", place, SHIM, "-ldl", "-lpthread"], check=True)
+    return lambda folder, at, mode: {
+        "LD_PRELOAD": str(place),
+        "FAULTS_FOLDER": str(folder),
+        "FAULTS_AT": str(at),
+        "FAULTS_MODE": str(MODES[mode]),
+    }
+
+
+@pytest.mark.parametrize("number", range(CASES))
+@pytest.mark.parametrize("mode", [m for m in MODES if m != "count"])
+def test_a_run_whose_disk_fails_says_so_and_goes_on(mode, number, finished, tmp_path, shim):
+    folder = tmp_path / "run"
+    at = random.Random(f"{mode} {number}").randrange(1, 400)
+    begun = process(*COMMAND, "--out", folder, more=shim(folder, at, mode))
+    said = begun.communicate()[0]
+    if mode == "killed":
+        assert begun.returncode in (0, -signal.SIGKILL), said
+    elif begun.returncode != 0:  # 0: an operation that it can do without, or none so late
+        assert begun.returncode in (1, 2) and "error:" in said and "Traceback" not in said, said
+    code, said = run(*COMMAND, "--out", folder)
+    assert code == 0, said
+    assert differences(folder, finished[0]) == []
+
+
+# --- damage ---------------------------------------------------------------------------------------
+
+
+def damaged(path: Path, way: str) -> None:
+    """Damages a file."""
+    data = path.read_bytes()
+    middle = len(data) // 2
+    if way == "deleted":
+        path.unlink()
+    elif way == "a folder":
+        path.unlink()
+        path.mkdir()
+    else:
+        flipped = data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :] if data else b"x"
+        ways = {"emptied": b"", "half": data[:middle], "zeros": bytes(len(data))}
+        ways |= {"flipped": flipped, "longer": data + b"\n\x00more", "other": bytes(range(256))}
+        path.write_bytes(ways[way])
+
+
+WAYS = ("deleted", "a folder", "emptied", "half", "zeros", "flipped", "longer", "other")
+READERS = (("evaluate", "--dry-run", "--run"), ("landscape", "--dry-run"), ("report",), ("export",))
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_damage_is_mended_or_refused(way, finished, tmp_path):
+    """Each file of the newest checkpoint and of the folder in turn; readers never fail unsaid."""
+    whole = finished[0]
+    names = [p.relative_to(whole) for p in sorted(whole.rglob("*")) if p.is_file()]
+    newest = max(int(n.parts[1]) for n in names if len(n.parts) > 2 and n.parts[1].isdigit())
+    chosen = [n for n in names if len(n.parts) == 1 or n.parts[1].split(".")[0] == str(newest)]
+    random.Random(way).shuffle(chosen)
+    for name in chosen[: 2 * CASES]:
+        folder = Path(shutil.copytree(whole, tmp_path / "run", symlinks=True))
+        damaged(folder / name, way)
+        before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+        for reader, *flags in READERS:
+            out = ["--out", tmp_path / "out"] if reader in ("export", "report") else []
+            out = ["--out", tmp_path / "out.html"] if reader == "report" else out
+            code, said = run(reader, *flags, folder, *out) if reader != "export" else (0, "")
+            assert code in (0, 1, 2) and (code == 0 or "error:" in said), (name, reader, said)
+        code, said = run(*COMMAND, "--out", folder)
+        if code:
+            assert code in (1, 2) and "error:" in said, (name, said)
+            after = {p: p.read_bytes() for p in before if p.is_file()}
+            assert after == {p: v for p, v in before.items() if p in after}, name
+        else:
+            assert differences(folder, whole) == [], name
+        shutil.rmtree(folder)
+
+
+# --- hostile input --------------------------------------------------------------------------------
+
+NUMBERS = (
+    *("0", "-1", "1", "1e308", "-1e308", "1e-320", "1e999", "inf", "-inf", "nan", "-0.0", "0x10"),
+    *("9" * 400, "9" * 5000, "0x" + "f" * 5000, "1e", "1_000", "01", "true", "2147483648"),
+    *("9223372036854775808", "0.1", "200", "3", "1979-05-27", "07:32:00", "1e-9", "25", "100"),
+)
+TEXTS = (
+    *("", " ", ".", "..", "/etc/passwd", "../../x", "a/b", "nan", "-x", "~", "paper", "full", "2d"),
+    *("a\u2028b", "a\u2029b", "a\u0085b", "a\x00b", "a\x1b[31mb", "a\rb", "a\nb", "\ufeffa"),
+    *(
+        "\u202ea",
+        "é" * 200,
+        "x" * 5000,
+        "<img src=x>",
+        "a.toml",
+        "none.toml",
+        "%j",
+        "$(id)",
+        "日本",
+    ),
+    *("😀", "a" * 300 + ".toml", "\\", '"', "a\\u0000b", "[0]", "\udcff", "\ud800"),
+)
+VALUES = (
+    *("[]", "{}", "[[]]", "[{}]", "[1, 2]", "[1, 'a']", "{a = 1}", "''", "'''\na'''", "[nan]"),
+    *("[15, 20, 25, 30]", "[1e308, 1, 2, 3]", "[nan, 1, 2, 3]", "[20]", "[20, 20, 20]", "[true]"),
+    *("[" * 2000, "[" * 50 + "]" * 50, "{a=" * 100 + "1" + "}" * 100, "[" + "0," * 2000 + "]"),
+)
+KEYS = (
+    *("gravity", "name", "hand", "hand.name", "objects.name", "objects.object.sphere.name"),
+    *("objects.object.sphere.size", "objects.object[0].mass", "hand.finger[1].tilt", "effects"),
+    *("hand.parameter.height.high", "hand.preset.2d.fixed.height", "hand.finger", "solver.x"),
+    *("objects.noise.size", "discretization.links", "phases.lift", "effects.surface"),
+    *("hand.finger[" + "9" * 5000 + "].tilt", "a." * 2000 + "b", "", ".", "..", "x[0][0]"),
+    *("gravity.x", "objects.object", "hand.finger[-1].tilt", "objects.object.sphere.file"),
+)
+SECONDS = 20.0
+"""Processor time within which input is refused."""
+hostile_value = st.sampled_from((*NUMBERS, *VALUES, *(f'"{t}"' for t in TEXTS)))
+pair = st.builds(
+    "{}{}{}".format,
+    st.sampled_from(KEYS),
+    st.sampled_from(("=", "=", "=", "", " = ")),
+    st.one_of(hostile_value, st.sampled_from((*TEXTS, "1\nx = 2"))),
+)
+
+
+@st.composite
+def damaged_bytes(draw: Any, data: bytes) -> bytes:
+    """Bytes of which some are other ones, gone, doubled or new."""
+    at = draw(st.integers(0, max(len(data) - 1, 0)))
+    end = at + draw(st.sampled_from((0, 1, 4, 50, len(data))))
+    new = draw(st.one_of(st.binary(max_size=8), st.just(data[at : at + 100] * 10)))
+    return data[:at] + new + data[end:]
+
+
+@st.composite
+def toml_files(draw: Any, kinds: tuple[str, ...] = ("scenes", "hands", "objects", "accuracy")):
+    """A kind of file and its bytes: a built-in one with one to three hostile changes."""
+    kind = draw(st.sampled_from(kinds))
+    # Sets with meshes take seconds to read.
+    paths = [p for n, p in sorted(library.available(kind).items()) if n != "household"]
+    text = draw(st.sampled_from(paths)).read_text(encoding="utf-8")
+    places = re.compile(r'(?<== ).*|-?\d[\d_.]*(e-?\d+)?|"[^"\n]*"|^[\w.]+(?= =)', re.M)
+    for _ in range(draw(st.integers(1, 3))):
+        lines = text.split("\n")
+        if draw(st.booleans()) and (found := [*places.finditer(text)]):
+            match = found[draw(st.integers(0, len(found) - 1))]
+            text = text[: match.start()] + draw(hostile_value) + text[match.end() :]
+        else:
+            i, j = (draw(st.integers(0, len(lines) - 1)) for _ in range(2))
+            line = st.builds("{} = {}".format, st.sampled_from(KEYS), hostile_value)
+            lines[i : draw(st.sampled_from((i, i + 1, i + 5)))] = draw(
+                st.one_of(st.just([lines[j]] * 20), st.lists(line, max_size=2))
+            )
+            text = "\n".join(lines)
+    data = text.encode("utf-8", "surrogatepass")
+    return kind, draw(st.one_of(st.just(data), damaged_bytes(data)))
+
+
+FLAGS = (
+    *("--scene", "--hand", "--objects", "--accuracy", "--preset", "--schedule", "--optimizer"),
+    *("--engine", "--particles", "--trials", "--episodes", "--seed", "--seeds", "--devices"),
+    *("--chunk", "--points", "--design", "--run", "--out", "--episode", "--object", "--set"),
+)
+NEVER = {
+    # No case simulates: these are refused by their last argument, once all others were read.
+    **dict.fromkeys(("optimize", "evaluate", "landscape"), ("--dry-run",)),
+    **{"render": ("--times", "-1"), "export": ("--mould-wall", "-1"), "scenes": ()},
+    **{"replay": ("--out", "no.txt"), "report": ("--engine", "none")},
+}
+
+
+@st.composite
+def command_lines(draw: Any) -> list[str]:
+    """Arguments with a few hostile ones, of a command that simulates nothing."""
+    command = draw(st.sampled_from([*NEVER]))
+    text = st.one_of(st.sampled_from((*TEXTS, *NUMBERS)), pair, st.text(max_size=5))
+    flag = st.tuples(st.sampled_from(FLAGS), text)
+    words = [word for one in draw(st.lists(flag, max_size=3)) for word in one]
+    return [command, *words, *draw(st.lists(text, max_size=1)), *NEVER[command]]
+
+
+@st.composite
+def mesh_files(draw: Any) -> tuple[str, bytes]:
+    """A format and the bytes of a mesh in it, damaged or of an odd size."""
+    kind = draw(st.sampled_from(("stl", "obj", "ply", "off", "glb")))
+    thin = tuple(draw(st.sampled_from((1e-6, 1e-4, 0.01, 0.05))) for _ in range(2))
+    mesh = draw(
+        st.sampled_from(
+            (
+                trimesh.creation.box((0.3, *thin)),
+                trimesh.creation.icosphere(2, 0.03),
+                trimesh.creation.torus(0.03, 0.01, 12, 8),
+            )
+        )
+    ).copy()
+    mesh.apply_scale(draw(st.sampled_from((1e-3, 1.0, 1.0, 1e3))))
+    exported: Any = mesh.export(file_type=kind)
+    data = exported.encode() if isinstance(exported, str) else exported
+    if draw(st.booleans()):
+        at = draw(st.integers(0, max(len(data) - 4, 0)))
+        number = draw(st.sampled_from((np.nan, np.inf, 1e38, 1e-45, 0.0)))
+        data = data[:at] + np.float32(number).tobytes() + data[at + 4 :]
+    return kind, draw(st.one_of(st.just(data), damaged_bytes(data)))
+
+
+def refused(trial: Callable[[], Any]) -> bool:
+    """Whether the project's own error, with words, refuses a trial; another one is passed on."""
+    begin = time.process_time()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            trial()
+    except InputError as error:
+        assert str(error).strip(), "an error without a word"
+        assert time.process_time() - begin < SECONDS
+        return True
+    return False
+
+
+def try_toml(kind: str, data: bytes, folder: Path) -> bool:
+    """Loads a file; a scene that is accepted reads back as it was written."""
+    path = folder / "mutated.toml"
+    path.write_bytes(data)
+    names = {"scenes": "scene", "hands": "hand_name", "objects": "object_set"}
+    how: dict[str, Any] = {names.get(kind, kind): str(path)}
+    loaded: list[scenes.Scene] = []
+    if refused(lambda: loaded.append(scenes.load(how.pop("scene", "paper"), **how))):
+        return True
+    reads_back(loaded[0], folder)
+    return False
+
+
+def reads_back(loaded: scenes.Scene, folder: Path) -> None:
+    """A scene is the same after it was written."""
+    texts = scene_files.scene_texts(loaded)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    again = scenes.load(folder / "scene.toml")
+    assert again == loaded or scene_files.scene_texts(again) == texts
+
+
+def try_command(arguments: list[str], folder: Path) -> bool:
+    """Runs a command line in a folder: exit status 0 or 2, and no files are left."""
+    with contextlib.chdir(folder):
+        code, said = run(*arguments)
+    assert code in (0, 2) and not [*folder.iterdir()], (arguments, code, said[-500:])
+    return code == 2
+
+
+def try_mesh(kind: str, data: bytes, folder: Path) -> bool:
+    """Reads a mesh; what is accepted is finite and has a volume."""
+    path = folder / f"mutated.{kind}"
+    path.write_bytes(data)
+    found: list[Any] = []
+    how = {"unit": "m", "repaired": True, "voxel_error": 5e-3}
+    if refused(lambda: found.append(meshes.load(path, **how))):
+        return True
+    solid = found[0]
+    numbers = (solid.grid.values, solid.support, solid.vertices, solid.inertia, solid.upright)
+    assert all(np.isfinite(v).all() for v in numbers) and solid.volume > 0
+    return False
+
+
+def often(count: int) -> Any:
+    """Settings of Hypothesis for so many examples."""
+    checks = hypothesis.HealthCheck
+    calm = [checks.too_slow, checks.data_too_large, checks.function_scoped_fixture]
+    calm += [checks.filter_too_much, checks.large_base_example]
+    return hypothesis.settings(max_examples=count, deadline=None, suppress_health_check=calm)
+
+
+@often(200 * CASES)
+@hypothesis.given(toml_files())
+def test_toml_files(tmp_path, case):
+    kind, data = case
+    try_toml(kind, data, tmp_path)
+
+
+@often(200 * CASES)
+@hypothesis.given(st.lists(pair, min_size=1, max_size=2))
+def test_values(tmp_path, pairs):
+    load = lambda: reads_back(scenes.load("paper", overrides=keypaths.parse(pairs)), tmp_path)  # noqa: E731
+    refused(load)
+
+
+@often(20 * CASES)
+@hypothesis.given(command_lines())
+def test_command_lines(tmp_path, arguments):
+    (tmp_path / "work").mkdir(exist_ok=True)
+    try_command(arguments, tmp_path / "work")
+
+
+@often(20 * CASES)
+@hypothesis.given(mesh_files())
+def test_mesh_files(tmp_path, case):
+    kind, data = case
+    try_mesh(kind, data, tmp_path)

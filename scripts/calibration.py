@@ -98,11 +98,7 @@ def values(units: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Constants:
-    """The scene's numbers with those of sets in them: leaves of shape () or (set,).
-
-    Raises:
-      InputError: If a finger has no base point of its own, or a value is out of its range.
-    """
+    """The scene's numbers with those of sets in them: leaves of shape () or (set,)."""
     if any(f.base is None for f in the_scene.hand.finger):
         raise InputError(["calibration moves base points; give each finger a base"])
     c, v = the_scene.constants(), chosen

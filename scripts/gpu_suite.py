@@ -79,14 +79,7 @@ class Recorder:
 
 
 def rate(name: str, values: dict[str, Any], wait: Callable[[], Any]) -> dict[str, Any]:
-    """World-steps a second of short rollouts in contact or of whole grasps; the times of gradients.
-
-    Args:
-      name: Name of the case.
-      values: Its overrides of the scene, object set, dtype, number of worlds, whether grasps are
-        whole.
-      wait: Called when everything is compiled; returns when the GPU is free.
-    """
+    """World-steps a second in contact or of whole grasps; the times of gradients."""
     values = dict(values)
     if "gradient" in values:
         found = gradients.cost(scenes.load(values["scene"]), values["gradient"], wait)

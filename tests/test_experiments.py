@@ -280,13 +280,7 @@ def test_paired_tests():
     assert statistics.trend(np.zeros((4, 30))) == 1.0
 
 
-def test_unpaired_tests_and_several_comparisons():
-    a, b = np.arange(10) < 9, np.arange(10) < 1
-    # All tables of these margins that are no likelier: 2 (1 * 1 + 10 * 10) of C(20, 10).
-    assert statistics.fisher(a, b) == pytest.approx(2 * 101 / 184756)
-    slow, fast = np.full(30, np.inf), np.arange(30.0)
-    assert statistics.mann_whitney(slow, fast) < 1e-3
-    assert statistics.mann_whitney(slow, slow) == 1.0
+def test_several_comparisons():
     # The step-down procedure by hand: 4 * 0.005, 3 * 0.01, 2 * 0.03, and no smaller than that.
     found = statistics.holm([0.01, 0.04, 0.03, 0.005])
     np.testing.assert_allclose(found, [0.03, 0.06, 0.06, 0.02])

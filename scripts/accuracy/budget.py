@@ -209,13 +209,7 @@ KEPT, FAILED, _PARTS = 255, 254, 250
 
 
 def encode(lost: np.ndarray, bad: np.ndarray, window: tuple[float, float]) -> str:
-    """Times of loss as text: a byte a trial, compressed, in base 64.
-
-    Args:
-      lost: Times of loss [s], infinite where the object is kept, shape (design, trial).
-      bad: Whether the trial failed, same shape.
-      window: Start and end of the time in which a loss costs [s]; a byte counts its 250th parts.
-    """
+    """Times of loss as text: a byte a trial, compressed, in base 64."""
     start, end = window
     share = np.clip((np.where(np.isfinite(lost), lost, end) - start) / (end - start), 0, 1)
     code = np.where(np.isfinite(lost), np.round(_PARTS * share), KEPT)

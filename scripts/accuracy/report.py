@@ -78,10 +78,6 @@ def mean_costs(cost: np.ndarray) -> np.ndarray:
 def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Interval]:
     """A variant beside another one over the same designs and trials, of which b may have more.
 
-    Args:
-      a: Costs, shape (design, trial), NaN where a trial failed.
-      b: The other's.
-
     Returns:
       The difference of success, the share of verdicts that flip and the rank correlation of mean
       costs, each with its interval of 95 % over designs and trials.
@@ -322,13 +318,7 @@ def _marks(axis: Axes, places: list[Place]) -> None:
 
 
 def _names(axis: Axes, places: list[Place], unit: float = 1) -> None:
-    """Joins the marks of a setting by a line, with its name in the widest gap.
-
-    Args:
-      axis: Axis whose scales and limits are final.
-      places: Marks.
-      unit: What the axis shows of an error of one.
-    """
+    """Joins the marks of a setting by a line, with its name in the widest gap."""
     names = sorted({p.setting for p in places})
     rows = [sorted((p.rate, unit * p.error.value) for p in places if p.setting == n) for n in names]
     heights = _apart(axis, [row[0] for row in rows])

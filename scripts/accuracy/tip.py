@@ -38,14 +38,7 @@ def motion(
     setting: tuple[float, int, str], engine: str = "structured", hands: int = HANDS,
     seconds: float = SECONDS,
 ) -> np.ndarray:  # fmt: skip
-    """Tips of hands in the air [m], shape (hand, time, finger, 3), every `EVERY` from the start.
-
-    Args:
-      setting: Time step [s], links and `discretization.spring_damping`.
-      engine: "structured", or "mujoco", which is MuJoCo C step by step in float64.
-      hands: Number of hands, in turn random and good ones.
-      seconds: Simulated time.
-    """
+    """Tips of hands in the air [m], shape (hand, time, finger, 3), every `EVERY` from the start."""
     step, links, damping = setting
     sizes = {"timestep": step, "links": links, "spring_damping": damping}
     scene = load("paper", overrides={**IN_THE_AIR, "discretization": sizes})

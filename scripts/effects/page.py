@@ -82,16 +82,7 @@ def _same(rows: dict[str, Any], name: str) -> bool:
 
 
 def write(results: dict[str, Any], page: Path, note: Path) -> None:
-    """Puts the tables between the pages' marks; what stands around them stays.
-
-    Args:
-      results: The measured file.
-      page: The user's page, with the mark of "support".
-      note: The note of the study, with the mark of "measured".
-
-    Raises:
-      ValueError: If a page lacks its mark.
-    """
+    """Puts the tables between the pages' marks; what stands around them stays."""
     p = results["provenance"]
     load = [f"{results[k][0]:.1f}" for k in ("load_before", "load_after") if k in results]
     worlds = results["effects"][REFERENCE].get("worlds", 0)

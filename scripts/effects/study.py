@@ -151,15 +151,7 @@ class Steps(NamedTuple):
 def compile_steps(
     scene: Scene, worlds: Worlds, at: Moment, compiled: dict[str, Any], *, new: bool = True
 ) -> Steps:
-    """Compiles the kernel of some steps from a state of the grasps.
-
-    Args:
-      scene: The scene.
-      worlds: The grasps.
-      at: Where they are.
-      compiled: Programs by digest: effects that are not in the step give the same kernel.
-      new: Whether a program that is not among them is compiled.
-    """
+    """Compiles the kernel of some steps from a state of the grasps."""
     engine = StructuredEngine(scene)
     fields, ctrl = inputs(scene, worlds)
     q, v = (jnp.asarray(x, fields.start.dtype) for x in (at.qpos, at.qvel))
@@ -174,10 +166,6 @@ def compile_steps(
 
 def measure(programs: dict[str, Steps], repeats: int) -> dict[str, list[float]]:
     """Times programs in turn, so that a busy machine slows all alike.
-
-    Args:
-      programs: Compiled programs.
-      repeats: Rounds over all of them.
 
     Returns:
       Seconds of a step of one world, a list for each program.

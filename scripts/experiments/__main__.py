@@ -5,7 +5,6 @@ timeout -s INT 500 python -m scripts.experiments 2d --out runs/reproduction    #
 python -m scripts.experiments 2d --out runs/big --share 1/4        # beside 2/4, 3/4 and 4/4
 python -m scripts.experiments 2d --out runs/big --gather           # then: results of all shares
 python -m scripts.experiments 2d --out runs/small --size cpu       # minutes on a CPU
-python -m scripts.experiments types --videos docs/figures            # what the landscape's hands do
 python -m scripts.experiments figures                                # of docs/data/experiments
 """
 
@@ -21,18 +20,18 @@ from rich.console import Console
 from codesign_jax import runs, scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
-from codesign_jax.engines import NAMES, make_engine
+from codesign_jax.engines import NAMES
 from codesign_jax.runs.together import Timing
 from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.scene.schema import InputError
-from scripts.experiments import landscape, plan, results, strategies
+from scripts.experiments import landscape, plan, report, results, strategies
 from scripts.shared import output, provenance
 
 
 def parse() -> argparse.Namespace:
     """Reads the command line."""
     parser = provenance.parser(__doc__)
-    parser.add_argument("experiment", choices=[*plan.PAPER, "types", "figures"])
+    parser.add_argument("experiment", choices=[*plan.PAPER, "figures"])
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
     parser.add_argument(
         "--scene",
@@ -40,7 +39,6 @@ def parse() -> argparse.Namespace:
         help="built-in scene or file",
     )
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
-    parser.add_argument("--preset", dest="size", choices=list(plan.OVERRIDES), help="as --size")
     parser.add_argument(
         "--strategies",
         type=lambda s: s.split(","),
@@ -70,7 +68,6 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
-    parser.add_argument("--videos", type=Path, help="folder for a video of each grasp type")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
     return parser.parse_args()
 
@@ -184,51 +181,10 @@ def _write(
         print(output.write_arrays(args.trials, found))
 
 
-def find_types(args: argparse.Namespace) -> int:
-    """Clusters what the hand does in the landscape's good designs, and shows it."""
-    from scripts.experiments import grasp_types, study
-    from scripts.experiments.figures import LANDSCAPE_THRESHOLD
-
-    common.use_compilation_cache()
-    grid = study.load(args.data, "landscape")
-    if grid is None:
-        sys.exit(f"error: {args.data} holds no landscape.npz")
-    overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
-    the_scene = scene.load(args.scene, overrides=overrides)
-    space = parameters.design_space(the_scene.hand, "2d")
-    engine = make_engine(args.engine, the_scene)
-    found = study.load(args.data, "types")
-    if found is None or args.fresh:
-        arrays = grasp_types.study(grid[0], the_scene, engine, space, LANDSCAPE_THRESHOLD)
-        notes = {
-            **provenance.results(args.commit),
-            "settings": {
-                "scene_sha256": provenance.scene_hash(the_scene),
-                "engine": args.engine,
-                "threshold": LANDSCAPE_THRESHOLD,
-            },
-        }
-        results.write(args.data, "types", arrays, notes)
-    else:
-        arrays = found[0]
-    print(grasp_types.describe(grid[0], arrays))
-    if args.videos:
-        for path in grasp_types.videos(grid[0], arrays, the_scene, engine, space, args.videos):
-            print(path)
-    return 0
-
-
 def main() -> int:
-    """Runs the command and returns the exit status."""
     args = parse()
-    if args.experiment not in ("types", "figures"):
+    if args.experiment != "figures":
         return simulate(args)
-    try:
-        if args.experiment == "types":
-            return find_types(args)
-        from scripts.experiments import report
-    except ModuleNotFoundError as error:
-        sys.exit(f"error: {error.name} is missing: pip install 'codesign-jax[study]'")
     print(report.make(args.data, args.figures, args.page))
     return 0
 

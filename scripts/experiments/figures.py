@@ -82,16 +82,8 @@ def landscape(
     data: dict[str, np.ndarray],
     path: Path,
     threshold: float = LANDSCAPE_THRESHOLD,
-    types: np.ndarray | None = None,
 ) -> Path:
-    """Draws Fig. 8: the mean cost, white where low, with the regions below the threshold.
-
-    Args:
-      data: Arrays of the landscape.
-      path: File of the figure.
-      threshold: Cost below which a point belongs to a region.
-      types: Grasp type of each point, shape (point, point), see `grasp_types`; None for none.
-    """
+    """Draws Fig. 8: the mean cost, white where low, with the regions below the threshold."""
     figure, axes = _axes(5.4, 4.4)
     x, y = data["first_axis"], data["second_axis"]
     image = axes.pcolormesh(x, y, data["exclude"].T, cmap="gray_r", shading="nearest", vmin=0)
@@ -105,11 +97,6 @@ def landscape(
         scale = np.array([np.ptp(x), np.ptp(y)])
         nearest = axis[np.argmin((((axis - region.centre) / scale) ** 2).sum(1))]
         axes.text(nearest[0], nearest[1], f"({letter})", color="tab:red", ha="center", va="center")
-    if types is not None:
-        for number in range(int(types.max()) + 1):
-            at = np.argwhere(types == number)
-            axes.plot(x[at[:, 0]], y[at[:, 1]], ".", ms=2, label=f"grasp type {number + 1}")
-        axes.legend(fontsize=8, loc="upper left", markerscale=4)
     names, units = data["parameters"], data["units"]
     axes.set(xlabel=f"{names[0]} [{units[0]}]", ylabel=f"{names[1]} [{units[1]}]")
     return pictures.save(figure, path)

@@ -39,15 +39,8 @@ EXPERIMENTS = ("2d", "23d")
 def winners(data: Path, name: str) -> tuple[list[str], np.ndarray]:
     """The final particle of each run that tested best.
 
-    Args:
-      data: Folder of the experiments.
-      name: Name of the experiment.
-
     Returns:
       Names of the strategies, and particles [SI units] of shape (strategy, run, parameter).
-
-    Raises:
-      FileNotFoundError: If the experiment is not there or has no final test.
     """
     found = study.load_study(data, name)
     if found is None or not found.tested:
@@ -61,12 +54,6 @@ def simulate(
     the_scene: scene.Scene, engine: str, every: dict[str, np.ndarray], trials: int
 ) -> dict[str, Any]:
     """Simulates the particles of all experiments as one batch of worlds.
-
-    Args:
-      the_scene: The scene.
-      engine: Name of the engine.
-      every: Particles of each experiment, shape (strategy, run, parameter).
-      trials: Trials, the same for all particles.
 
     Returns:
       `NAME|cost` (float16) and `NAME|status`, shape (strategy, run, trial).
@@ -161,14 +148,7 @@ def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> s
 def _kept(
     arrays: dict[str, np.ndarray], name: str, label: str, trials: int | None = None
 ) -> np.ndarray:
-    """Share of grasps that kept the object, failed trials left out, shape (strategy, run).
-
-    Args:
-      arrays: What was simulated.
-      name: Name of the experiment.
-      label: Accuracy.
-      trials: Number of the first trials that count; None for all.
-    """
+    """Share of grasps that kept the object, failed trials left out, shape (strategy, run)."""
     cost, status = (arrays[f"{name}|{label}|{what}"][..., :trials] for what in ("cost", "status"))
     good = ~failed(status)
     return ((cost == 0) & good).sum(-1) / np.maximum(good.sum(-1), 1)

@@ -20,15 +20,7 @@ STREAM_GRID = 0x67726964
 
 
 def grid(space: DesignSpace, points: int) -> np.ndarray:
-    """Returns the designs of a regular grid, shape (points, points, 2), first parameter first.
-
-    Args:
-      space: A design space of two parameters.
-      points: Points along either parameter, bounds included.
-
-    Raises:
-      ValueError: If the space has another number of parameters.
-    """
+    """Returns the designs of a regular grid, shape (points, points, 2), first parameter first."""
     if space.num_parameters != 2:
         raise ValueError(f"a landscape needs two parameters, got {space.names}")
     axes = [np.linspace(a, b, points) for a, b in zip(space.low, space.high, strict=True)]
@@ -48,16 +40,6 @@ def simulate(
     console: Console,
 ) -> tuple[Arrays, int]:
     """Simulates every point in the same trials; the same call goes on where it stopped.
-
-    Args:
-      plan: The experiment.
-      scene: The scene.
-      engine: Name of the engine.
-      part: File of what is done, which the caller deletes at the end.
-      seed: Root of the trials' noise.
-      chunk: Most worlds of a call.
-      devices: Devices that calls are dealt to; None for all.
-      console: Told what is done.
 
     Returns:
       `designs` (point, point, parameter), `trial_cost` and `status` (point, point, trial); and how

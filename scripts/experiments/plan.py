@@ -33,11 +33,7 @@ class Strategies:
     test_trials: int
 
     def __post_init__(self) -> None:
-        """Checks the sizes.
-
-        Raises:
-          ValueError: If the tests are not whole rounds of an episode's trials.
-        """
+        """Checks the sizes."""
         if self.test_trials % self.trials:
             raise ValueError(f"{self.test_trials=} must be a multiple of {self.trials=}")
 
@@ -104,7 +100,6 @@ TOTAL_GRASPS = sum(PAPER_GRASPS.values())
 
 _FEW = ("single", "switch-1", "switch-4", "concurrent")
 # Two links and few runs: the whole path in seconds.  Four links: some minutes on two cores.
-# Short: the paper's width for a few steps, to measure devices with.
 SMALL: dict[str, dict[str, Strategies | Landscape]] = {
     "tiny": {
         "2d": Strategies("2d", "2d", ("single", "concurrent"), 2, 2, 2, 3, 3),
@@ -116,27 +111,17 @@ SMALL: dict[str, dict[str, Strategies | Landscape]] = {
         "23d": Strategies("23d", "23d", ("single", "concurrent"), 2, 12, 16, 3, 6),
         "landscape": Landscape("landscape", "2d", 12, 6),
     },
-    "short": {
-        "2d": dataclasses.replace(_TWO, episodes=33, test_trials=6),
-        "23d": dataclasses.replace(_MANY, episodes=8, test_trials=6),
-        "landscape": Landscape("landscape", "2d", 60, 12),
-    },
 }
 OVERRIDES = {
     "paper": (),
     "tiny": ("discretization.links=2",),
     "cpu": ("discretization.links=4",),
-    "short": (),
 }
 """What the sizes change in the scene; the paper's change nothing."""
 
 
 def experiment(name: str, size: str = "paper") -> Strategies | Landscape:
-    """Returns an experiment by name in the paper's or a smaller size.
-
-    Raises:
-      RuntimeError: If the paper's sizes do not give the paper's counts.
-    """
+    """Returns an experiment by name in the paper's or a smaller size."""
     for known, expected in PAPER_GRASPS.items():
         if PAPER[known].grasps != expected:
             raise RuntimeError(f"{known}: {PAPER[known].grasps} grasps, the paper has {expected}")
@@ -150,14 +135,6 @@ def narrowed(
 
     Run r of a strategy is the same run whatever is beside it, up to rounding: its keys come from
     the seed of run r alone.
-
-    Args:
-      the_plan: The experiment.
-      strategies: Names of `optimize.schedule`; None keeps the experiment's.
-      runs: Runs of each strategy; None keeps the experiment's.
-
-    Raises:
-      ValueError: If the experiment has no strategies, or a name or number is wrong.
     """
     if strategies is None and runs is None:
         return the_plan

@@ -6,7 +6,7 @@ import numpy as np
 
 from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.types import WARNINGS
-from scripts.experiments import figures, grasp_types
+from scripts.experiments import figures
 from scripts.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
 from scripts.experiments.results import BITS
 from scripts.experiments.study import RULES, Study, load, load_study, regions
@@ -20,16 +20,11 @@ _HEAD = "| the paper | here |\n|---|---|"
 def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     """Draws the figures of whatever results there are and writes the table.
 
-    Args:
-      data: Folder of the results.
-      pictures: Folder of the figures.
-      page: Markdown page whose text between the marks is replaced; None for none.
-
     Returns:
       The table in Markdown.
     """
     studies = {name: load_study(data, name) for name in ("2d", "23d")}
-    grid, types = load(data, "landscape"), load(data, "types")
+    grid = load(data, "landscape")
     text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
     for study in studies.values():
         if study and len(study.strategies) > 1:
@@ -37,13 +32,7 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     if page:
         fill(page, text, "results")
     if grid:
-        shown = types[0]["type"] if types else None
-        figures.landscape(grid[0], pictures / "fig8_landscape.png", types=shown)
-    if grid and types:
-        table = grasp_types.describe(grid[0], types[0])
-        if page:
-            fill(page, table, "types")
-        text += f"\n\n{table}"
+        figures.landscape(grid[0], pictures / "fig8_landscape.png")
     return text
 
 
@@ -104,32 +93,24 @@ def details(study: Study) -> str:
 
 
 def _against_last(study: Study) -> list[str]:
-    """Every strategy against the last one, by tests that use the pairing of the runs or do not.
-
-    Runs of one number share seed particle and noise, so they are pairs; the tests that ignore it
-    show how much hangs on that.
-    """
+    """Every strategy against the last one; runs of one number share seed and noise: pairs."""
     episodes, good = study.convergence(), study.success()
     limit, others = study.episodes, range(len(study.strategies) - 1)
-    tests = (
-        [statistics.mcnemar(good[s], good[-1]) for s in others],
-        [statistics.fisher(good[s], good[-1]) for s in others],
-        [statistics.wilcoxon(episodes[s], episodes[-1], limit) for s in others],
-        [statistics.mann_whitney(episodes[s], episodes[-1]) for s in others],
-    )
-    columns = [statistics.holm(p) for p in tests]
+    columns = [
+        statistics.holm([statistics.mcnemar(good[s], good[-1]) for s in others]),
+        statistics.holm([statistics.wilcoxon(episodes[s], episodes[-1], limit) for s in others]),
+    ]
     many = f", adjusted by Holm's method for the {len(others)} comparisons of a column"
     lines = [
         f"{study.plan['name']}: p of a difference to {study.strategies[-1]}"
         f"{many if len(others) > 1 else ''}",
         "",
-        "| strategy | success, paired (McNemar) | unpaired (Fisher) "
-        "| convergence, paired (Wilcoxon) | unpaired (Mann-Whitney) |",
-        "|---|---|---|---|---|",
+        "| strategy | success, paired (McNemar) | convergence, paired (Wilcoxon) |",
+        "|---|---|---|",
     ]
     for s in others:
         cells = [figures.label(study.strategies[s]), *(_p(float(c[s])) for c in columns)]
-        cells[1:3] = cells[1:3] if study.tested else ["–", "–"]
+        cells[1] = cells[1] if study.tested else "–"
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 

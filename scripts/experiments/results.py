@@ -105,11 +105,6 @@ class Process(NamedTuple):
 def log(path: Path, process: Process, commit: str | None) -> list[dict[str, Any]]:
     """Notes a process that simulated something; several at once may do so.
 
-    Args:
-      path: File with a line of JSON for each process.
-      process: What this one did.
-      commit: Commit of the code, for a machine without git.
-
     Returns:
       Every process that the file has.
     """
@@ -142,15 +137,7 @@ def describe(
     *,
     commit: str | None = None,
 ) -> dict[str, object]:
-    """Returns what a result depends on, and what it took.
-
-    Args:
-      settings: See `settings_of`.
-      processes: Those that simulated it, see `log`; its commit is theirs.
-      grasps: Grasps of the experiment so far.
-      screened: Grasps that screened the seeds.
-      commit: Commit of the code, for a machine without git.
-    """
+    """Returns what a result depends on, and what it took."""
     notes = provenance.results(commit)
     commits = dict.fromkeys(str(p["commit"]) for p in processes)
     return {
@@ -165,14 +152,7 @@ def describe(
 
 
 def settings_of(plan: Any, scene: Scene, engine: str, seed: int) -> dict[str, object]:
-    """What determines the numbers of an experiment, beside code, versions and device.
-
-    Args:
-      plan: Sizes of the experiment, a dataclass of numbers and names.
-      scene: The scene.
-      engine: Name of the engine.
-      seed: Root of all random numbers.
-    """
+    """What determines the numbers of an experiment, beside code, versions and device."""
     return {
         "plan": dataclasses.asdict(plan),
         "scene": scene.name,

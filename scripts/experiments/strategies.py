@@ -27,18 +27,7 @@ def folders(plan: Strategies, folder: Path, seed: int) -> dict[str, list[Path]]:
 def plans(
     plan: Strategies, scene: Scene, engine: str, folder: Path, seed: int
 ) -> dict[Path, runs.Plan]:
-    """Every run by its folder.
-
-    Args:
-      plan: The experiment.
-      scene: The scene.
-      engine: Name of the engine.
-      folder: Folder of the experiment.
-      seed: Seed of run 0.
-
-    Raises:
-      InputError: If the scene's hand has no such design space.
-    """
+    """Every run by its folder."""
     sizes = {n: getattr(plan, n) for n in ("particles", "trials", "episodes", "test_trials")}
     how = plan.preset, plan.strategies[0], plan.first()[0], engine
     base = runs.prepare(scene, runs.make_settings(*how, seed, **sizes))
@@ -53,20 +42,12 @@ def plans(
 def gather(plan: Strategies, folder: Path, seed: int) -> Arrays | None:
     """What the runs of an experiment have so far.
 
-    Args:
-      plan: The experiment.
-      folder: Its folder.
-      seed: Seed of run 0.
-
     Returns:
       Arrays that begin with the axes (strategy, run): `particles`, and of the episodes that every
       run has `cost` (episode, particle), `trial_cost`, `status` and `lost_time` (episode, particle,
       trial); `test_cost` and `test_status` (particle, trial) if every run has its final test; and
       `seeds`, `seed_cost`, `seed_candidates` of the first strategy, which begin with the axis
       (run,). None if a run has not begun.
-
-    Raises:
-      InputError: If a run cannot be read.
     """
     every = [
         [runs.load_record(place) for place in places]

@@ -55,9 +55,6 @@ class Study:
         """Episodes simulated when the mean cost is below 1.0 for good, (strategy, run).
 
         The episode that converged is counted; infinite where a run did not converge.
-
-        Args:
-          rule: Rule for failed trials.
         """
 
         def count(means: np.ndarray) -> float:
@@ -117,14 +114,7 @@ class Region(NamedTuple):
 def regions(
     data: dict[str, np.ndarray], threshold: float, rule: str = "exclude", smallest: float = 0.005
 ) -> list[Region]:
-    """Connected components with cost below a threshold, largest first; points meet at edges.
-
-    Args:
-      data: Arrays of the landscape.
-      threshold: Cost.
-      rule: Rule for failed trials.
-      smallest: Part of the grid below which a component counts as a speck and is left out.
-    """
+    """Connected components with cost below a threshold, largest first; points meet at edges."""
     from scipy import ndimage
 
     cost = data[rule]

@@ -22,12 +22,7 @@ PAGE, FIGURE = Path("docs/notes/search.md"), Path("docs/figures/search.png")
 
 
 def merged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of one search over other seeds, or of the same seeds at other marks, as one row each.
-
-    Raises:
-      ValueError: If rows of the same marks have a seed in common, or rows of other marks have not
-        all seeds in common.
-    """
+    """Rows of one search over other seeds, or of the same seeds at other marks, as one row each."""
     found: dict[tuple, dict[str, Any]] = {}
     for row in sorted(rows, key=lambda row: row.get("first_seed", 0)):
         first, place = row.get("first_seed", 0), (_question(row), *row["grasps"])

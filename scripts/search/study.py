@@ -61,14 +61,7 @@ class Case:
 
 
 def make_case(name: str, space: DesignSpace, preset: str, objects: int = 3) -> Case:
-    """A case by its name; what the name does not change has the command's defaults.
-
-    Args:
-      name: Name of an optimiser, and after a colon its fields, `particles`, `trials` or `tests`.
-      space: The design space.
-      preset: Its name.
-      objects: Number of objects, each of which a particle of a screened search meets in an episode.
-    """
+    """A case by its name; what the name does not change has the command's defaults."""
     kind, _, changes = name.partition(":")
     given = dict(pair.split("=") for pair in changes.split(",") if pair)
     sizes = {n: int(given.pop(n)) for n in ("particles", "trials") if n in given}
@@ -118,25 +111,7 @@ class Study:
         chunk: int,
         path: Path,
     ):
-        """Reads what is done.
-
-        Args:
-          case: The case.
-          scene: The scene.
-          engine: The engine.
-          space: The design space.
-          seeds: Number of seeds.
-          budget: Grasps of a seed after which the search ends.
-          tests: Trials that judge a recommended design.
-          marks: Number of times at which one is recommended.
-          at: Grasps of a seed after which one is recommended, instead of `marks`; each mark is the
-            last episode that they allow.
-          first_seed: The first seed.
-          shapes: Objects that the trials of each seed take turns with, shape (seed, object); None
-            for the scene's.
-          chunk: Most grasps of a call.
-          path: File of what is done.
-        """
+        """Reads what is done."""
         self.case, self.scene, self.engine, self.space = case, scene, engine, space
         self.tests, self.chunk, self.path = tests, chunk, path
         self.keys = jax.vmap(jax.random.key)(first_seed + jnp.arange(seeds))
@@ -240,12 +215,6 @@ class Study:
     def judge(self, mark: int, particles: jax.Array, costs: jax.Array | None = None) -> int:
         """Chooses from particles by fresh trials, and judges the chosen one by others.
 
-        Args:
-          mark: Number of the mark.
-          particles: Particles of each seed, shape (seed, particle, parameter).
-          costs: Their costs, by which finalists are taken, shape (seed, particle); None if the
-            best stand first.
-
         Returns:
           The number of grasps.
         """
@@ -276,12 +245,7 @@ class Study:
         return self.outcomes(populations, self.drawn(keys, trials, self.shapes, self.scene))
 
     def outcomes(self, populations: jax.Array, trials: Trial) -> Outcome:
-        """Outcomes of shape (seed, particle, trial), by one program whatever the shape.
-
-        Args:
-          populations: Particles of each seed, shape (seed, particle, parameter).
-          trials: Trials that these meet, leading axes (seed, trial).
-        """
+        """Outcomes of shape (seed, particle, trial), by one program whatever the shape."""
         shape = (*populations.shape[:2], trials.yaw.shape[1])
         seed, particle, trial = np.indices(shape).reshape(3, -1)
         designs, trials = np.asarray(populations), jax.tree.map(np.asarray, trials)
@@ -295,12 +259,6 @@ class Study:
 
     def drawn(self, keys: jax.Array, trials: int, shapes: np.ndarray, scene: Scene) -> Trial:
         """Trials of each key with a scene's noise, of objects that take turns.
-
-        Args:
-          keys: Typed keys, shape (seed,).
-          trials: Trials of each.
-          shapes: Objects of each, shape (seed, object).
-          scene: Scene with the noise.
 
         Returns:
           Trials with leading axes (seed, trial).

@@ -7,23 +7,12 @@ import matplotlib.figure
 
 
 def new(width: float, height: float) -> matplotlib.figure.Figure:
-    """An empty figure whose parts are laid out when it is drawn.
-
-    Args:
-      width: Width [inch].
-      height: Height [inch].
-    """
+    """An empty figure whose parts are laid out when it is drawn."""
     return matplotlib.figure.Figure(figsize=(width, height), dpi=120, layout="constrained")
 
 
 def save(figure: matplotlib.figure.Figure, path: Path, **options: Any) -> Path:
-    """Writes a figure, its folder included, and returns its path.
-
-    Args:
-      figure: The figure.
-      path: File; its ending says the format.
-      **options: Options of `Figure.savefig`.
-    """
+    """Writes a figure, its folder included, and returns its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, **options)
     return path

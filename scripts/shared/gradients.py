@@ -21,11 +21,6 @@ def cost(scene: Scene, worlds: int, wait: Callable[[], Any] = lambda: None) -> d
 
     On a CPU they are processor time, of all threads, which other programs do not change.
 
-    Args:
-      scene: The scene.
-      worlds: Number of worlds.
-      wait: Called when everything is compiled; returns when the device is free.
-
     Returns:
       Seconds by name: "forward", "recorded" (the forward pass of a derivative), "reverse" and
       "value_and_gradient", and of each the time of its compile, "..._compile"; the ratios to the

@@ -52,11 +52,6 @@ _CHEAP = 5.0  # s
 def repeat(run: Callable[[], tuple[Any, float]], repeats: int, until: float) -> tuple[Any, dict]:
     """Runs once to warm up and then repeatedly.
 
-    Args:
-      run: Returns results and seconds.
-      repeats: Timed runs.
-      until: `time.monotonic` after which no further run is begun.
-
     Returns:
       Results of the last run, and all seconds; "seconds" holds the warm-up if there was no time for
       more.

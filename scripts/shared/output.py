@@ -12,13 +12,7 @@ from codesign_jax import files
 
 
 def write_json(path: Path, content: Any, *, indent: int | None = 1) -> Path:
-    """Writes a JSON file, its folder included.
-
-    Args:
-      path: The file.
-      content: What `json.dumps` takes.
-      indent: Spaces of a level; None for no white space at all.
-    """
+    """Writes a JSON file, its folder included."""
     separators = (",", ":") if indent is None else None
     with files.atomically(path) as part:
         text = json.dumps(content, indent=indent, separators=separators)

@@ -38,13 +38,7 @@ def solver_values(engine: str, setting: str) -> dict[str, Any]:
 
 
 def build(engine: str, setting: str, scene: Scene) -> Engine:
-    """Builds an engine behind the common interface.
-
-    Args:
-      engine: Name.
-      setting: Name of the setting; the scene must have its solver values already.
-      scene: The scene.
-    """
+    """Builds an engine behind the common interface."""
     if engine == "reference":
         return make_engine("mujoco", scene)
     if engine != "structured":

@@ -44,11 +44,7 @@ def add_commit(parser: argparse.ArgumentParser) -> None:
 
 
 def results(commit: str | None = None) -> dict[str, object]:
-    """What results depend on: command, commit, versions, platform and device.
-
-    Args:
-      commit: Commit of the code, for a machine without its repository.
-    """
+    """What results depend on: command, commit, versions, platform and device."""
     return {"command": command(), **git_state(commit), **environment()}
 
 
@@ -59,11 +55,7 @@ def scene_hash(scene: Scene) -> str:
 
 
 def measurement(commit: str | None = None) -> dict:
-    """What times depend on: command, commit, versions, device, processor and its load.
-
-    Args:
-      commit: Commit of the code, for a machine without its repository.
-    """
+    """What times depend on: command, commit, versions, device, processor and its load."""
     device = jax.devices()[0]
     return {
         "command": command(),

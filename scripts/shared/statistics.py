@@ -28,24 +28,8 @@ def spearman(a: ArrayLike, b: ArrayLike) -> np.ndarray:
         return (x * y).sum(-1) / norm
 
 
-def slope(sizes: ArrayLike, values: ArrayLike) -> float:
-    """Slope of a straight line through the logarithms: an order of convergence or of growth."""
-    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
-
-
-def quantiles(errors: np.ndarray) -> dict[str, float]:
-    """Median, upper quantiles and maximum of errors."""
-    levels = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
-    return {name: float(np.quantile(errors, q)) for name, q in levels.items()}
-
-
 def agreement(cost: ArrayLike, reference: ArrayLike, trials: int) -> dict:
     """Compares costs of the same worlds, trials of a design following each other.
-
-    Args:
-      cost: Costs of worlds, shape (world,).
-      reference: Costs of the same worlds, or of more of them, shape (>= world,).
-      trials: Trials of a design; an incomplete last design is left out of the correlation.
 
     Returns:
       Counts and shares by name: the verdicts are cost < `SUCCESS_COST`.
@@ -66,47 +50,6 @@ def agreement(cost: ArrayLike, reference: ArrayLike, trials: int) -> dict:
         "designs": int(whole // trials),
         "spearman": None if rank is None or np.isnan(rank) else rank,
     }
-
-
-def paired_difference(a: ArrayLike, b: ArrayLike) -> dict:
-    """Difference of two success shares over the same worlds with its 95 % interval.
-
-    The variance of the mean of the differences -1, 0 and 1, with one pseudo-count in each cell of
-    discordant pairs (Agresti and Min 2005), so that an interval is never empty.
-
-    Args:
-      a: Whether each world succeeded, bool, shape (world,).
-      b: The same of the other engine.
-    """
-    a, b = np.asarray(a, bool), np.asarray(b, bool)
-    n = a.size
-    only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
-    difference = (only_a - only_b) / n
-    up, down, total = only_a + 0.5, only_b + 0.5, n + 2.0
-    centre = (up - down) / total
-    half = 1.96 * np.sqrt(up + down - (up - down) ** 2 / total) / total
-    return {
-        "difference": difference,
-        "interval_95": [float(centre - half), float(centre + half)],
-        "only_first": only_a,
-        "only_second": only_b,
-    }
-
-
-def kolmogorov_smirnov(a: ArrayLike, b: ArrayLike) -> dict:
-    """Two-sample Kolmogorov-Smirnov test with the asymptotic p-value.
-
-    With ties, of which costs have many, the p-value is too large rather than too small.
-
-    Args:
-      a: Sample, shape (n,).
-      b: Sample, shape (m,).
-    """
-    x, y = np.asarray(a, float), np.asarray(b, float)
-    distance = float(np.asarray(scipy.stats.ks_2samp(x, y, method="asymp"))[0])
-    # The limiting law: SciPy's own p-value is that of an exact test of n m / (n + m) values.
-    scaled = distance * np.sqrt(x.size * y.size / (x.size + y.size))
-    return {"distance": distance, "p": float(scipy.stats.kstwobign.sf(scaled))}
 
 
 def quantile(values: np.ndarray, q: float) -> np.ndarray:
@@ -131,13 +74,6 @@ def bootstrap(
     """Percentile bootstrap; infinite values take part, undefined ones are left out.
 
     SciPy's interpolates between resamples, which makes two infinite neighbours not a number.
-
-    Args:
-      statistic: From indices of what is resampled, shape (..., count), to values, shape (...):
-        whatever it reads at these indices is resampled together, which keeps the pairing.
-      count: Number of runs or particles.
-      resamples: Number of resamples.
-      seed: Seed of the resampling.
     """
     rows = np.random.default_rng(seed).integers(0, count, (resamples, count))
     drawn = np.asarray(statistic(rows), float)
@@ -157,12 +93,6 @@ def two_way(
 
     Trials are common to all particles, so that resampling particles alone would call what one
     unlucky trial does to all of them certain (Owen 2007, "The pigeonhole bootstrap").
-
-    Args:
-      statistics: From tables like the given ones to several values.
-      *tables: Arrays of one shape (row, column); resampled together, which keeps the pairing.
-      resamples: Number of resamples.
-      seed: Seed of the resampling.
 
     Returns:
       An interval for each value; resamples in which it is NaN are left out, and its ends are NaN if
@@ -205,42 +135,17 @@ def mcnemar(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def wilcoxon(a: np.ndarray, b: np.ndarray, episodes: int) -> float:
-    """Two-sided signed rank test of paired episodes to convergence: the p-value.
-
-    Args:
-      a: Episodes, shape (run,); infinite where a run did not converge.
-      b: Episodes of the other strategy.
-      episodes: Episodes of a run; a run that did not converge counts as one more.
-    """
+    """Two-sided signed rank test of paired episodes to convergence: the p-value."""
     a, b = (np.minimum(v, episodes + 1) for v in (a, b))
     if (a == b).all():
         return 1.0
     return float(np.asarray(scipy.stats.wilcoxon(a, b, method="approx", zero_method="pratt"))[1])
 
 
-def fisher(a: np.ndarray, b: np.ndarray) -> float:
-    """Fisher's exact two-sided test of unpaired successes, shape (run,): the p-value."""
-    table = [[int(v.sum()), int((~v).sum())] for v in (a, b)]
-    return float(np.asarray(scipy.stats.fisher_exact(table))[1])
-
-
-def mann_whitney(a: np.ndarray, b: np.ndarray) -> float:
-    """Two-sided rank test of episodes that are not paired, shape (run,): the p-value.
-
-    A run that did not converge, infinite, ranks behind every other one.
-    """
-    if (a[:, None] == b).all():
-        return 1.0
-    return float(scipy.stats.mannwhitneyu(a, b, method="asymptotic").pvalue)
-
-
 def holm(p: ArrayLike) -> np.ndarray:
     """P-values of several comparisons, adjusted by Holm's step-down method.
 
     S. Holm, A simple sequentially rejective multiple test procedure, Scand. J. Statist. 6, 1979.
-
-    Args:
-      p: P-values, shape (comparison,).
     """
     values = np.asarray(p, float)
     order = np.argsort(values)
@@ -251,11 +156,7 @@ def holm(p: ArrayLike) -> np.ndarray:
 
 
 def trend(values: np.ndarray) -> float:
-    """Page's test that values grow along the strategies: the one-sided p-value.
-
-    Args:
-      values: Finite numbers, shape (strategy, run); runs are the paired blocks.
-    """
+    """Page's test that values grow along the strategies: the one-sided p-value."""
     if (values == values[:1]).all():
         return 1.0
     return float(scipy.stats.page_trend_test(values.T, method="asymptotic").pvalue)

@@ -12,16 +12,7 @@ def markdown(rows: list[list[str]]) -> str:
 
 
 def fill(page: Path, text: str, mark: str) -> None:
-    """Replaces what stands between the marks of a page, NAME:begin and NAME:end in comments.
-
-    Args:
-      page: Markdown page.
-      text: The new text.
-      mark: Name of the marks.
-
-    Raises:
-      ValueError: If the page does not hold both marks.
-    """
+    """Replaces what stands between the marks of a page, NAME:begin and NAME:end in comments."""
     begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
     old = page.read_text(encoding="utf-8")
     if begin not in old or end not in old:

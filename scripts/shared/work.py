@@ -38,15 +38,7 @@ def variant(
     spheres: int | None = None,
     solver: dict[str, Any] | None = None,
 ) -> Scene:
-    """The scene `paper_spheres` with parts of it changed.
-
-    Args:
-      hand_name: Another hand file.
-      fingers: Number of fingers, spread evenly around the palm, instead of the hand's own.
-      links: Segments a finger.
-      spheres: Contact spheres a link.
-      solver: Values of the scene's solver table.
-    """
+    """The scene `paper_spheres` with parts of it changed."""
     sizes = {"links": links, "spheres_per_link": spheres}
     table = {k: v for k, v in sizes.items() if v is not None}
     chosen = scene.load(
@@ -71,10 +63,6 @@ def designs(chosen: Scene, count: int) -> jax.Array:
 
     Vector i does not depend on the count, so that a small batch is the start of a large one.
 
-    Args:
-      chosen: The scene.
-      count: Number of designs.
-
     Returns:
       Vectors in SI units, shape (design, full).
     """
@@ -93,13 +81,7 @@ def designs(chosen: Scene, count: int) -> jax.Array:
 
 
 def make_worlds(chosen: Scene, count: int, *, repeat: int | None = None) -> Worlds:
-    """The first worlds of designs x trials, design by design, every design in the same trials.
-
-    Args:
-      chosen: The scene.
-      count: Number of worlds.
-      repeat: Number of distinct worlds after which they repeat; None if all differ.
-    """
+    """The first worlds of designs x trials, design by design, every design in the same trials."""
     distinct = min(count, repeat or count)
     vectors = designs(chosen, -(-distinct // TRIALS))
     params = jax.vmap(lambda v: parameters.unflatten(chosen.hand, v))(vectors)
@@ -136,12 +118,6 @@ def window(
 
     The start states are those of MuJoCo C at the end of the inflation, at rest.  A rollout of less
     than the time to the cost window decides no world, so that every engine simulates every step.
-
-    Args:
-      chosen: The scene.
-      count: Number of worlds.
-      steps: Time steps.
-      distinct: Number of distinct worlds.
 
     Returns:
       Fields, whose start states are in contact, and controls, shape (world, steps, nu).

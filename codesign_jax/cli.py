@@ -119,7 +119,7 @@ class Evaluate(Command, RunOrDesign):
     out: File = None
     """Write a table of the trials, with their noise and how they ended (.csv)."""
     render: File = None
-    """Draw the first trial of each object: an animation (.gif) or a film strip (.png)."""
+    """Draw the first trial of each object: a film (.gif, .mp4) or a strip of pictures (.png)."""
     dry_run: Flag = False
     """Print the number of grasps; simulate nothing."""
 
@@ -205,16 +205,21 @@ class Landscape(Command, RunOrDesign):
 
 @dataclasses.dataclass
 class Render(Command, Shown, RunOrDesign):
-    """Draw one grasp, of a design or of a run: an animation (.gif) or a film strip (.png)."""
+    """Draw one grasp of a design or of a run: a film (.gif, .mp4) or a strip of pictures (.png)."""
 
     out: Path = Path("grasp.gif")
-    """The picture, .gif or .png."""
+    """The film or strip: .gif, .mp4 or .png."""
     times: Annotated[
         tuple[float, ...], tyro.conf.arg(metavar="SECONDS ...", help_behavior_hint="")
     ] = ()
     """Times of a strip's pictures [s]; default: the end of each phase."""
     size: int = 320
     """Width and height of a picture in pixels."""
+    camera: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="VIEW NAME=NUMBER ...", help_behavior_hint="")
+    ] = ()
+    """Where it is seen from: front, side or top, and any of azimuth=125 elevation=-20 [degrees]
+    distance=0.62 [m] x=0 y=0 z=0.15 [m, the point looked at], as of MuJoCo's free camera."""
 
 
 @dataclasses.dataclass

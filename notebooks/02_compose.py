@@ -148,7 +148,7 @@ print(lifting.evaluate(designs, jax.random.key(0)).cost)
 # particle filter had; its particles are the best designs so far, the best one first.
 
 # %%
-searcher = codesign.make_optimizer("cma-es", space)  # pip install 'codesign-jax[baselines]'
+searcher = codesign.make_optimizer("cma-es", space)  # evosax's
 begin = searcher.init(jax.random.key(0), start, particles)
 end, info = lifting.run(searcher, begin, masks)
 print("mean cost of each episode [m]:", np.round(np.asarray(info.selection.mean_cost), 3))

@@ -106,7 +106,7 @@ class CrossEntropy:
 # ## On one budget
 #
 # Everybody evaluates as many designs in the same trials, from the same start.  The particle filter
-# is the paper's; `cma-es`, `pso` and `random` come from evosax (`codesign-jax[baselines]`).
+# is the paper's; `cma-es`, `pso` and `random` come from evosax.
 
 # %%
 episodes, particles, trials = (3, 4, 2) if FAST else (20, 10, 3)

@@ -1,5 +1,6 @@
 """Figures and animations exist and show what they should."""
 
+import av
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +52,7 @@ def test_gif_plays_in_real_time_and_names_what_is_missing(grasp, no_opengl, tmp_
     the_scene, replay = grasp
     said = []
     path = tmp_path / "new" / "grasp.gif"
-    animation.write_gif(the_scene, [replay, replay], path, size=(80, 60), notify=said.append)
+    animation.write_film(the_scene, [replay, replay], path, size=(80, 60), notify=said.append)
     assert len(said) == 1 and "apt-get install libegl1" in said[0]
     with Image.open(path) as image:
         assert image.size == (160, 60)
@@ -60,6 +61,20 @@ def test_gif_plays_in_real_time_and_names_what_is_missing(grasp, no_opengl, tmp_
             image.seek(k)
             total += image.info["duration"]
     assert total == pytest.approx(1000 * the_scene.end_time, abs=80)  # one frame at most
+
+
+def test_mp4_plays_in_real_time_with_even_sides(grasp, no_opengl, tmp_path):
+    """Read back by FFmpeg: players need even sides, so an odd one has its edge twice."""
+    the_scene, replay = grasp
+    path = animation.write_film(the_scene, [replay], tmp_path / "g.mp4", size=(81, 61))
+    with av.open(str(path)) as film:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+        assert film.streams.video[0].average_rate == 25
+    assert pictures[0].shape == (62, 82, 3)
+    assert len(pictures) == round(25 * the_scene.end_time)
+    drawn = animation.frames(the_scene, replay, np.array([0.0]), size=(81, 61))[0]
+    # Colours are kept for blocks of four pixels alone, so that lines of one pixel blur.
+    assert np.abs(pictures[0][:61, :81].astype(int) - drawn).mean() < 6
 
 
 def test_strip_has_a_row_a_grasp_and_a_column_a_phase(grasp, no_opengl, tmp_path):
@@ -78,6 +93,45 @@ def test_renderer_draws_hand_and_object(grasp):
     r, g, b = np.moveaxis(frames.astype(int), -1, 0)
     assert ((r > 150) & (b < 80)).any(axis=(1, 2)).all(), "an orange object in every frame"
     assert ((b > r + 40) & (b > 90)).any(axis=(1, 2)).all(), "blue fingers in every frame"
+
+
+def test_pictures_are_larger_than_mujoco_s_own_buffer(grasp):
+    """640 x 480 unless the model says otherwise: 481 rows ended in a traceback."""
+    the_scene, replay = grasp
+    if animation.opengl_backend() is None:
+        pytest.skip("no OpenGL on this machine")
+    small, large = (
+        animation.frames(the_scene, replay, TIMES[:1], size=size)[0].astype(int)
+        for size in ((70, 50), (700, 500))
+    )
+    blocks = large.reshape(50, 10, 70, 10, 3).mean((1, 3))
+    assert np.abs(blocks - small).mean() < 8, "the same picture, but for the edges"
+
+
+@pytest.mark.parametrize("opengl", [True, False])
+def test_camera_moves(grasp, opengl, monkeypatch):
+    """Closer is larger, and what is beside the point looked at is beside the middle."""
+    the_scene, replay = grasp
+    if not opengl:
+        monkeypatch.setattr(animation, "opengl_backend", lambda: None)
+    elif animation.opengl_backend() is None:
+        pytest.skip("no OpenGL on this machine")
+
+    def orange(camera):
+        [frame] = animation.frames(
+            the_scene, replay, TIMES[:1], size=(120, 120), camera=camera
+        ).astype(int)
+        r, b = frame[..., 0], frame[..., 2]
+        rows, columns = np.nonzero((r > 150) & (b < 120))
+        return len(rows), rows.mean(), columns.mean()
+
+    camera = animation.CAMERA
+    usual, near = orange(camera), orange(camera._replace(distance=0.4))
+    assert near[0] > 1.2 * usual[0]
+    # The object stands in the origin: a look at a place below and beside it moves it up and left.
+    side = animation.VIEWS["side"]._replace(lookat=(0.0, 0.1, 0.0))  # along -x: +y is on the right
+    _, row, column = orange(side)
+    assert row < 60 and column < 60 and abs(usual[2] - 60) < 8
 
 
 def test_broken_opengl_falls_back(grasp, monkeypatch, tmp_path):
@@ -109,7 +163,7 @@ def test_cost_evolution_of_an_unfinished_run(tmp_path):
     figures.cost_evolution(np.ones((1, 1)), tmp_path / "one.png")
 
 
-@pytest.mark.parametrize("name", ["grasp.gif", "grasp.png"])
+@pytest.mark.parametrize("name", ["grasp.gif", "grasp.mp4", "grasp.png"])
 def test_evaluate_renders(name, tmp_path, monkeypatch, capsys, no_opengl):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     out = tmp_path / name

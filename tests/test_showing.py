@@ -2,7 +2,6 @@
 
 import csv
 import errno
-import importlib
 import json
 import os
 import re
@@ -111,7 +110,15 @@ def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
     cases = {
         ("render", *DESIGN, "--trial", "0"): "--trial: numbers of a run's trials.csv",
         ("render", *DESIGN, "--object", "spheer"): "did you mean 'sphere'",
-        ("render", *DESIGN, "--out", "a.jpg"): "must end in .gif or .png",
+        ("render", *DESIGN, "--out", "a.jpg"): "must end in .gif, .mp4 or .png",
+        ("render", *DESIGN, "--out", "a.mp4", "--times", "0"): "a film shows the whole grasp",
+        ("render", *DESIGN, "--camera", "frnt"): "did you mean 'front'",
+        ("render", *DESIGN, "--camera", "side", "zoom=2"): "'zoom' is no view and no number",
+        ("render", *DESIGN, "--camera", "distance"): "must say distance=NUMBER",
+        ("render", *DESIGN, "--camera", "distance=0"): "distance = 0.0 is outside [0.05, 10] m",
+        ("render", *DESIGN, "--camera", "azimuth=left"): "azimuth=left must be a number [deg]",
+        ("render", *DESIGN, "--camera", "x=nan"): "x = nan is outside [-10, 10] m",
+        ("render", *DESIGN, "--size", "5000"): "--size = 5000 is outside [16, 4096] pixels",
         ("render", *DESIGN, "--out", "a.png", "--times", "5"): "outside [0, 1.2] s",
         ("render", *own, "--trial", "0", "--object", "sphere"): "exclude each other",
         ("render", *own, "--trial", "3"): "--trial = 3 is outside [0, 2]",
@@ -307,10 +314,21 @@ def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
 
 
 def test_missing_extra_is_one_line(monkeypatch, capsys):
-    monkeypatch.delitem(sys.modules, "codesign_jax.report.animation")
-    monkeypatch.delattr(importlib.import_module("codesign_jax.report"), "animation")
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    for name in ("render", "replay"):
-        assert cli.main([name, *DESIGN]) == 2
+    monkeypatch.setitem(sys.modules, "av", None)
+    for arguments in (["render", *DESIGN, "--out"], ["evaluate", *DESIGN, "--render"]):
+        assert cli.main([*arguments, "a.mp4"]) == 2
         [line] = capsys.readouterr().err.splitlines()
-        assert "PIL" in line and "pip install '.[viz]' in the checkout" in line
+        assert ".mp4 needs PyAV: pip install '.[report]' in the checkout" in line
+
+
+def test_camera_of_render(workplace, monkeypatch):
+    """A view, and numbers that replace its own in whatever order."""
+    cameras = []
+    monkeypatch.setattr(animation, "write_strip", lambda *_, camera, **__: cameras.append(camera))
+    words = ["z=0.2", "side", "distance=0.3"]
+    for given in ([], words):
+        flags = ["--camera", *given] if given else []
+        assert cli.main(["render", *DESIGN, "--out", "a.png", *flags]) == 0
+    side = animation.VIEWS["side"]
+    wanted = side._replace(distance=0.3, lookat=(0.0, 0.0, 0.2))
+    assert cameras == [animation.CAMERA, wanted]

@@ -1,6 +1,7 @@
 """What the commands share: designs, notes and JAX's compilation cache."""
 
 import dataclasses
+import importlib.util
 import math
 import sys
 import tempfile
@@ -215,6 +216,15 @@ def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[st
     """
     given = [(flag, v, "", low, high) for flag, v, low, high in numbers if v is not None]
     return [problem for number in given if (problem := schema.range_problem(*number))]
+
+
+def picture_problems(flag: str, path: Path) -> list[str]:
+    """What is wrong with the path of a picture."""
+    if path.suffix not in (".gif", ".mp4", ".png"):
+        return [f"{flag} {path} must end in .gif, .mp4 or .png"]
+    if path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
+        return [f"{flag} {path}: .mp4 needs PyAV: pip install '.[report]' in the checkout"]
+    return []
 
 
 def check_engine(name: str) -> None:

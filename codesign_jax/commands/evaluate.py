@@ -78,8 +78,8 @@ def _check(options: "Evaluate", engine: str) -> None:
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
-    if options.render and options.render.suffix not in (".gif", ".png"):
-        problems.append(f"--render {options.render} must end in .gif or .png")
+    if options.render:
+        problems += common.picture_problems("--render", options.render)
     if options.out and options.out.suffix != ".csv":
         problems.append(f"--out {options.out} must end in .csv")
     problems += common.engine_problems(engine, options.overrides)
@@ -129,18 +129,15 @@ def _untried(case: Case, options: "Evaluate") -> list[str]:
 
 def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
     """Simulates grasps of the first objects and draws them."""
-    try:
-        from codesign_jax.report import animation
-    except ImportError as error:
-        message = f"--render needs {error.name}: pip install '.[viz]' in the checkout"
-        raise InputError([message]) from error
+    from codesign_jax.report import animation
+
     count = min(options.trials, len(case.scene.objects.object))
     trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
     with Busy(console, "simulating what is drawn"):
         grasps = animation.replay(case.scene, engine, params, trials)
     path: Path = options.render  # type: ignore[assignment]
-    write = animation.write_gif if path.suffix == ".gif" else animation.write_strip
+    write = animation.write_strip if path.suffix == animation.STRIP else animation.write_film
     with Busy(console, "drawing"):
         write(case.scene, grasps, path, notify=console.print)
     console.print(f"picture: {path}", markup=False)

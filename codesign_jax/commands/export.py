@@ -96,18 +96,15 @@ def _check(options: "Export", case: Case) -> None:
 
 
 def _missing(options: "Export") -> list[str]:
-    """What is to be installed for parts and sheet."""
-    needed = {"parts": ("manifold3d", "networkx", "lxml"), "sheet": ("matplotlib",)}
-    unwanted = {"parts": options.no_parts, "sheet": options.no_sheet}
-    found = []
-    for what, names in needed.items():
-        absent = [name for name in names if importlib.util.find_spec(name) is None]
-        if absent and not unwanted[what]:
-            found.append(
-                f"the {what} need{'s' * (what == 'sheet')} {' and '.join(absent)}: "
-                f"pip install '.[export]' in the checkout, or give --no-{what}"
-            )
-    return found
+    """What is to be installed for the parts."""
+    names = () if options.no_parts else ("manifold3d", "networkx", "lxml")
+    absent = [name for name in names if importlib.util.find_spec(name) is None]
+    if not absent:
+        return []
+    return [
+        f"the parts need {' and '.join(absent)}: pip install '.[export]' in the checkout, or give "
+        "--no-parts"
+    ]
 
 
 def write_files(

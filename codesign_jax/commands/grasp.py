@@ -79,16 +79,9 @@ def _nominal(case: Case, shape: int | str) -> Asked:
 
 
 def simulate(asked: Asked) -> "Replay":
-    """Simulates the grasp and keeps its trajectory.
+    """Simulates the grasp and keeps its trajectory."""
+    from codesign_jax.report import animation
 
-    Raises:
-      InputError: If the extra for pictures is missing.
-    """
-    try:
-        from codesign_jax.report import animation
-    except ImportError as error:
-        message = f"pictures need {error.name}: pip install '.[viz]' in the checkout"
-        raise InputError([message]) from error
     case = asked.case
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
     trials = jax.tree.map(lambda v: v[None], asked.trial)

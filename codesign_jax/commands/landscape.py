@@ -243,11 +243,8 @@ def write_files(case: Case, found: Landscape, folder: Path, console: Console) ->
         write_scene(case.scene, folder)
     for path in landscape.save(found, folder):
         console.print(f"landscape: {path}", markup=False)
-    try:
-        from codesign_jax.report import figures
-    except ImportError:
-        console.print("no figure: pip install '.[viz]' in the checkout", markup=False)
-        return
+    from codesign_jax.report import figures
+
     path = folder / "figures" / "landscape.png"
     with files.naming(path):
         figures.landscape(found, path)

@@ -237,7 +237,7 @@ def _judge(
 
 
 def _say_places(result: RunResult, folder: Path, console: Console) -> None:
-    """Draws the figure if matplotlib is there, and says where everything is."""
+    """Draws the figure, and says where everything is."""
     _figures(result, folder, console)
     console.print(f"results: {folder}", markup=False)
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}", markup=False)
@@ -246,12 +246,8 @@ def _say_places(result: RunResult, folder: Path, console: Console) -> None:
 def _figures(result: RunResult, folder: Path, console: Console) -> None:
     assert result.record is not None
     path = folder / "figures" / "cost_evolution.png"
-    try:
-        with Busy(console, "drawing"), files.naming(path):
-            from codesign_jax.report import figures
+    with Busy(console, "drawing"), files.naming(path):
+        from codesign_jax.report import figures
 
-            figures.cost_evolution(result.record.history.cost, path)
-    except ImportError:
-        console.print("no figures: pip install '.[viz]' in the checkout", markup=False)
-        return
+        figures.cost_evolution(result.record.history.cost, path)
     console.print(f"figure: {path}", markup=False)

@@ -1,6 +1,7 @@
 """`codesign render`."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -11,6 +12,7 @@ from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Render
+    from codesign_jax.report.animation import Camera
 
 
 def main(options: "Render") -> int:
@@ -21,28 +23,76 @@ def main(options: "Render") -> int:
     """
     common.use_compilation_cache()
     _check(options)
+    camera = _camera(options.camera)
     asked = grasp.find(options)
     end = asked.case.scene.end_time
     late = [t for t in options.times if not 0 <= t <= end]
     if late:
         raise InputError([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
-    draw(asked, options, Console(highlight=False, soft_wrap=True))
+    draw(asked, options, camera, Console(highlight=False, soft_wrap=True))
     return 0
 
 
 def _check(options: "Render") -> None:
-    problems = []
-    if options.out.suffix not in (".gif", ".png"):
-        problems.append(f"--out {options.out} must end in .gif or .png")
-    if options.times and options.out.suffix == ".gif":
-        problems.append("--times are those of a strip (.png); a .gif shows the whole grasp")
+    problems = common.picture_problems("--out", options.out)
+    if options.times and options.out.suffix != ".png":
+        problems.append("--times are those of a strip (.png); a film shows the whole grasp")
     problem = schema.range_problem("--size", options.size, "pixels", 16, 4096)
     if problems or problem:
         raise InputError([*problems, *([problem] if problem else [])])
     common.check_place("--out", options.out)
 
 
-def draw(asked: grasp.Asked, options: "Render", console: Console) -> None:
+_LIMITS = {"azimuth": ("deg", 360), "elevation": ("deg", 90), "distance": ("m", 10)}
+_LIMITS |= dict.fromkeys("xyz", ("m", 10))
+"""Unit and largest magnitude of the camera's numbers."""
+
+
+def _camera(words: Sequence[str]) -> "Camera":
+    """The camera that --camera names: a view, and numbers that replace its own.
+
+    Raises:
+      InputError: With every word that says nothing of a camera.
+    """
+    from codesign_jax.report.animation import CAMERA, VIEWS
+
+    camera, problems = CAMERA, []
+    for word in sorted(words, key=lambda word: "=" in word):  # numbers replace those of the view
+        name, given, text = word.partition("=")
+        if not given and name in VIEWS:
+            camera = VIEWS[name]
+        elif name not in _LIMITS:
+            hint = schema.nearest(name, [*VIEWS, *_LIMITS])
+            problems.append(f"--camera {name!r} is no view and no number of a camera; {hint}")
+        elif not given:
+            problems.append(f"--camera {name} must say {name}=NUMBER")
+        else:
+            problem, value = _number(name, text)
+            if problem:
+                problems.append(problem)
+            elif name in "xyz":
+                at = list(camera.lookat)
+                at["xyz".index(name)] = value
+                camera = camera._replace(lookat=tuple(at))
+            else:
+                camera = camera._replace(**{name: value})
+    if problems:
+        raise InputError(problems)
+    return camera
+
+
+def _number(name: str, text: str) -> tuple[str | None, float]:
+    """What is wrong with a number of a camera, and the number."""
+    unit, most = _LIMITS[name]
+    try:
+        value = float(text)
+    except ValueError:
+        return f"--camera {name}={text} must be a number [{unit}]", 0.0
+    least = 0.05 if name == "distance" else -most  # MuJoCo cuts what is nearer than 1 cm
+    return schema.range_problem(f"--camera {name}", value, unit, least, most), value
+
+
+def draw(asked: grasp.Asked, options: "Render", camera: "Camera", console: Console) -> None:
     """Simulates the grasp and draws it."""
     with Busy(console, "simulating the grasp"):
         shown = grasp.simulate(asked)
@@ -51,11 +101,9 @@ def draw(asked: grasp.Asked, options: "Render", console: Console) -> None:
     console.print("\n".join(grasp.description(asked, shown)), markup=False)
     scene, size = asked.case.scene, (options.size, options.size)
     with Busy(console, "drawing"):
-        if options.out.suffix == ".gif":
-            animation.write_gif(scene, [shown], options.out, size=size, notify=console.print)
+        how: Any = {"size": size, "camera": camera, "notify": console.print}
+        if options.out.suffix == animation.STRIP:
+            animation.write_strip(scene, [shown], options.out, times=options.times or None, **how)
         else:
-            times = options.times or None
-            animation.write_strip(
-                scene, [shown], options.out, times=times, size=size, notify=console.print
-            )
+            animation.write_film(scene, [shown], options.out, **how)
     console.print(f"picture: {options.out}", markup=False)

@@ -1,4 +1,4 @@
-"""Figures and animations; nothing numerical imports this package, and it needs the extra `viz`.
+"""Figures and animations; nothing numerical imports this package.
 
 >>> from codesign_jax.report import statistics
 >>> share = statistics.wilson(3, 3)  # three of three trials kept: how sure is that?

@@ -1,7 +1,7 @@
-"""Animation of grasps as GIF (MuJoCo's renderer and Pillow).
+"""Pictures of grasps: films (.gif by Pillow, .mp4 by PyAV) and strips of MuJoCo's renderer.
 
-Where the machine has no OpenGL, links and object are drawn with matplotlib instead, so that an
-animation always exists.
+Where the machine has no OpenGL, links and object are drawn with matplotlib instead, so that a
+picture always exists.
 """
 
 import functools
@@ -9,7 +9,8 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,8 +26,33 @@ from codesign_jax.report import sketch
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Params, Trial
 
-# Point looked at [m], distance [m], azimuth and elevation [deg].
-CAMERA = (0.0, 0.0, 0.15, 0.62, 125.0, -20.0)
+STRIP = ".png"
+"""Ending of a strip of pictures; films are .gif or .mp4."""
+
+
+class Camera(NamedTuple):
+    """MuJoCo's free camera.
+
+    Attributes:
+      azimuth: Direction of view about the vertical, 0 along x and 90 along y [deg].
+      elevation: Direction of view above the horizontal, -90 straight down [deg].
+      distance: Distance from the point looked at [m].
+      lookat: That point [m].
+    """
+
+    azimuth: float = 125.0
+    elevation: float = -20.0
+    distance: float = 0.62
+    lookat: tuple[float, float, float] = (0.0, 0.0, 0.15)
+
+
+CAMERA = Camera()
+VIEWS: Mapping[str, Camera] = {
+    "front": Camera(azimuth=90.0, elevation=-5.0),
+    "side": Camera(azimuth=180.0, elevation=-5.0),
+    "top": Camera(azimuth=90.0, elevation=-89.9),
+}
+"""Cameras by name."""
 _OBJECT_COLOR = (0.95, 0.50, 0.10)
 _PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
 
@@ -80,6 +106,7 @@ def frames(
     times: np.ndarray,
     *,
     size: tuple[int, int] = (320, 320),
+    camera: Camera = CAMERA,
 ) -> np.ndarray:
     """Draws a grasp at given times.
 
@@ -88,71 +115,106 @@ def frames(
       grasp: The grasp.
       times: Times of the frames [s], shape (frame,).
       size: Width and height in pixels.
+      camera: Where it is seen from.
 
     Returns:
       Frames, uint8, shape (frame, height, width, 3).
     """
-    way = opengl_backend()
-    if way is None:
-        return sketches(scene, grasp, times, size=size)
-    qpos, index = _states(scene, grasp, times)
-    return _render(_visual_model(scene, grasp), qpos, size, way)[index]
+    pictures, index = _pictures(scene, grasp, times, size, camera, opengl_backend())
+    return pictures[index]
 
 
 def sketches(
     scene: Scene, grasp: Replay, times: np.ndarray, *, size: tuple[int, int] = (240, 240)
 ) -> np.ndarray:
     """As `frames`, drawn without OpenGL: lines of fingers and object."""
-    qpos, index = _states(scene, grasp, times)
-    compiled = _visual_model(scene, grasp)
-    return sketch.draw(scene, compiled, qpos, int(grasp.trial.shape), size)[index]
+    pictures, index = _pictures(scene, grasp, times, size, CAMERA, None)
+    return pictures[index]
 
 
-def _states(scene: Scene, grasp: Replay, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Different states among those at some times, and which of them each time has.
+def _pictures(
+    scene: Scene,
+    grasp: Replay,
+    times: np.ndarray,
+    size: tuple[int, int],
+    camera: Camera,
+    way: str | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures of the different states among those at some times, and which of them each time has.
 
     A world that was lost or failed stands still from then on: its frames are drawn once.
     """
     step = np.rint(times / scene.discretization.timestep).astype(int)
     qpos = grasp.qpos[np.clip(step, 0, len(grasp.qpos) - 1)]
-    return np.unique(qpos, axis=0, return_inverse=True)
+    qpos, index = np.unique(qpos, axis=0, return_inverse=True)
+    compiled = _visual_model(scene, grasp)
+    if way is None:
+        return sketch.draw(scene, compiled, qpos, int(grasp.trial.shape), size, camera), index
+    return _render(compiled, qpos, size, camera, way), index
 
 
-def write_gif(
+def write_film(
     scene: Scene,
     grasps: list[Replay],
     path: Path,
     *,
-    frames_per_second: float = 12.5,
+    frames_per_second: float | None = None,
     size: tuple[int, int] = (320, 320),
+    camera: Camera = CAMERA,
     notify: Callable[[str], None] = print,
 ) -> Path:
-    """Writes grasps side by side as an animated GIF.
+    """Writes grasps side by side as a film, GIF or MP4 (H.264) by the path's ending.
 
     Args:
       scene: The scene.
       grasps: Grasps to draw.
       path: File to write; its folder is made.
-      frames_per_second: Frames of a second of simulated time, which is shown in real time.
+      frames_per_second: Frames of a second of simulated time, which is shown in real time; default:
+        12.5 of a GIF, 25 of an MP4.
       size: Width and height of one grasp's picture in pixels.
+      camera: Where it is seen from.
       notify: Told in one line if there is no OpenGL.
 
     Returns:
       The path.
+
+    Raises:
+      ImportError: Without PyAV, which writes MP4.
     """
     _announce(notify)
-    times = np.arange(0.0, scene.end_time, 1 / frames_per_second)
-    parts = [frames(scene, g, times, size=size) for g in grasps]
-    images = [Image.fromarray(f) for f in np.concatenate(parts, axis=2)]
+    write = _write_mp4 if path.suffix == ".mp4" else _write_gif
+    rate = frames_per_second or (25.0 if path.suffix == ".mp4" else 12.5)
+    times, way = np.arange(0.0, scene.end_time, 1 / rate), opengl_backend()
+    parts = [_pictures(scene, g, times, size, camera, way) for g in grasps]
+    with files.atomically(path) as part:
+        # One at a time: those of a large film together would fill the memory.
+        write((np.hstack([p[i[k]] for p, i in parts]) for k in range(len(times))), part, rate)
+    return path
+
+
+def _write_gif(pictures: Iterator[np.ndarray], path: Path, rate: float) -> None:
+    images = [Image.fromarray(picture) for picture in pictures]
     # One palette for all frames: separate ones flicker and take more space.
     palette = _common_palette(images)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # GIF counts in hundredths of a second.
-    duration = 10 * round(100 / frames_per_second)
-    every = {"save_all": True, "append_images": indexed[1:], "duration": duration, "loop": 0}
-    with files.atomically(path) as part:
-        indexed[0].save(part, "GIF", **every)
-    return path
+    every = {"save_all": True, "append_images": indexed[1:], "loop": 0}
+    indexed[0].save(path, "GIF", duration=10 * round(100 / rate), **every)
+
+
+def _write_mp4(pictures: Iterator[np.ndarray], path: Path, rate: float) -> None:
+    import av  # of the extra `report`
+
+    with av.open(str(path), "w", format="mp4") as film:
+        stream = film.add_stream("libx264", Fraction(rate), {"crf": "18"})
+        stream.pix_fmt = "yuv420p"  # which every player has; it needs even sides
+        for picture in pictures:
+            odd = [(0, n % 2) for n in picture.shape[:2]]
+            even = np.pad(picture, (*odd, (0, 0)), "edge")
+            if not stream.codec_context.is_open:
+                stream.height, stream.width = even.shape[:2]
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(even, "rgb24")))
+        film.mux(stream.encode())
 
 
 def write_strip(
@@ -162,6 +224,7 @@ def write_strip(
     *,
     times: tuple[float, ...] | None = None,
     size: tuple[int, int] = (240, 240),
+    camera: Camera = CAMERA,
     notify: Callable[[str], None] = print,
 ) -> Path:
     """Writes a film strip, one row a grasp, by default one frame at the end of each phase.
@@ -172,6 +235,7 @@ def write_strip(
       path: Image file to write; its folder is made.
       times: Times of the frames [s].
       size: Width and height of a frame in pixels.
+      camera: Where it is seen from.
       notify: Told in one line if there is no OpenGL.
 
     Returns:
@@ -180,7 +244,7 @@ def write_strip(
     _announce(notify)
     p = scene.phases
     chosen = times or (0.0, p.approach, p.inflate, p.lift, p.disturb, scene.end_time)
-    rows = [frames(scene, g, np.array(chosen), size=size) for g in grasps]
+    rows = [frames(scene, g, np.array(chosen), size=size, camera=camera) for g in grasps]
     picture = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
     with files.atomically(path) as part:  # whose name does not say the kind of picture
         kind = Image.registered_extensions().get(path.suffix.lower(), "PNG")
@@ -237,15 +301,16 @@ def _visual_model(scene: Scene, grasp: Replay) -> mujoco.MjModel:
         pos=[-0.15, 0.25, 1.0],
         castshadow=True,
         dir=[0.15, -0.25, -1.0],
-        diffuse=[0.5] * 3,
-        specular=[0.1] * 3,
+        diffuse=[0.45] * 3,
+        specular=[0.0] * 3,
     )
     spec.visual.headlight.ambient = [0.5] * 3
-    spec.visual.headlight.diffuse = [0.4] * 3
+    spec.visual.headlight.diffuse = [0.25] * 3
     spec.visual.headlight.specular = [0.0] * 3
     spec.visual.quality.offsamples = 2  # a software renderer pays for every sample
-    spec.stat.extent, spec.stat.center = 1.0, [0, 0, 0.15]  # what the shadow map covers
-    spec.visual.map.znear, spec.visual.quality.shadowsize = 0.01, 2048
+    spec.stat.extent, spec.stat.center = 1.0, [0, 0, 0.15]
+    spec.visual.map.znear = 0.01
+    spec.visual.map.shadowclip = 1.2  # the shadow map's border leaves dots where it is in view
     return spec.compile()
 
 
@@ -258,7 +323,7 @@ def opengl_backend() -> str | None:
     )
     for way in [chosen] if chosen else ["egl", "osmesa"]:
         try:
-            _render(tiny, np.zeros((1, tiny.nq)), (16, 16), way)
+            _render(tiny, np.zeros((1, tiny.nq)), (16, 16), CAMERA, way)
         except subprocess.CalledProcessError:
             continue
         return way
@@ -266,7 +331,7 @@ def opengl_backend() -> str | None:
 
 
 def _render(
-    compiled: mujoco.MjModel, qpos: np.ndarray, size: tuple[int, int], way: str
+    compiled: mujoco.MjModel, qpos: np.ndarray, size: tuple[int, int], camera: Camera, way: str
 ) -> np.ndarray:
     """Renders in a child process; see `renderer`.
 
@@ -277,11 +342,11 @@ def _render(
         places = [str(Path(folder) / name) for name in ("model.mjb", "qpos.npy", "frames.npy")]
         mujoco.mj_saveModel(compiled, places[0])
         np.save(places[1], qpos)
-        numbers = [str(v) for v in (*size, *CAMERA)]
+        numbers = [str(v) for v in (*size, *camera[:3], *camera.lookat)]
         subprocess.run(
             [sys.executable, "-m", "codesign_jax.report.renderer", *places, *numbers],
             check=True,
             capture_output=True,
             env=os.environ | {"MUJOCO_GL": way, "PYOPENGL_PLATFORM": way},
         )
-        return np.load(places[2], allow_pickle=False)
+        return np.load(places[2], mmap_mode="r", allow_pickle=False)  # the file may be gone

@@ -12,24 +12,22 @@ import numpy as np
 
 
 def render(
-    model: mujoco.MjModel, qpos: np.ndarray, camera: list[float], width: int, height: int
-) -> np.ndarray:
+    model: mujoco.MjModel, qpos: np.ndarray, camera: list[float], frames: np.ndarray
+) -> None:
     """Renders one frame for each row of qpos.
 
     Args:
       model: Model to draw.
       qpos: Generalized positions, shape (frame, nq).
-      camera: Point looked at [m], distance [m], azimuth and elevation [deg], six numbers.
-      width: Width of a frame in pixels.
-      height: Height of a frame in pixels.
-
-    Returns:
-      Frames, uint8, shape (frame, height, width, 3).
+      camera: Azimuth and elevation [deg], distance [m] and point looked at [m], six numbers.
+      frames: What becomes the frames, uint8, shape (frame, height, width, 3).
     """
     data, view = mujoco.MjData(model), mujoco.MjvCamera()
-    view.lookat[:] = camera[:3]
-    view.distance, view.azimuth, view.elevation = camera[3:]
-    frames = np.empty((len(qpos), height, width, 3), np.uint8)
+    view.azimuth, view.elevation, view.distance, *view.lookat[:] = camera
+    height, width = frames.shape[1:3]
+    model.vis.global_.offheight, model.vis.global_.offwidth = height, width
+    # A texel of shadow larger than a few pixels leaves teeth on the fingers; 8192 take 0.5 s.
+    model.vis.quality.shadowsize = min(max(2048, 4 * max(height, width)), 8192)
     with mujoco.Renderer(model, height, width) as renderer:
         for frame, q in zip(frames, qpos, strict=True):
             data.qpos[:] = q
@@ -37,7 +35,6 @@ def render(
             mujoco.mj_camlight(model, data)
             renderer.update_scene(data, view)
             renderer.render(out=frame)
-    return frames
 
 
 def main(arguments: list[str]) -> None:
@@ -45,7 +42,9 @@ def main(arguments: list[str]) -> None:
     model_path, qpos_path, out_path, width, height, *camera = arguments
     model = mujoco.MjModel.from_binary_path(model_path)
     qpos = np.load(qpos_path, allow_pickle=False)
-    np.save(out_path, render(model, qpos, [float(c) for c in camera], int(width), int(height)))
+    shape = len(qpos), int(height), int(width), 3
+    frames = np.lib.format.open_memmap(out_path, "w+", np.uint8, shape)
+    render(model, qpos, [float(c) for c in camera], frames)
 
 
 if __name__ == "__main__":

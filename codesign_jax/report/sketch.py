@@ -1,5 +1,7 @@
 """Sketches of a grasp in matplotlib, from link and object positions alone: no OpenGL needed."""
 
+from typing import TYPE_CHECKING
+
 import matplotlib.backends.backend_agg
 import matplotlib.figure
 import mujoco
@@ -8,9 +10,17 @@ import numpy as np
 from codesign_jax.model import layout
 from codesign_jax.scene import Scene
 
+if TYPE_CHECKING:
+    from codesign_jax.report.animation import Camera
+
 
 def draw(
-    scene: Scene, model: mujoco.MjModel, qpos: np.ndarray, shape: int, size: tuple[int, int]
+    scene: Scene,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    shape: int,
+    size: tuple[int, int],
+    camera: "Camera",
 ) -> np.ndarray:
     """Draws one frame for each row of qpos.
 
@@ -20,6 +30,7 @@ def draw(
       qpos: Generalized positions, shape (frame, nq).
       shape: Index of the object's shape.
       size: Width and height in pixels.
+      camera: Where it is seen from.
 
     Returns:
       Frames, uint8, shape (frame, height, width, 3).
@@ -34,13 +45,15 @@ def draw(
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         axes.clear()
-        _frame(axes, scene, data, outline)
+        _frame(axes, scene, data, outline, camera)
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return np.stack(pictures)
 
 
-def _frame(axes, scene: Scene, data: mujoco.MjData, outline: list[np.ndarray]) -> None:
+def _frame(
+    axes, scene: Scene, data: mujoco.MjData, outline: list[np.ndarray], camera: "Camera"
+) -> None:
     lay = layout(scene)
     reach = 0.15
     corners = reach * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
@@ -53,9 +66,11 @@ def _frame(axes, scene: Scene, data: mujoco.MjData, outline: list[np.ndarray]) -
     position, rotation = data.xpos[lay.object], data.xmat[lay.object].reshape(3, 3)
     for line in outline:
         axes.plot(*(position + line @ rotation.T).T, color="tab:orange", lw=1.5)
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(0, 2 * reach))
+    seen = reach / 0.62 * camera.distance
+    limits = [(v - seen, v + seen) for v in camera.lookat]
+    axes.set(**dict(zip(("xlim", "ylim", "zlim"), limits, strict=True)))
     axes.set_box_aspect((1, 1, 1))
-    axes.view_init(elev=14, azim=-55)
+    axes.view_init(elev=-camera.elevation, azim=camera.azimuth - 180)
     axes.set_axis_off()
 
 

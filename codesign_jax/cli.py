@@ -5,14 +5,15 @@ import importlib
 import importlib.metadata
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from codesign_jax import caches
+from codesign_jax import caches, sizes
 from codesign_jax.commands import flags, status
 from codesign_jax.commands.flags import (
     Count,
+    Engine,
     File,
     Flag,
     Overrides,
@@ -20,6 +21,12 @@ from codesign_jax.commands.flags import (
     Shown,
     Text,
 )
+
+
+def _size(name: str, meaning: str) -> Any:
+    """A flag of a run's size, whose help says the default."""
+    text = f"{meaning}; default: {sizes.text(name)}."
+    return tyro.conf.arg(metavar="INT", help=text, help_behavior_hint="")
 
 
 class Command:
@@ -67,18 +74,17 @@ class Optimize(Command):
     cost: Text = None
     """MODULE:FUNCTION, a cost of your own instead of the scene's: a number from scene, trace and
     controls of a grasp (docs/command_line.md)."""
-    engine: Text = None
-    """Engine that simulates: structured (ours, the default), mujoco (C, float64) or mjx (stock)."""
-    particles: Count = None
-    """Particles; default: 13 in 2d, 25 otherwise; the paper's are 10 and 60."""
-    trials: Count = None
-    """Trials of a particle in an episode, best a multiple of the objects; default: one with each
-    object; the paper's are 6."""
-    episodes: Count = None
-    """Episodes; default: 21 in 2d, 28 otherwise; the paper's are 64 and 128."""
-    test_trials: Count = None
-    """Further trials that test each final particle, in whole rounds of --trials; default: 12; the
-    paper's are 36 in 2d, 72 otherwise; 0: none."""
+    engine: Engine = None
+    particles: Annotated[int | None, _size("particles", "Particles")] = None
+    trials: Annotated[
+        int | None,
+        _size("trials", "Trials of a particle in an episode, best a multiple of the objects"),
+    ] = None
+    episodes: Annotated[int | None, _size("episodes", "Episodes")] = None
+    test_trials: Annotated[
+        int | None,
+        _size("test_trials", "Further trials of each particle of the final test; 0: none"),
+    ] = None
     reference_trials: Count = None
     """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine
     structured; 0: none."""
@@ -269,8 +275,7 @@ class Sample(Command):
     robust: Flag = False
     """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
     does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
-    engine: str = "structured"
-    """Engine that simulates: structured, mujoco (C, float64) or mjx (stock)."""
+    engine: Annotated[str, flags.ENGINE] = "structured"
     seed: int = 0
     """Root of designs and noise."""
     chunk: Count = None

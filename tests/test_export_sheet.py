@@ -1,12 +1,15 @@
 """Build sheet and tolerances: thresholds that are known are found, and the page says them."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rich.console import Console
 
-from codesign_jax import cli, codesign, files, scene
+from codesign_jax import cli, codesign, files, runs, scene
 from codesign_jax.commands import calls, export
 from codesign_jax.commands.calls import Meter
 from codesign_jax.export import drawing, process, sheet, tolerance
@@ -153,7 +156,7 @@ def page():
 def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
     content = sheet.sheet_sections(*page)
     text = sheet.write(tmp_path, "Build sheet", ["Design: x"], content).read_text()
-    fingers = "| 0 | 110.0 | 20.0 | 20.0 | 5.0 | 100.0 x 10.0 x 10.0 | 34.0 | 36.4 | 120.0 (200) |"
+    fingers = "| 0 | 110.0 | 20.0 | 20.0 | 5.00 | 100.0 x 10.0 x 10.0 | 34.0 | 36.4 | 120.0 (200) |"
     assert fingers in text  # 110 x 20 x 20 - 100 x 10 x 10 = 34 cm^3 of 1.07 g
     row = next(line for line in text.splitlines() if line.startswith("| length[0] | mm | 110 |"))
     cells = [c.strip() for c in row.strip("|").split("|")]
@@ -175,6 +178,26 @@ def test_a_design_that_fails_has_no_tolerance(page):
     poor = drift._replace(nominal=drift.nominal._replace(value=0.5), rows=[])
     section = sheet.tolerance_section(poor)
     assert not section.rows and "no tolerance to give" in section.notes[0]
+
+
+def test_text_stands_apart_from_the_drawings(page):
+    """The line of a design with 23 parameters ran into them."""
+    the_scene, params, sizes, drift = page
+    space = parameters.design_space(the_scene.hand, "full")
+    lines = [f"Best final design of runs/a: {runs.describe(space, space.default())}", "Scene x"]
+    shown = {"scene": the_scene, "params": params, "sizes": sizes, "drift": drift}
+    figure = drawing.page("Build sheet", lines, sheet.sheet_sections(*page), **shown)
+    FigureCanvasAgg(figure).draw()
+    texts = [*figure.texts, *(axes.title for axes in figure.axes)]
+    boxes = {t.get_text(): t.get_window_extent() for t in texts if t.get_text()}
+    assert any("pressure[3]" in text for text in boxes) and len(boxes) > 10
+    for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
+        assert not one.overlaps(two), (text, other)
+    for axes in figure.axes[:2]:
+        drawn = [axes.transData.transform_bbox(patch.get_bbox()) for patch in axes.patches[:1]]
+        for text, box in boxes.items():
+            assert not any(box.overlaps(patch) for patch in drawn), text
+    assert min(box.y0 for box in boxes.values()) > 0, "all of it is on the page"
 
 
 def test_drawing_is_one_page(page, tmp_path):

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = """
 sources files memory_maps
 kept_programs archives
-caches
+caches sizes
 types provenance compiler optimize
 scene
 axes model control verdict

@@ -106,19 +106,19 @@ def test_rows_of_runs_are_verdicts():
             for seed, run in enumerate(chosen, 1)
         }
 
-    def shown(every, width=80):
+    def shown(every):
         text = io.StringIO()
-        seeds.compare(tiny, every, Console(file=text, width=width))
+        seeds.compare(tiny, every, Console(file=text, width=40))  # as a log has, or less
         return [" ".join(line.split()) for line in text.getvalue().splitlines()]
 
     one = compared("single", (result, fresh), (None, None), (result, None))
-    lines = shown(one)  # 80 columns have room for it
+    lines = shown(one)
     assert "1 no reference 24 of 24 0 0 0 good" in lines and "2 failed" in lines
     assert "3 no final test 1 of 3 1 1 0 not good" in lines
     assert any(line.startswith("1 of 2 runs found a good design") for line in lines)
     good = SimpleNamespace(history=SimpleNamespace(cost=np.array([[2.0], [0.0]])))
     other = compared("concurrent", (runs.RunResult(good, test, 0), fresh))
-    lines = shown(one | other, width=100)
+    lines = shown(one | other)
     assert "single 3 no final test 1 of 3 1 1 0 not good" in lines
     # By Wilson's formula: 1 of 2 is 9.5 to 90.5 %, 1 of 1 is 20.7 to 100 %.
     assert "single 0 of 3 never 1 of 2 9 to 91 %" in lines

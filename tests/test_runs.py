@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+import re
 import signal
 import threading
 import time
@@ -16,8 +17,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from codesign_jax import codesign, files, optimize, runs, scene
-from codesign_jax.runs import columns, tables
+from codesign_jax import cli, codesign, files, optimize, runs, scene, sizes
+from codesign_jax.runs import columns, loop, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.checkpoint import digest
@@ -25,7 +26,7 @@ from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Busy, GroupProgress, Progress, Ticker, duration
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
-from codesign_jax.scene import library, parameters
+from codesign_jax.scene import effects, library, parameters
 from codesign_jax.types import Status
 from tests.helpers import episodes
 from tests.helpers.toy_engine import tiny
@@ -113,28 +114,71 @@ def test_text_survives_the_scene_file(tmp_path):
 
 
 def test_sizes_default_to_the_papers():
-    def sizes(preset, optimizer="particle-filter", objects=3):
+    def of(preset, optimizer="particle-filter", objects=3):
         s = settings_module.make_settings(
             preset, "concurrent", "control", "mujoco", 0, optimizer=optimizer, objects=objects
         )
         return s.particles, s.trials, s.episodes, s.test_trials
 
-    assert sizes("2d") == (10, 6, 64, 36)
-    assert sizes("23d") == (60, 6, 128, 72)
+    assert of("2d") == (10, 6, 64, 36)
+    assert of("23d") == (60, 6, 128, 72)
     # Figure 7's budget, per run: 64 episodes of 60 grasps and 36 more tests of 10 particles.
     two = settings_module.make_settings(
         "2d", "concurrent", "control", "structured", 0, optimizer="particle-filter"
     )
     assert runs.prepare(scene.load(), two).grasps == 64 * 60 + 360
     # The default optimiser's: each of its trials is one with another object.
-    assert sizes("23d", optimize.DEFAULT) == (25, 3, 30, 48)
-    assert sizes("full", optimize.DEFAULT, objects=8) == (25, 8, 30, 48)
+    assert of("23d", optimize.DEFAULT) == (25, 3, 30, 48)
+    assert of("full", optimize.DEFAULT, objects=8) == (25, 8, 30, 48)
+    assert of("full", optimize.DEFAULT, objects=1) == (25, 3, 30, 48)
     # Its final test simulates three averages, and no copies of them; in 2D three designs more.
     for preset, grasps in (("23d", 30 * 75 + 3 * 48), ("2d", 19 * 39 + 6 * 36)):
         made = settings_module.make_settings(
             preset, "concurrent", "control", "structured", 0, optimizer=optimize.DEFAULT
         )
         assert runs.prepare(scene.load(), made).grasps == grasps
+
+
+@pytest.mark.parametrize("episodes", [1, 5, 6])
+def test_the_planned_test_is_the_one_that_is_simulated(episodes):
+    """A search that ends among its random designs tests all of them: "39/36 grasps"."""
+    the_scene, space, _ = tiny()
+    own = settings(particles=8, episodes=episodes, optimizer=optimize.DEFAULT)
+    plan = runs.prepare(the_scene, own)
+    state = plan.optimizer.init(jax.random.key(0), space.default(), own.particles)
+    for mask in plan.mask:
+        asked = plan.optimizer.ask(state, mask)
+        state, _ = plan.optimizer.tell(state, asked, jnp.arange(8.0), mask)
+    tested, _ = loop.finalists(plan, np.asarray(state.particles))
+    assert len(tested) * own.trials * own.test_rounds == plan.test_grasps
+    assert len(tested) == (8 if episodes <= 5 else 6)
+
+
+def test_sizes_are_told_as_they_are(capsys):
+    """The help and the pages have the numbers of `sizes`, and the engines that refuse a scene."""
+    with pytest.raises(SystemExit):
+        cli.main(["optimize", "--help"])
+    told = " ".join(re.sub(r"[│\n]", " ", capsys.readouterr().out).split())
+    for name in sizes.Sizes._fields:
+        assert f"default: {sizes.text(name)}." in told
+    assert "one with each object, and at least 3; the paper's are 6" in sizes.text("trials")
+    two, many = sizes.SCREENED["2d"], sizes.SCREENED[""]
+    assert f"{many.episodes} otherwise; the paper's are 64 and 128" in sizes.text("episodes")
+    pages = Path(__file__).parents[1] / "docs"
+    assert f"episodes ({sizes.text('episodes')})" in (pages / "concepts.md").read_text()
+    for words in (
+        f"{many.particles} particles ({two.particles} in 2D) in one trial with each object "
+        f"(three where there are fewer objects), {many.episodes} episodes ({two.episodes} in 2D), "
+        f"and {many.test_trials} more trials ({two.test_trials} in 2D)",
+        f"as in the paper: {' particles, '.join(map(str, sizes.PAPER['2d'][:2]))} trials, 64 epi",
+    ):
+        assert words in " ".join((pages / "command_line.md").read_text().split())
+    # What the help says of the engines is what they refuse.
+    assert "not of the default one, mujoco (C, float64) and mjx (stock)" in told
+    for engine in effects.ENGINES:
+        own = scene.load("paper"), scene.load("paper_spheres")
+        refused = [bool(effects.refusals(the_scene.effects, engine)) for the_scene in own]
+        assert refused == [engine != "structured", False]
 
 
 def test_settings_report_every_problem():

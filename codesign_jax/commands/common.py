@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
 from codesign_jax import engines
 from codesign_jax import scene as scenes
@@ -216,6 +218,11 @@ def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[st
     """
     given = [(flag, v, "", low, high) for flag, v, low, high in numbers if v is not None]
     return [problem for number in given if (problem := schema.range_problem(*number))]
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Prints a table as wide as it is: a log takes long lines, and a terminal folds them."""
+    Console(file=console.file, width=1000).print(table)
 
 
 def picture_problems(flag: str, path: Path) -> list[str]:

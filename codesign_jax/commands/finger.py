@@ -101,7 +101,7 @@ def compare(
         shown.add_column(name.replace("_", " "), justify="right")
     for row in zip(*columns.values(), strict=True):
         shown.add_row(*("" if math.isnan(v) else f"{v:.4g}" for v in row))
-    console.print(shown)
+    common.print_table(console, shown)
     if options.measured:
         for which, values in found.items():
             console.print(f"{which}: {_errors(table, values)}", markup=False)

@@ -25,6 +25,14 @@ Overrides = Annotated[
 # Without a default of its own: the help text says what takes its place.
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Count = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+ENGINE = tyro.conf.arg(
+    metavar="STR",
+    help="Engine that simulates: structured (ours); or, of scenes with contact spheres such as "
+    "paper_spheres and not of the default one, mujoco (C, float64) and mjx (stock). Default: "
+    "structured, or the run's own.",
+    help_behavior_hint="",
+)
+Engine = Annotated[str | None, ENGINE]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 
@@ -91,8 +99,7 @@ class Subject:
     robust: Flag = False
     """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
     does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
-    engine: Text = None
-    """Engine that simulates; default: the run's, or structured."""
+    engine: Engine = None
 
 
 @dataclasses.dataclass

@@ -97,11 +97,11 @@ def compare(scene: Scene, every: Mapping[Path, Compared], console: Console) -> N
     for run in every.values():
         own = [run.settings.schedule] if len(strategies) > 1 else []
         rows.append((*own, str(run.settings.seed), *_row(scene, run)))
-    console.print(_table((*(["strategy"] * (len(strategies) > 1)), *head), rows))
+    common.print_table(console, _table((*(["strategy"] * (len(strategies) > 1)), *head), rows))
     rows = [_summary(scene, name, every) for name in strategies]
     if len(strategies) > 1:
         head = ("strategy", "converged", "grasps until then, median", "good", "95 % interval")
-        console.print(_table(head, rows))
+        common.print_table(console, _table(head, rows))
     name, _, _, good, interval = rows[0]
     if good and len(strategies) == 1:
         console.print(f"{good} runs found a good design: {interval} of such runs (95 % interval)")

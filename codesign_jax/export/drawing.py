@@ -3,6 +3,7 @@
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.figure
 import matplotlib.patches
@@ -17,10 +18,17 @@ from codesign_jax.types import Params
 
 _A4 = (8.27, 11.69)
 _SMALL = 5.6
+_LINE = 0.0095  # height of a line of that size in the figure's
 
 
-def write(
-    folder: Path,
+def write(folder: Path, *content: Any, **shown: Any) -> Path:
+    """Writes the sheet to a folder as one page of PDF; the other arguments are those of `page`."""
+    path = folder / f"{NAME}.pdf"
+    page(*content, **shown).savefig(path)
+    return path
+
+
+def page(
     title: str,
     lines: Sequence[str],
     content: Sequence[SheetSection],
@@ -29,11 +37,10 @@ def write(
     params: Params,
     sizes: Sequence[Size],
     drift: Drift | None,
-) -> Path:
+) -> matplotlib.figure.Figure:
     """Draws the sheet on one page.
 
     Args:
-      folder: An existing folder.
       title: Its title.
       lines: What it is about, below the title.
       content: The sections, see `sheet.sheet_sections`.
@@ -41,27 +48,23 @@ def write(
       params: Parameters of the design as concrete arrays.
       sizes: Dimensions of the fingers.
       drift: Tolerances, or None.
-
-    Returns:
-      The file's path.
     """
     # A figure of its own instead of pyplot's: no state and no display is touched.
     figure = matplotlib.figure.Figure(figsize=_A4)
     figure.text(0.06, 0.965, title, fontsize=13, weight="bold")
-    about = "\n".join(textwrap.fill(line, 130) for line in lines)
+    about = "\n".join(textwrap.fill(line, 165) for line in lines)
     figure.text(0.06, 0.957, about, fontsize=_SMALL, va="top")
-    _section(figure.add_axes((0.04, 0.775, 0.24, 0.13)), sizes[0])
-    _side_view(figure.add_axes((0.30, 0.775, 0.38, 0.13)), sizes[0])
-    _palm(figure.add_axes((0.70, 0.755, 0.26, 0.17)), scene, params)
-    top = 0.745
+    top = 0.935 - _LINE * (about.count("\n") + 1)  # below what it is about, however long that is
+    _section(figure.add_axes((0.04, top - 0.14, 0.24, 0.13)), sizes[0])
+    _side_view(figure.add_axes((0.30, top - 0.14, 0.38, 0.13)), sizes[0])
+    _palm(figure.add_axes((0.70, top - 0.16, 0.26, 0.16)), scene, params)
+    top -= 0.175
     for section in content:
         if section.title.startswith("Tolerance") and drift and drift.rows:
             top = _tolerance(figure, top, section, drift)
         else:
             top = _table(figure, top, section)
-    path = folder / f"{NAME}.pdf"
-    figure.savefig(path)
-    return path
+    return figure
 
 
 def _lines(text: str) -> list[str]:
@@ -92,7 +95,7 @@ def _table(figure: matplotlib.figure.Figure, top: float, section: SheetSection) 
 def _notes(figure: matplotlib.figure.Figure, top: float, notes: Sequence[str]) -> float:
     text = [line for note in notes for line in _lines(note)]
     figure.text(0.06, top, "\n".join(text), fontsize=_SMALL, va="top", linespacing=1.3)
-    return top - 0.0095 * len(text) - 0.010
+    return top - _LINE * len(text) - 0.010
 
 
 def _tolerance(
@@ -100,7 +103,7 @@ def _tolerance(
 ) -> float:
     """A bar from the last good value on either side, a cross at the first bad one."""
     figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
-    bottom = 0.02 + 0.0095 * sum(len(_lines(note)) for note in section.notes) + 0.015
+    bottom = 0.02 + _LINE * sum(len(_lines(note)) for note in section.notes) + 0.015
     bottom = max(bottom, top - 0.03 - 0.03 * len(drift.rows))
     axes = figure.add_axes((0.14, bottom, 0.63, top - 0.018 - bottom))
     for k, row in enumerate(drift.rows):

@@ -69,11 +69,12 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
         pressure = float(params.pressure[i])
         limit = scene.hand.pressure_limit.per_wall * float(params.wall[i])
         chamber = " x ".join(f"{v:.1f}" for v in size.chamber)
-        numbers = [size.length, size.width, size.height, size.wall]
+        numbers = [size.length, size.width, size.height]
         rows.append(
             (
                 str(i),
                 *(f"{v:.1f}" for v in numbers),
+                _castable(size.wall),
                 chamber,
                 f"{size.volume / 1e3:.1f}",
                 f"{1e-6 * size.volume * density:.1f}",
@@ -83,12 +84,19 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
         )
     head = ("finger", "length mm", "width mm", "height mm", "wall mm", "chamber mm")
     head += ("silicone cm³", "mass g", "pressure kPa (limit)", "free bend °")
+    ends = "as thick as the others"
+    if any(size.end != size.wall for size in sizes):
+        ends = f"{', '.join(dict.fromkeys(_castable(size.end) for size in sizes))} mm"
     notes = [
-        f"Walls at base and tip: {', '.join(f'{s:g}' for s in dict.fromkeys(z.end for z in sizes))}"
-        " mm. Free bend: predicted by beam theory for a straight finger at its pressure, without "
-        "load; measure it first."
+        f"Walls to 0.05 mm; at base and tip: {ends}. Free bend: predicted by beam theory for a "
+        "straight finger at its pressure, without load; measure it first."
     ]
     return SheetSection("Fingers", head, rows, notes)
+
+
+def _castable(thickness: float) -> str:
+    """A thickness [mm] to what a mould can be made to."""
+    return f"{round(20 * thickness) / 20:.2f}"
 
 
 def bends(scene: Scene, params: Params) -> np.ndarray:

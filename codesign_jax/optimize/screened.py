@@ -113,6 +113,11 @@ class Screened:
         """Particles of the state that the final test takes: averages, and screened designs."""
         return AVERAGES + (STARTS if jnp.size(self.space.low) <= FEW else 0)
 
+    @property
+    def begins(self) -> int:
+        """Episode in which the strategy begins; before it all particles are random designs."""
+        return self.screening + self.retests
+
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
         """The state before episode 0; see `Optimizer.init`.
 
@@ -181,7 +186,7 @@ class Screened:
         finalists = way[jnp.minimum(ago, len(cost) - 1)]
         # Screened designs stand best first until the strategy begins.
         starts = (rows >= AVERAGES) & (rows < self.finalists)
-        begins = state.episode == self.screening + self.retests
+        begins = state.episode == self.begins
         screened_rows = jnp.where(begins, jnp.maximum(rows - AVERAGES, 0), rows)
         finalists = jnp.where(starts[:, None], state.particles[screened_rows], finalists)
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
@@ -198,14 +203,12 @@ class Screened:
 
     def _screens(self, state: State) -> jax.Array:
         """Whether the episode is one of random designs, drawn or simulated again."""
-        return state.episode < self.screening + self.retests
+        return state.episode < self.begins
 
     def _asked(self, state: State, mask: ArrayLike) -> tuple[jax.Array, Any, dict[str, Any]]:
         """The average and the strategy's points, its state with them, and what was remembered."""
         assert state.memory is not None
-        begun = jnp.all(mask == state.memory["mask"]) & (
-            state.episode > self.screening + self.retests
-        )
+        begun = jnp.all(mask == state.memory["mask"]) & (state.episode > self.begins)
         first = self._start(state)
         memory = jax.tree.map(
             partial(jnp.where, begun), {name: state.memory[name] for name in first}, first

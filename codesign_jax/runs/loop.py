@@ -81,6 +81,8 @@ class Plan(NamedTuple):
     def finalists(self) -> int:
         """Particles that the final test simulates; see `optimize.Optimizer`."""
         every = self.settings.particles
+        if self.settings.episodes <= getattr(self.optimizer, "begins", 0):
+            return every  # the run ends among random designs, which all differ
         return min(every, getattr(self.optimizer, "finalists", every))
 
     @property
@@ -350,7 +352,7 @@ class Loop:
             return
         # Outcomes by which the best particles so far were chosen are too good to count.
         previous = None if plan.optimizer.keeps_best else record.last_outcomes()
-        particles, same = _finalists(plan, np.asarray(record.state.particles))
+        particles, same = finalists(plan, np.asarray(record.state.particles))
         testing = codesign.testing(
             plan.scene,
             jnp.asarray(particles),
@@ -407,7 +409,7 @@ class Loop:
         self.run_directory.log(message)
 
 
-def _finalists(plan: Plan, particles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def finalists(plan: Plan, particles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Particles that the final test simulates, and for each final particle its place among them.
 
     They are all of them, unless the optimiser says that few differ, and so few do.

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax import engines, optimize, own
+from codesign_jax import engines, optimize, own, sizes
 from codesign_jax.optimize import MAX_PARTICLES, schedule
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.hand import Hand
@@ -52,12 +52,6 @@ class Settings:
         return -(-self.test_trials // self.trials)
 
 
-# Particles, trials, episodes and further test trials.  The paper's (sections VI.2 and VI.4), which
-# the optimisers that are compared with the paper's share; and those of the screened searches, by
-# docs/notes/search.md.
-_SIZES = {"2d": (10, 6, 64, 36), "": (60, 6, 128, 72)}
-_SCREENED_SIZES = {"2d": (13, 3, 19, 36), "": (25, 3, 30, 48)}
-
 _RANGES = {
     "particles": (1, MAX_PARTICLES),
     "trials": (1, 100_000),
@@ -82,19 +76,14 @@ def make_settings(
     cost: str = SCENE_COST,
     objects: int = 3,
 ) -> Settings:
-    """Fills sizes that are not given: those of 2D for "2d", of 23D otherwise.
-
-    They are the paper's, but for a screened search, whose particles meet each of the scene's
-    `objects` once in an episode.
-    """
+    """Fills sizes that are not given: those of `sizes`, in a scene with so many `objects`."""
     screens = optimizer in optimize.SCREENED
-    by_preset = _SCREENED_SIZES if screens else _SIZES
-    sizes = by_preset.get(preset, by_preset[""])
+    by_preset = sizes.SCREENED if screens else sizes.PAPER
+    usual = by_preset.get(preset, by_preset[""])
     if screens:
-        sizes = (sizes[0], max(objects, sizes[1]), *sizes[2:])
+        usual = usual._replace(trials=max(objects, usual.trials))
     asked = (particles, trials, episodes, test_trials)
-    chosen = (s if a is None else a for a, s in zip(asked, sizes, strict=True))
-    n, t, e, test = chosen
+    n, t, e, test = (s if a is None else a for a, s in zip(asked, usual, strict=True))
     return Settings(preset, schedule, first, engine, n, t, e, seed, test, optimizer, cost)
 
 

@@ -1,0 +1,41 @@
+"""Sizes that a run has where none are asked for.  The help text reads them: nothing heavy here."""
+
+from typing import NamedTuple
+
+
+class Sizes(NamedTuple):
+    """Sizes of a run.
+
+    Attributes:
+      particles: Particles.
+      trials: Trials of a particle in an episode.
+      episodes: Episodes.
+      test_trials: Further trials of each particle of the final test.
+    """
+
+    particles: int
+    trials: int
+    episodes: int
+    test_trials: int
+
+
+PAPER = {"2d": Sizes(10, 6, 64, 36), "": Sizes(60, 6, 128, 72)}
+"""The paper's (sections VI.2 and VI.4), by preset or for all others, which the optimisers that are
+compared with the paper's share."""
+SCREENED = {"2d": Sizes(13, 3, 19, 36), "": Sizes(25, 3, 30, 48)}
+"""Those of the screened searches, by docs/notes/search.md; `trials` is the least, as each particle
+meets every object."""
+
+
+def text(name: str) -> str:
+    """The defaults of a size in words, such as "13 in 2d, 25 otherwise; the paper's are 10 and 60".
+
+    Args:
+      name: A field of `Sizes`.
+    """
+    two, many, paper_two, paper_many = (
+        getattr(sizes[preset], name) for sizes in (SCREENED, PAPER) for preset in ("2d", "")
+    )
+    if name == "trials":
+        return f"one with each object, and at least {many}; the paper's are {paper_many}"
+    return f"{two} in 2d, {many} otherwise; the paper's are {paper_two} and {paper_many}"

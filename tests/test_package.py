@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -95,3 +96,22 @@ def test_dependencies_are_bounded():
     for requirement in [*project["dependencies"], *extras]:
         own = requirement.startswith("codesign-jax")
         assert own or (">=" in requirement and "<" in requirement), requirement
+
+
+def test_extras_that_are_named_exist():
+    """In pages, notebooks and messages: pip only warns of one that does not."""
+    extras = {
+        *tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    }
+    places = ["README.md", "pyproject.toml", "Makefile", *ROOT.glob("docs/*.md")]
+    places += [
+        p for top in ("codesign_jax", "notebooks", "scripts") for p in (ROOT / top).rglob("*.py")
+    ]
+    texts = [(ROOT / place).read_text(encoding="utf-8") for place in places]
+    named = {
+        name
+        for text in texts
+        for names in re.findall(r"(?:codesign-jax|'\.|-e \.)\[([a-z,]+)\]", text)
+        for name in names.split(",")
+    }
+    assert {"report", "export", "parquet"} <= named <= extras

@@ -263,7 +263,7 @@ def test_evaluate_says_which_objects_it_leaves_out(capsys):
         (["--trials", "0"], "--trials = 0 is outside"),
         (["--engine", "c"], "--engine"),
         (["--set", "solver.iterations=50"], "set newton.iterations, which limits the solver"),
-        (["--render", "grasp.mp4"], "must end in .gif"),
+        (["--render", "grasp.avi"], "must end in .gif"),
         (["--run", "nowhere"], "nowhere is not a run folder: there is no such folder"),
         (["--run", "nowhere", "--design", "length=100"], "own; leave out --design"),
         (["--run", "nowhere", "--hand", "tripod3", "--preset", "23d"], "out --hand and --preset"),

@@ -28,7 +28,7 @@ help:
 	@echo "make stability   the hard cases and their margins, docs/notes/stability.md"
 	@echo "make faults      kills, full disks, damage, hostile input: FAULTS=100"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
-	@echo "make benchmark   measure the engines: BENCHMARK=docs/data/benchmark_cpu.json, ARGS=--quick"
+	@echo "make benchmark   measure rates: BENCHMARK=docs/data/rates_cpu.json"
 	@echo "make effects     what each effect costs and decides: docs/notes/effects.md"
 	@echo "make accuracy    what accuracy costs in time, and what moves a verdict"
 	@echo "make docs        the documentation as a site without a network: site/index.html"
@@ -76,7 +76,7 @@ notebooks: $(STAMP)
 	$(BIN)/python -m scripts.run_notebooks
 
 # Whole grasps of all engines; a file that exists is extended.
-BENCHMARK ?= runs/benchmark.json
+BENCHMARK ?= runs/rates.json
 benchmark: $(STAMP)
 	$(BIN)/python -m scripts.benchmark --json $(BENCHMARK) $(ARGS)
 

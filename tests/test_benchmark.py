@@ -1,12 +1,16 @@
 """The benchmark's statistics against closed forms and SciPy, its worlds, and its book-keeping."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
 import scipy.stats
 
-from codesign_jax.types import Trace
-from scripts.benchmark import cases, grasps, report
+from codesign_jax import rollout, scene
+from codesign_jax.engines import make_engine
+from scripts.benchmark import __main__ as benchmark
+from scripts.benchmark import report
 from scripts.shared import statistics, work
 
 
@@ -54,30 +58,6 @@ def test_variants_have_good_designs(change):
     np.testing.assert_allclose(worlds.params.length[6:], work.GOOD["length"][0] * 1e-3, rtol=1e-6)
 
 
-def test_simulated_steps_end_where_a_trace_stops_changing():
-    """A world that is simulated on changes to the end, one that is stopped repeats its entry."""
-    scene = work.variant()
-    steps = scene.num_steps
-    moving = np.linspace(0.01, 0.02, steps, dtype=np.float32)
-    stopped = np.where(np.arange(steps) < 400, moving, moving[400])
-    distance = np.stack([moving, stopped])
-    trace = Trace(distance, 0 * distance + 0.03, 0 * distance, np.zeros((2, steps, 0)))
-    _, count = cases.summary(scene, jax.tree.map(jax.numpy.asarray, trace))
-    assert count.tolist() == [steps, 401]
-    rates = cases.rates(scene, 2, steps, 1.0, np.asarray(count))
-    assert rates["nominal_world_steps_per_s"] == 2 * steps
-    assert rates["simulated_world_steps_per_s"] == pytest.approx(steps + 401)
-
-
-def test_a_second_run_replaces_its_cases():
-    results = {"records": []}
-    record = {"engine": "mjx", "setting": "equal", "worlds": 3}
-    for value in (1, 2):
-        report.add(results, {**record, "value": value}, [])
-    report.add(results, {**record, "worlds": 4, "value": 3}, [])
-    assert [r["value"] for r in results["records"]] == [2, 3]
-
-
 def test_a_micrometre_moves_the_objects_and_nothing_else():
     worlds = work.make_worlds(work.variant(links=2), 60)
     moved = work.nudged(worlds.trials)
@@ -86,9 +66,70 @@ def test_a_micrometre_moves_the_objects_and_nothing_else():
     assert not any(np.any(d) for d in difference._replace(position=0.0))
 
 
-def test_a_case_that_is_measured_again_keeps_its_calls_and_counts_the_shortest():
-    first = grasps.merged(None, {"worlds": 60, "seconds": [2.0, 1.0], "processor_s": [2.0, 1.5]})
-    assert (first["best_s"], first["grasps_per_s"]) == (1.0, 60.0)
-    slow = grasps.merged(first, {"worlds": 60, "seconds": [4.0], "processor_s": [1.4]})
-    assert slow["seconds"] == [2.0, 1.0, 4.0] and slow["grasps_per_s"] == 60.0
-    assert slow["processor_s"] == [2.0, 1.5, 1.4]
+def test_winners_are_the_best_final_particle_of_each_concurrent_run():
+    """Each as often as any other, and in a second round with another object."""
+    chosen = scene.load("paper")
+    found, objects = benchmark.winners(chosen), len(chosen.objects.object)
+    with np.load(benchmark.WINNERS) as file:
+        particles, cost = file["final_particles"][2], file["test_worst"][2]
+        assert file["strategies"][2] == "concurrent" and len(found) == 30
+    for design, candidates, costs in zip(found, particles, cost, strict=True):
+        [best] = {costs[k] for k, c in enumerate(candidates) if np.array_equal(c, design)}
+        assert best == costs.min()
+    worlds = benchmark.make_worlds(chosen, "winners", 60)
+    np.testing.assert_array_equal(worlds.params.length[:30], worlds.params.length[30:])
+    assert not np.any(worlds.trials.shape[:30] == worlds.trials.shape[30:])
+    random = benchmark.make_worlds(chosen, "random", 60)
+    assert len(np.unique(random.params.length, axis=0)) == 60 // objects
+    assert np.bincount(random.trials.shape).tolist() == [60 // objects] * objects
+
+
+def test_a_batch_is_measured_and_judged(monkeypatch):
+    """Its verdicts are those of the engine; the rate is that of the shortest call."""
+    monkeypatch.setattr(benchmark, "SECONDS", 0.0)
+    chosen = work.variant(links=2)
+    record = benchmark.measured(chosen, "mixed", "mujoco", 12, calls=3)
+    worlds = work.make_worlds(chosen, 12)
+    outcomes, _ = rollout.simulate(chosen, make_engine("mujoco", chosen), *worlds)
+    assert record["verdicts"] == "".join("01"[int(c < 0.01)] for c in np.asarray(outcomes.cost))
+    assert "0" in record["verdicts"] and "1" in record["verdicts"]
+    assert record["grasps_per_s"] == pytest.approx(12 / min(record["seconds"]), abs=0.1)
+    assert record["kept"] == pytest.approx(record["verdicts"].count("1") / 12, abs=1e-4)
+
+
+RUN = {"platform": "cpu", "cpus": 2, "commit": "0123456789", "jax": "0.1", "date": "2026-01-02T03"}
+
+
+def record(engine, rate, **more):
+    base = {"scene": "paper", "designs": "winners", "engine": engine, "worlds": 60, "run": 0}
+    return {**base, "grasps_per_s": rate, **more}
+
+
+def test_tables_are_those_of_the_records_and_a_second_measurement_replaces_the_first():
+    records = []
+    for new in (record("structured", 1.0), record("structured", 44.4, verdicts="0011")):
+        records = report.replaced(records, new)
+    records = report.replaced(records, record("MuJoCo C 4.0.0", 8.0, verdicts="0111"))
+    gpu = {**RUN, "platform": "gpu", "device": "NVIDIA H100 80GB HBM3"}
+    larger = {"runs": [gpu], "records": [record("structured", 1234.0, worlds=16384)]}
+    files = [{"runs": [RUN], "records": records}, larger]
+    assert report.rates(files).splitlines() == [
+        "| grasps a second (time of a batch) | 2 CPU cores, winners | one H100, winners |",
+        "| --- | --- | --- |",
+        "| 60 grasps, an episode of the paper's 2D | 44 (1.4 s) | – |",
+        "| 16,384 grasps | – | 1,200 (13 s) |",
+    ]
+    assert report.measured(files) == (
+        "Measured on 2 CPU cores, JAX 0.1, 2026-01-02; on one H100, JAX 0.1, 2026-01-02 "
+        "(`docs/data/rates_*.json`)."
+    )
+    row = "| paper | 2 CPU cores, 60 grasps | MuJoCo C 4.0.0 | 8.0 | 44 | 6 | 3 of 4 |"
+    assert report.peers(files).splitlines()[2:] == [row]
+
+
+@pytest.mark.parametrize("page", report.PAGES)
+def test_tables_of_the_pages_are_those_of_the_data(page):
+    text, files = (report.ROOT / page).read_text(encoding="utf-8"), report.read()
+    for mark in report.PAGES[page]:
+        [shown] = re.findall(f"<!-- {mark}:begin -->\n\n(.*?)\n\n<!-- {mark}:end -->", text, re.S)
+        assert shown == getattr(report, mark)(files)

@@ -1,1 +1,1 @@
-"""Measures engines against each other: work, timing, errors; `python -m` runs a single case."""
+"""Rates of this engine and of its peers, in whole grasps a second."""

@@ -1,159 +1,191 @@
-"""Measures the engines against each other on the scene `paper_spheres`, one case a process.
+"""Whole grasps a second, of this engine with random and with good designs, and of its peers.
 
-python -m scripts.benchmark --json docs/data/benchmark_cpu.json
+python -m scripts.benchmark --json docs/data/rates_cpu.json     # three minutes on two idle cores
+python -m scripts.benchmark --page                              # README's table and the page's
 
-Whole grasps, with verdicts against converged float64 MuJoCo C.  A second run with the same file
-replaces the cases that it measures and keeps the others, so that engines can be measured in several
-runs: --engines structured, then --engines mjx.
+On a GPU the batches are larger, and MuJoCo Warp is measured where it is installed.  A file that
+exists is extended, and a case that is measured again is replaced, so that another MuJoCo can be
+measured into the same file from another environment (--engines mujoco).  Of several calls the
+shortest counts: other programs make a call longer and never shorter.
 """
 
 import argparse
 import json
 import os
-import subprocess
-import sys
-import tempfile
 import time
+from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from scripts.benchmark import report
-from scripts.benchmark.cases import Case
-from scripts.shared import output, peers, provenance
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
 
-# Worlds of the sizes measured; stock MJX and Warp get what their speed and memory allow.
-SIZES = {
-    "cpu": {"structured": [60, 360], "mujoco": [60, 360], "mjx": [12, 60], "warp": []},
-    "gpu": {
-        "structured": [1728, 16384, 65536],
-        "mujoco": [1728],
-        "mjx": [1728, 16384],
-        "warp": [1728, 16384, 65536],
-    },
+from codesign_jax import cost, rollout, sampling, scene
+from codesign_jax.engines import make_engine
+from codesign_jax.scene import Scene, parameters
+from codesign_jax.types import Outcome, failed
+from scripts.benchmark import report
+from scripts.shared import output, provenance, work
+
+SPHERES = {"surface": "spheres"}
+"""What engines without the skinned hull can simulate of the default scene."""
+CASES: dict[str, tuple[str, dict[str, Any], tuple[str, ...], tuple[str, ...]]] = {
+    "paper": ("paper", {}, ("random", "winners"), ("structured",)),
+    "paper_spheres": ("paper_spheres", {}, ("mixed",), ("structured", "mujoco", "warp")),
+    "paper with spheres": ("paper", SPHERES, ("mixed",), ("structured", "mujoco", "warp")),
 }
-REFERENCE = {"cpu": 360, "gpu": 1728}
-"""Worlds whose verdicts are compared."""
-QUICK = 12
-"""Worlds of a case with --quick."""
+"""Scenes: file, effects, designs and engines."""
+WORLDS = {"cpu": {"": (60, 360), "mixed": (120,)}, "gpu": {"": (60, 360, 1728, 16384)}}
+WORLDS["gpu"]["mixed"] = (1728,)
+SECONDS = 10.0
+"""Time after which no further call begins."""
+JUDGED = 360
+"""Grasps whose verdicts are kept, to be compared between engines."""
+WINNERS = report.ROOT / "docs/data/experiments/23d.npz"
+
+
+def winners(chosen: Scene) -> np.ndarray:
+    """The final particle that tested best of each concurrent run with 23 parameters, (run, 23)."""
+    space = parameters.design_space(chosen.hand, "23d")
+    with np.load(WINNERS, allow_pickle=False) as file:
+        assert tuple(file["parameters"]) == space.names
+        place = list(file["strategies"]).index("concurrent")
+        tested, particles = file["test_worst"][place], file["final_particles"][place]
+    return particles[np.arange(len(particles)), tested.argmin(1)]
+
+
+def make_worlds(chosen: Scene, designs: str, count: int) -> work.Worlds:
+    """Hands and trials; every design meets other objects and noise.
+
+    Args:
+      chosen: The scene.
+      designs: "random" (uniform over the 23 parameters), "winners", or "mixed" (half random, half
+        good ones of two parameters).
+      count: Number of grasps.
+    """
+    if designs == "mixed":
+        return work.make_worlds(chosen, count)
+    space, key = parameters.design_space(chosen.hand, "23d"), jax.random.key(work.SEED)
+    objects = len(chosen.objects.object)
+    trials = rollout.sample_trials(chosen, key, count)
+    if designs == "winners":
+        vectors, index = winners(chosen), np.arange(count)
+        trials = trials._replace(shape=(index + index // len(vectors)) % objects)
+        vectors = vectors[index % len(vectors)]
+    else:
+        drawn = sampling.draw(chosen, space, key, first=0, n=-(-count // objects), num_trials=1)
+        vectors = np.repeat(np.asarray(drawn.designs), objects, axis=0)[:count]
+    params = jax.vmap(space.params)(jnp.asarray(vectors, jnp.float32))
+    return work.Worlds(*jax.tree.map(np.asarray, (params, trials)))
+
+
+class JaxProgram:
+    """A function of arrays, compiled in `compile_s`."""
+
+    def __init__(self, function: Callable, *args: Any):
+        """Compiles the function for its arguments."""
+        begin = time.perf_counter()
+        self.args, self.compiled = args, jax.jit(function).lower(*args).compile()
+        self.compile_s = time.perf_counter() - begin
+
+    def run(self) -> tuple[Any, float]:
+        """Runs once; returns results and seconds on the host's clock."""
+        begin = time.perf_counter()
+        result = jax.block_until_ready(self.compiled(*self.args))
+        return result, time.perf_counter() - begin
+
+
+def _program(chosen: Scene, engine: str, worlds: work.Worlds) -> Any:
+    """What runs the grasps: `run` returns outcomes, or a trace of Warp's, and seconds."""
+    if engine == "warp":
+        from scripts.benchmark.warp import WarpProgram
+
+        fields, ctrl = work.inputs(chosen, worlds)
+        return WarpProgram(chosen, fields, np.asarray(ctrl))
+    made = make_engine(engine, chosen)
+    return JaxProgram(lambda p, t: rollout.simulate(chosen, made, p, t)[0], *worlds)
+
+
+def _outcomes(chosen: Scene, result: Any) -> Outcome:
+    if not isinstance(result, Outcome):  # Warp's trace is judged outside of its timing
+        result = jax.vmap(lambda t: cost.outcome(chosen, t))(jax.tree.map(jnp.asarray, result))
+    return jax.tree.map(np.asarray, result)
+
+
+def measured(chosen: Scene, designs: str, engine: str, count: int, calls: int) -> dict[str, Any]:
+    """Times one batch, compiled and warmed up before."""
+    program = _program(chosen, engine, make_worlds(chosen, designs, count))
+    result, first = program.run()
+    seconds: list[float] = []
+    while not seconds or (len(seconds) < calls and sum(seconds) + first < SECONDS):
+        result, taken = program.run()
+        seconds.append(round(taken, 4))
+    outcomes = _outcomes(chosen, result)
+    bad = np.asarray(failed(outcomes.status))
+    kept = (outcomes.cost < 0.01) & ~bad
+    return {
+        "seconds": seconds,
+        "grasps_per_s": round(count / min(seconds), 1),
+        "compile_s": round(program.compile_s, 1),
+        "kept": round(float(kept.mean()), 4),
+        "failed": int(bad.sum()),
+        "verdicts": "".join(map(str, kept[:JUDGED].astype(int))),
+    }
+
+
+def named(engine: str) -> str:
+    """The engine's name with the version of a peer."""
+    peers = {"mujoco": f"MuJoCo C {mujoco.__version__}", "mjx": "MJX", "warp": "MuJoCo Warp"}
+    package = {"mjx": "mujoco-mjx", "warp": "mujoco-warp"}.get(engine)
+    return peers.get(engine, engine) + (f" {metadata.version(package)}" if package else "")
 
 
 def arguments() -> argparse.Namespace:
     """Command line."""
     parser = provenance.parser(__doc__)
-    parser.add_argument("--json", type=Path, default=Path("runs/benchmark.json"))
-    parser.add_argument(
-        "--engines",
-        nargs="+",
-        default=["structured", "mujoco", "mjx", "warp"],
-        help="names, or name:setting for one setting",
-    )
-    parser.add_argument("--worlds", nargs="+", type=int, help="batch sizes instead of the usual")
-    parser.add_argument("--reference", type=Path, help="file to take the reference costs from")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--budget", type=float, default=2400.0, help="seconds in all")
-    parser.add_argument("--quick", action="store_true", help="a few worlds: does it run?")
-    parser.add_argument("--case", nargs=2, type=Path, help="CASE.json RECORDS.jsonl: run one case")
+    parser.add_argument("--json", type=Path, default=Path("runs/rates.json"))
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE")
+    parser.add_argument("--engines", nargs="+", help="instead of those of a case, such as mjx")
+    parser.add_argument("--worlds", type=int, nargs="+", help="sizes of batches")
+    parser.add_argument("--calls", type=int, default=5)
+    parser.add_argument("--page", action="store_true", help="fill in the tables of docs/data")
     return parser.parse_args()
 
 
-def run_case(case: dict[str, Any], grace: float = 120.0) -> list[dict[str, Any]]:
-    """Runs a case in a process of its own; returns its records, or what went wrong as one."""
-    named = {k: case[k] for k in ("engine", "setting")}
-    # Warp allocates beside JAX, which otherwise takes most of the device's memory.
-    extra = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if case["engine"] == "warp" else {}
-    with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder) / name for name in ("case.json", "records.jsonl")]
-        files[0].write_text(json.dumps(case))
-        command = [sys.executable, "-m", "scripts.benchmark", "--case", *map(str, files)]
-        problem = None
-        try:
-            done = subprocess.run(
-                command,
-                env={**os.environ, **extra},
-                capture_output=True,
-                text=True,
-                timeout=case["seconds"] + grace,
-                check=False,
-            )
-            if done.returncode:
-                problem = (done.stderr.strip().splitlines() or ["no output"])[-1]
-        except subprocess.TimeoutExpired:
-            problem = f"stopped after {case['seconds'] + grace:.0f} s"
-        lines = files[1].read_text().splitlines() if files[1].exists() else []
-    records = [json.loads(line) for line in lines]
-    complete = len(records) >= len(case.get("worlds", [0]))  # stopped on its way out
-    return records + ([{**named, "problem": problem}] if problem and not complete else [])
-
-
-def plan(args: argparse.Namespace, kind: str, available: set[str]) -> list[dict[str, Any]]:
-    """The cases of a run; `weight` is their share of the budget."""
-    count = QUICK if args.quick else REFERENCE[kind]
-    every = {"repeats": 1 if args.quick else args.repeats, "reference": count}
-    cases = []
-    for name in args.engines:
-        engine, _, setting = name.partition(":")
-        if engine not in available or (args.quick and engine == "mjx"):  # a minute to compile
-            continue
-        worlds = args.worlds or ([QUICK] if args.quick else SIZES[kind][engine])
-        for one in [setting] if setting else peers.settings(engine):
-            head = {"engine": engine, "setting": one, "worlds": worlds, "commit": args.commit}
-            cases.append({**every, **head, "weight": 2.0 if engine == "mjx" else 1.0})
-    return cases
-
-
-def reference(args: argparse.Namespace, results: dict, count: int) -> list[float]:
-    """Costs of converged MuJoCo C: of this file, of --reference, or computed."""
-    stored = results.get("reference", {})
-    if args.reference and not stored:
-        stored = json.loads(args.reference.read_text())["reference"]
-    if stored.get("key") == report.reference_key() and len(stored["costs"]) >= count:
-        return stored["costs"]
-    case = {"engine": "reference", "setting": "converged", "worlds": [count]}
-    limits = {"repeats": 0, "reference": count, "seconds": args.budget, "commit": args.commit}
-    [record] = run_case({**case, **limits})
-    if "costs" not in record:
-        raise SystemExit(f"The reference failed: {record.get('problem')}")
-    results["reference"] = {
-        "key": report.reference_key(),
-        "solver": peers.REFERENCE,
-        "seconds": record["first_s"],
-        "provenance": record["provenance"],
-        "costs": record["costs"],
-    }
-    return record["costs"]
-
-
 def main() -> None:
-    """Plans the cases, runs them in turn and writes the file after each."""
+    """Measures the cases and writes the file after each, or fills in the tables."""
     args = arguments()
-    if args.case:
-        Case(json.loads(args.case[0].read_text()), args.case[1]).run()
-        return
-    begin = time.monotonic()
-    results = json.loads(args.json.read_text()) if args.json.exists() else {"records": []}
-    probe = {"engine": "structured", "setting": "default", "seconds": 120.0, "probe": True}
-    [found] = run_case(probe | {"commit": args.commit})
-    if "problem" in found:
-        raise SystemExit(found["problem"])
-    machine = found["provenance"] | {"command": provenance.command()}
-    results.setdefault("runs", []).append(machine)
-    kind = "gpu" if machine["platform"] == "gpu" else "cpu"
-    warp = {"warp"} if kind == "gpu" and machine["warp"] else set()
-    cases = plan(args, kind, {"structured", "mujoco", "mjx"} | warp)
-    costs = reference(args, results, max(c["reference"] for c in cases))
-    total = sum(c["weight"] for c in cases)
-    for number, case in enumerate(cases, 1):
-        left = args.budget - (time.monotonic() - begin)
-        weight = case.pop("weight")
-        case["seconds"] = max(left, 0.0) * weight / total
-        total -= weight
-        late = {k: case[k] for k in ("engine", "setting")}
-        records = run_case(case) if left > 0 else [{**late, "skipped": "no time left"}]
-        for record in records:
-            report.add(results, record, costs)
-            print(f"[{number}/{len(cases)}]", report.line(record), flush=True)
-        output.write_json(args.json, results)
-    print(report.table(results))
+    if args.page:
+        return report.fill_pages()
+    # Warp allocates beside JAX, which otherwise takes most of the device's memory.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    found = json.loads(args.json.read_text()) if args.json.exists() else {"runs": [], "records": []}
+    found["runs"].append(provenance.measurement(args.commit))
+    platform = found["runs"][-1]["platform"]
+    warp = found["runs"][-1]["warp"]
+    for name in args.cases:
+        file, effects, kinds, engines = CASES[name]
+        chosen = scene.load(file, overrides={"effects": effects})
+        # MuJoCo C would be measured on the host's cores, Warp's kernels are for GPUs.
+        never = "mujoco" if platform == "gpu" else "warp"
+        engines = [e for e in args.engines or engines if e != never and (e != "warp" or warp)]
+        usual = WORLDS["cpu" if platform == "cpu" else "gpu"]
+        sizes = args.worlds or usual.get(kinds[0], usual[""])
+        for designs in kinds:
+            for engine in engines:
+                for count in sizes:
+                    begin = time.perf_counter()
+                    new = {"scene": name, "designs": designs, "engine": named(engine)}
+                    new |= {"worlds": count, "run": len(found["runs"]) - 1}
+                    new |= measured(chosen, designs, engine, count, args.calls)
+                    found["records"] = report.replaced(found["records"], new)
+                    output.write_json(args.json, found)
+                    words = f"{new['grasps_per_s']} grasps/s, kept {new['kept']:.0%}"
+                    took = time.perf_counter() - begin
+                    print(name, designs, named(engine), count, words, f"({took:.0f} s)", flush=True)
 
 
 if __name__ == "__main__":

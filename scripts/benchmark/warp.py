@@ -26,8 +26,8 @@ except ImportError:
 # Contacts and constraint rows that Warp allocates for each world.  Its documentation asks for as
 # few as are never exceeded; Warp prints a warning if they are.
 CONTACTS, ROWS = 64, 192
-# Not in Warp's model: it derives the inertia of free bodies.
-_ABSENT = ("start", "dof_M0")
+# Not in Warp's model: it derives the inertia of free bodies. Options are the template's there.
+_ABSENT = ("dof_M0", "opt.gravity", "opt.impratio")
 
 
 @wp.kernel
@@ -74,7 +74,7 @@ def _places(
 
 
 class WarpProgram:
-    """A rollout of worlds; has the times and the `run` of `measure.JaxProgram`."""
+    """A rollout of worlds; has `compile_s` and `run` as `JaxProgram` of scripts.benchmark."""
 
     def __init__(self, scene: Scene, fields: ModelFields, ctrl: np.ndarray):
         """Puts model and data on the device and captures a step.
@@ -101,7 +101,6 @@ class WarpProgram:
         self.thing = int(lay.object)
         self.index = wp.zeros(1, dtype=int)
         self.out = wp.zeros((self.steps, self.worlds, 3), dtype=float)
-        middle = time.perf_counter()
         self._reset()
         self._step()  # compiles the kernels
         self.graph = None
@@ -110,7 +109,7 @@ class WarpProgram:
                 self._step()
             self.graph = capture.graph
         wp.synchronize()
-        self.times = {"trace_s": middle - begin, "compile_s": time.perf_counter() - middle}
+        self.compile_s = time.perf_counter() - begin
 
     def _assign(self, name: str, value: np.ndarray) -> None:
         array = getattr(self.model, name)
@@ -147,8 +146,3 @@ class WarpProgram:
         out = np.array(np.moveaxis(self.out.numpy(), 0, 1))
         none = np.zeros((*out.shape[:2], 0), np.float32)
         return Trace(out[..., 0], out[..., 1], out[..., 2], none), seconds
-
-    def memory(self) -> int:
-        """Largest memory of the device's pool so far [byte]; 0 where Warp does not count it."""
-        device = wp.get_device()
-        return int(wp.get_mempool_used_mem_high(device)) if device.is_cuda else 0

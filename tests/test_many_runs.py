@@ -174,10 +174,10 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     assert command(*run) == 1
     output = capsys.readouterr()
     assert "error: seed 5: no space left" in output.err
-    assert "resuming episode 3/3" in output.out and "of 2 runs found a design" in output.out
+    assert "resuming episode 3/3" in output.out and "of 2 runs found a good design" in output.out
     monkeypatch.setattr(Checkpoints, "save", save)
     assert command(*run) == 0
-    assert "of 3 runs found a design" in capsys.readouterr().out
+    assert "of 3 runs found a good design" in capsys.readouterr().out
     events, fetch, report = [], runs.loop.fetch, runs.loop.records.add_report
 
     def noted_fetch(tree):
@@ -228,5 +228,5 @@ def test_hosts_share_the_seeds(tmp_path, capsys):
         assert stored(tmp_path / "two" / seed) == stored(tmp_path / "one" / seed)
     tables = [(tmp_path / name / "seeds.csv").read_bytes() for name in ("one", "two")]
     assert tables[0] == tables[1]
-    assert "of 3 runs found a design" in outputs[0]
+    assert "of 3 runs found a good design" in outputs[0]
     assert "seed 4: final test" not in outputs[0] and "of 3 runs" not in outputs[1]

@@ -227,7 +227,8 @@ def test_landscape_varies_two_of_many_and_counts_what_it_should():
     status = np.zeros((16, 3), np.int32)
     status[0] = [Status.SPEED, Status.SOLVER_CAP, 0]
     cost = np.tile(np.float32([3.0, 0.0, 1.0]), (16, 1))
-    found = command.summarize(case, made, Outcome(cost, status, cost, status), 7)
+    lost = np.where(cost > 0, 0.5, np.inf)
+    found = command.summarize(case, made, Outcome(cost, status, lost, status), 7)
     assert found.cost[0, 0] == pytest.approx(0.5) and found.cost[1, 0] == pytest.approx(4 / 3)
     assert found.kept[0, 0] == 1 and found.counted[0, 0] == 2 and found.counted[3, 3] == 3
     assert [*found.units] == ["kPa", "mm"]

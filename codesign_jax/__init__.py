@@ -7,7 +7,7 @@ are first asked for, so that importing the package costs a millisecond and sets 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from codesign_jax import sources as _sources  # noqa: F401  # notes the state of the files first
+from codesign_jax import reuse as _reuse  # noqa: F401  # notes the state of the files first
 
 if TYPE_CHECKING:
     from codesign_jax import (
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
         scene,
         types,
     )
-    from codesign_jax.caches import use_compilation_cache
     from codesign_jax.codesign import Task
     from codesign_jax.engines import make_engine
+    from codesign_jax.reuse import use_compilation_cache
     from codesign_jax.scene import InputError, constants, hand, objects, parameters
     from codesign_jax.types import Params, Status, Trace, Trial
 
@@ -44,7 +44,7 @@ _HOME = {
     "Status": "codesign_jax.types",
     "Trace": "codesign_jax.types",
     "Trial": "codesign_jax.types",
-    "use_compilation_cache": "codesign_jax.caches",
+    "use_compilation_cache": "codesign_jax.reuse",
 }
 """Where the names are that are not modules of this folder."""
 

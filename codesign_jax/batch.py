@@ -20,7 +20,7 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import block_lanes, staged
 from codesign_jax.optimize import Optimizer, State
-from codesign_jax.programs import Program, shared
+from codesign_jax.reuse import Program, shared
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Trial

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from codesign_jax import caches, sizes
+from codesign_jax import reuse, sizes
 from codesign_jax.commands import flags, status
 from codesign_jax.commands.flags import (
     Count,
@@ -255,7 +255,7 @@ class Sample(Command):
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="PATH")]
-    """The file, .parquet; what is done of it is kept in a folder beside it until it is finished."""
+    """The file, .parquet; what is done of it is kept in a file beside it until it is finished."""
     designs: int = 1000
     """Number of designs."""
     trials: int = 3
@@ -282,8 +282,8 @@ class Sample(Command):
     """Most grasps of a call, after each of which the outcomes are saved; default: 512 on CPUs,
     16384 on a GPU. Results depend on it in the last bits only."""
     outcomes: Flag = False
-    """Simulate and keep the outcomes alone, in the folder FILE.part; the same command without this
-    flag writes the file, here or where that folder was copied to."""
+    """Simulate and keep the outcomes alone, in the file PATH.part; the same command without this
+    flag writes the table, here or where that file was copied to."""
     dry_run: Flag = False
     """Print the number of grasps and the size; simulate and write nothing."""
 
@@ -377,7 +377,7 @@ def main(arguments: list[str] | None = None) -> int:
             prog="codesign",
             description="Co-design of soft hand morphology and control; --version says which.",
         )
-        refuse(caches.problems() + flags.path_problems(command))
+        refuse(reuse.problems() + flags.path_problems(command))
         return command.run()
 
     def refuse(problems: list[str]) -> None:

@@ -22,11 +22,11 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import axes, control, model
+from codesign_jax import axes, control, model, reuse
 from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
 from codesign_jax.scene import Constants, Scene, reach, schema, unit_slips
-from codesign_jax.scene.constants import batch_axes, check
+from codesign_jax.scene.constants import batch_axes
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Status, Trace, Trial, failed
 from codesign_jax.verdict import as_bit
@@ -81,7 +81,7 @@ def sample_trials(
         constants do not fit the scene or the trials.
     """
     axes.refuse_draws(key, num_trials)
-    constants = numbers(scene, constants)
+    constants = scene.numbers(constants)
     axes.refuse_constants(constants, num_trials, "trial")
     return _draw(num_trials, len(scene.objects.object), key, constants.objects.noise)
 
@@ -111,18 +111,6 @@ def _draw(num_trials: int, shapes: int, key: jax.Array, noises: Any) -> Trial:
         )
 
     return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(jnp.arange(num_trials), noises)
-
-
-def numbers(scene: Scene, constants: Constants | None) -> Constants:
-    """The constants if there are any, checked, or else the scene's.
-
-    Raises:
-      InputError: If they do not fit the scene, see `scene.constants.check`.
-    """
-    if constants is None:
-        return scene.constants()
-    check(scene, constants)
-    return constants
 
 
 def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
@@ -253,7 +241,7 @@ def _checked(
       InputError: See `simulate`.
     """
     axes.refuse_other(scene, engine)
-    constants = numbers(scene, constants)
+    constants = scene.numbers(constants)
     axes.refuse(scene, params, trials, ("world", "world"))
     axes.refuse_constants(constants, len(trials.yaw), "world")
     unit_slips.refuse(params)
@@ -431,3 +419,6 @@ def crossed(params: Params, trials: Trial) -> tuple[Params, Trial]:
 def grid(tree: Any, shape: tuple[int, ...]) -> Any:
     """Arrays whose leading axis (particle * trial,) becomes two, (particle, trial)."""
     return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), tree)
+
+
+reuse.note()  # what programs are traced from has been imported

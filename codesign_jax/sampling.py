@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from codesign_jax import axes, rollout
 from codesign_jax.engines import Engine
-from codesign_jax.programs import Program, shared
+from codesign_jax.reuse import Program, shared
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial

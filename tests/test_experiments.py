@@ -208,7 +208,7 @@ def test_runs_that_are_no_variants_of_one_are_refused(toy, tmp_path):
 def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
     whole, found = points(tmp_path / "whole.part")
     assert found == 0 and whole["status"].shape == (4, 4, 5)
-    append, written = landscape.calls.archives.Store.append, []
+    append, written = landscape.calls.Store.append, []
 
     def dies(parts, arrays):
         if len(written) == 2:
@@ -216,7 +216,7 @@ def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
         written.append(arrays)
         append(parts, arrays)
 
-    monkeypatch.setattr(landscape.calls.archives.Store, "append", dies)
+    monkeypatch.setattr(landscape.calls.Store, "append", dies)
     with pytest.raises(KeyboardInterrupt):
         points(tmp_path / "x.part")
     monkeypatch.undo()

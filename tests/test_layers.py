@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from codesign_jax import sources
+from codesign_jax import reuse
 
 ROOT = Path(__file__).parents[1]
 
 # What stands in a line may import lines before it, and its own folder.
 LAYERS = """
-sources files memory_maps
-kept_programs archives
-caches sizes
+files sizes
+reuse
+store
 types provenance compiler optimize
 scene
 axes model control verdict
@@ -24,7 +24,6 @@ engines cost
 start
 rollout
 own
-programs
 codesign finger fit sampling
 batch
 runs
@@ -193,7 +192,7 @@ def test_no_modules_import_in_a_circle():
 def test_no_kernel_depends_on_what_its_key_leaves_out():
     """Kept kernels are known by the digest of the code that writes them."""
     folders = {path.name for path in (ROOT / "codesign_jax").iterdir() if path.is_dir()}
-    assert set(sources.UNRELATED) <= folders
+    assert set(reuse.UNRELATED) <= folders
     links, found = graph(), set()
     left = ["codesign_jax.engines.structured.kernel.program"]
     while left:
@@ -202,7 +201,7 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
             found.add(name)
             left += links.get(name, ())
     assert "codesign_jax.engines.structured.kernel.newton" in found
-    assert not {n for n in found if n.split(".")[1:2] and n.split(".")[1] in sources.UNRELATED}
+    assert not {n for n in found if n.split(".")[1:2] and n.split(".")[1] in reuse.UNRELATED}
 
 
 def defined(tree):

@@ -71,7 +71,7 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
 
 
 def test_starts_inside_table_or_object_are_refused():
-    """Straight fingers of 180 mm, 75 degrees down from 150 mm: as deep as in `test_containment`."""
+    """Straight fingers of 180 mm, 75 degrees down from 150 mm: as deep as MuJoCo C finds."""
     the_scene = pinch(arm__start_height=0.15)
     worlds = [hand_world(the_scene, length=length)[0] for length in (0.08, 0.18)]
     designs = Params(*(np.stack(v) for v in zip(*worlds, strict=True)))

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import runs, sources
+from codesign_jax import reuse, runs
 from codesign_jax.commands import reference
 from codesign_jax.runs import choice, columns, manifest
 from codesign_jax.runs.checkpoint import Checkpoints
@@ -251,7 +251,7 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         with pytest.raises(AssertionError, match="simulated again"):
             command(*RUN, "--reference-trials", "3", "--out", folder)
         capsys.readouterr()
-        patch.setattr(sources, "digest", lambda: "other code")
+        patch.setattr(reuse, "code_digest", lambda **_: "other code")
         with pytest.raises(AssertionError, match="simulated again"):
             command(*RUN, "--reference-trials", "2", "--out", folder)
         said = capsys.readouterr().out

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import scene, sources
-from codesign_jax.compiler import cache, gpu, launch
+from codesign_jax import reuse, scene
+from codesign_jax.compiler import gpu, launch
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
     adjoint,
@@ -236,9 +236,9 @@ def planted(faults):
 
         patch.setattr(reverse.ReverseStep, "__init__", prepare)
         # Sound kernels must neither be found in the place of this one nor find it.
-        patch.setattr(sources, "digest", lambda: f"planted: {sorted(faults)}")
+        patch.setattr(reuse, "code_digest", lambda **_: f"planted: {sorted(faults)}")
         patch.setattr(adjoint, "of_code", lambda _: None)
-        patch.setattr(cache, "kept", lambda name, build: build())
+        patch.setattr(reuse, "kept", lambda path, build: build())
         yield
     assert fault.used == set(faults), set(faults) - fault.used
 

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import caches
-from codesign_jax.compiler import cache, cpu, ffi, gpu, host, launch, vector
+from codesign_jax.compiler import cpu, ffi, gpu, host, launch, vector
 from codesign_jax.compiler.layout import OUTPUT, SCRATCH, Array, Layout
 from tests.helpers import call_frames, kernels
 
@@ -469,50 +468,3 @@ def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
         gpu.driver.cache_clear()
         ffi.installed_version.cache_clear()
     assert launch.available("cpu") is None
-
-
-# Kept code
-
-
-def test_code_is_kept_and_damage_is_seen(folder):
-    """One file a kernel; a damaged one is built again; without a folder nothing is written."""
-    built = []
-
-    def build():
-        built.append(1)
-        return b"code"
-
-    for count in (1, 1):
-        assert cache.kept("a", build) == b"code" and len(built) == count
-    (path,) = folder.rglob("*.kernel")
-    for damage in (path.read_bytes()[:-1], b"", path.read_bytes()[:-1] + b"f"):
-        path.write_bytes(damage)
-        before = len(built)
-        assert cache.kept("a", build) == b"code" and len(built) == before + 1
-    for place in (None, "gs://bucket/cache", str(path / "none")):
-        jax.config.update("jax_compilation_cache_dir", place)
-        before = len(built)
-        assert cache.kept("a", build) == b"code" and len(built) == before + 1
-    assert list(folder.rglob("*")) == [path.parent, path] and not Path("gs:").exists()
-
-
-def test_what_is_not_used_goes(folder, monkeypatch):
-    """Ten kernels of 100 bytes under a limit of 532: four stay, the used one among them."""
-    monkeypatch.setenv(caches.KERNELS, str(4 * 132 + 4))
-    abandoned = folder / "kernels" / "x.tmp"
-    for k in range(10):
-        cache.kept(f"k{k}", lambda: bytes(100))
-        for n in range(k + 1):  # files of one instant have an order all the same
-            path = folder / "kernels" / f"k{n}.kernel"
-            if path.exists() and n:
-                os.utime(path, ns=(10**9 * n, 10**9 * n))
-        cache.kept("k0", lambda: pytest.fail("gone"))
-        if not k:
-            abandoned.write_bytes(b"part")
-            os.utime(abandoned, (0, 0))
-    assert {p.name for p in (folder / "kernels").iterdir()} == {
-        f"k{k}.kernel" for k in (0, 7, 8, 9)
-    }
-    monkeypatch.setenv(caches.KERNELS, "much")
-    with pytest.raises(ValueError, match="must be a number of bytes"):
-        cache.kept("new", lambda: b"")

@@ -14,6 +14,7 @@ from codesign_jax.commands import sample
 from codesign_jax.runs import dataset
 from codesign_jax.runs.tables import design_columns
 from codesign_jax.scene import parameters
+from codesign_jax.store import Store
 from codesign_jax.types import Outcome, Status
 from tests.helpers.grasps import nth
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
@@ -65,16 +66,16 @@ def test_robust_draws_what_the_paper_keeps():
 
 def killed_after(saves, monkeypatch, **sizes):
     """Runs the command until so many shards have been saved."""
-    save, done = dataset.Shards.save, []
+    append, done = Store.append, []
 
-    def counted(self, shard, found):
+    def counted(self, arrays):
         if len(done) == saves:
             raise Killed
-        done.append(shard)
-        save(self, shard, found)
+        done.append(len(self))
+        append(self, arrays)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(dataset.Shards, "save", counted)
+        patch.setattr(Store, "append", counted)
         run(**sizes)
     return done
 
@@ -190,7 +191,6 @@ def test_verdicts_are_the_losses_and_the_status():
 def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):
     assert run(out="whole.parquet") == 0
     assert killed_after(1, monkeypatch) == [0]
-    (place / "a.parquet.part" / "00000000.npz.123.tmp").touch()
     (place / "a.parquet.123.tmp").touch()
     # Without --chunk: as large as the calls that made what is there.
     assert killed_after(1, monkeypatch, chunk=None) == [1]
@@ -202,7 +202,7 @@ def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):
 
 
 def test_outcomes_from_elsewhere_make_the_file(place, monkeypatch, capsys):
-    """A machine without pyarrow simulates; where its folder was copied to, nothing simulates."""
+    """A machine without pyarrow simulates; where its file was copied to, nothing simulates."""
     assert run(out="whole.parquet") == 0
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "pyarrow", None)
@@ -211,17 +211,17 @@ def test_outcomes_from_elsewhere_make_the_file(place, monkeypatch, capsys):
     (place / "here").mkdir()
     shutil.move(place / "a.parquet.part", place / "here" / "a.parquet.part")
     # Every call of the engine is saved, so that none is made where nothing can be.
-    monkeypatch.setattr(dataset.Shards, "save", None)
+    monkeypatch.setattr(Store, "append", None)
     assert run(out="here/a.parquet", chunk=None) == 0
     assert (place / "here" / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
     assert [p.name for p in (place / "here").iterdir()] == ["a.parquet"]
 
 
-def test_a_damaged_shard_is_simulated_again(place, monkeypatch):
+def test_a_damaged_part_is_simulated_again(place, monkeypatch):
     assert run(out="whole.parquet") == 0
     killed_after(2, monkeypatch)
-    shard = place / "a.parquet.part" / "00000001.npz"
-    shard.write_bytes(shard.read_bytes()[:200])
+    part = place / "a.parquet.part"
+    part.write_bytes(part.read_bytes()[:-20])
     assert run() == 0
     assert (place / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
 
@@ -242,9 +242,9 @@ def test_fewer_designs_of_what_was_begun_are_enough(place, monkeypatch):
 def test_a_finished_file_is_left_as_it_is(place, capsys):
     assert run() == 0
     before = (place / "a.parquet").stat().st_mtime_ns  # reading it may change its time of access
-    dataset.folder_of(place / "a.parquet").mkdir()  # killed before it had tidied up
-    question = pq.read_schema("a.parquet").metadata[b"question"]
-    (place / "a.parquet.part" / dataset.QUESTION).write_bytes(question)
+    # Killed before it had tidied up.
+    question = json.loads(pq.read_schema("a.parquet").metadata[b"question"])
+    Store(place / "a.parquet.part", question).append({"cost": np.zeros(1)})
     assert run(chunk=None) == 0
     assert "a.parquet is finished: 10 designs x 2 trials: 20 grasps" in capsys.readouterr().out
     assert (place / "a.parquet").stat().st_mtime_ns == before
@@ -267,12 +267,12 @@ def test_a_finished_file_is_left_as_it_is(place, capsys):
 )
 def test_another_question_is_refused(more, expected, place, monkeypatch, capsys):
     killed_after(1, monkeypatch)
-    part = sorted(p.name for p in (place / "a.parquet.part").iterdir())
+    part = (place / "a.parquet.part").read_bytes()
     assert run(*more) == 2
     words = capsys.readouterr().err
     assert "a.parquet.part has a part of other grasps; choose another --out" in words
     assert expected in words
-    assert part == sorted(p.name for p in (place / "a.parquet.part").iterdir())
+    assert (place / "a.parquet.part").read_bytes() == part
 
 
 def test_a_file_that_is_there_is_never_replaced(place, monkeypatch, capsys):
@@ -281,7 +281,7 @@ def test_a_file_that_is_there_is_never_replaced(place, monkeypatch, capsys):
     words = capsys.readouterr().err
     assert "--out a.parquet has other grasps; choose another file, or delete it" in words
     assert "designs 4, asked for are 5" in words
-    monkeypatch.setattr(dataset.sources, "digest", lambda: "other")
+    monkeypatch.setattr(dataset.reuse, "code_digest", lambda: "other")
     assert run(designs=4) == 2
     assert "it was simulated by another version of the code" in capsys.readouterr().err
     for content in (b"PAR1 no table", b""):
@@ -291,17 +291,16 @@ def test_a_file_that_is_there_is_never_replaced(place, monkeypatch, capsys):
         assert (place / "a.parquet").read_bytes() == content
 
 
-def test_a_folder_of_somebody_else_is_left_alone(place, capsys):
-    (place / "a.parquet.part").mkdir()
-    (place / "a.parquet.part" / "00000000.npz").write_bytes(b"mine")
+def test_a_file_of_somebody_else_is_left_alone(place, capsys):
+    (place / "a.parquet.part").write_bytes(b"mine")
     assert run() == 2
-    assert "a.parquet.part holds other files (00000000.npz)" in capsys.readouterr().err
-    assert (place / "a.parquet.part" / "00000000.npz").read_bytes() == b"mine"
+    assert "a.parquet.part is no part of a data set" in capsys.readouterr().err
+    assert (place / "a.parquet.part").read_bytes() == b"mine"
 
 
 def test_two_processes_do_not_write_one_file(place, capsys):
     question = sample.Question(THREE, "structured", "2d", 2, 3, 4)
-    with dataset.open_shards(place / "a.parquet", question):
+    with dataset.outcomes(place / "a.parquet", question).alone():
         assert run() == 2
     assert "--out a.parquet is in use by another process" in capsys.readouterr().err
 

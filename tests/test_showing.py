@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codesign_jax import cli, codesign, runs, scene, sources
+from codesign_jax import cli, codesign, reuse, runs, scene
 from codesign_jax.commands import calls, failure, replay, status
 from codesign_jax.commands import landscape as command
 from codesign_jax.commands.case import Case
@@ -271,7 +271,9 @@ def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
 def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
     """After the first of three calls; another seed begins anew.  Costs are made of the designs."""
     monkeypatch.setitem(calls.WORLDS, "cpu", 3)
-    monkeypatch.setattr(sources, "digest", lambda: "this code")  # in spite of what is replaced here
+    monkeypatch.setattr(
+        reuse, "code_digest", lambda: "this code"
+    )  # in spite of what is replaced here
     count = []
 
     def made(task, designs, key):
@@ -308,7 +310,7 @@ def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
     monkeypatch.setattr(codesign.Task, "evaluate", stopping)
     count.clear()
     assert cli.main([*grid, "part"]) == 130
-    monkeypatch.setattr(sources, "digest", lambda: "other code")
+    monkeypatch.setattr(reuse, "code_digest", lambda: "other code")
     assert cli.main([*grid, "part"]) == 0
     said = capsys.readouterr().out
     assert "going on" not in said and "is of another version of the code: simulated again" in said

@@ -15,7 +15,7 @@ from codesign_jax import axes, engines, rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
-from codesign_jax.programs import Program, shared
+from codesign_jax.reuse import Program, shared
 from codesign_jax.scene import Constants, InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
@@ -101,7 +101,7 @@ class Task:
 
     @property
     def how(self) -> tuple[Any, ...]:
-        """What its programs are built from, see `programs.shared`."""
+        """What its programs are built from, see `reuse.shared`."""
         recording = rollout.Recording(self.record_qpos, self.stop_when_lost, self.cost)
         return self.scene, self.engine, self.space, self.trials, recording
 

@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,14 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TimeRemainingColumn
 
-from codesign_jax import archives, batch, codesign
+from codesign_jax import batch, codesign
 from codesign_jax.codesign import Task
 from codesign_jax.engines import Engine
 from codesign_jax.runs import outcomes
 from codesign_jax.runs.progress import Live, duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
+from codesign_jax.store import Store
 from codesign_jax.types import Outcome
 
 WORLDS = {"cpu": 512}
@@ -171,10 +172,9 @@ class Calls:
         """
         how = trials.scene, trials.engine, designs, trials.count, trials.seed
         key = " ".join(map(str, (outcomes.key(*how), size, *trials.stream)))
-        self._trials, self._size, self._part = trials, size, archives.Store(part, key)
+        self._trials, self._size, self._part = trials, size, Store(part, key)
         self.refused = self._part.refused
-        found: list[dict[str, Any]] = [*self._part.found]
-        kept = [Outcome(**arrays) for arrays in found]  # a part has no fields that are None
+        kept = [Outcome(**arrays) for arrays in self._part]  # a part has no fields that are None
         self._kept = joined(kept) if kept else None
         self.found = sum(len(outcome.cost) for outcome in kept)
         self._next, self._simulated = 0, False

@@ -17,8 +17,8 @@ from rich.table import Table
 
 from codesign_jax import engines
 from codesign_jax import scene as scenes
-from codesign_jax.caches import use_compilation_cache
 from codesign_jax.commands import preflight
+from codesign_jax.reuse import use_compilation_cache
 from codesign_jax.scene import Scene, keypaths, library, objects, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import InputError

@@ -14,11 +14,12 @@ from codesign_jax.commands import calls, common
 from codesign_jax.commands.calls import Meter
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset, parquet
-from codesign_jax.runs.dataset import Question, Shards
+from codesign_jax.runs.dataset import Question
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
+from codesign_jax.store import Store
 from codesign_jax.types import Outcome
 
 if TYPE_CHECKING:
@@ -42,9 +43,9 @@ def main(options: "Sample") -> int:
     if _finished(options, question):
         console.print(f"{options.out} is finished: {_amount(options)}", markup=False)
         if dataset.begun(options.out) == question.described:  # killed before it had tidied up
-            Shards(dataset.folder_of(options.out), question.key).delete()
+            dataset.part_of(options.out).unlink()
         return 0
-    dataset.refuse_other(options.out, question)
+    outcomes = dataset.outcomes(options.out, question)
     design = question.space.default()
     designs = {"the default design": design}
     notes = common.preflight_warnings(scene, question.space, designs)
@@ -55,17 +56,21 @@ def main(options: "Sample") -> int:
     if options.dry_run:
         _dry_run(options, question, console)
         return 0
-    with dataset.open_shards(options.out, question) as shards:
+    with outcomes.alone() as free:
+        if not free:
+            raise InputError([f"--out {options.out} is in use by another process"])
+        for left in options.out.parent.glob(f"{options.out.name}.*.tmp"):
+            left.unlink()  # what a killed process was writing
         with Interrupts(console.print) as interrupts:
             try:
-                found = _simulate(options.designs, question, engine, shards, interrupts, console)
+                found = _simulate(options.designs, question, engine, outcomes, interrupts, console)
             except Stopped as stopped:
                 console.print("stopped; the same command goes on")
                 return 128 + stopped.signum
         if not options.outcomes:
-            dataset.write(options.out, question, options.designs, shards)
-            shards.delete()
-    _report(shards.folder if options.outcomes else options.out, found, console)
+            dataset.write(options.out, question, options.designs, outcomes)
+            outcomes.path.unlink()
+    _report(outcomes.path if options.outcomes else options.out, found, console)
     return 0
 
 
@@ -156,7 +161,7 @@ def _simulate(
     designs: int,
     question: Question,
     engine: Engine,
-    shards: Shards,
+    outcomes: Store,
     interrupts: Interrupts,
     console: Console,
 ) -> _Tally:
@@ -166,27 +171,23 @@ def _simulate(
       Stopped: If a signal came; what was simulated is saved.
     """
     simulate = sampling.make_simulate(question.scene, engine, question.space)
-    tally, missing = _Tally(np.zeros(len(VERDICTS), int)), []
+    tally = _Tally(np.zeros(len(VERDICTS), int))
     total = question.shards(designs)
     with Meter("sample", designs * question.trials, console) as meter:
-        for shard in range(total):
-            kept = shards.load(shard)
-            if kept is None:
-                missing.append(shard)
-            else:
-                meter.found(tally.add(question, shard, designs, kept))
-        if len(missing) < total:
-            done = total - len(missing)
+        for shard, arrays in zip(range(total), outcomes, strict=False):
+            meter.found(tally.add(question, shard, designs, Outcome(**arrays)))
+        done = min(len(outcomes), total)
+        if done:
             words = (
-                f"going on after {done} of {common.counted(total, 'call')}, from {shards.folder}"
+                f"going on after {done} of {common.counted(total, 'call')}, from {outcomes.path}"
             )
             console.print(words, markup=False)
-        for shard in missing:
+        for shard in range(done, total):
             found = interrupts.call(lambda s=shard: simulate(*question.drawn(s)))
             outcome = jax.tree.map(np.asarray, found)
-            shards.save(shard, outcome)
+            outcomes.append(outcome._asdict())
             meter.advance(tally.add(question, shard, designs, outcome))
-            if shard == missing[0]:
+            if shard == done:
                 meter.compiled()
     return tally
 
@@ -196,6 +197,6 @@ def _report(path: Path, found: _Tally, console: Console) -> None:
     ends = zip(VERDICTS, found.counts.tolist(), strict=True)
     words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
     console.print(f"of {total} grasps: {words}")
-    size = sum(file.stat().st_size for file in (path, *path.glob("*"))) / 1e6
-    what = "outcomes" if path.is_dir() else "table"
+    size = path.stat().st_size / 1e6
+    what = "table" if path.suffix == ".parquet" else "outcomes"
     console.print(f"{what}: {path} ({size:.1f} MB)", markup=False)

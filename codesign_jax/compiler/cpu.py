@@ -12,7 +12,8 @@ from collections.abc import Callable
 from ctypes import c_int64
 from typing import Any
 
-from codesign_jax.compiler import cache, ffi, host, vector
+from codesign_jax import reuse
+from codesign_jax.compiler import ffi, host, vector
 from codesign_jax.compiler.code import Code
 from codesign_jax.compiler.handler import Handler
 from codesign_jax.compiler.layout import SCRATCH, Layout
@@ -69,7 +70,7 @@ def register(
       KernelUnavailable: If XLA does not take the handler.
       NotImplementedError: If the kernel does something that has no instruction.
     """
-    name = cache.key("cpu", origin, layout, level, *host.identity())
+    name = "kernel_" + reuse.digest("cpu", origin, layout, level, *host.identity())
 
     def build() -> bytes:
         text = block_code(trace(), layout) + handler_code(name, layout)
@@ -77,7 +78,7 @@ def register(
 
     with host.LOCK:
         if not host.known(name):
-            code = cache.kept(name, build) if keep else build()
+            code = reuse.kept(reuse.kernel_file(name) if keep else None, build)
             host.register(name, host.Loaded(code), "cpu")
     return name
 

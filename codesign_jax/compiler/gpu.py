@@ -17,7 +17,8 @@ from typing import Any
 
 import jax
 
-from codesign_jax.compiler import cache, ffi, host, nvptx, thread
+from codesign_jax import reuse
+from codesign_jax.compiler import ffi, host, nvptx, thread
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.compiler.handler import Handler
 from codesign_jax.compiler.layout import ONCHIP, Layout
@@ -161,14 +162,14 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: boo
       KernelUnavailable: If the driver does not take the kernel, or XLA the handler.
       NotImplementedError: If the kernel does something that has no instruction.
     """
-    name = cache.key("cuda", origin, layout, *host.identity()[:2])
+    name = "kernel_" + reuse.digest("cuda", origin, layout, *host.identity()[:2])
 
     def build() -> bytes:
         return device_code(trace(), layout).encode()
 
     with host.LOCK:
         if not host.known(name):
-            text = (cache.kept(name, build) if keep else build()).decode()
+            text = reuse.kept(reuse.kernel_file(name) if keep else None, build).decode()
             device = jax.local_devices(backend="cuda")[0].local_hardware_id or 0
             loaded = prepare(name, layout, load(driver(), text, device), driver())
             host.register(name, loaded, "CUDA")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import memory_maps, sources
+from codesign_jax import reuse
 from codesign_jax.compiler import ffi
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.compiler.layout import INPUT, ONCHIP, OUTPUT, SCRATCH, Array, Layout
@@ -26,7 +26,7 @@ class Kernel(NamedTuple):
 
     Attributes:
       origin: Cache key, beyond the source of the compiler and the types and shapes of the blocks.
-        Kernels of one origin and layout, written by one state of this package's code (`sources`),
+        Kernels of one origin and layout, written by one state of this package's code (`reuse`),
         are taken to be the same.
       backend: "gpu" or "cpu".
       lanes: Lanes of a block, see `block_lanes`.
@@ -121,11 +121,11 @@ def launch(
       The results, None in the place of scratch memory.
 
     Raises:
-      KernelUnavailable: If kernels cannot run here, or no longer, see `memory_maps`.
+      KernelUnavailable: If kernels cannot run here, or no longer, see `reuse`.
       NotImplementedError: If the kernel does something that the compiler has no instruction for.
       ValueError: If an array's leading axis is not that of the others.
     """
-    if reason := available(kernel.backend) or memory_maps.problem():
+    if reason := available(kernel.backend) or reuse.memory_problem():
         raise KernelUnavailable(reason)
     if kernel.backend == "cpu":
         from codesign_jax.compiler import cpu
@@ -141,11 +141,11 @@ def launch(
     def trace() -> Any:
         return kernel_jaxpr(call, avals)
 
-    code = sources.digest()
     # Of code that is not known no kernel is found again, neither on disk nor in this process.
-    origin = f"{kernel.origin} {code or uuid.uuid4()} {jax.__version__}"
+    known = reuse.key(kernel.origin)
+    origin = known or str(uuid.uuid4())
     with _no_collection():
-        name = register(origin, trace, layout, keep=code is not None)
+        name = register(origin, trace, layout, keep=known is not None)
     made = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
     varying = _varying(inputs)
     shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax import archives, files
+from codesign_jax import files, store
 from codesign_jax.runs import columns
 from codesign_jax.scene.schema import InputError
 
@@ -45,7 +45,7 @@ class Landscape(NamedTuple):
 def save(found: Landscape, folder: Path) -> list[Path]:
     """Writes a landscape as arrays and as a table of its points; returns the files."""
     npz, table = folder / FILE, folder / TABLE
-    archives.save(npz, found._asdict())
+    store.save(npz, found._asdict())
     axes = [
         f"{n}_{u}".replace("[", "_").replace("]", "")
         for n, u in zip(found.names, found.units, strict=True)
@@ -70,9 +70,9 @@ def load(path: Path) -> Landscape:
       InputError: If the file holds none.
     """
     try:
-        stored = archives.load(path)
+        stored = store.load(path)
         return Landscape(**{name: stored[name] for name in Landscape._fields})
-    except (OSError, archives.ArchiveError, KeyError) as error:
+    except (OSError, store.StoreError, KeyError) as error:
         problem = (
             f"{path} is not a landscape of this version ({error}); codesign landscape writes one"
         )

@@ -1,31 +1,26 @@
 """Grasps of random designs in one Parquet file, in steps that survive a kill.
 
 A row follows from the question (scene, design space, seed, ...) and the indices of design and
-trial, but for its outcome.  So the folder beside the unfinished file holds outcomes alone, a shard
-for each call of the engine, a few bytes a grasp; the rest is drawn again when the file is
-written, shard by shard.
+trial, but for its outcome.  So a file beside the unfinished one holds outcomes alone, a shard for
+each call of the engine, a few bytes a grasp; the rest is drawn again when the file is written.
 """
 
-import contextlib
 import dataclasses
-import fcntl
 import functools
 import hashlib
 import json
 import uuid
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from codesign_jax import archives, files, sampling, sources
+from codesign_jax import files, reuse, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.provenance import environment
 from codesign_jax.runs import parquet
 from codesign_jax.runs.columns import DESIGNS, GRASPS, MAY_BE_EMPTY
-from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.parquet import Column, Names
 from codesign_jax.runs.scene_files import contents, scene_texts
 from codesign_jax.runs.tables import design_columns, noise_values, status_names
@@ -33,13 +28,11 @@ from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
+from codesign_jax.store import Store
 from codesign_jax.types import Outcome
 
-QUESTION = "question.json"
-"""File of the folder of shards that says what they are of."""
 ROWS = 1 << 16
 """About as many rows are written at once: a row group of the file."""
-_LOCK, _KEY = ".lock", "key"
 _NAMES = ("engine", "preset", "trials", "seed", "chunk")
 _WORDS = {"chunk": "designs of a call (by --chunk)"}
 
@@ -75,14 +68,9 @@ class Question:
         texts, every = scene_texts(self.scene), contents(self.scene)
         meshes = [hashlib.sha256(every[name]).hexdigest() for name in sorted({*every} - {*texts})]
         # What code that is not known has simulated is no part of anything else.
-        code = sources.digest() or f"unknown {uuid.uuid4()}"
+        code = reuse.code_digest() or f"unknown {uuid.uuid4()}"
         own = {name: getattr(self, name) for name in _NAMES}
         return own | {"scene": texts, "meshes": meshes, "code": code}
-
-    @functools.cached_property
-    def key(self) -> str:
-        """Digest of it."""
-        return hashlib.sha256(json.dumps(self.described, sort_keys=True).encode()).hexdigest()
 
     def drawn(self, shard: int) -> Drawn:
         """Designs and trials of a shard, NumPy arrays."""
@@ -120,57 +108,29 @@ def differences(before: dict[str, Any], asked: Question) -> list[str]:
     return words
 
 
-class Shards:
-    """Outcomes that were simulated, in a folder beside the file; see `open_shards`."""
-
-    def __init__(self, folder: Path, key: str):
-        """Refers to a folder of shards of the question with this key."""
-        self.folder, self._key = folder, key
-
-    def path(self, shard: int) -> Path:
-        """File of a shard."""
-        return self.folder / f"{shard:08d}.npz"
-
-    def save(self, shard: int, found: Outcome) -> None:
-        """Keeps outcomes of a shard, arrays of shape (design, trial)."""
-        archives.save(self.path(shard), {_KEY: self._key, **found._asdict()}, compressed=True)
-
-    def load(self, shard: int) -> Outcome | None:
-        """Outcomes of a shard; None if they are not there, or damaged."""
-        try:
-            arrays = archives.load(self.path(shard))
-        except (OSError, archives.ArchiveError):
-            return None
-        return Outcome(**arrays) if str(arrays.pop(_KEY)) == self._key else None
-
-    def delete(self) -> None:
-        """Deletes the shards and their folder."""
-        for path in self.folder.glob("[0-9]*.npz*"):
-            path.unlink()
-        for name in (QUESTION, _LOCK):
-            (self.folder / name).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # somebody else's files stay
-            self.folder.rmdir()
-
-
-def folder_of(path: Path) -> Path:
-    """Folder of the shards of an unfinished file."""
+def part_of(path: Path) -> Path:
+    """File of the outcomes of an unfinished file."""
     return path.with_name(f"{path.name}.part")
 
 
 def begun(path: Path) -> dict[str, Any] | None:
-    """The question of an unfinished file, as `Question.described`; None if there is none.
+    """The question of an unfinished file, as `Question.described`; None if there is none."""
+    return Store(part_of(path), None).about
+
+
+def outcomes(path: Path, question: Question) -> Store:
+    """The outcomes that were simulated for a file, a part for each call; changes nothing.
 
     Raises:
-      InputError: If it cannot be read.
+      InputError: If what was begun there is of another question, with what differs.
     """
-    try:
-        return json.loads((folder_of(path) / QUESTION).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        problem = f"{folder_of(path) / QUESTION} cannot be read: {error}"
-        raise InputError([problem]) from error
+    part, before = part_of(path), begun(path)
+    if part.exists() and before is None and (part.is_dir() or part.stat().st_size):
+        raise InputError([f"{part} is no part of a data set; choose another --out"])
+    if before is not None and (others := differences(before, question)):
+        head = f"{part} has a part of other grasps; choose another --out, or delete the file"
+        raise InputError([head, *others])
+    return Store(part, question.described)
 
 
 def finished(path: Path) -> tuple[dict[str, Any], int] | None:
@@ -188,52 +148,6 @@ def finished(path: Path) -> tuple[dict[str, Any], int] | None:
     except (OSError, KeyError, ValueError, pa.ArrowException) as error:
         problem = f"--out {path} is there already, and is no file of `codesign sample`"
         raise InputError([f"{problem}; choose another"]) from error
-
-
-def refuse_other(path: Path, question: Question) -> None:
-    """Refuses to go on with what was begun for another question.
-
-    Raises:
-      InputError: With what differs, or if the folder of shards holds other files.
-    """
-    folder, before = folder_of(path), begun(path)
-    head = f"{folder} has a part of other grasps; choose another --out, or delete the folder"
-    if before is None and folder.exists():
-        ours = {_LOCK, *(left.name for left in folder.glob("*.tmp"))}
-        others = sorted({place.name for place in folder.iterdir()} - ours)[:3]
-        head = f"{folder} holds other files ({', '.join(others)}); choose another --out"
-    else:
-        others = [] if before is None else differences(before, question)
-    if others:
-        raise InputError([head] if before is None else [head, *others])
-
-
-@contextlib.contextmanager
-def open_shards(path: Path, question: Question) -> Iterator[Shards]:
-    """Makes or finds the folder of a file's shards, and locks it.
-
-    Args:
-      path: The file.
-      question: What it will have.
-
-    Raises:
-      InputError: If another process writes there, and see `refuse_other`.
-    """
-    folder = folder_of(path)
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / _LOCK).open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError([f"--out {path} is in use by another process"]) from error
-        refuse_other(path, question)
-        # What a killed process was writing.
-        for left in (*folder.glob("*.tmp"), *path.parent.glob(f"{path.name}.*.tmp")):
-            left.unlink()
-        if not (folder / QUESTION).exists():
-            with files.atomically(folder / QUESTION) as part:
-                part.write_text(json.dumps(question.described, indent=1) + "\n", encoding="utf-8")
-        yield Shards(folder, question.key)
 
 
 def columns(space: DesignSpace) -> dict[str, Column]:
@@ -278,30 +192,16 @@ def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[s
     return values | {name: designs[:, k, None] for k, name in enumerate(own)}
 
 
-def write(path: Path, question: Question, designs: int, shards: Shards) -> None:
-    """Writes the file from its shards, as a whole or not at all.
-
-    Args:
-      path: The file.
-      question: What it has.
-      designs: Number of designs.
-      shards: All of its outcomes.
-
-    Raises:
-      RunError: If a shard cannot be read any more.
-    """
+def write(path: Path, question: Question, designs: int, outcomes: Store) -> None:
+    """Writes the file from its outcomes, as a whole or not at all."""
     pa = parquet.pyarrow_module("--out")
     notes = {"question": question.described, "designs": designs, "environment": environment()}
     notes |= {"status_bits": parquet.STATUS_BITS}
     schema = parquet.arrow_schema(pa, columns(question.space), notes)
     shape, left, group = (question.chunk, question.trials), designs * question.trials, []
     with files.naming(path), parquet.writing(pa, path, schema) as writer:
-        for shard in range(question.shards(designs)):
-            found = shards.load(shard)
-            if found is None:
-                words = f"{shards.path(shard)} cannot be read any more; the same command goes on"
-                raise RunError(words)
-            values = rows(question, shard, question.drawn(shard), found)
+        for shard, arrays in zip(range(question.shards(designs)), outcomes, strict=False):
+            values = rows(question, shard, question.drawn(shard), Outcome(**arrays))
             group.append(parquet.table(pa, schema, values, shape).slice(0, left))
             left -= group[-1].num_rows
             if not left or sum(table.num_rows for table in group) >= ROWS:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import archives, types
+from codesign_jax import store, types
 from codesign_jax.codesign import EpisodeInfo
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
@@ -59,7 +59,7 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
             "bad_step": info.outcomes.bad_step[p, t],
             "place": np.array([episode, p, t]),
         }
-        archives.save(path, arrays | {f"trial_{k}": v for k, v in trial._asdict().items()})
+        store.save(path, arrays | {f"trial_{k}": v for k, v in trial._asdict().items()})
         files.append(path)
     return files
 
@@ -73,7 +73,7 @@ def load(path: Path) -> Failure:
     if not path.exists():
         raise InputError([f"{path}: there is no such file or folder"])
     try:
-        values = archives.load(path)
+        values = store.load(path)
         trial = Trial(**{name: values[f"trial_{name}"] for name in Trial._fields})
         place = tuple(int(v) for v in values["place"])
         status, bad_step = int(values["status"]), int(values["bad_step"])

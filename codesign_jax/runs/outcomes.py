@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign_jax import archives
+from codesign_jax import store
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
@@ -28,7 +28,7 @@ def key(scene: Scene, engine: str, designs: np.ndarray, trials: int, seed: int) 
 
 def save(path: Path, outcomes: Outcome, key: str) -> None:
     """Writes outcomes, arrays of any shape, their `key` and the code that simulated them."""
-    archives.save(path, archives.head(key) | outcomes._asdict())
+    store.save(path, store.head(key) | outcomes._asdict())
 
 
 def load(path: Path, key: str) -> tuple[Outcome | None, str]:
@@ -43,8 +43,8 @@ def load(path: Path, key: str) -> tuple[Outcome | None, str]:
       it is of another key, of other code, or damaged. Empty if there is no such file.
     """
     try:
-        arrays = archives.load(path)
-        why = archives.refusal(arrays, key)
+        arrays = store.load(path)
+        why = store.refusal(arrays, key)
         if why:
             return None, why
         return Outcome(**{name: arrays[name] for name in Outcome._fields if name in arrays}), ""
@@ -52,13 +52,13 @@ def load(path: Path, key: str) -> tuple[Outcome | None, str]:
         return None, ""
     except OSError as error:
         return None, f"cannot be read ({error.strerror})"
-    except archives.ArchiveError:
+    except store.StoreError:
         return None, "is damaged, or of another version of the code"
 
 
 def count(path: Path) -> int:
     """Number of trials of the outcomes in a file, whatever their key; 0 if there are none."""
     try:
-        return archives.load(path)["cost"].size
-    except (OSError, archives.ArchiveError, KeyError):
+        return store.load(path)["cost"].size
+    except (OSError, store.StoreError, KeyError):
         return 0

@@ -94,6 +94,19 @@ class Scene(SceneFile):
         """The numbers of the scene's files that are not structure."""
         return Constants(**schema.numbers(self)._asdict())
 
+    def numbers(self, constants: Constants | None) -> Constants:
+        """The given constants, checked, or else the scene's.
+
+        Raises:
+          InputError: If they do not fit the scene, see `scene.constants.check`.
+        """
+        from codesign_jax.scene.constants import check
+
+        if constants is None:
+            return self.constants()
+        check(self, constants)
+        return constants
+
     def with_constants(self, constants: Constants) -> "Scene":
         """The scene with other numbers, which may be arrays or traced, for functions to read.
 

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import sources
-from codesign_jax.compiler import cache
+from codesign_jax import reuse
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
     Limits,
@@ -186,11 +185,12 @@ def planted(faults: Mapping[str, Fault]) -> Iterator[Planted]:
 
         patch.setattr(step.Step, "__init__", prepare)
         # Sound kernels must neither be found in the place of this one nor find it.
-        patch.setattr(sources, "digest", lambda: f"planted: {sorted(faults)}")
+        digest = f"planted: {sorted(faults)}"
+        patch.setattr(reuse, "code_digest", lambda **_: digest)
         patch.setattr(
             program, "of_code", lambda _: None
         )  # what has no fault is traced once for all
-        patch.setattr(cache, "kept", lambda name, build: build())
+        patch.setattr(reuse, "kept", lambda path, build: build())
         yield fault
     missing = fault.wanted() - fault.used
     assert not missing, f"stages that the kernel has no more: {missing}"

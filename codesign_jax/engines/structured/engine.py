@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import sources
+from codesign_jax import reuse
 from codesign_jax.compiler import launch
 from codesign_jax.compiler.launch import KernelUnavailable
 from codesign_jax.engines.base import Equal, Staged
@@ -286,4 +286,4 @@ def _unavailable(reason: str) -> KernelUnavailable:
     )
 
 
-sources.note()  # everything that a kernel is traced from has been imported
+reuse.note()  # everything that a kernel is traced from has been imported

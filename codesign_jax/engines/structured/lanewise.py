@@ -166,7 +166,7 @@ _code: list[str | None] = [None]  # digest of the code that `_program` traced
 
 
 def of_code(digest: str | None) -> None:
-    """Forgets what was traced of other code than that of a `sources.digest`; None: it is not known.
+    """Forgets what was traced of other code than this `reuse.code_digest`; None: it is not known.
 
     The key of a call has the code of its function, but not of the functions that this one calls.
     """

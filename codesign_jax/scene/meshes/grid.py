@@ -1,15 +1,12 @@
 """Signed distance on a voxel grid, as fine as a bound on its interpolation error asks for."""
 
-import contextlib
-import hashlib
-import time
-from pathlib import Path
-from typing import NamedTuple
+import io
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 
-from codesign_jax import archives, caches, sources
+from codesign_jax import reuse, store
 from codesign_jax.scene.meshes import surface as surfaces
 from codesign_jax.scene.meshes.surface import Surface
 from codesign_jax.scene.reach import LEAST
@@ -23,7 +20,6 @@ MAX_WORK = 3e10  # faces times nodes
 _LARGE = 300_000  # nodes; more take a second
 _NEAR = 0.002  # how far from the surface "near the surface" goes [m]
 WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
-_ENDING = ".npz"  # of the files in the cache
 
 
 class Grid(NamedTuple):
@@ -166,37 +162,17 @@ def cached(
       bound: As for `build`.
       reach: As for `build`.
     """
-    code = sources.of_files()
-    if code is None or not caches.enabled():
-        return build(vertices, faces, bound)
-    name = hashlib.sha256(f"{key} {code}".encode()).hexdigest()
-    path = caches.folder() / "meshes" / f"{name}{_ENDING}"
-    stored = _read(path)
-    if stored is not None:
-        return stored
-    start = time.perf_counter()
-    grid = build(vertices, faces, bound, reach)
-    if time.perf_counter() - start > WORTH_KEEPING:
-        _write(path, grid)
-    return grid
+    name = reuse.key(key, bound, reach, traced=False)
+    if name is None or reuse.limit() is None:
+        return build(vertices, faces, bound, reach)
+    path = reuse.folder() / "meshes" / f"{name}.kept"
 
+    def made() -> bytes:
+        return store.packed(build(vertices, faces, bound, reach)._asdict())
 
-def _read(path: Path) -> Grid | None:
-    """A stored grid, or None; a damaged file counts as none."""
-    try:
-        stored = archives.load(path)
-        if str(stored["name"]) != path.name:  # another grid's file
-            return None
-        scalars = {k: float(stored[k]) for k in ("cell", "error", "worst")}
-        found = Grid(origin=stored["origin"], values=stored["values"], **scalars)
-    except (OSError, archives.ArchiveError, KeyError):
-        return None
-    caches.used(path)
-    return found
-
-
-def _write(path: Path, grid: Grid) -> None:
-    """Writes a grid to the cache; a full disk is no error."""
-    with contextlib.suppress(OSError):
-        archives.save(path, {"name": path.name, **grid._asdict()}, compressed=True)
-        caches.evict(path.parent, _ENDING, caches.limit(caches.MESHES), path)
+    found: dict[str, Any] = store.unpacked(
+        io.BytesIO(reuse.kept(path, made, worth=WORTH_KEEPING)), path
+    )
+    for name in ("cell", "error", "worst"):
+        found[name] = float(found[name])
+    return Grid(**found)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-from codesign_jax import sources
+from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.engines.structured.kernel.bars import STEP, Bars
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
@@ -111,7 +111,7 @@ class AdjointProgram(Program):
         if self.backend == "interpreter":
             found = call(*given)[:6]
         else:
-            of_code(sources.digest())
+            of_code(reuse.code_digest())
             origin = repr((self.scene.structure, "adjoint"))
             shared = (len(given) - 1,) if self.meshes else ()
             # At LLVM's level 1 it is as fast, with the same bits, after two thirds of LLVM's time.

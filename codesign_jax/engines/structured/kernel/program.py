@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-from codesign_jax import sources, verdict
+from codesign_jax import reuse, verdict
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import speed, teams
@@ -122,7 +122,7 @@ class Program(Packing):
         call, outputs = self._call(inputs, trajectory, states)
         if self.backend == "interpreter":
             return call(*inputs)
-        of_code(sources.digest())
+        of_code(reuse.code_digest())
         origin = repr((self.scene.structure, self.limits, trajectory, states))
         shared = (len(inputs) - 1,) if self.meshes else ()
         kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))

@@ -1,0 +1,407 @@
+"""What may be reused: programs within a process; programs, kernels and grids of meshes on disk.
+
+All of it is known by the code that made it, the versions of packages, and kernels by the device.
+
+Environment variables, which the commands check before they do anything:
+
+* CODESIGN_CACHE: `on`, the default, or `off`: then nothing is read from a cache or written to one,
+  that of JAX included.
+* CODESIGN_CACHE_BYTES: the most bytes on disk of JAX's programs, of kernels and of grids, each, by
+  default 512 MiB; what was not used for the longest time goes first.
+* XDG_CACHE_HOME: where the folder `codesign-jax` is, by default `~/.cache`.
+* JAX_COMPILATION_CACHE_DIR: JAX's own variable. Programs and kernels are in that folder then, and
+  nobody checks or deletes the programs.
+"""
+
+import contextlib
+import functools
+import gc
+import hashlib
+import importlib.metadata
+import os
+import sys
+import time
+import types
+import zlib
+from collections.abc import Callable, Hashable
+from pathlib import Path
+from typing import Any
+
+from codesign_jax import files  # NumPy and JAX are imported where they are used: `--help` is quick
+
+ROOT = Path(__file__).parent
+UNRELATED = ("commands", "export", "optimize", "report", "runs")
+"""Folders that no simulation depends on: they import engines, never the other way."""
+_UNTRACED = ("compiler", "files", "reuse", "store")
+"""What is not traced: to replace a name there is to change the machinery and no physics."""
+
+# The code that runs.  An editor or `git checkout` may change files after the import, so their state
+# is noted before the first module is imported, and what modules define when the engine is.
+
+
+def _state() -> dict[str, tuple[int, ...]]:
+    """What the file system says of each file of code that a simulation depends on.
+
+    With the time of the inode's last change, which no program can set back.
+    """
+    found, folders = {}, [""]
+    with contextlib.suppress(OSError):  # a file goes away while its state is read
+        while folders:
+            folder = folders.pop()
+            for entry in os.scandir(os.path.join(ROOT, folder)):
+                name = f"{folder}{entry.name}"
+                if entry.name.endswith(".py"):
+                    s = entry.stat()
+                    found[name] = (s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
+                elif entry.is_dir() and name not in UNRELATED and entry.name != "__pycache__":
+                    folders.append(f"{name}/")
+    return found
+
+
+at_import = _state()
+_defined: dict[str, dict[str, object]] = {}
+
+
+def code_digest(*, traced: bool = True) -> str | None:
+    """Digest of the code that this process runs; None if it is not known: nothing is reused then.
+
+    It is not known once a file was edited after the import, or, of what is `traced`, once a name
+    was replaced, as by IPython's autoreload.
+    """
+    if (traced and replaced()) or _state() != at_import:
+        return None
+    found = _content_digest()
+    return found if _state() == at_import else None  # edited while it was read
+
+
+@functools.cache
+def _content_digest() -> str:
+    found = hashlib.sha256()
+    for name in sorted(at_import):
+        code = (ROOT / name).read_bytes()
+        found.update(f"{name} {len(code)}\n".encode() + code)
+    return found.hexdigest()
+
+
+def note() -> None:
+    """Notes what the modules that have been imported so far define, see `replaced`."""
+    for name, module in list(sys.modules.items()):
+        parts = name.split(".")
+        if parts[0] == __package__ and parts[1:2] and name not in _defined:
+            if parts[1] not in (*UNRELATED, *_UNTRACED):
+                _defined[name] = _names(module)
+
+
+def replaced() -> list[str]:
+    """Names of modules and classes that are not what they were when their module was noted."""
+    note()
+    return [
+        f"{module}.{name}"
+        for module, names in _defined.items()
+        for now in [_names(sys.modules.get(module))]
+        for name, value in names.items()
+        if now.get(name) is not value
+    ]
+
+
+def _names(module: object) -> dict[str, object]:
+    """What a module and its own classes define, and the code of its own functions."""
+    found, own = {}, getattr(module, "__name__", None)
+    for name, value in getattr(module, "__dict__", {}).items():
+        if name.startswith("__"):
+            continue
+        found[name] = value
+        if getattr(value, "__module__", None) == own and isinstance(value, types.FunctionType):
+            found[f"{name}()"] = value.__code__
+        elif getattr(value, "__module__", None) == own and isinstance(value, type):
+            found |= {f"{name}.{key}": v for key, v in vars(value).items() if key[:2] != "__"}
+    return found
+
+
+def key(*parts: object, traced: bool = True) -> str | None:
+    """Name of what this code and these versions make of the parts; None: see `code_digest`."""
+    code = code_digest(traced=traced)
+    return None if code is None else digest(code, *map(_version, _COMPILERS), *parts)
+
+
+_COMPILERS = ("jax", "jaxlib", "llvmlite", "numpy", "scipy", "trimesh")
+_version = functools.cache(importlib.metadata.version)
+
+
+def digest(*parts: object) -> str:
+    """SHA-256 of the parts' representation."""
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+# Caches on disk.
+
+MOST = str(512 * 2**20)
+"""Most bytes of each, if the environment does not say."""
+
+
+def folder() -> Path:
+    """Folder of all caches; it may not exist yet."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "codesign-jax"
+
+
+def _environment() -> tuple[str, str]:
+    return os.environ.get("CODESIGN_CACHE") or "on", os.environ.get("CODESIGN_CACHE_BYTES", MOST)
+
+
+def problems() -> list[str]:
+    """What is wrong with the environment variables, in words."""
+    switch, most = _environment()
+    number = most.isascii() and most.isdecimal() and len(most) <= 18
+    found = [] if switch in ("on", "off") else [f"CODESIGN_CACHE = {switch!r} must be on or off"]
+    return found + [f"CODESIGN_CACHE_BYTES = {most[:40]!r} must be a number of bytes"] * (
+        not number
+    )
+
+
+def limit() -> int | None:
+    """The most bytes of each cache; None if caches are off.
+
+    Raises:
+      ValueError: If an environment variable has a wrong value.
+    """
+    if wrong := problems():
+        raise ValueError("; ".join(wrong))
+    switch, most = _environment()
+    return int(most) if switch == "on" else None
+
+
+def kernel_file(name: str) -> Path | None:
+    """File of a kernel, beside JAX's programs; None where these are not kept, or are remote."""
+    import jax
+
+    place = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return None if not place or "://" in str(place) else Path(place) / "kernels" / f"{name}.kept"
+
+
+def kept(path: Path | None, build: Callable[[], bytes], *, worth: float = 0.0) -> bytes:
+    """Content of a file of a cache, or what `build` returns, which is kept if it took `worth` [s].
+
+    A file that is damaged, or another one's, is built again. A folder that cannot be read or
+    written does not matter.
+    """
+    most = limit()
+    if path is None or most is None:
+        return build()
+    with contextlib.suppress(OSError):
+        found = path.read_bytes()
+        if found[:32] == hashlib.sha256(path.name.encode() + found[32:]).digest():
+            with contextlib.suppress(OSError):  # of somebody else
+                os.utime(path)
+            return found[32:]
+    start = time.perf_counter()
+    content = build()
+    if time.perf_counter() - start >= worth:
+        with contextlib.suppress(OSError):
+            files.clear_place(path)
+            with files.atomically(path) as part:
+                part.write_bytes(hashlib.sha256(path.name.encode() + content).digest() + content)
+            _evict(path, most)
+    return content
+
+
+def _evict(newest: Path, most: int) -> None:
+    """Deletes a folder's files that were not used for the longest time; the newest stays."""
+    found = []
+    for path in newest.parent.iterdir():
+        with contextlib.suppress(OSError):  # another process deletes as well
+            state = path.stat()
+            if path.suffix == newest.suffix:
+                found.append((state.st_mtime_ns, state.st_size, path))
+            elif path.suffix == ".tmp" and time.time() - state.st_mtime > 3600:  # abandoned
+                path.unlink()
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total > most and path != newest:
+            path.unlink(missing_ok=True)
+            total -= size
+
+
+def use_compilation_cache() -> None:
+    """Keeps compiled programs between processes, in `folder`, as the commands do.
+
+    For scripts and notebooks, before their first simulation. Damaged programs are deleted first. A
+    place that was chosen already (`jax_compilation_cache_dir`) stays. With CODESIGN_CACHE=off JAX
+    keeps and finds nothing.
+
+    Raises:
+      ValueError: If an environment variable has a wrong value.
+
+    >>> import jax
+    >>> from codesign_jax import use_compilation_cache
+    >>> use_compilation_cache()
+    >>> jax.config.jax_compilation_cache_dir is None
+    False
+    """
+    import jax
+
+    most = limit()
+    if most is None:
+        jax.config.update("jax_enable_compilation_cache", False)
+    elif jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        place = folder() / "jax"
+        check_programs(place)
+        jax.config.update("jax_compilation_cache_dir", str(place))
+        if os.access(place, os.W_OK) or not place.exists():  # JAX locks a folder that has a limit
+            jax.config.update("jax_compilation_cache_max_size", most)
+        # Small programs too, of which a command has dozens: JAX keeps those that take a second.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def check_programs(place: Path) -> None:
+    """Deletes what JAX wrote since the last check and cannot be unpacked, and dates the rest.
+
+    JAX (`lru_cache.py`) writes no program as a whole and writes over nothing: what a full disk or a
+    power cut left would stay, with a warning in each process.
+    """
+    checked, now = place / "checked", time.time_ns()
+    with contextlib.suppress(OSError):  # no folder, a read-only one, or a full disk: no matter
+        last = checked.stat().st_mtime_ns - 10**9 if checked.exists() else 0
+        for path in place.glob("*-cache"):
+            with contextlib.suppress(OSError):  # another process deletes as well
+                files.clear_place(path)
+                used, written = path.with_name(f"{path.name[:-6]}-atime"), path.stat().st_mtime_ns
+                if written > last and not _complete(path.read_bytes()):
+                    path.unlink()
+                elif not used.exists():  # JAX's limit of size needs it of every program
+                    used.write_bytes(written.to_bytes(8, "little"))
+        checked.touch()
+        os.utime(checked, ns=(now, now))
+
+
+def _complete(content: bytes) -> bool:
+    """Whether a program can be unpacked to its end, by the library that JAX packed it with."""
+    try:
+        if content.startswith(b"\x28\xb5\x2f\xfd"):
+            import zstandard  # type: ignore[import-not-found]
+
+            return bool(zstandard.ZstdDecompressor().decompress(content))
+        return bool(zlib.decompress(content))
+    except Exception:  # each library has errors of its own, for whatever it finds
+        return False
+
+
+# Within a process.  On a CPU XLA gives each piece of machine code three memory maps: 600 for the
+# programs that simulate a scene of one structure and 1,000 for those that optimise one, of the
+# 65,530 (`vm.max_map_count`) beyond which LLVM ends the process.
+
+
+def memory_maps() -> tuple[int, int]:
+    """Memory maps of this process and how many it may have; 0 of 1 if the system does not tell."""
+    try:
+        with open("/proc/self/maps", "rb") as file:
+            return sum(1 for _ in file), int(Path("/proc/sys/vm/max_map_count").read_text())
+    except (OSError, ValueError):
+        return 0, 1
+
+
+def memory_problem() -> str | None:
+    """Why nothing more should be compiled, or None."""
+    now, most = memory_maps()
+    if now <= 0.9 * most:
+        return None
+    return (
+        f"this process has {now:,} of the {most:,} memory maps that Linux allows "
+        "(vm.max_map_count), nearly all of compiled programs, and LLVM would end it: call "
+        "jax.clear_caches(), drop compiled functions, or begin a new process"
+    )
+
+
+forgetters: list[Callable[[], object]] = []
+"""What drops the programs that `shared` keeps."""
+
+
+def _relieve() -> None:
+    """Drops all programs, those of JAX included, if many maps are taken; who holds one keeps it."""
+    now, most = memory_maps()
+    if now > 0.3 * most:
+        import jax
+
+        for forget in forgetters:
+            forget()
+        jax.clear_caches()
+        gc.collect()
+
+
+def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
+    """Jits what build(scene, engine, space, *more) returns once for each structure.
+
+    The program reads numbers from its constants alone (`Scene.constants`), so that another file of
+    the same structure traces and compiles nothing; with a `cost` of the user's own, which may read
+    whatever else, and once the code is not known, nothing is shared.
+    """
+
+    def jitted(*arguments: Any) -> Callable:
+        import jax
+
+        _relieve()
+        return jax.jit(build(*arguments))
+
+    found = functools.lru_cache(maxsize=32)(jitted)
+    forgetters.append(found.cache_clear)
+
+    @functools.wraps(build)
+    def find(scene: Any, engine: Any, space: Any, *arguments: Any) -> Callable:
+        if getattr(arguments[-1], "cost", None) is not None:
+            return jitted(scene, engine, space, *arguments)
+        known = isinstance(engine, Hashable) and code_digest() is not None
+        return (found if known else jitted)(scene.structure, engine, space.structure, *arguments)
+
+    return find
+
+
+class Program:
+    """A jitted function of two arguments that gets a scene's numbers, or others, as its third.
+
+    `jax.jit`, `jax.vmap` and so on work on it as on a function.
+    """
+
+    def __init__(self, scene: Any, jitted: Any, *more: Any):
+        """Joins a program with what a scene passes to it, and further arguments of every call."""
+        self._scene, self._jitted, self._more = scene, jitted, more
+
+    def __call__(self, first: Any, second: Any, constants: Any = None) -> Any:
+        """Calls the program; `constants` are checked and replace the scene's."""
+        numbers = self._numbers(constants)
+        return _run(lambda: self._jitted(first, second, numbers, *self._more))
+
+    def compile(self, first: Any, second: Any) -> Callable[..., Any]:
+        """Compiles the program ahead for arguments like these; a function to call it by."""
+        numbers = self._numbers(None)
+        compiled = _run(lambda: self._jitted.lower(first, second, numbers, *self._more).compile())
+        return lambda first, second: compiled(first, second, numbers, *self._more)
+
+    def _numbers(self, constants: Any) -> Any:
+        import jax
+
+        # Python's floats would be traced apart from arrays.
+        numbers = self._scene.numbers(constants)
+        return jax.tree.map(lambda v: jax.numpy.asarray(v, float), numbers)
+
+
+# Whether programs have run in this process, and whether it was forked from one in which they had.
+process = {"begun": False, "forked": False}
+os.register_at_fork(after_in_child=lambda: process.update(forked=process["begun"]))
+
+
+def _run(call: Callable[[], Any]) -> Any:
+    """Returns call(); Ctrl-C while JAX traces may leave a mark that it takes for a recursion."""
+    if process["forked"]:
+        raise RuntimeError(
+            "this process was forked from one that had simulated, and would wait for ever for "
+            "XLA's threads, which it has not: begin processes by multiprocessing's `spawn`"
+        )
+    process["begun"] = True
+    try:
+        return call()
+    except RecursionError as error:
+        if "Recursively calling" not in str(error):
+            raise
+        import jax
+
+        jax.clear_caches()
+        return call()

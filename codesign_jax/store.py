@@ -1,0 +1,201 @@
+"""Arrays in files that are known to be what was written, and results that a command goes on from.
+
+The checksums of zip leave out names and lengths, and what reads them has an error of its own for
+each damage; here there is one.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import io
+import json
+import os
+import uuid
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from codesign_jax import files, reuse
+
+MOST = 2**30
+"""Most bytes of arrays that a file may unpack to."""
+SCHEMA = 2
+"""Layout of results, in which their arrays have names and shapes."""
+_DIGEST, _NUMBER = "digest", "number of the part"
+_HEAD = 8  # bytes of a part's length
+
+Arrays = Mapping[str, Any]
+
+
+class StoreError(ValueError):
+    """A file is not what was written, or not of this kind; the message says so of the file."""
+
+
+def save(path: Path, arrays: Arrays) -> None:
+    """Writes arrays by name, as a whole or not at all.
+
+    Raises:
+      OSError: If the file cannot be written.
+    """
+    with files.atomically(path) as part:
+        part.write_bytes(packed(arrays))
+
+
+def load(path: Path) -> dict[str, np.ndarray]:
+    """Reads the arrays of a file.
+
+    Raises:
+      OSError: If the file cannot be opened.
+      StoreError: If it is not what `save` wrote.
+    """
+    with path.open("rb") as file:
+        return unpacked(file, path)
+
+
+def packed(arrays: Arrays) -> bytes:
+    """Arrays by name, without those that are None, and the digest of all of them."""
+    found: dict[str, Any] = {n: np.asarray(v) for n, v in arrays.items() if v is not None}
+    found[_DIGEST] = np.array(_digest(found))
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **found)
+    return buffer.getvalue()
+
+
+def unpacked(file: BinaryIO, path: Path) -> dict[str, np.ndarray]:
+    """The arrays that `packed` had; `path` is for the error.
+
+    Raises:
+      StoreError: If it is something else.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size <= MOST:
+            with np.load(file, allow_pickle=False) as stored:
+                arrays = {name: np.asarray(stored[name]) for name in stored.files}
+            if str(arrays.pop(_DIGEST)) == _digest(arrays):
+                return arrays
+    except Exception as error:  # zip, zlib and NumPy have a dozen kinds for what damage they find
+        raise StoreError(f"{path} is damaged, or another version wrote it: {error!r}") from error
+    raise StoreError(f"{path} is damaged: it does not hold what was written")
+
+
+def _digest(arrays: Arrays) -> str:
+    found = hashlib.sha256()
+    for name in sorted(arrays):
+        value = np.ascontiguousarray(arrays[name])
+        found.update(f"{name} {value.dtype.str} {arrays[name].shape}\n".encode())
+        found.update(value.tobytes())
+    return found.hexdigest()
+
+
+def head(about: Any) -> dict[str, np.ndarray]:
+    """Arrays that say of what results are, for `refusal`.
+
+    Args:
+      about: What determines the results, beside code, versions and device: of JSON's types.
+    """
+    # Results of code that is not known are nobody's: nothing is equal to this.
+    code = reuse.code_digest() or f"unknown {uuid.uuid4()}"
+    text = json.dumps(about, sort_keys=True)
+    return {"about": np.array(text), "code": np.array(code), "schema": np.array(SCHEMA)}
+
+
+def refusal(arrays: Arrays, about: Any) -> str:
+    """Why results are not taken for those of `about`, with the file as subject; else nothing."""
+    own = head(about)
+    found = {name: str(arrays.get(name)) for name in own}
+    if found["schema"] == str(SCHEMA) and found["about"] != str(own["about"]):
+        return "is of another design or other settings"
+    return (
+        "" if found == {n: str(v) for n, v in own.items()} else "is of another version of the code"
+    )
+
+
+class Store:
+    """Results that grow part by part in one file, and are found again by the same case and code.
+
+    A process that is killed leaves the parts before. They are checked when the file is opened, and
+    read again one by one: memory does not grow with the file.
+
+    Attributes:
+      about: What the results that are there are of; None without any.
+      refused: Why they are not taken, with the file as subject; empty if they are. The next part
+        then takes their place.
+    """
+
+    def __init__(self, path: Path, about: Any):
+        """Reads what is there, up to the first damaged part; what cannot be read counts as none.
+
+        Args:
+          path: The file.
+          about: See `head`.
+        """
+        self.path, self._own, self.about, self.refused = path, about, None, ""
+        self._ends = [0]
+        with contextlib.suppress(OSError, StoreError), path.open("rb") as file:
+            while part := self._next(file, path):
+                if len(self._ends) == 1:
+                    self.refused = refusal(part, about)
+                    self.about = json.loads(str(part.get("about", "null")))
+                self._ends.append(file.tell())
+        if self.refused:
+            self._ends = [0]
+
+    def _next(self, file: BinaryIO, path: Path) -> dict[str, np.ndarray] | None:
+        """The part that begins here; None at the end of what is whole."""
+        size = int.from_bytes(file.read(_HEAD), "little")
+        if not 0 < size <= MOST:
+            return None
+        part = unpacked(io.BytesIO(file.read(size)), path)
+        # A damaged length may reach over a whole part: a zip file is read from its end.
+        return part if part.pop(_NUMBER, None) == len(self._ends) - 1 else None
+
+    def __len__(self) -> int:
+        """Number of parts."""
+        return max(len(self._ends) - 2, 0)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """The parts' arrays, in their order."""
+        with open(self.path if len(self) else os.devnull, "rb") as file:
+            for start, end in zip(self._ends[1:-1], self._ends[2:], strict=True):
+                file.seek(start + _HEAD)
+                part = unpacked(io.BytesIO(file.read(end - start - _HEAD)), self.path)
+                del part[_NUMBER]
+                yield part
+
+    def append(self, arrays: Arrays) -> None:
+        """Adds a part after the others.
+
+        Raises:
+          OSError: If the file cannot be written.
+        """
+        if len(self._ends) == 1:
+            self._write(head(self._own))
+        self._write(arrays)
+
+    def _write(self, arrays: Arrays) -> None:
+        content = packed({**arrays, _NUMBER: np.array(len(self._ends) - 1)})
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("r+b" if self.path.exists() else "wb") as file:
+            file.truncate(self._ends[-1])  # without what a killed process began
+            file.seek(self._ends[-1])
+            file.write(len(content).to_bytes(_HEAD, "little") + content)
+            file.flush()
+            os.fsync(file.fileno())
+        self._ends.append(self._ends[-1] + _HEAD + len(content))
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[bool]:
+        """Whether no other process has the file; none gets it meanwhile."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("ab") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                free = True
+            except OSError:
+                free = False
+            yield free

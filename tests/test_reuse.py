@@ -1,0 +1,435 @@
+"""What is reused belongs to the code that this process imported, and is what was kept."""
+
+import os
+import subprocess
+import sys
+import types
+import warnings
+import zlib
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from codesign_jax import cli, codesign, reuse
+from codesign_jax.compiler.ffi import KernelUnavailable
+from codesign_jax.engines.structured import lanewise
+from codesign_jax.scene import parameters
+from codesign_jax.scene.meshes import grid
+from tests.helpers import grasps, kernels
+
+# The code
+
+
+@pytest.fixture
+def code(tmp_path, monkeypatch):
+    """A package of two files that was just imported, in the place of this one."""
+    root = tmp_path / "code"
+    for name in ("a.py", "deep/b.py", "report/c.py"):
+        (root / name).parent.mkdir(exist_ok=True, parents=True)
+        (root / name).write_text(name)
+    monkeypatch.setattr(reuse, "ROOT", root)
+    imported(monkeypatch)
+    yield root
+    reuse._content_digest.cache_clear()
+
+
+def imported(monkeypatch):
+    """A process begins."""
+    monkeypatch.setattr(reuse, "at_import", reuse._state())
+    reuse._content_digest.cache_clear()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder where kernels are kept."""
+    previous = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "jax"))
+    yield tmp_path / "jax"
+    jax.config.update("jax_compilation_cache_dir", previous)
+
+
+def test_every_file_but_those_left_out_is_part_of_the_digest(code, monkeypatch):
+    first = reuse.code_digest()
+    assert first
+    (code / "report" / "c.py").write_text("other")
+    assert reuse.code_digest() == first
+    for name, text in (("deep/b.py", "other"), ("new.py", ""), ("a.py", "more")):
+        (code / name).write_text(text)
+        imported(monkeypatch)
+        assert reuse.code_digest() not in (None, first)
+    (code / "new.py").unlink()
+    (code / "deep/b.py").write_text("deep/b.py")
+    (code / "a.py").write_text("a.py")
+    imported(monkeypatch)
+    assert reuse.code_digest() == first
+
+
+def set_back(path):
+    """Another text of the same length, with the time of the old one, as rsync and tar leave it."""
+    old = path.stat()
+    path.write_text(path.read_text().swapcase())
+    os.utime(path, ns=(old.st_atime_ns, old.st_mtime_ns))
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda root: (root / "a.py").write_text("edited"),
+        lambda root: set_back(root / "deep" / "b.py"),
+        lambda root: (root / "a.py").unlink(),
+        lambda root: (root / "deep" / "new.py").write_text(""),
+    ],
+    ids=["edited", "same size and time", "deleted", "added"],
+)
+def test_code_that_changed_after_the_import_has_no_digest(code, edit):
+    """Before the first kernel, and between two."""
+    edit(code)
+    assert reuse.code_digest() is None
+
+
+def test_a_kernel_of_code_that_changed_is_neither_kept_nor_found(code, folder, monkeypatch):
+    """The next process, which imports what the disk says, must not run this one's kernel."""
+    run = partial(kernels.run, rounds=7)
+    x, table = kernels.numbers(2)
+    jax.jit(run)(x, table)
+    [first] = folder.rglob("kernels/*.kept")
+    text = (code / "a.py").read_text()
+    (code / "a.py").write_text("edited")
+    got = jax.jit(lambda *v: run(*v))(x, table)
+    assert list(folder.rglob("kernels/*.kept")) == [first]
+    np.testing.assert_array_equal(got, jax.jit(run)(x, table))
+    imported(monkeypatch)  # the next process builds a kernel of its own
+    jax.jit(lambda *v: run(*v))(x, table)
+    assert len(list(folder.rglob("kernels/*.kept"))) == 2
+    (code / "a.py").write_text(text)
+    imported(monkeypatch)
+    jax.jit(lambda *v: run(*v))(x, table)
+    assert len(list(folder.rglob("kernels/*.kept"))) == 2
+
+
+def test_a_replaced_name_is_seen_until_it_is_put_back(monkeypatch):
+    from codesign_jax.engines.structured.kernel import step
+    from codesign_jax.engines.structured.laws import contact
+
+    first = reuse.code_digest()
+    assert first and reuse.replaced() == []
+    function = next(
+        v
+        for v in vars(contact).values()
+        if isinstance(v, types.FunctionType) and v.__module__ == contact.__name__
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(step.Step, "advance", lambda *_: None)
+        assert reuse.code_digest() is None and len(reuse.replaced()) == 1
+    with monkeypatch.context() as patch:  # as IPython's autoreload does
+        patch.setattr(function, "__code__", (lambda: None).__code__)
+        assert reuse.code_digest() is None and len(reuse.replaced()) == 1
+    assert reuse.code_digest() == first
+
+
+def test_nothing_traced_is_found_once_the_code_is_not_known(monkeypatch):
+    """A function's key does not have the functions that it calls."""
+    scene, built = types.SimpleNamespace(structure="s"), []
+    find = reuse.shared(lambda *how: built.append(how) or (lambda v: v))
+    first = find(scene, "engine", scene, None)
+    assert find(scene, "engine", scene, None) is first
+    lanewise.of_code("a")
+    lanewise._program.cache_clear()
+    keep = lanewise._program.cache_info
+    monkeypatch.setattr(reuse, "code_digest", lambda **_: None)
+    assert find(scene, "engine", scene, None) is not first and len(built) == 2
+
+    half = lanewise.lanes([np.float32(3)], (), wide=False)
+    jax.make_jaxpr(lambda: lanewise.lanewise(lambda v: v * 2, half).lane)()
+    assert keep().currsize == 1
+    lanewise.of_code("a")
+    assert keep().currsize == 1
+    for other in ("b", None, None):
+        jax.make_jaxpr(lambda: lanewise.lanewise(lambda v: v * 2, half).lane)()
+        lanewise.of_code(other)
+        assert keep().currsize == 0
+
+
+def test_another_process_has_the_same_digest():
+    program = "from codesign_jax import reuse; print(reuse.code_digest())"
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=reuse.ROOT.parent, capture_output=True, text=True
+    )
+    assert done.stdout.split() == [reuse.code_digest()], done.stderr
+
+
+# Memory maps and processes
+
+
+def full(monkeypatch, share):
+    """The process has this share of the maps that it may have."""
+    monkeypatch.setattr(reuse, "memory_maps", lambda: (int(share * 65_530), 65_530))
+
+
+def test_the_system_tells_how_many_maps_there_are():
+    now, most = reuse.memory_maps()
+    assert 100 < now < most
+
+
+def test_programs_go_when_many_maps_are_taken(monkeypatch):
+    """All that nobody holds; a program that is held works on."""
+    cleared, built, scene = [], [], types.SimpleNamespace(structure="s")
+    monkeypatch.setattr(reuse, "forgetters", [])
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
+    find = reuse.shared(lambda *how: built.append(how) or (lambda v: v + 1))
+
+    def get(number):
+        return find(scene, "engine", types.SimpleNamespace(structure=number), None)
+
+    full(monkeypatch, 0.29)
+    first = get(0)
+    assert get(0) is first and get(1) is not first and not cleared
+    full(monkeypatch, 0.31)
+    assert get(0) is first and not cleared  # nothing new is made
+    get(2)
+    assert cleared == [1]
+    full(monkeypatch, 0.1)
+    assert get(0) is not first and get(2) is get(2) and cleared == [1]
+    assert first(1) == 2
+
+
+def test_a_kernel_is_refused_before_the_limit(monkeypatch):
+    full(monkeypatch, 0.91)
+    with pytest.raises(KernelUnavailable, match=r"memory maps that Linux allows.*clear_caches"):
+        jax.jit(lambda *v: kernels.run(*v, rounds=3))(*kernels.numbers(2))
+    full(monkeypatch, 0.89)
+    jax.jit(lambda *v: kernels.run(*v, rounds=3))(*kernels.numbers(2))
+
+
+def test_what_ctrl_c_left_in_jax_is_forgotten(monkeypatch):
+    """The next call works; another recursion is an error as ever."""
+    cleared, scene = [], grasps.pinch("sphere", 2)
+    words = ["Recursively calling <weakref> multiply"]
+
+    def stuck(*_):
+        if words and not cleared:
+            raise RecursionError(words[0])
+        return 3
+
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
+    program = reuse.Program(scene, stuck)
+    assert program(0, 0) == 3 and cleared == [1]
+    cleared.clear()
+    words[0] = "maximum recursion depth exceeded"
+    with pytest.raises(RecursionError, match="maximum"):
+        program(0, 0)
+    assert not cleared
+
+
+def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
+    """Only of a process that had simulated; its own first call is then an error at once."""
+    program = reuse.Program(grasps.pinch("sphere", 2), lambda *_: 3)
+    monkeypatch.setattr(reuse, "process", {"begun": False, "forked": False})
+    assert program(0, 0) == 3 and reuse.process["begun"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of processes with threads
+        child = os.fork()
+    if not child:
+        os._exit(3 if reuse.process["forked"] else 4)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
+    monkeypatch.setitem(reuse.process, "forked", True)
+    with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
+        program(0, 0)
+
+
+@pytest.mark.slow  # test_programs_go_when_many_maps_are_taken keeps the idea
+def test_many_structures_stay_below_a_limit(monkeypatch):
+    """Eight structures under a limit that the maps of four exceed."""
+    effects = dict.fromkeys(("disturb", "ungrasp", "palm_object", "palm_table", "twist"), False)
+    changes = {f"effects__{name}": value for name, value in effects.items()}
+    changes |= {"phases__approach": 0.05, "phases__inflate": 0.1, "phases__lift": 0.15}
+    found = []
+    for links in range(2, 11):
+        scene = grasps.pinch("sphere", links, **changes)
+        space = parameters.design_space(scene.hand)
+        evaluate = codesign.Task(scene, space, 2).evaluate
+        population = np.repeat(np.asarray(space.default(), np.float32)[None], 2, 0)
+        jax.block_until_ready(evaluate(population, jax.random.key(0)))
+        found.append(reuse.memory_maps()[0])
+        if len(found) == 2:  # the first one also loads libraries
+            each = found[1] - found[0]
+            most = int((found[1] + 2 * each) / 0.3)
+            count = reuse.memory_maps
+            monkeypatch.setattr(reuse, "memory_maps", lambda c=count, m=most: (c()[0], m))
+    # Programs are dropped when the next ones are made.
+    assert each > 50 and max(found) < found[1] + 4 * each
+
+
+# On disk
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """The folder of all caches; JAX's is not chosen yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    previous = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_compilation_cache
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()
+    yield tmp_path / "codesign-jax"
+    jax.config.update("jax_compilation_cache_dir", previous[0])
+    jax.config.update("jax_enable_compilation_cache", previous[1])
+    compilation_cache.reset_cache()
+
+
+@pytest.mark.parametrize("text", ["abc", "", "-1", "1e9", "9" * 400, "\u0661"])
+def test_a_wrong_limit_is_refused_before_anything_is_done(text, monkeypatch, capsys):
+    monkeypatch.setenv("CODESIGN_CACHE_BYTES", text)
+    assert cli.main(["scenes", "hands"]) == 2
+    said = capsys.readouterr()
+    assert "error: CODESIGN_CACHE_BYTES = " in said.err and "must be a number of bytes" in said.err
+    assert not said.out
+    with pytest.raises(ValueError, match="CODESIGN_CACHE_BYTES"):
+        reuse.use_compilation_cache()
+
+
+def test_a_wrong_switch_is_refused_and_all_that_is_wrong_is_said(monkeypatch, capsys):
+    monkeypatch.setenv("CODESIGN_CACHE", "maybe")
+    monkeypatch.setenv("CODESIGN_CACHE_BYTES", "many")
+    assert cli.main(["scenes", "hands"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 2
+    assert reuse.problems()[0] == "CODESIGN_CACHE = 'maybe' must be on or off"
+
+
+def cube():
+    """Vertices and faces of a cube of 2 cm."""
+    import trimesh
+
+    box = trimesh.creation.box((0.02, 0.02, 0.02))
+    return np.asarray(box.vertices), np.asarray(box.faces)
+
+
+def use_all(monkeypatch):
+    """Uses every cache once."""
+    reuse.use_compilation_cache()
+    jax.jit(lambda v: v * 3.25)(jnp.ones(7))
+    reuse.kept(reuse.kernel_file("kernel"), lambda: b"code")
+    monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
+    return grid.cached("cube", *cube(), 1e-3)
+
+
+def test_one_switch_turns_all_caches_off(place, monkeypatch):
+    monkeypatch.setenv("CODESIGN_CACHE", "off")
+    found = use_all(monkeypatch)
+    assert not place.exists() and not jax.config.jax_enable_compilation_cache
+    monkeypatch.setenv("CODESIGN_CACHE", "on")
+    jax.config.update("jax_enable_compilation_cache", True)
+    np.testing.assert_array_equal(found.values, use_all(monkeypatch).values)
+    np.testing.assert_array_equal(found.values, use_all(monkeypatch).values)
+    names = {(p.parent.name, p.name.rpartition("-")[2]) for p in place.rglob("*") if p.is_file()}
+    assert {("jax", "cache"), ("jax", "atime")} <= names
+    assert len([*place.glob("meshes/*.kept")]) == len([*place.glob("jax/kernels/*.kept")]) == 1
+
+
+def test_jax_deletes_what_was_not_used_for_the_longest_time(place, monkeypatch):
+    """By its own limit of size, also among programs from before there was one."""
+    monkeypatch.setenv("CODESIGN_CACHE_BYTES", "20000")
+    (place / "jax").mkdir(parents=True)
+    old = place / "jax" / "jit_old-0-cache"
+    old.write_bytes(zlib.compress(os.urandom(9000)))
+    os.utime(old, (1, 1))
+    reuse.use_compilation_cache()
+    assert old.exists()
+    for k in range(8):
+        jax.jit(lambda v, k=k: jnp.sin(v) * 1.5 + k)(jnp.ones(5))
+    programs = [*(place / "jax").glob("*-cache")]
+    assert not old.exists() and 0 < sum(p.stat().st_size for p in programs) <= 20000
+
+
+def test_a_grid_in_the_place_of_another_is_not_taken(place, monkeypatch):
+    monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
+    vertices, faces = cube()
+    first = grid.cached("a", vertices, faces, 1e-3)
+    grid.cached("b", 0.5 * vertices, faces, 1e-3)
+    one, other = sorted((place / "meshes").iterdir(), key=lambda p: p.stat().st_size)
+    content = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(content)
+    np.testing.assert_array_equal(grid.cached("a", vertices, faces, 1e-3).values, first.values)
+
+
+def test_what_is_kept_is_found_and_damage_is_seen(folder):
+    """One file a kernel; a damaged one is built again; without a folder nothing is written."""
+    built = []
+
+    def build():
+        built.append(1)
+        return b"code"
+
+    def kept():
+        return reuse.kept(reuse.kernel_file("a"), build)
+
+    for count in (1, 1):
+        assert kept() == b"code" and len(built) == count
+    (path,) = folder.rglob("*.kept")
+    for damage in (path.read_bytes()[:-1], b"", path.read_bytes()[:-1] + b"f"):
+        path.write_bytes(damage)
+        before = len(built)
+        assert kept() == b"code" and len(built) == before + 1
+    path.unlink()
+    path.mkdir()  # where nothing could be kept
+    assert kept() == b"code" and path.is_file()
+    for place in (None, "gs://bucket/cache"):
+        jax.config.update("jax_compilation_cache_dir", place)
+        before = len(built)
+        assert kept() == b"code" and len(built) == before + 1
+    assert [p for p in folder.rglob("*") if p.is_file()] == [path] and not Path("gs:").exists()
+
+
+def test_what_is_not_used_goes(folder, monkeypatch):
+    """Ten kernels of 100 bytes under a limit of 532: four stay, the used one among them."""
+    monkeypatch.setenv("CODESIGN_CACHE_BYTES", str(4 * 132 + 4))
+    abandoned = folder / "kernels" / "x.tmp"
+    for k in range(10):
+        reuse.kept(reuse.kernel_file(f"k{k}"), lambda: bytes(100))
+        for n in range(k + 1):  # files of one instant have an order all the same
+            path = folder / "kernels" / f"k{n}.kept"
+            if path.exists() and n:
+                os.utime(path, ns=(10**9 * n, 10**9 * n))
+        reuse.kept(reuse.kernel_file("k0"), lambda: pytest.fail("gone"))
+        if not k:
+            abandoned.write_bytes(b"part")
+            os.utime(abandoned, (0, 0))
+    assert {p.name for p in (folder / "kernels").iterdir()} == {f"k{k}.kept" for k in (0, 7, 8, 9)}
+
+
+# JAX's programs
+
+
+@pytest.mark.parametrize(
+    "damage", [b"", b"nothing", bytes(30), zlib.compress(b"program" * 99)[:-9]]
+)
+def test_jax_compiles_again_what_was_damaged_and_keeps_it(damage, place):
+    """Right results, no warning, and sound files after."""
+
+    def run():
+        compilation_cache.reset_cache()  # a new process
+        jax.config.update("jax_compilation_cache_dir", None)
+        reuse.use_compilation_cache()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            return [float(jax.jit(lambda v, k=k: v * 1.25 + k)(2.0)) for k in range(3)]
+
+    want = run()
+    paths = sorted((place / "jax").glob("*-cache"))
+    assert want == [2.5, 3.5, 4.5] and len(paths) >= 3
+    for path in paths[:2]:
+        path.write_bytes(damage)
+    assert run() == want
+    assert sorted((place / "jax").glob("*-cache")) == paths
+    assert all(reuse._complete(path.read_bytes()) for path in paths)
+    # What was checked is not unpacked again.
+    os.utime(paths[0], (1, 1))
+    paths[0].write_bytes(b"")
+    os.utime(paths[0], (1, 1))
+    reuse.check_programs(place / "jax")
+    assert paths[0].exists()

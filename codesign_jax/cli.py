@@ -113,6 +113,33 @@ class Optimize(Command):
 
 
 @dataclasses.dataclass
+class Compare(Command):
+    """Compare runs: a row for each, and how many of each kind found a good design.
+
+    With --trials the designs of two runs are simulated in the same trials, and their difference
+    comes with its 95 % interval.
+    """
+
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER ...")]
+    """Run folders, or folders of run folders."""
+    trials: Count = None
+    """Trials in which the two designs are compared; default: none, only what the runs found."""
+    seed: int = 0
+    """Root of these trials' noise."""
+    objects: Text = None
+    """Object set of these trials; default: the runs'."""
+    accuracy: Text = None
+    """Accuracy of these trials, such as reference; default: the runs'."""
+    overrides: Overrides = ()
+    robust: Flag = False
+    """Draw friction, mass, size, stiffness and placement of these trials more widely."""
+    engine: Text = None
+    """Engine that simulates them; default: the runs'."""
+    out: File = None
+    """Write a table of the runs (.csv, docs/files.md)."""
+
+
+@dataclasses.dataclass
 class Evaluate(Command, RunOrDesign):
     """Evaluate one design: costs of each object, how sure they are, an animation if asked for."""
 
@@ -343,6 +370,7 @@ class Finger(Command, flags.Subject):
 COMMANDS = (
     Optimize
     | Evaluate
+    | Compare
     | Check
     | Landscape
     | Sample

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # One run a job of a SLURM array: sbatch slurm_array.sh FOLDER [flags of codesign optimize]
+# When the jobs have ended:       codesign compare FOLDER
 #SBATCH --array=0-9%4
 #SBATCH --cpus-per-task=8
 #SBATCH --time=04:00:00

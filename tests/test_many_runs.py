@@ -18,8 +18,8 @@ from rich.console import Console
 
 from codesign_jax import codesign, runs, scene
 from codesign_jax.batch import Batch
-from codesign_jax.commands import seeds
-from codesign_jax.commands.seeds import Compared
+from codesign_jax.commands import compare
+from codesign_jax.commands.compare import Compared
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.types import Outcome, Status
@@ -102,13 +102,13 @@ def test_rows_of_runs_are_verdicts():
     def compared(schedule, *chosen):
         own = runs.make_settings("2d", schedule, "morphology", "structured", 0)
         return {
-            Path(f"{schedule}-{seed}"): Compared(dataclasses.replace(own, seed=seed), *run)
+            Path(f"{schedule}-{seed}"): Compared(tiny, dataclasses.replace(own, seed=seed), *run)
             for seed, run in enumerate(chosen, 1)
         }
 
     def shown(every):
         text = io.StringIO()
-        seeds.compare(tiny, every, Console(file=text, width=40))  # as a log has, or less
+        compare.compare(every, Console(file=text, width=40))  # as a log has, or less
         return [" ".join(line.split()) for line in text.getvalue().splitlines()]
 
     one = compared("single", (result, fresh), (None, None), (result, None))

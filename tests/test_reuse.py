@@ -323,6 +323,7 @@ def test_one_switch_turns_all_caches_off(place, monkeypatch):
     assert not place.exists() and not jax.config.jax_enable_compilation_cache
     monkeypatch.setenv("CODESIGN_CACHE", "on")
     jax.config.update("jax_enable_compilation_cache", True)
+    compilation_cache.reset_cache()  # another process
     np.testing.assert_array_equal(found.values, use_all(monkeypatch).values)
     np.testing.assert_array_equal(found.values, use_all(monkeypatch).values)
     names = {(p.parent.name, p.name.rpartition("-")[2]) for p in place.rglob("*") if p.is_file()}

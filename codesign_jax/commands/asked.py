@@ -2,13 +2,14 @@
 
 import dataclasses
 import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
 
 from codesign_jax import engines, optimize, own, runs
-from codesign_jax.commands import common, seeds
+from codesign_jax.commands import common
 from codesign_jax.runs import Settings
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.schema import InputError
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 ALTERNATE, DOMAINS = "alternate", ("morphology", "control")
 """Value of --first by which even seeds begin in the first domain and odd ones in the other."""
+MOST = 1000
+"""Most runs of one command: a guard against a slip such as 0-99999."""
 _LONGEST = 200
 """Most bytes of a folder's name; file systems take 255, temporary files add to it."""
 
@@ -150,7 +153,25 @@ def seeds_of(options: "Optimize") -> list[int]:
     Raises:
       InputError: If --seeds is no list of them.
     """
-    return [options.seed] if options.seeds is None else seeds.parse(options.seeds)
+    return [options.seed] if options.seeds is None else parse_seeds(options.seeds)
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Reads seeds such as "0-9" or "1,3,5-7", in ascending order.
+
+    Raises:
+      InputError: If the text is none, or names too many.
+    """
+    found: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+        if last < first or last >= 2**31:
+            raise InputError([f"--seeds {text!r} must be seeds such as 0-9 or 1,3,5"])
+        if last - first >= MOST or len(found) > MOST:
+            raise InputError([f"--seeds {text!r} names more than {MOST} runs"])
+        found |= set(range(first, last + 1))
+    return sorted(found)
 
 
 def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:

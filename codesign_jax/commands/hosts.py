@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 
-from codesign_jax.commands import seeds, status
+from codesign_jax.commands import asked, status
 from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def run(options: "Optimize") -> tuple[int, Hosts]:
     Raises:
       InputError: See `join`.
     """
-    chosen = seeds.parse(options.seeds or "")
+    chosen = asked.parse_seeds(options.seeds or "")
     here = join(options.distributed or "")
     mine = ",".join(map(str, chosen[here.index :: here.count]))
     code = 0

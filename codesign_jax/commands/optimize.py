@@ -13,10 +13,11 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import asked, common, hosts, reference, seeds, status
+from codesign_jax.commands import asked, common, compare, hosts, reference, status
+from codesign_jax.commands.compare import Compared
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import Plan, RunResult, Settings
+from codesign_jax.runs import Plan, RunResult, Settings, columns
 from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
@@ -46,7 +47,7 @@ def main(options: "Optimize") -> int:
     for folder, own in every.items():
         runs.check_folder(folder, scene, own, fresh=options.fresh, sources=sources)
     if asked.several(options):
-        seeds.check_table(asked.table_folder(options))
+        compare.check_table(asked.table_folder(options) / columns.SEEDS)
     notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
@@ -68,7 +69,8 @@ def main(options: "Optimize") -> int:
     console = Console(highlight=False, soft_wrap=True)
     _tell(options, plans, results, called, console)
     if called:
-        _compare(options, scene, every, results, console)
+        pairs = {folder: (scene, own) for folder, own in every.items()}
+        _compare(options, compare.with_fresh(pairs, results), console)
     return int(any(result is None for result in results.values()))
 
 
@@ -100,26 +102,16 @@ def _compare_all(options: "Optimize") -> int:
     """Compares the runs of all hosts; returns the exit status."""
     scene, settings = asked.resolve(options)
     every = asked.runs_of(options, scene, settings)
-    results = {folder: seeds.read(scene, folder) for folder in every}
-    _compare(options, scene, every, results, Console(highlight=False, soft_wrap=True))
-    return int(any(result is None for result in results.values()))
+    found = compare.read_all({folder: (scene, own) for folder, own in every.items()})
+    _compare(options, found, Console(highlight=False, soft_wrap=True))
+    return int(any(run.result is None for run in found.values()))
 
 
-def _compare(
-    options: "Optimize",
-    scene: Scene,
-    every: dict[Path, Settings],
-    results: dict[Path, RunResult | None],
-    console: Console,
-) -> None:
+def _compare(options: "Optimize", every: dict[Path, Compared], console: Console) -> None:
     """Compares runs on the console and in seeds.csv."""
-    fresh = reference.of_runs(results)
-    compared = {
-        folder: seeds.Compared(every[folder], result, fresh[folder])
-        for folder, result in results.items()
-    }
-    seeds.compare(scene, compared, console)
-    table = seeds.write_table(scene, compared, asked.table_folder(options))
+    compare.compare(every, console)
+    table = asked.table_folder(options) / columns.SEEDS
+    compare.write_table(every, table)
     console.print(f"table: {table}", markup=False)
 
 
@@ -217,7 +209,7 @@ def _judge(
 ) -> None:
     """Prints the verdict: on fresh trials, or on those of the final test if there are no others."""
     assert result.test is not None
-    test = seeds.of_test(plan.scene, result)
+    test = compare.of_test(plan.scene, result)
     assert result.record is not None
     count = len(np.unique(np.asarray(result.record.state.particles), axis=0))
     chosen = f"chosen as the best of {count} final particles"

@@ -1,5 +1,6 @@
 """Statistics that commands and studies share, by SciPy."""
 
+import math
 from typing import NamedTuple
 
 
@@ -22,3 +23,44 @@ def wilson(successes: int, total: int) -> Interval:
 
     found = stats.binomtest(successes, total).proportion_ci(0.95, method="wilson")
     return Interval(successes / total, float(found.low), float(found.high))
+
+
+def paired(both: int, first: int, second: int, total: int) -> Interval:
+    """Difference of two shares of the same trials, by Newcombe's method 10 (Newcombe 1998).
+
+    It joins Wilson's intervals of the two shares by their correlation: with no trial in which the
+    two differ it has a width, unlike Wald's and the bootstrap's.
+
+    Args:
+      both: Trials in which both succeeded.
+      first: Those in which the first alone did.
+      second: Those in which the second alone did.
+      total: All trials, at least one.
+    """
+    one, other = wilson(both + first, total), wilson(both + second, total)
+    neither = total - both - first - second
+    product = (both + first) * (second + neither) * (both + second) * (first + neither)
+    together = both * neither - first * second
+    if together > 0:
+        together = max(together - total / 2, 0)
+    phi = together / math.sqrt(product) if product else 0.0
+
+    def width(a: float, b: float) -> float:
+        return math.sqrt(max(a * a - 2 * phi * a * b + b * b, 0.0))
+
+    value = one.value - other.value
+    low = value - width(one.value - one.low, other.high - other.value)
+    high = value + width(one.high - one.value, other.value - other.low)
+    return Interval(value, low, high)
+
+
+def mcnemar(first: int, second: int) -> float:
+    """McNemar's exact test of two shares of the same trials: the p-value, two-sided.
+
+    Args:
+      first: Trials in which the first alone succeeded.
+      second: Those in which the second alone did.
+    """
+    from scipy import stats
+
+    return float(stats.binomtest(first, first + second).pvalue) if first + second else 1.0

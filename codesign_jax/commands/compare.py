@@ -1,0 +1,345 @@
+"""`codesign compare`: runs side by side, and two designs in the same trials.
+
+`codesign optimize` ends with it where there are several seeds or strategies.
+"""
+
+import csv
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from codesign_jax import codesign, cost, files, runs
+from codesign_jax.commands import common, flags, reference
+from codesign_jax.commands.case import Case, find_case
+from codesign_jax.engines import make_engine
+from codesign_jax.report import statistics, verdicts
+from codesign_jax.report.verdicts import Judged
+from codesign_jax.runs import RunResult, Settings, columns
+from codesign_jax.runs.interrupts import interruptible
+from codesign_jax.runs.manifest import PROVENANCE
+from codesign_jax.runs.progress import Busy
+from codesign_jax.scene import Scene
+from codesign_jax.scene.schema import InputError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Compare
+
+_OF_SETTINGS = ("schedule", "optimizer", "preset", "engine", "cost")
+_WORDS = {"schedule": "strategy"}
+
+
+class Compared(NamedTuple):
+    """A run that is compared with others.
+
+    Attributes:
+      scene: Its scene.
+      settings: Its settings.
+      result: How it ended; None if it could not finish.
+      fresh: Fresh trials of its design; None without any.
+    """
+
+    scene: Scene
+    settings: Settings
+    result: RunResult | None
+    fresh: Judged | None
+
+    @property
+    def converged(self) -> int | None:
+        """Number of the episode, from 1, from which on the mean cost stays below the limit."""
+        if self.result is None or self.result.record is None:
+            return None
+        episode = codesign.convergence_episode(self.result.record.history.cost.mean(1))
+        return None if episode is None else episode + 1
+
+    @property
+    def judged(self) -> Judged | None:
+        """Fresh trials of its design, else its final test's trials, else None."""
+        if self.fresh is None and self.result is not None and self.result.test is not None:
+            return of_test(self.scene, self.result)
+        return self.fresh
+
+    @property
+    def kind(self) -> dict[str, str]:
+        """What runs may differ in, beside their seeds, by the column's name."""
+        own = {"scene": self.scene.name, "hand": self.scene.hand.name}
+        own["objects"] = self.scene.objects.name
+        return own | {_WORDS.get(n, n): str(getattr(self.settings, n)) for n in _OF_SETTINGS}
+
+
+def main(options: "Compare") -> int:
+    """Runs the command and returns the exit status.
+
+    Raises:
+      InputError: If a folder is no run and has none, or something is wrong with the input.
+    """
+    folders = [run for folder in options.folders for run in _runs_in(folder)]
+    problems = common.number_problems(
+        ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
+    )
+    if options.trials is not None and len(folders) != 2:
+        problems.append(f"--trials compares two designs; the folders have {len(folders)} runs")
+    if options.out is not None and options.out.suffix != ".csv":
+        problems.append(f"--out {options.out} must end in .csv")
+    if problems:
+        raise InputError(problems)
+    pair = [] if options.trials is None else _pair(options, folders)
+    if options.out is not None:
+        common.check_place("--out", options.out)
+        check_table(options.out)
+    every = read_all({folder: runs.read_run(folder) for folder in folders})
+    console = Console(highlight=False, soft_wrap=True)
+    compare(every, console, named=True)
+    if options.out is not None:
+        write_table(every, options.out)
+        console.print(f"table: {options.out}", markup=False)
+    if pair:
+        _compare_pair(pair, [str(folder) for folder in folders], options, console)
+    return 0
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    """The folder, or the runs in it, seed-2 before seed-10.
+
+    Raises:
+      InputError: If it is no run and has none.
+    """
+    found = [file.parent for file in folder.glob(f"**/{PROVENANCE}")]
+    if (folder / PROVENANCE).exists() or not found:
+        runs.read_run(folder)  # which says what is wrong
+        return [folder]
+    return sorted(found, key=lambda path: (path.parent, len(path.name), path.name))
+
+
+def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compared]:
+    """The runs in folders as they are, by folder."""
+    results = {folder: read(scene, folder) for folder, (scene, _) in every.items()}
+    return with_fresh(every, results)
+
+
+def with_fresh(
+    every: Mapping[Path, tuple[Scene, Settings]], results: dict[Path, RunResult | None]
+) -> dict[Path, Compared]:
+    """Results of runs with the fresh trials that their folders have."""
+    fresh = reference.of_runs(results)
+    return {f: Compared(*every[f], result, fresh[f]) for f, result in results.items()}
+
+
+def _pair(options: "Compare", folders: list[Path]) -> list[Case]:
+    """The designs of two runs, with the same objects.
+
+    Raises:
+      InputError: If the runs have other objects and the flags do not say which to take.
+    """
+    replaced = {n: getattr(options, n) for n in ("accuracy", "objects", "overrides", "robust")}
+    given = [
+        flags.Subject(run_folder=folder, engine=options.engine, **replaced) for folder in folders
+    ]
+    one, other = [find_case(subject) for subject in given]
+    if one.scene.objects != other.scene.objects:
+        raise InputError(["the two runs have other objects or noise: --objects says which to take"])
+    return [one, other]
+
+
+def _compare_pair(pair: list[Case], names: list[str], options: "Compare", console: Console) -> None:
+    """Simulates both designs in the same trials and says how they differ."""
+    kept, count = [], options.trials or 0
+    for case, name in zip(pair, names, strict=True):
+        outcome = simulate(case, count, options.seed, console)
+        console.print(f"{name} {Judged(case.scene, outcome, options.accuracy)}", markup=False)
+        kept.append(codesign.verdicts(outcome) == codesign.VERDICTS.index("kept"))
+    for line in difference(*kept, names=names):
+        console.print(line, markup=False)
+
+
+def difference(first: np.ndarray, second: np.ndarray, names: list[str]) -> list[str]:
+    """Says how often each of two designs kept the object, in the same trials.
+
+    Args:
+      first: Which trials the first design kept, shape (trial,) bool.
+      second: Those of the second.
+      names: What to call them.
+    """
+    only = int((first & ~second).sum()), int((~first & second).sum())
+    both, total = int((first & second).sum()), len(first)
+    found = statistics.paired(both, *only, total)
+    value, low, high = (100 * v for v in found)
+    word = "no difference is shown" if low <= 0 <= high else f"{names[value < 0]} keeps more"
+    return [
+        f"of the same {total} trials {both} were kept by both, {only[0]} by {names[0]} alone, "
+        f"{only[1]} by {names[1]} alone, and {total - both - sum(only)} by neither",
+        f"difference: {value:+.1f} percentage points ({low:+.1f} to {high:+.1f}, 95 % interval by "
+        f"Newcombe; McNemar's exact test: p = {statistics.mcnemar(*only):.2g}): {word}",
+    ]
+
+
+def simulate(case: Case, trials: int, seed: int, console: Console) -> Any:
+    """Outcomes of a design in trials that depend on seed and objects alone, shape (trial,)."""
+    task = codesign.Task(case.scene, case.space, trials, make_engine(case.engine, case.scene))
+    population = jnp.asarray(case.design, jnp.float32)[None]
+    with Busy(console, f"simulating {common.counted(trials, 'grasp')}"):
+        found = interruptible(task.evaluate, population, jax.random.key(seed))
+    return jax.tree.map(lambda v: np.asarray(v)[0], found)
+
+
+def of_test(scene: Scene, result: RunResult) -> Judged:
+    """The final test of a run's best final particle.
+
+    Args:
+      scene: Scene of the run.
+      result: The run, with a final test.
+    """
+    assert result.test is not None
+    best = int(np.asarray(result.test.cost).argmin())
+    trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.outcomes)
+    return Judged(scene, trials, grasps="grasps of its final test")
+
+
+def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = False) -> None:
+    """Prints a row for each run and for each kind of them the share of those with a good design.
+
+    Args:
+      every: The runs by their folders.
+      console: Where to print.
+      named: Whether rows have the runs' folders.
+    """
+    kinds = {folder: run.kind for folder, run in every.items()}
+    differ = [n for n in next(iter(kinds.values())) if len({k[n] for k in kinds.values()}) > 1]
+    groups: dict[tuple[str, ...], list[Compared]] = {}
+    rows = []
+    for folder, run in every.items():
+        own = tuple(kinds[folder][n] for n in differ)
+        groups.setdefault(own, []).append(run)
+        name = [folder.as_posix()] if named else []
+        rows.append((*name, *own, str(run.settings.seed), *_row(run)))
+    head = ("seed", "converged", "judged by", "kept", "lost", "stuck", "failed", "verdict")
+    common.print_table(console, _table((*["run"] * named, *differ, *head), rows))
+    rows = [(*kind, *_summary(own)) for kind, own in groups.items()]
+    if len(groups) > 1:
+        head = ("converged", "grasps until then, median", "good", "95 % interval")
+        common.print_table(console, _table((*differ, *head), rows))
+    *_, good, interval = rows[0]
+    if good and len(groups) == 1:
+        console.print(f"{good} runs found a good design: {interval} of such runs (95 % interval)")
+    if good:
+        console.print(verdicts.RULE)
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
+    table = Table(box=box.SIMPLE, collapse_padding=True, pad_edge=False)
+    for name in head:
+        table.add_column(name, no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _summary(own: list[Compared]) -> tuple[str, ...]:
+    """How the runs of a kind did; what is not known of them is empty."""
+    size = own[0].settings.particles * own[0].settings.trials
+    episodes = [run.converged for run in own]
+    # Of an even number the upper one of the two in the middle: never, if half of them never do.
+    middle = sorted(np.inf if e is None else (e - 1) * size for e in episodes)[len(own) // 2]
+    converged = f"{sum(e is not None for e in episodes)} of {len(own)}"
+    grasps = "never" if np.isinf(middle) else f"{middle:.0f}"
+    found = [judged for run in own if (judged := run.judged) is not None]
+    if not found:
+        return converged, grasps, "", ""
+    good = sum(judged.verdict.word == "good" for judged in found)
+    share = statistics.wilson(good, len(found))
+    interval = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
+    return converged, grasps, f"{good} of {len(found)}", interval
+
+
+def check_table(path: Path) -> None:
+    """Refuses to replace a file that is no table of runs.
+
+    Raises:
+      InputError: If it is another one.
+    """
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        head = file.readline(1000)
+    if not (head.startswith(b"seed,") and b",best_test_cost," in head):
+        raise InputError(
+            [f"{path} is no table of runs, and would be replaced: choose another --out"]
+        )
+
+
+def write_table(every: Mapping[Path, Compared], path: Path) -> None:
+    """Writes a row for each run; see `runs.columns.MORE`."""
+    with files.atomically(path) as part, part.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*columns.MORE[columns.SEEDS].columns])
+        writer.writeheader()
+        for place, run in every.items():
+            relative = Path(os.path.relpath(place, path.parent)).as_posix()
+            own = {"seed": run.settings.seed, "run": relative}
+            own |= {"schedule": run.settings.schedule, "first": run.settings.first}
+            own["finished"] = int(run.result is not None)
+            writer.writerow(own | _values(run) | _fresh_values(run.fresh))
+
+
+def _values(run: Compared) -> dict[str, object]:
+    """How a run converged and how its final test ended, by column."""
+    found: dict[str, object] = {"converged_episode": run.converged}
+    if run.result is None or run.result.record is None or run.result.test is None:
+        return found
+    test = run.result.test
+    costs = np.asarray(test.cost)
+    best = int(costs.argmin())
+    own = verdicts.tally(jax.tree.map(lambda v: np.asarray(v)[best], test.outcomes))
+    first = np.unique(np.asarray(run.result.record.state.particles), axis=0, return_index=True)[1]
+    judged = run.judged
+    return found | {
+        "best_test_cost": f"{costs[best]:.9g}",
+        "kept_trials": own.kept,
+        "trials": own.total,
+        "paper_successes": int(np.asarray(test.paper_success)[first].sum()),
+        "particles": first.size,
+        "verdict": judged and judged.verdict.word,
+    }
+
+
+def _fresh_values(judged: Judged | None) -> dict[str, object]:
+    """Kept, lost, stuck and failed fresh trials, and their mean cost, by column."""
+    if judged is None:
+        return {}
+    mean = float(cost.particle_cost(judged.scene, judged.outcomes))
+    counts = verdicts.tally(judged.outcomes)
+    found: dict[str, object] = {f"fresh_{n}_trials": v for n, v in counts._asdict().items()}
+    return found | {"fresh_cost": f"{mean:.9g}"}
+
+
+def _row(run: Compared) -> tuple[str, ...]:
+    """Convergence of a run, and how its design did."""
+    if run.result is None or run.result.record is None:
+        return ("failed", *[""] * 6)
+    converged = f"episode {run.converged}" if run.converged else "no"
+    judged = run.judged
+    if judged is None:
+        return (converged, *[""] * 6)
+    where = "final test" if run.fresh is None else f"{judged.accuracy}"
+    found = verdicts.tally(judged.outcomes)
+    numbers = f"{found.kept} of {found.total}", *map(str, found[1:])
+    return (converged, where, *numbers, judged.verdict.word)
+
+
+def read(scene: Scene, folder: Path) -> RunResult | None:
+    """The run in a folder as it is; None if it has no checkpoint, or every trial failed."""
+    try:
+        record = runs.load_record(folder, tell=common.warn)
+    except InputError as error:
+        common.warn(str(error))
+        return None
+    if record is None or record.failed_status() is not None:
+        return None
+    test = None if record.test is None else codesign.summarize_test(scene, record.test)
+    return RunResult(record, test, 0)

@@ -1,0 +1,107 @@
+"""`codesign compare`: runs side by side, and two designs in the same trials."""
+
+import csv
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from codesign_jax.commands import compare
+from codesign_jax.report import statistics
+from tests.helpers.command_runs import command, own_workplace  # noqa: F401
+from tests.helpers.tiny_run import copied
+
+DATA = Path(__file__).parent / "data"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """Runs of an earlier commit, and one of today's code with the same object."""
+    folder = tmp_path_factory.mktemp("runs")
+    for path in DATA.glob("run*.zip"):
+        zipfile.ZipFile(path).extractall(folder)
+    copied(folder / "today")
+    return folder
+
+
+def test_runs_of_folders_are_rows(place, tmp_path, monkeypatch, capsys):
+    """One a run, with what the runs differ in; folders of runs are those in them."""
+    monkeypatch.chdir(place)
+    table, folders = tmp_path / "runs.csv", ["particle-filter", "screened", "seeds"]
+    assert command("compare", *folders, "--out", table) == 0
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert "run scene hand objects optimizer preset engine seed converged judged by" in lines[1]
+    assert any(line.startswith("seeds/seed-1 tiny pinch mesh") for line in lines)
+    # Neither a test nor fresh trials: the search was stopped after five episodes.
+    [stopped] = [line for line in lines if line.startswith("screened")]
+    assert stopped.endswith("screened-es 23d structured 0 episode 6")
+    with table.open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    assert [row["seed"] for row in rows] == ["3", "0", "0", "1"]
+    there = [(tmp_path / row["run"]).resolve() for row in rows]
+    assert there[-1] == (place / "seeds" / "seed-1").resolve()
+    assert command("compare", *folders, "--out", table) == 0  # it is such a table
+
+
+def test_two_designs_meet_the_same_trials(place, capsys):
+    """Counts add up, and a design beside itself differs in no trial."""
+    runs = [place / "particle-filter", place / "today"]
+    assert command("compare", *runs, "--trials", "12") == 0
+    said = capsys.readouterr().out
+    assert said.count("of 12 fresh grasps") == 2 and "of the same 12 trials" in said
+    assert "95 % interval by Newcombe; McNemar's exact test" in said
+    copy = Path(shutil.copytree(place / "today", place / "copy"))
+    assert command("compare", place / "today", copy, "--trials", "3") == 0
+    assert f"0 by {place / 'today'} alone, 0 by {copy} alone" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("names", "flags", "expected"),
+    [
+        (["none"], [], "none is not a run folder: there is no such folder"),
+        (["today"], ["--trials", "3"], "--trials compares two designs; the folders have 1 runs"),
+        (["today", "screened"], ["--trials", "3"], "other objects or noise: --objects says which"),
+        (["today"], ["--out", "a.txt"], "--out a.txt must end in .csv"),
+        (["today", "screened"], ["--trials", "0"], "--trials = 0 is outside"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(names, flags, expected, place, capsys):
+    assert command("compare", *(place / name for name in names), *flags) == 2
+    assert expected in capsys.readouterr().err
+
+
+def test_the_interval_of_a_difference_covers_as_often_as_it_says():
+    """By the exact probabilities of all tables of 20 trials, for shares of good and bad designs."""
+    total, covered = 20, []
+    tables = [
+        (a, b, c)
+        for a in range(total + 1)
+        for b in range(total + 1 - a)
+        for c in range(total + 1 - a - b)
+    ]
+    found = np.array([statistics.paired(*table, total) for table in tables])
+    counts = np.array([(a, b, c, total - a - b - c) for a, b, c in tables])
+    for shares in ((0.9, 0.05, 0.03, 0.02), (0.6, 0.3, 0.05, 0.05), (0.3, 0.2, 0.2, 0.3)):
+        weights = stats.multinomial(total, shares).pmf(counts)
+        inside = (found[:, 1] <= shares[1] - shares[2]) & (shares[1] - shares[2] <= found[:, 2])
+        covered.append(weights[inside].sum())
+    # Newcombe's own evaluation has a mean of 0.95 and no less than 0.92 at such sizes.
+    assert min(covered) > 0.92 and np.mean(covered) < 0.995
+
+
+def test_the_interval_in_closed_form():
+    """No trial differs: Wilson's bounds lie on both sides; exchanged designs change the sign."""
+    for both in (0, 7, 20):
+        value, low, high = statistics.paired(both, 0, 0, 20)
+        assert value == 0 and low == pytest.approx(-high) and high > 0
+    value, low, high = statistics.paired(5, 9, 2, 20)
+    assert statistics.paired(5, 2, 9, 20) == pytest.approx((-value, -high, -low))
+    assert value == pytest.approx(7 / 20) and low > 0
+    first = np.arange(20) < 14
+    second = (np.arange(20) < 5) | (np.arange(20) >= 18)
+    lines = compare.difference(first, second, ["a", "b"])
+    assert lines[0].endswith("5 were kept by both, 9 by a alone, 2 by b alone, and 4 by neither")
+    assert lines[1].endswith("p = 0.065): a keeps more")  # 2 (1 + 11 + 55) / 2^11

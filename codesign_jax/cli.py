@@ -16,7 +16,6 @@ from codesign_jax.commands.flags import (
     Engine,
     File,
     Flag,
-    Overrides,
     RunOrDesign,
     Shown,
     Text,
@@ -39,7 +38,7 @@ class Command:
 
 
 @dataclasses.dataclass
-class Optimize(Command):
+class Optimize(Command, flags.SceneFlags):
     """Co-design morphology and control of a hand.
 
     The same command again resumes the run in its folder, and more --episodes extend it.  Sizes that
@@ -48,19 +47,8 @@ class Optimize(Command):
 
     preset: str = "2d"
     """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
-    hand: Text = None
-    """Hand: a built-in name or a .toml file; default: the scene's."""
-    objects: Text = None
-    """Object set: a built-in name or a .toml file; default: the scene's."""
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
-    accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
-    and costs: docs/accuracy.md), or a .toml."""
-    overrides: Overrides = ()
-    robust: Flag = False
-    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
-    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control. Several, such as
     single,switch-4,concurrent: runs of each, simulated in one batch, and a comparison."""
@@ -112,8 +100,8 @@ class Optimize(Command):
     """Print the resolved scene and the number of grasps; write nothing."""
 
 
-@dataclasses.dataclass
-class Compare(Command):
+@dataclasses.dataclass(kw_only=True)
+class Compare(Command, flags.TrialFlags):
     """Compare runs: a row for each, and how many of each kind found a good design.
 
     With --trials the designs of two runs are simulated in the same trials, and their difference
@@ -126,13 +114,6 @@ class Compare(Command):
     """Trials in which the two designs are compared; default: none, only what the runs found."""
     seed: int = 0
     """Root of these trials' noise."""
-    objects: Text = None
-    """Object set of these trials; default: the runs'."""
-    accuracy: Text = None
-    """Accuracy of these trials, such as reference; default: the runs'."""
-    overrides: Overrides = ()
-    robust: Flag = False
-    """Draw friction, mass, size, stiffness and placement of these trials more widely."""
     engine: Text = None
     """Engine that simulates them; default: the runs'."""
     out: File = None
@@ -274,7 +255,7 @@ class Report(Command):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Sample(Command):
+class Sample(Command, flags.SceneFlags):
     """Simulate random designs, one row a grasp of a Parquet file: a data set.
 
     Designs are uniform between their bounds, with pressures lowered under the limit of their
@@ -289,19 +270,8 @@ class Sample(Command):
     """Trials of each design, each with noise of its own; objects take turns."""
     preset: str = "2d"
     """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
-    hand: Text = None
-    """Hand: a built-in name or a .toml file; default: the scene's."""
-    objects: Text = None
-    """Object set: a built-in name or a .toml file; default: the scene's."""
     scene: str = "paper"
     """Scene: a built-in name or a .toml file."""
-    accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
-    and costs: docs/accuracy.md), or a .toml."""
-    overrides: Overrides = ()
-    robust: Flag = False
-    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
-    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
     engine: Annotated[str, flags.ENGINE] = "structured"
     seed: int = 0
     """Root of designs and noise."""

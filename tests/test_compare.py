@@ -61,6 +61,7 @@ def test_two_designs_meet_the_same_trials(place, capsys):
 @pytest.mark.parametrize(
     ("names", "flags", "expected"),
     [
+        ([], [], "compare needs at least one run folder"),
         (["none"], [], "none is not a run folder: there is no such folder"),
         (["today"], ["--trials", "3"], "--trials compares two designs; the folders have 1 runs"),
         (["today", "screened"], ["--trials", "3"], "other objects or noise: --objects says which"),

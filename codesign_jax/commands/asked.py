@@ -27,11 +27,7 @@ _LONGEST = 200
 
 
 def resolve(options: "Optimize") -> tuple[Scene, Settings]:
-    """Reads the scene and fills the settings.
-
-    Raises:
-      InputError: With the problems of both.
-    """
+    """Reads the scene and fills the settings."""
     problems, scene = [], None
     try:
         problems += common.engine_problems(options.engine or engines.DEFAULT, options.overrides)
@@ -95,9 +91,6 @@ def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:
     """The optimiser of the runs that are there: a run goes on with its own.
 
     One of somebody's own is not among them: only a command line has code imported.
-
-    Raises:
-      InputError: If the runs differ in it.
     """
     cost = options.cost or runs.SCENE_COST
     usual = runs.make_settings(options.preset, "", "", "", 0, optimizer=optimize.DEFAULT, cost=cost)
@@ -107,11 +100,7 @@ def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:
 
 
 def _as_the_runs(options: "Optimize", scene: Scene, settings: Settings) -> Settings:
-    """Settings with the episodes of the runs that are there: these may have been extended.
-
-    Raises:
-      InputError: If the runs differ in them.
-    """
+    """Settings with the episodes of the runs that are there: these may have been extended."""
     folders = runs_of(options, scene, settings)
     episodes = runs.setting_of(folders, "episodes") or settings.episodes
     return dataclasses.replace(settings, episodes=episodes)
@@ -123,16 +112,7 @@ def several(options: "Optimize") -> bool:
 
 
 def runs_of(options: "Optimize", scene: Scene, settings: Settings) -> dict[Path, Settings]:
-    """Settings of each run by its folder: of every strategy those of every seed.
-
-    Args:
-      options: The command line.
-      scene: The scene.
-      settings: Settings of any of the runs.
-
-    Raises:
-      InputError: If --seeds is no list of seeds, or see `_folder`.
-    """
+    """Settings of each run by its folder: of every strategy those of every seed."""
     found = {}
     for name in options.schedule.split(","):
         for seed in seeds_of(options):
@@ -148,20 +128,12 @@ def table_folder(options: "Optimize") -> Path:
 
 
 def seeds_of(options: "Optimize") -> list[int]:
-    """Seeds of the runs.
-
-    Raises:
-      InputError: If --seeds is no list of them.
-    """
+    """Seeds of the runs."""
     return [options.seed] if options.seeds is None else parse_seeds(options.seeds)
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Reads seeds such as "0-9" or "1,3,5-7", in ascending order.
-
-    Raises:
-      InputError: If the text is none, or names too many.
-    """
+    """Reads seeds such as "0-9" or "1,3,5-7", in ascending order."""
     found: set[int] = set()
     for part in text.split(","):
         match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)
@@ -175,12 +147,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:
-    """Folder of one run: --out, with a folder inside for each of several strategies and --seeds.
-
-    Raises:
-      InputError: If there is no --out, and what the files call hand or preset is no name of a
-        folder: whoever wrote them would choose a place on this disk.
-    """
+    """Folder of one run: --out, with a folder inside for each of several strategies and --seeds."""
     if options.out is not None:
         inside = [settings.schedule] if "," in options.schedule else []
         inside += [f"seed-{settings.seed}"] if several(options) else []
@@ -189,6 +156,7 @@ def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:
     others = (settings.optimizer, optimize.DEFAULT), (settings.cost, runs.SCENE_COST)
     names[3:3] = [asked.replace(":", ".") for asked, usual in others if asked != usual]
     name = "-".join(names)
+    # Whoever wrote the files would choose a place on this disk.
     if name[0] in ".-~" or "/" in name or "\\" in name or len(os.fsencode(name)) > _LONGEST:
         given = schema.shown(name)
         raise InputError([f"{given}, of hand and preset, is no name of a folder: give --out"])

@@ -50,15 +50,7 @@ class Case(NamedTuple):
 
 
 def find_case(options: Options, *, tell: Tell = common.warn) -> Case:
-    """The design that the flags name.
-
-    Args:
-      options: The flags.
-      tell: Called with what is amiss with the run, such as damaged checkpoints.
-
-    Raises:
-      InputError: If something is wrong with the flags, the run or the files.
-    """
+    """The design that the flags name."""
     return _from_run(options, tell) if options.run_folder else _from_flags(options)
 
 

@@ -68,11 +68,7 @@ class Measured(NamedTuple):
 
 
 def main(options: "Check") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     load = os.getloadavg()[0]
     case = find_case(options)

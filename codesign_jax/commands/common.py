@@ -66,22 +66,14 @@ class SceneFlags(Overriding, Protocol):
 
 
 def changes(options: Overriding) -> dict[keypaths.Path, Any]:
-    """Values by key path that --robust and --set replace; what --set names holds.
-
-    Raises:
-      InputError: If an argument of --set is no pair of key and value.
-    """
+    """Values by key path that --robust and --set replace; what --set names holds."""
     noise = dataclasses.asdict(objects.ROBUST) if options.robust else {}
     given = keypaths.parse(chain.from_iterable(options.overrides))
     return {("objects", "noise", name): value for name, value in noise.items()} | given
 
 
 def load_scene(options: SceneFlags) -> Scene:
-    """Reads the scene that a command's flags name.
-
-    Raises:
-      InputError: If a file or a value is wrong.
-    """
+    """Reads the scene that a command's flags name."""
     return scenes.load(
         options.scene or SCENE,
         hand_name=options.hand,
@@ -92,11 +84,7 @@ def load_scene(options: SceneFlags) -> Scene:
 
 
 def source_files(options: SceneFlags) -> tuple[Path, ...]:
-    """The .toml files that a command's flags name, and those that its scene names.
-
-    Args:
-      options: The flags, which `load_scene` has read.
-    """
+    """The .toml files that a command's flags name, and those that its scene names."""
     scene = library.find("scenes", options.scene or SCENE)
     table = library.read(scene)
     beside = {"hands": table.get("hand"), "objects": table.get("objects")}
@@ -114,16 +102,8 @@ def warn(text: str) -> None:
 def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
     """Reads a design given as NAME=VALUE in the hand file's units.
 
-    Args:
-      space: The design space; parameters that are not named take its default.
-      pairs: The pairs; a name without an index, where the space has one for each finger, sets all.
-
     Returns:
       The design [SI units], shape (parameter,).
-
-    Raises:
-      InputError: With every unknown name, name given twice, value that is not a number and value
-        out of range.
     """
     values = dict(zip(space.names, space.in_units(space.default()), strict=True))
     lows = dict(zip(space.names, space.in_units(np.array(space.low)), strict=True))
@@ -162,12 +142,7 @@ def _members(name: str, space: DesignSpace) -> list[str]:
 
 
 def by_default(space: DesignSpace, pairs: Sequence[str]) -> str:
-    """Says which parameters of a design are the hand file's defaults; empty if none is.
-
-    Args:
-      space: The design space.
-      pairs: What `parse_design` was given.
-    """
+    """Says which parameters of a design are the hand file's defaults; empty if none is."""
     given = {each for pair in pairs for each in _members(pair.partition("=")[0], space)}
     left = [name for name in space.names if name not in given]
     if not left:
@@ -183,14 +158,6 @@ def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
 
     A temporary file is made and removed in the path's folder, or in the nearest folder above it
     that exists; missing folders are not made.
-
-    Args:
-      flag: Flag that chose the path, for the message.
-      path: A file that will be written.
-      folder: Whether the path is a folder that will be filled instead.
-
-    Raises:
-      InputError: If the path cannot be written.
     """
     place = path.absolute() if folder else path.absolute().parent
     try:
@@ -235,11 +202,7 @@ def picture_problems(flag: str, path: Path) -> list[str]:
 
 
 def check_engine(name: str) -> None:
-    """Refuses an engine that there is not.
-
-    Raises:
-      InputError: With the nearest name.
-    """
+    """Refuses an engine that there is not."""
     if problems := engine_problems(name):
         raise InputError(problems)
 
@@ -250,9 +213,6 @@ def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[
     Args:
       name: The engine's name.
       overrides: Values as KEY=VALUE, as of --set.
-
-    Raises:
-      InputError: If a pair is not KEY=VALUE.
     """
     if name not in engines.NAMES:
         return [f"--engine = {name!r} is not valid; {schema.nearest(name, engines.NAMES)}"]
@@ -291,9 +251,6 @@ def preflight_warnings(
       scene: The scene.
       space: The design space.
       designs: Designs [SI units], each of shape (parameter,), by what to call them.
-
-    Raises:
-      InputError: If a design must not be simulated.
     """
     stacked = np.array([*designs.values()], np.float32)
     params = params_of(space, stacked)

@@ -75,15 +75,13 @@ class Compared(NamedTuple):
 
 
 def main(options: "Compare") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If a folder is no run and has none, or something is wrong with the input.
-    """
+    """Runs the command and returns the exit status."""
     folders = [run for folder in options.folders for run in _runs_in(folder)]
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
+    if not folders:
+        problems.append("compare needs at least one run folder")
     if options.trials is not None and len(folders) != 2:
         problems.append(f"--trials compares two designs; the folders have {len(folders)} runs")
     if options.out is not None and options.out.suffix != ".csv":
@@ -106,11 +104,7 @@ def main(options: "Compare") -> int:
 
 
 def _runs_in(folder: Path) -> list[Path]:
-    """The folder, or the runs in it, seed-2 before seed-10.
-
-    Raises:
-      InputError: If it is no run and has none.
-    """
+    """The folder, or the runs in it, seed-2 before seed-10."""
     found = [file.parent for file in folder.glob(f"**/{PROVENANCE}")]
     if (folder / PROVENANCE).exists() or not found:
         runs.read_run(folder)  # which says what is wrong
@@ -133,11 +127,7 @@ def with_fresh(
 
 
 def _pair(options: "Compare", folders: list[Path]) -> list[Case]:
-    """The designs of two runs, with the same objects.
-
-    Raises:
-      InputError: If the runs have other objects and the flags do not say which to take.
-    """
+    """The designs of two runs, with the same objects."""
     replaced = {n: getattr(options, n) for n in ("accuracy", "objects", "overrides", "robust")}
     given = [
         flags.Subject(run_folder=folder, engine=options.engine, **replaced) for folder in folders
@@ -190,12 +180,7 @@ def simulate(case: Case, trials: int, seed: int, console: Console) -> Any:
 
 
 def of_test(scene: Scene, result: RunResult) -> Judged:
-    """The final test of a run's best final particle.
-
-    Args:
-      scene: Scene of the run.
-      result: The run, with a final test.
-    """
+    """The final test of a run's best final particle."""
     assert result.test is not None
     best = int(np.asarray(result.test.cost).argmin())
     trials = jax.tree.map(lambda v: np.asarray(v)[best], result.test.outcomes)
@@ -203,13 +188,7 @@ def of_test(scene: Scene, result: RunResult) -> Judged:
 
 
 def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = False) -> None:
-    """Prints a row for each run and for each kind of them the share of those with a good design.
-
-    Args:
-      every: The runs by their folders.
-      console: Where to print.
-      named: Whether rows have the runs' folders.
-    """
+    """Prints a row for each run and for each kind of them the share of those with a good design."""
     kinds = {folder: run.kind for folder, run in every.items()}
     differ = [n for n in next(iter(kinds.values())) if len({k[n] for k in kinds.values()}) > 1]
     groups: dict[tuple[str, ...], list[Compared]] = {}
@@ -259,11 +238,7 @@ def _summary(own: list[Compared]) -> tuple[str, ...]:
 
 
 def check_table(path: Path) -> None:
-    """Refuses to replace a file that is no table of runs.
-
-    Raises:
-      InputError: If it is another one.
-    """
+    """Refuses to replace a file that is no table of runs."""
     if not path.exists():
         return
     with path.open("rb") as file:

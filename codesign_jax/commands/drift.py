@@ -24,15 +24,7 @@ PART = "tolerance.part"
 def simulate(
     case: Case, engine: Engine, options: "Export", folder: Path, console: Console
 ) -> "sheet.Drift":
-    """Tolerances of the design: says how many grasps they take at most, and simulates.
-
-    Args:
-      case: The design.
-      engine: Engine that simulates.
-      options: The command line.
-      folder: Where `PART` is kept: another process goes on from it.
-      console: Told what is done.
-    """
+    """Tolerances of the design: says how many grasps they take at most, and simulates."""
     from codesign_jax.export import sheet, tolerance  # with the extra
 
     steps, count = options.tolerance_steps, options.tolerance_trials

@@ -25,11 +25,7 @@ if TYPE_CHECKING:
 
 
 def main(options: "Evaluate") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     case = _of_particle(find_case(options), options)
     _check(options, case.engine)
@@ -57,11 +53,7 @@ def main(options: "Evaluate") -> int:
 
 
 def _of_particle(case: Case, options: "Evaluate") -> Case:
-    """The case of the final particle that was asked for, if one was.
-
-    Raises:
-      InputError: If there is no such particle.
-    """
+    """The case of the final particle that was asked for, if one was."""
     if options.particle is None:
         return case
     if options.run_folder is None:

@@ -27,11 +27,7 @@ if TYPE_CHECKING:
 
 
 def main(options: "Export") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input; nothing is written then.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     doubts: list[str] = []
     case = find_case(options, tell=doubts.append)

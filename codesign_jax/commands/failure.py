@@ -28,9 +28,6 @@ def main(path: Path, engine: str | None) -> int:
     Args:
       path: A file of a run folder's failures/.
       engine: Engine that simulates; None for the run's.
-
-    Raises:
-      InputError: If the file is no failed world of a run, or the engine is unknown.
     """
     failure = failures.load(path)
     scene, settings = runs.read_run(path.resolve().parent.parent)

@@ -37,11 +37,7 @@ POINTS = 11
 
 
 def main(options: "Options") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input, or the finger has no rest.
-    """
+    """Runs the command and returns the exit status."""
     case = find_case(options)
     params = case.space.params(np.asarray(case.design))
     problems = []

@@ -49,11 +49,7 @@ def text_problems(arguments: Sequence[str]) -> list[str]:
 
 
 def path_problems(command: object) -> list[str]:
-    """What is wrong with the paths of a parsed command: names that no file system has.
-
-    Args:
-      command: One of `cli.COMMANDS`.
-    """
+    """What is wrong with the paths of a parsed command: names that no file system has."""
     problems = []
     for field in dataclasses.fields(command):  # type: ignore[arg-type]
         path = getattr(command, field.name)
@@ -70,7 +66,30 @@ def path_problems(command: object) -> list[str]:
 
 
 @dataclasses.dataclass
-class Subject:
+class TrialFlags:
+    """What is grasped, and how exactly that is simulated."""
+
+    objects: Text = None
+    """Object set: a built-in name or a .toml file; default: the scene's."""
+    accuracy: Text = None
+    """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
+    and costs: docs/accuracy.md), or a .toml."""
+    overrides: Overrides = ()
+    robust: Flag = False
+    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
+    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
+
+
+@dataclasses.dataclass
+class SceneFlags(TrialFlags):
+    """The scene but for its name, which has a default of its own."""
+
+    hand: Text = None
+    """Hand: a built-in name or a .toml file; default: the scene's."""
+
+
+@dataclasses.dataclass
+class Subject(SceneFlags):
     """Which design, of what scene, simulated by which engine."""
 
     design: Annotated[
@@ -86,19 +105,8 @@ class Subject:
     and --engine then replace the run's."""
     preset: Text = None
     """Design space that the names belong to; default: the run's, or 2d."""
-    hand: Text = None
-    """Hand: a built-in name or a .toml file; default: the scene's."""
-    objects: Text = None
-    """Object set: a built-in name or a .toml file; default: the scene's."""
     scene: Text = None
     """Scene: a built-in name or a .toml file; default: the run's, or paper."""
-    accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
-    and costs: docs/accuracy.md), or a .toml."""
-    overrides: Overrides = ()
-    robust: Flag = False
-    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
-    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
     engine: Engine = None
 
 

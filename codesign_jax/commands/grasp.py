@@ -37,11 +37,7 @@ class Asked(NamedTuple):
 
 
 def find(options: "Shown") -> Asked:
-    """The grasp that the flags name; simulates nothing.
-
-    Raises:
-      InputError: If something is wrong with the flags, the run or the files.
-    """
+    """The grasp that the flags name; simulates nothing."""
     places = {"--episode": options.episode, "--particle": options.particle}
     places |= {"--trial": options.trial}
     given = " and ".join(flag for flag, value in places.items() if value is not None)

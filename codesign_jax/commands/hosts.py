@@ -53,15 +53,7 @@ def check(text: str) -> tuple[str, int, int] | None:
 
 
 def join(text: str) -> Hosts:
-    """Meets the other processes; before anything of JAX is used.
-
-    Args:
-      text: "auto" under SLURM, MPI and other launchers that JAX knows, or where the first process
-        listens, how many there are, and which one this is; see `check`.
-
-    Raises:
-      InputError: If the text is wrong, or the others cannot be met.
-    """
+    """Meets the other processes; before anything of JAX is used."""
     given = check(text)
     address, count, index = given or (None, None, None)
     jax.config.update("jax_platforms", "cpu")  # this process leaves the GPUs to the one that runs
@@ -73,17 +65,7 @@ def join(text: str) -> Hosts:
 
 
 def run(options: "Optimize") -> tuple[int, Hosts]:
-    """Runs this host's seeds, and waits until the runs of all hosts have ended.
-
-    Args:
-      options: The command line; this host takes each of its seeds that its turn comes to.
-
-    Returns:
-      The command's exit status for these seeds, and which host this is.
-
-    Raises:
-      InputError: See `join`.
-    """
+    """Runs this host's seeds, and waits until the runs of all hosts have ended."""
     chosen = asked.parse_seeds(options.seeds or "")
     here = join(options.distributed or "")
     mine = ",".join(map(str, chosen[here.index :: here.count]))
@@ -97,11 +79,7 @@ def run(options: "Optimize") -> tuple[int, Hosts]:
 
 
 def in_a_process(function: Callable[[], int]) -> int:
-    """The exit status of a function in a process that knows nothing of other hosts.
-
-    Args:
-      function: The function, which can be pickled; wrong input ends it as it ends the command.
-    """
+    """The exit status of a function in a process that knows nothing of other hosts."""
     process = multiprocessing.get_context("spawn").Process(
         target=_child, args=(function, [*sys.argv])
     )

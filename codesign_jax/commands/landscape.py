@@ -43,11 +43,7 @@ class Plane(NamedTuple):
 
 
 def main(options: "Options") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input; nothing is written then.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     case = find_case(options)
     _check(options, case)
@@ -76,11 +72,7 @@ def main(options: "Options") -> int:
 
 
 def _folder(options: "Options", case: Case) -> Path:
-    """Where the files go: to the run, if it is the run's scene that is simulated.
-
-    Raises:
-      InputError: If the folder cannot be written.
-    """
+    """Where the files go: to the run, if it is the run's scene that is simulated."""
     own = options.run_folder
     folder = Path("landscape")
     if own is not None and case.scene == runs.read_run(own)[0]:
@@ -94,11 +86,7 @@ def _folder(options: "Options", case: Case) -> Path:
 
 
 def _refuse_other_scene(folder: Path, case: Case) -> None:
-    """Refuses to replace scene files that are not those of the landscape.
-
-    Raises:
-      InputError: With their names.
-    """
+    """Refuses to replace scene files that are not those of the landscape."""
     others = [
         str(folder / name)
         for name, content in contents(case.scene).items()
@@ -147,11 +135,6 @@ def make_plane(case: Case, columns: tuple[int, int], points: int) -> Plane:
     """A regular grid over the ranges of two parameters, ends included.
 
     Pressures are lowered under the limit that the walls set, as of every particle.
-
-    Args:
-      case: The design, whose other parameters stay as they are.
-      columns: Indices of the two parameters.
-      points: Points along each.
     """
     space = case.space
     axes = [np.linspace(space.low[k], space.high[k], points) for k in columns]

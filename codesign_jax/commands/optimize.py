@@ -29,11 +29,7 @@ if TYPE_CHECKING:
 
 
 def main(options: "Optimize") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input; nothing was created then.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     if options.distributed is not None:
         return _distributed(options)
@@ -143,9 +139,6 @@ def _preflight(scene: Scene, settings: Settings) -> list[str]:
     """Checks the ends of the design space, as every particle lies between them.
 
     Only the ends themselves are refused or warned about: what a particle is later, its status says.
-
-    Raises:
-      InputError: If an end must not be simulated.
     """
     space = design_space(scene.hand, settings.preset)
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}

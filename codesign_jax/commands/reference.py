@@ -51,12 +51,6 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
 
     Its outcomes are kept in the run folder: a finished run does not simulate them again.
 
-    Args:
-      folder: Run folder.
-      settings: The run's settings.
-      trials: Fresh trials.
-      console: Shown that it goes on.
-
     Returns:
       Outcomes of the trials, shape (trial,).
     """
@@ -74,21 +68,12 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
 
 
 def judged(scene: Scene, found: Outcome) -> Judged:
-    """Outcomes of the test with the scene that was simulated.
-
-    Args:
-      scene: Scene of the run.
-      found: The outcomes.
-    """
+    """Outcomes of the test with the scene that was simulated."""
     return Judged(with_accuracy(scene, ACCURACY), found, ACCURACY)
 
 
 def of_runs(results: dict[Path, RunResult | None]) -> dict[Path, Judged | None]:
-    """What `test` kept of each run, by its folder; None where there is nothing.
-
-    Args:
-      results: Runs of a command by their folders.
-    """
+    """What `test` kept of each run, by its folder; None where there is nothing."""
     kept: dict[Path, Judged | None] = dict.fromkeys(results)
     for folder, result in results.items():
         if result is not None and result.test is not None and (folder / FILE).exists():
@@ -107,10 +92,6 @@ def steps_and_links(scene: Scene) -> float:
 
 def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
     """Outcomes that `test` kept in a run folder, shape (trial,), if they are of its design today.
-
-    Args:
-      folder: Run folder with a finished episode.
-      settings: The run's settings.
 
     Returns:
       The outcomes or None, and why there are none; see `runs.outcomes.load`.

@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 
 
 def main(options: "Render") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     _check(options)
     camera = _camera(options.camera)
@@ -49,11 +45,7 @@ _LIMITS |= dict.fromkeys("xyz", ("m", 10))
 
 
 def _camera(words: Sequence[str]) -> "Camera":
-    """The camera that --camera names: a view, and numbers that replace its own.
-
-    Raises:
-      InputError: With every word that says nothing of a camera.
-    """
+    """The camera that --camera names: a view, and numbers that replace its own."""
     from codesign_jax.report.animation import CAMERA, VIEWS
 
     camera, problems = CAMERA, []

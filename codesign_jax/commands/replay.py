@@ -15,11 +15,7 @@ if TYPE_CHECKING:
 
 
 def main(options: "Replay") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     if options.path is not None:
         if options.run_folder is not None:

@@ -23,11 +23,7 @@ if TYPE_CHECKING:
 
 
 def main(options: "Report") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If the folder is no run, has no finished episode, or an extra is missing.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
     name = options.engine or settings.engine

@@ -30,11 +30,7 @@ MOST = 1_000_000_000
 
 
 def main(options: "Sample") -> int:
-    """Runs the command and returns the exit status.
-
-    Raises:
-      InputError: If something is wrong with the input; nothing was created then.
-    """
+    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     _check(options)
     scene = common.load_scene(options)
@@ -93,11 +89,7 @@ def _check(options: "Sample") -> None:
 
 
 def _question(options: "Sample", scene: Scene) -> Question:
-    """What is asked; without --chunk calls are as large as those that made what is there.
-
-    Raises:
-      InputError: If the hand has no such preset.
-    """
+    """What is asked; without --chunk calls are as large as those that made what is there."""
     design_space(scene.hand, options.preset)
     done = dataset.finished(options.out)
     before = done[0] if done else dataset.begun(options.out)
@@ -121,11 +113,7 @@ def _grasps(options: "Sample") -> int:
 
 
 def _finished(options: "Sample", question: Question) -> bool:
-    """Whether the file is there and has what is asked.
-
-    Raises:
-      InputError: If it has something else.
-    """
+    """Whether the file is there and has what is asked."""
     done = dataset.finished(options.out)
     if done is None:
         return False

@@ -34,11 +34,7 @@ _INSIDE = {
 
 
 def refuse_foreign(path: Path) -> None:
-    """Refuses a folder with files of other names than a run's.
-
-    Raises:
-      InputError: With their names.
-    """
+    """Refuses a folder with files of other names than a run's."""
     if path.is_symlink() and not path.exists():
         raise InputError([f"--out {path} is a symbolic link to nothing"])
     if path.exists() and not path.is_dir():
@@ -53,11 +49,7 @@ def refuse_foreign(path: Path) -> None:
 
 
 def refuse_unmarked(path: Path) -> None:
-    """Refuses a folder that is no run and holds more than what a start that was cut short left.
-
-    Raises:
-      InputError: With what is there and what to do.
-    """
+    """Refuses a folder that is no run and holds more than what a start that was cut short left."""
     if (path / PROVENANCE).exists():
         return
     made = _marked(path)
@@ -77,15 +69,7 @@ def refuse_unmarked(path: Path) -> None:
 
 
 def refuse_to_delete(path: Path, sources: tuple[Path, ...] = ()) -> None:
-    """Refuses `--fresh` where more than a run's own files would go.
-
-    Args:
-      path: The folder of a run.
-      sources: Files that the command reads.
-
-    Raises:
-      InputError: With what is in the way.
-    """
+    """Refuses `--fresh` where more than a run's own files would go."""
     place = path.resolve()
     read = [str(file) for file in sources if place in file.resolve().parents]
     if read:
@@ -122,12 +106,7 @@ def delete_run(path: Path) -> None:
 
 
 def begin(path: Path, contents: Mapping[str, bytes]) -> None:
-    """Clears what an earlier start left, and names the files that this one is about to make.
-
-    Args:
-      path: A folder that `refuse_unmarked` does not refuse.
-      contents: The files' contents by name.
-    """
+    """Clears what an earlier start left, and names the files that this one is about to make."""
     made = _marked(path)
     for name in _all(path):
         if name != LOCK and name != MARKER and _is_left(path, name, made):

@@ -114,10 +114,6 @@ class Checkpoints:
     def save(self, step: int, arrays: Arrays) -> None:
         """Writes a step; it becomes visible at once and as a whole, or not at all.
 
-        Args:
-          step: Number of the step, above every saved one.
-          arrays: What to save.
-
         Raises:
           OSError: If it cannot be written, for example on a full disk; older steps stay intact.
         """

@@ -60,9 +60,6 @@ def read_record(folder: Path, *, tell: Tell | None = None) -> Record:
     Args:
       folder: The run folder.
       tell: Called with what is amiss, see `runs.load_record`; None to warn.
-
-    Raises:
-      InputError: If it has no finished episode, or none that can be read.
     """
     record = load_record(folder, tell=tell)
     if record is None or record.done == 0:
@@ -74,10 +71,6 @@ def choose(scene: Scene, record: Record) -> Chosen:
     """The final particle that tested best.
 
     Without a test the last episode's best, or the run's where the optimiser keeps the best so far.
-
-    Args:
-      scene: The run's scene, with its rule for failed trials.
-      record: The run, with a finished episode at least.
     """
     history = record.history
     if record.test is None:
@@ -137,9 +130,6 @@ def find_grasp(
       particle: Index of the particle; None for the chosen one in its episode, otherwise for the
         episode's best.
       trial: Index of the trial; None for its best one.
-
-    Raises:
-      InputError: If the run has no such episode, particle or trial.
     """
     history = record.history
     _, particles, trials = history.outcomes.cost.shape

@@ -26,11 +26,7 @@ class CsvTable:
     design: str = ""
 
     def head(self, designs: list[str]) -> list[str]:
-        """Names of all columns.
-
-        Args:
-          designs: Names of the free parameters with units; see `tables.design_columns`.
-        """
+        """Names of all columns."""
         own = [*self.columns]
         return own if self.designs is None else own + [self.designs + name for name in designs]
 

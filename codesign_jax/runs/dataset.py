@@ -85,12 +85,7 @@ class Question:
 
 
 def differences(before: dict[str, Any], asked: Question) -> list[str]:
-    """What another question has otherwise, in words; empty if it is the same.
-
-    Args:
-      before: The other one, as `Question.described`.
-      asked: The question.
-    """
+    """What another question has otherwise, in words; empty if it is the same."""
     now, words = asked.described, []
     for name in _NAMES:
         if before.get(name) != now[name]:
@@ -119,11 +114,7 @@ def begun(path: Path) -> dict[str, Any] | None:
 
 
 def outcomes(path: Path, question: Question) -> Store:
-    """The outcomes that were simulated for a file, a part for each call; changes nothing.
-
-    Raises:
-      InputError: If what was begun there is of another question, with what differs.
-    """
+    """The outcomes that were simulated for a file, a part for each call; changes nothing."""
     part, before = part_of(path), begun(path)
     if part.exists() and before is None and (part.is_dir() or part.stat().st_size):
         raise InputError([f"{part} is no part of a data set; choose another --out"])
@@ -134,11 +125,7 @@ def outcomes(path: Path, question: Question) -> Store:
 
 
 def finished(path: Path) -> tuple[dict[str, Any], int] | None:
-    """Question, as `Question.described`, and number of designs of a file; None if there is none.
-
-    Raises:
-      InputError: If the file is not one of grasps of random designs.
-    """
+    """Question, as `Question.described`, and number of designs of a file; None if there is none."""
     if not path.exists():
         return None
     pa = parquet.pyarrow_module("--out")
@@ -163,14 +150,7 @@ def columns(space: DesignSpace) -> dict[str, Column]:
 
 
 def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[str, Any]:
-    """Values of the columns for a shard, arrays that broadcast to (design, trial).
-
-    Args:
-      question: The question.
-      shard: Index of the shard.
-      drawn: Its designs and trials.
-      found: Their outcomes.
-    """
+    """Values of the columns for a shard, arrays that broadcast to (design, trial)."""
     trials, status = drawn.trials, np.asarray(found.status)
     texts, index = np.unique(status, return_inverse=True)
     bad_step = np.asarray(found.bad_step)

@@ -64,21 +64,6 @@ def open_run(
     """Opens a run folder: makes it, or checks that it is this very run; locks it meanwhile.
 
     Nothing is deleted in it but what `belongings` tells to be a run's or an unfinished start's.
-
-    Args:
-      path: The folder.
-      scene: The scene of the run.
-      settings: Its settings.
-      command: Command line to note in provenance.json.
-      fresh: Deletes an earlier run's files first.
-      sources: Files that the scene was read from, which `fresh` must not delete.
-
-    Yields:
-      The folder and what the user should know about resuming in it.
-
-    Raises:
-      InputError: If the folder holds other files, belongs to another scene or other settings
-        (with a diff; more episodes extend the run), or is in use; nothing is changed then.
     """
     sources = tuple(sources)
     check_folder(path, scene, settings, fresh=fresh, sources=sources)

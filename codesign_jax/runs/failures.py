@@ -38,13 +38,7 @@ class Failure(NamedTuple):
 
 
 def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
-    """Saves an episode's first failed worlds, a file each; returns the files.
-
-    Args:
-      folder: The run folder.
-      episode: Number of the episode, from 1.
-      info: Its report, with the trials that were drawn.
-    """
+    """Saves an episode's first failed worlds, a file each; returns the files."""
     # From the device as a whole: to index there would be a program for each number.
     info = jax.tree.map(np.asarray, info)
     status, trials, files = info.outcomes.status, info.drawn, []
@@ -65,11 +59,7 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
 
 
 def load(path: Path) -> Failure:
-    """Reads a failed world.
-
-    Raises:
-      InputError: If the file is not one.
-    """
+    """Reads a failed world."""
     if not path.exists():
         raise InputError([f"{path}: there is no such file or folder"])
     try:

@@ -19,10 +19,6 @@ def interruptible(function: Callable[..., T], *arguments: Any) -> T:
     The function goes on in a thread of its own until the process ends: what may be interrupted must
     have nothing to save.
 
-    Args:
-      function: Returns a tree of arrays.
-      *arguments: Its arguments.
-
     Raises:
       KeyboardInterrupt: If SIGINT came.
     """

@@ -31,13 +31,7 @@ _OF_ENVIRONMENT = ("python", "platform", "machine", "device")
 
 
 def new(settings: Settings, contents: Mapping[str, bytes], command: list[str]) -> dict[str, Any]:
-    """What is noted of a run that begins now.
-
-    Args:
-      settings: Its settings.
-      contents: Its scene files by name; see `scene_files.contents`.
-      command: Command line that began it.
-    """
+    """What is noted of a run that begins now."""
     return {
         "schema": SCHEMA,
         "id": uuid.uuid4().hex,
@@ -67,11 +61,7 @@ def write(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
-    """Reads provenance.json of a run folder; settings that it lacks have their defaults.
-
-    Raises:
-      InputError: If it is not a run folder, the file is damaged, or the run of a newer version.
-    """
+    """Reads provenance.json of a run folder; settings that it lacks have their defaults."""
     file = path / PROVENANCE
     try:
         size = file.stat().st_size
@@ -111,10 +101,6 @@ def changed_files(path: Path, stored: Mapping[str, Any]) -> list[str]:
 
     Other comments or another layout of a TOML file are no difference. Runs from before digests were
     noted have none to compare with.
-
-    Args:
-      path: The run folder.
-      stored: Its provenance.
     """
     noted = stored.get("files", {})
     found = []
@@ -130,15 +116,7 @@ def changed_files(path: Path, stored: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_changed(path: Path, stored: Mapping[str, Any]) -> None:
-    """Refuses a run whose scene files are not those it was made with.
-
-    Args:
-      path: The run folder.
-      stored: Its provenance.
-
-    Raises:
-      InputError: With what to do about it.
-    """
+    """Refuses a run whose scene files are not those it was made with."""
     changed = changed_files(path, stored)
     if not changed:
         return

@@ -34,10 +34,6 @@ def save(path: Path, outcomes: Outcome, key: str) -> None:
 def load(path: Path, key: str) -> tuple[Outcome | None, str]:
     """Reads outcomes.
 
-    Args:
-      path: The file.
-      key: Their `key`.
-
     Returns:
       The outcomes, or None; and why there are none, in words of which the file is the subject:
       it is of another key, of other code, or damaged. Empty if there is no such file.

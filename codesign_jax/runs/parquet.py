@@ -46,14 +46,7 @@ class Names(NamedTuple):
 
 
 def pyarrow_module(what: str) -> ModuleType:
-    """Returns pyarrow.
-
-    Args:
-      what: What needs it, such as a flag, for the error.
-
-    Raises:
-      InputError: If it is not installed; says how to install it.
-    """
+    """Returns pyarrow."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -64,13 +57,7 @@ def pyarrow_module(what: str) -> ModuleType:
 
 
 def arrow_schema(pa: ModuleType, columns: Mapping[str, Column], notes: Mapping[str, Any]) -> Any:
-    """The schema of a file.
-
-    Args:
-      pa: pyarrow.
-      columns: The columns by name.
-      notes: Metadata of the file by name, each kept as JSON.
-    """
+    """The schema of a file."""
     fields = []
     for name, column in columns.items():
         named = column.kind == "name"
@@ -111,11 +98,7 @@ def table(pa: ModuleType, schema: Any, columns: Mapping[str, Any], shape: tuple[
 
 @contextlib.contextmanager
 def writing(pa: ModuleType, path: Path, schema: Any) -> Iterator[Any]:
-    """Writes a file as a whole or not at all.
-
-    Yields:
-      A writer, whose `write_table` adds a group of rows.
-    """
+    """Writes a file as a whole or not at all."""
     with (
         files.atomically(path) as part,
         pa.parquet.ParquetWriter(part, schema, compression="zstd") as writer,

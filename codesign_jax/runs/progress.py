@@ -117,14 +117,7 @@ class Progress(Live):
         after: float = 0.0,
         console: rich.console.Console | None = None,
     ):
-        """Takes what there is to do.
-
-        Args:
-          total: Episodes.
-          test: Grasps of the final test.
-          after: What else is simulated when the run has ended, as a number of its grasps.
-          console: Where to tell.
-        """
+        """Takes what there is to do."""
         self.total, self._test, self._after = total, test, after
         self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
         columns = rich.progress.BarColumn(), rich.progress.TextColumn("{task.description}")
@@ -163,18 +156,7 @@ class Progress(Live):
         causes: str = "",
         warnings: str = "",
     ) -> str:
-        """Reports a finished episode and returns the line.
-
-        Args:
-          done: Episodes finished, with those of earlier processes.
-          mean: Mean particle cost.
-          best: Lowest particle cost.
-          failed: Failed worlds among the episode's grasps.
-          grasps: Grasps of the episode.
-          seconds: Wall time of the episode.
-          causes: How often each cause of failure occurs, such as "SPEED 1, STUCK 3".
-          warnings: How often each warning occurs, such as "SOLVER_CAP 3".
-        """
+        """Reports a finished episode and returns the line."""
         left = (self.total - done) * grasps + self._test + self._after
         pace = self._pace(grasps, seconds, left)
         reasons = f" ({causes})" if causes else ""
@@ -188,12 +170,7 @@ class Progress(Live):
         return line
 
     def tested(self, grasps: int, seconds: float) -> None:
-        """Reports a part of the final test.
-
-        Args:
-          grasps: Grasps of the part.
-          seconds: Wall time of the part.
-        """
+        """Reports a part of the final test."""
         self._tested += grasps
         pace = self._pace(grasps, seconds, max(self._test - self._tested, 0) + self._after)
         line = f"final test {self._tested}/{self._test} grasps  {pace}"
@@ -203,13 +180,7 @@ class Progress(Live):
             self.message(line)
 
     def _pace(self, grasps: int, seconds: float, left: float) -> str:
-        """Counts grasps that took so long; the rate so far and the time left, in words.
-
-        Args:
-          grasps: Grasps that were simulated.
-          seconds: Wall time of these.
-          left: Grasps that are still to be simulated.
-        """
+        """Counts grasps that took so long; the rate so far and the time left, in words."""
         self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
         self._bar.update(self._task, completed=self._grasps, total=self._grasps + left)
         rate = self._grasps / max(self._seconds, 1e-9)

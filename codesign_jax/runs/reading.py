@@ -94,11 +94,7 @@ def lost_all(folder: Path) -> str:
 
 
 def lost(episodes: int) -> str:
-    """What to do about a run whose checkpoints are all lost, in words.
-
-    Args:
-      episodes: Episodes of which its tables tell.
-    """
+    """What to do about a run whose checkpoints are all lost, in words."""
     return (
         f"while its tables have {episodes} episode{'s' * (episodes != 1)}. Put checkpoints/ back "
         "from a copy; or copy the tables, if they are wanted, and begin anew with codesign "

@@ -46,11 +46,6 @@ def contents(scene: Scene) -> dict[str, bytes]:
 def write_scene(scene: Scene, folder: Path, written: Mapping[str, bytes] | None = None) -> None:
     """Writes a resolved scene, meshes included; `scene.load` of it returns an equal one.
 
-    Args:
-      scene: The scene.
-      folder: An existing folder.
-      written: Its `contents`, if they were read before.
-
     Raises:
       RuntimeError: If what was written does not read back as the same scene.
     """

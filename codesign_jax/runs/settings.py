@@ -88,12 +88,7 @@ def make_settings(
 
 
 def masks_of(scene: Scene, settings: Settings) -> np.ndarray:
-    """Mask of the parameters that may move in each episode, shape (episode, parameter).
-
-    Args:
-      scene: The scene.
-      settings: Settings without `check`'s problems.
-    """
+    """Mask of the parameters that may move in each episode, shape (episode, parameter)."""
     space = design_space(scene.hand, settings.preset)
     first: Any = settings.first
     return schedule(settings.schedule, np.array(space.is_morphology), settings.episodes, first)

@@ -36,16 +36,7 @@ def design_columns(space: DesignSpace) -> list[str]:
 def write_episodes(
     folder: Path, scene: Scene, space: DesignSpace, history: History, start: int, stop: int
 ) -> None:
-    """Writes the rows of episodes start to stop: replaces the files if start is 0, else appends.
-
-    Args:
-      folder: The run folder.
-      scene: The scene, for the objects' names.
-      space: The design space.
-      history: The run's history.
-      start: First episode.
-      stop: Episode after the last.
-    """
+    """Writes the rows of episodes start to stop: replaces the files if start is 0, else appends."""
     for name, rows in _of_episodes(scene, space, history, range(start, stop)).items():
         path, text = folder / name, _text(name, space, rows, named=start == 0)
         if start == 0:
@@ -263,11 +254,6 @@ def _text(table: str, space: DesignSpace, rows: Iterable[Row], *, named: bool = 
 
 def written(head: list[str], rows: Iterable[Row], *, named: bool = True) -> str:
     """Text of a table.
-
-    Args:
-      head: Names of its columns, in their order.
-      rows: Values by the columns' names.
-      named: Whether it begins with the names.
 
     Raises:
       ValueError: If a row has other columns.

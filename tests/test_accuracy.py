@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import cli, model, scene
-from codesign_jax.commands import asked
+from codesign_jax.commands import optimize
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import parameters, schema
@@ -48,7 +48,7 @@ def test_an_unknown_preset_is_refused_with_the_other_problems(tmp_path):
 
 
 def test_the_command_line_takes_a_preset(capsys):
-    found, _ = asked.resolve(
+    found, _ = optimize.resolve(
         cli.Optimize(accuracy="fast", engine="mujoco", overrides=(("solver.iterations=7",),))
     )
     assert found.discretization == scene.Discretization(0.01, 10, 1, spring_damping="least")

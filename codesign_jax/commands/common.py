@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import math
+import re
 import sys
 import tempfile
 from collections import Counter
@@ -41,6 +42,8 @@ __all__ = [
 ]
 
 
+MOST = 1000
+"""Most runs of one command: a guard against a slip such as 0-99999."""
 SCENE = "paper"
 """Scene where none is named."""
 
@@ -271,3 +274,17 @@ def _number(text: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Reads seeds such as "0-9" or "1,3,5-7", in ascending order."""
+    found: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+        if last < first or last >= 2**31:
+            raise InputError([f"--seeds {text!r} must be seeds such as 0-9 or 1,3,5"])
+        if last - first >= MOST or len(found) > MOST:
+            raise InputError([f"--seeds {text!r} names more than {MOST} runs"])
+        found |= set(range(first, last + 1))
+    return sorted(found)

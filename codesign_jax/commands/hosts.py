@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 
-from codesign_jax.commands import asked, status
+from codesign_jax.commands import common, status
 from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def join(text: str) -> Hosts:
 
 def run(options: "Optimize") -> tuple[int, Hosts]:
     """Runs this host's seeds, and waits until the runs of all hosts have ended."""
-    chosen = asked.parse_seeds(options.seeds or "")
+    chosen = common.parse_seeds(options.seeds or "")
     here = join(options.distributed or "")
     mine = ",".join(map(str, chosen[here.index :: here.count]))
     code = 0

@@ -47,8 +47,6 @@ class Optimize(Command, flags.SceneFlags):
 
     preset: str = "2d"
     """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
-    scene: str = "paper"
-    """Scene: a built-in name or a .toml file."""
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control. Several, such as
     single,switch-4,concurrent: runs of each, simulated in one batch, and a comparison."""
@@ -270,8 +268,6 @@ class Sample(Command, flags.SceneFlags):
     """Trials of each design, each with noise of its own; objects take turns."""
     preset: str = "2d"
     """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
-    scene: str = "paper"
-    """Scene: a built-in name or a .toml file."""
     engine: Annotated[str, flags.ENGINE] = "structured"
     seed: int = 0
     """Root of designs and noise."""

@@ -2,12 +2,13 @@
 
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from codesign_jax import engines, runs
 from codesign_jax.commands import common
+from codesign_jax.commands.flags import Subject
 from codesign_jax.runs import choice
 from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene
@@ -16,21 +17,6 @@ from codesign_jax.scene.schema import InputError
 
 PRESET = "2d"
 """Design space where none is named."""
-
-
-class Options(Protocol):
-    """Flags that say which design; `cli.Evaluate` has their meaning."""
-
-    design: tuple[tuple[str, ...], ...]
-    run_folder: Path | None
-    preset: str | None
-    hand: str | None
-    objects: str | None
-    scene: str | None
-    accuracy: str | None
-    overrides: tuple[tuple[str, ...], ...]
-    robust: bool
-    engine: str | None
 
 
 class Case(NamedTuple):
@@ -49,19 +35,19 @@ class Case(NamedTuple):
     engine: str
 
 
-def find_case(options: Options, *, tell: Tell = common.warn) -> Case:
+def find_case(options: Subject, *, tell: Tell = common.warn) -> Case:
     """The design that the flags name."""
     return _from_run(options, tell) if options.run_folder else _from_flags(options)
 
 
-def _from_flags(options: Options) -> Case:
+def _from_flags(options: Subject) -> Case:
     scene = common.load_scene(options)
     space = design_space(scene.hand, options.preset or PRESET)
     design = common.parse_design(space, [*chain.from_iterable(options.design)])
     return Case(scene, space, design, options.engine or engines.DEFAULT)
 
 
-def _from_run(options: Options, tell: Tell) -> Case:
+def _from_run(options: Subject, tell: Tell) -> Case:
     """The design of a run that tested best, or without a test the best of its last episode.
 
     Objects, accuracy and single values may differ from the run's.

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -19,28 +19,11 @@ from rich.table import Table
 from codesign_jax import engines
 from codesign_jax import scene as scenes
 from codesign_jax.commands import preflight
-from codesign_jax.reuse import use_compilation_cache
+from codesign_jax.commands.flags import SceneFlags, TrialFlags
+from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.scene import Scene, keypaths, library, objects, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import InputError
-
-__all__ = [
-    "SceneFlags",
-    "changes",
-    "check_engine",
-    "check_place",
-    "counted",
-    "engine_problems",
-    "load_scene",
-    "mesh_notes",
-    "number_problems",
-    "parse_design",
-    "preflight_warnings",
-    "source_files",
-    "use_compilation_cache",
-    "warn",
-]
-
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
@@ -48,27 +31,7 @@ SCENE = "paper"
 """Scene where none is named."""
 
 
-class Overriding(Protocol):
-    """Flags that replace values of a scene; `flags.Subject` has their meaning."""
-
-    overrides: tuple[tuple[str, ...], ...]
-    robust: bool
-
-
-class SceneFlags(Overriding, Protocol):
-    """Flags that say which scene; `flags.Subject` has their meaning."""
-
-    @property
-    def scene(self) -> str | None:
-        """The scene; of some commands it has a default."""
-        ...
-
-    hand: str | None
-    objects: str | None
-    accuracy: str | None
-
-
-def changes(options: Overriding) -> dict[keypaths.Path, Any]:
+def changes(options: TrialFlags) -> dict[keypaths.Path, Any]:
     """Values by key path that --robust and --set replace; what --set names holds."""
     noise = dataclasses.asdict(objects.ROBUST) if options.robust else {}
     given = keypaths.parse(chain.from_iterable(options.overrides))

@@ -82,8 +82,10 @@ class TrialFlags:
 
 @dataclasses.dataclass
 class SceneFlags(TrialFlags):
-    """The scene but for its name, which has a default of its own."""
+    """The scene that is simulated."""
 
+    scene: Text = None
+    """Scene: a built-in name or a .toml file; default: the run's, or paper."""
     hand: Text = None
     """Hand: a built-in name or a .toml file; default: the scene's."""
 
@@ -105,8 +107,6 @@ class Subject(SceneFlags):
     and --engine then replace the run's."""
     preset: Text = None
     """Design space that the names belong to; default: the run's, or 2d."""
-    scene: Text = None
-    """Scene: a built-in name or a .toml file; default: the run's, or paper."""
     engine: Engine = None
 
 

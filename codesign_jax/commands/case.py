@@ -4,16 +4,22 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import engines, runs
+from codesign_jax.codesign import Task
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Subject
+from codesign_jax.engines import make_engine
 from codesign_jax.runs import choice
+from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
+from codesign_jax.types import Outcome
 
 PRESET = "2d"
 """Design space where none is named."""
@@ -33,6 +39,13 @@ class Case(NamedTuple):
     space: DesignSpace
     design: np.ndarray
     engine: str
+
+    def simulate(self, trials: int, key: jax.Array) -> Outcome:
+        """Outcomes in trials that depend on objects and key alone, arrays of shape (trial,)."""
+        task = Task(self.scene, self.space, trials, make_engine(self.engine, self.scene))
+        population = jnp.asarray(self.design, jnp.float32)[None]
+        found = interruptible(task.evaluate, population, key)
+        return jax.tree.map(lambda v: np.asarray(v)[0], found)
 
 
 def find_case(options: Subject, *, tell: Tell = common.warn) -> Case:

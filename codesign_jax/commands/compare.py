@@ -7,10 +7,9 @@ import csv
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich import box
 from rich.console import Console
@@ -19,11 +18,9 @@ from rich.table import Table
 from codesign_jax import codesign, cost, files, runs
 from codesign_jax.commands import common, flags, reference
 from codesign_jax.commands.case import Case, find_case
-from codesign_jax.engines import make_engine
 from codesign_jax.report import statistics, verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns
-from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
@@ -142,7 +139,8 @@ def _compare_pair(pair: list[Case], names: list[str], options: "Compare", consol
     """Simulates both designs in the same trials and says how they differ."""
     kept, count = [], options.trials or 0
     for case, name in zip(pair, names, strict=True):
-        outcome = simulate(case, count, options.seed, console)
+        with Busy(console, f"simulating {common.counted(count, 'grasp')}"):
+            outcome = case.simulate(count, jax.random.key(options.seed))
         console.print(f"{name} {Judged(case.scene, outcome, options.accuracy)}", markup=False)
         kept.append(codesign.verdicts(outcome) == codesign.VERDICTS.index("kept"))
     for line in difference(*kept, names=names):
@@ -168,15 +166,6 @@ def difference(first: np.ndarray, second: np.ndarray, names: list[str]) -> list[
         f"difference: {value:+.1f} percentage points ({low:+.1f} to {high:+.1f}, 95 % interval by "
         f"Newcombe; McNemar's exact test: p = {statistics.mcnemar(*only):.2g}): {word}",
     ]
-
-
-def simulate(case: Case, trials: int, seed: int, console: Console) -> Any:
-    """Outcomes of a design in trials that depend on seed and objects alone, shape (trial,)."""
-    task = codesign.Task(case.scene, case.space, trials, make_engine(case.engine, case.scene))
-    population = jnp.asarray(case.design, jnp.float32)[None]
-    with Busy(console, f"simulating {common.counted(trials, 'grasp')}"):
-        found = interruptible(task.evaluate, population, jax.random.key(seed))
-    return jax.tree.map(lambda v: np.asarray(v)[0], found)
 
 
 def of_test(scene: Scene, result: RunResult) -> Judged:

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, rollout, runs, types
+from codesign_jax import engines, rollout, runs, types
 from codesign_jax.commands import common
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.report import verdicts
 from codesign_jax.runs import choice, tables
-from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import InputError
@@ -46,7 +45,7 @@ def main(options: "Evaluate") -> int:
     if options.dry_run:
         console.print(f"grasps: {options.trials}")
         return 0
-    one = simulate(case, engine, options, console)
+    one = simulate(case, options, console)
     if options.render:
         draw(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
@@ -82,16 +81,10 @@ def _check(options: "Evaluate", engine: str) -> None:
             common.check_place(flag, path)
 
 
-def simulate(
-    case: Case, engine: engines.Engine, options: "Evaluate", console: Console
-) -> types.Outcome:
+def simulate(case: Case, options: "Evaluate", console: Console) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
-    task = codesign.Task(case.scene, case.space, options.trials, engine)
-    population = jnp.asarray(case.design, jnp.float32)[None]
     with Busy(console, f"simulating {common.counted(options.trials, 'grasp')}"):
-        found = interruptible(task.evaluate, population, jax.random.key(options.seed))
-    outcomes = jax.tree.map(np.asarray, found)
-    one = jax.tree.map(lambda v: v[0], outcomes)
+        one = case.simulate(options.trials, jax.random.key(options.seed))
     names = [shape.name for shape in case.scene.objects.object]
     for k, name in enumerate(names[: options.trials]):
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)

@@ -8,18 +8,14 @@ trials that the run has not met and with finer steps; docs/results.md has how mu
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, rollout
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.commands.common import counted
 from codesign_jax.commands.flags import Subject
-from codesign_jax.engines import make_engine
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns, outcomes, read_run, tables
-from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene, with_accuracy
 from codesign_jax.types import Outcome
@@ -60,7 +56,7 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
         if why:
             console.print(f"{folder / FILE} {why}: simulated again", markup=False)
         with Busy(console, f"reference test, {counted(trials, 'grasp')}"):
-            found = simulate(case, settings, trials)
+            found = case.simulate(trials, _noise(settings))
             outcomes.save(folder / FILE, found, key)
             drawn = rollout.sample_trials(case.scene, _noise(settings), trials)
             tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
@@ -105,14 +101,6 @@ def _case(folder: Path, settings: Settings, trials: int) -> tuple[Case, str]:
     subject = Subject(run_folder=folder, engine=settings.engine, accuracy=ACCURACY)
     case = find_case(subject, tell=lambda text: None)  # the command says what is amiss
     return case, outcomes.key(case.scene, case.engine, case.design[None], trials, settings.seed)
-
-
-def simulate(case: Case, settings: Settings, trials: int) -> Outcome:
-    """Outcomes of the design in fresh trials, shape (trial,)."""
-    task = codesign.Task(case.scene, case.space, trials, make_engine(case.engine, case.scene))
-    population = jnp.asarray(case.design, jnp.float32)[None]
-    found = interruptible(task.evaluate, population, _noise(settings))
-    return jax.tree.map(lambda v: np.asarray(v)[0], found)
 
 
 def _noise(settings: Settings) -> jax.Array:

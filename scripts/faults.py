@@ -73,7 +73,8 @@ def finished(tmp_path_factory) -> tuple[Path, float]:
     assert code == 0, said
     begin = time.monotonic()
     done = process(*COMMAND, "--out", folder / "run")
-    assert done.wait() == 0, done.stdout
+    said = done.communicate()[0]
+    assert done.returncode == 0, said
     took = time.monotonic() - begin
     assert differences(folder / "first", folder / "run") == []
     return folder / "run", took

@@ -1,6 +1,6 @@
 """What each effect costs and decides: python -m scripts.effects [--quick] [--draw].
 
-Measures the paper's scene with each effect turned over, writes docs/data/effects.json and .csv and
+Measures the paper's scene with each effect turned over, writes docs/data/effects.json and
 fills in docs/effects.md and docs/notes/effects.md and draws their figure; --draw only draws.  An
 effect's decisions come from MuJoCo C, its program and time from the structured engine.  About 15
 minutes on two idle cores.
@@ -79,7 +79,7 @@ def _decisions(
         record = effects.compare(found, reference, trials)
         results["effects"].setdefault(name, {}).update(record)
         print(name, record["success"], record["same_verdict"], flush=True)
-        _store(results, path)
+        output.write_json(path, results)
 
 
 def _programs(
@@ -112,14 +112,7 @@ def _programs(
             "ratio": float(np.median(ratios)),
             "ratio_quartiles": [float(q) for q in np.quantile(ratios, [0.25, 0.75])],
         }
-    _store(results, path)
-
-
-def _store(results: dict[str, Any], path: Path) -> None:
     output.write_json(path, results)
-    rows = [{"effect": name, **record} for name, record in results["effects"].items()]
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    output.write_csv(path.with_suffix(".csv"), columns, rows)
 
 
 if __name__ == "__main__":

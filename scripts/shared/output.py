@@ -1,8 +1,7 @@
 """Writes what studies found: as a whole or not at all, whenever a process ends."""
 
-import csv
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +23,4 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
     """Writes arrays by name as a compressed .npz file, its folder included."""
     with files.atomically(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)
-    return path
-
-
-def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> Path:
-    """Writes a table, its folder included; what a row does not have stays empty."""
-    with files.atomically(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(columns), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
     return path

@@ -26,7 +26,8 @@ import pytest
 
 from codesign_jax import scene as scenes
 from codesign_jax.engines.structured import StructuredEngine
-from scripts.shared import gradients, output, provenance, work
+from codesign_jax.scene import Scene
+from scripts.shared import output, provenance, work
 
 RATES: dict[str, dict[str, Any]] = {
     "spheres": {},
@@ -82,8 +83,7 @@ def rate(name: str, values: dict[str, Any], wait: Callable[[], Any]) -> dict[str
     """World-steps a second in contact or of whole grasps; the times of gradients."""
     values = dict(values)
     if "gradient" in values:
-        found = gradients.cost(scenes.load(values["scene"]), values["gradient"], wait)
-        return {"case": name} | found
+        return {"case": name} | gradient(scenes.load(values["scene"]), values["gradient"], wait)
     dtype, worlds = values.pop("dtype", np.float32), values.pop("worlds", WORLDS)
     objects, whole = values.pop("objects", None), values.pop("whole", False)
     base, effects = values.pop("scene", "paper_spheres"), values.get("effects", {})
@@ -117,6 +117,32 @@ def rate(name: str, values: dict[str, Any], wait: Callable[[], Any]) -> dict[str
     found = {"case": name, "worlds": worlds, "steps": steps, "median_s": median}
     found |= {"repetitions": len(times), "compile_s": round(built, 2)}
     return found | {"world_steps_per_s": worlds * steps / median}
+
+
+def gradient(scene: Scene, worlds: int, wait: Callable[[], Any]) -> dict[str, Any]:
+    """Seconds of whole grasps and of their value with its gradient, and how many are finite."""
+    fields, ctrl = work.inputs(scene, work.make_worlds(scene, worlds))
+    fields, ctrl = jax.tree.map(lambda x: jax.numpy.asarray(x, np.float32), (fields, ctrl))
+    engine = StructuredEngine(scene)
+    weights = np.random.default_rng(0).normal(size=ctrl.shape[1]).astype(np.float32)
+
+    def value(fields: Any, ctrl: jax.Array) -> jax.Array:
+        return (engine.rollout(fields, ctrl).distance @ weights).sum()
+
+    programs = {"forward": value, "value_and_gradient": jax.value_and_grad(value, (0, 1))}
+    compiled = {n: jax.jit(f).lower(fields, ctrl).compile() for n, f in programs.items()}
+    wait()
+    found: dict[str, Any] = {"worlds": worlds, "steps": ctrl.shape[1]}
+    for name, program in compiled.items():
+        seconds = []
+        for _ in range(REPETITIONS):
+            begin = time.perf_counter()
+            result = jax.block_until_ready(program(fields, ctrl))
+            seconds.append(time.perf_counter() - begin)
+        found[name] = min(seconds)
+    found["ratio"] = found["value_and_gradient"] / found["forward"]
+    each = [np.isfinite(x).reshape(worlds, -1).all(1) for x in jax.tree.leaves(result[1])]
+    return found | {"finite": float(np.all(each, 0).mean())}
 
 
 class Rate:

@@ -11,7 +11,6 @@ python -m scripts.experiments figures                                # of docs/d
 import argparse
 import json
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,10 @@ from codesign_jax import runs, scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.commands import common
 from codesign_jax.engines import NAMES
-from codesign_jax.runs.together import Timing
 from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.scene.schema import InputError
 from scripts.experiments import landscape, plan, report, results, strategies
-from scripts.shared import output, provenance
+from scripts.shared import provenance
 
 
 def parse() -> argparse.Namespace:
@@ -33,11 +31,7 @@ def parse() -> argparse.Namespace:
     parser = provenance.parser(__doc__)
     parser.add_argument("experiment", choices=[*plan.PAPER, "figures"])
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
-    parser.add_argument(
-        "--scene",
-        default="paper",
-        help="built-in scene or file",
-    )
+    parser.add_argument("--scene", default="paper", help="built-in scene or file")
     parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
     parser.add_argument(
         "--strategies",
@@ -61,11 +55,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--gather", action="store_true", help="simulate nothing: write what the runs have"
     )
-    parser.add_argument(
-        "--trials",
-        type=Path,
-        help="write every trial to this .npz",
-    )
     parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
@@ -73,27 +62,29 @@ def parse() -> argparse.Namespace:
 
 
 def simulate(args: argparse.Namespace) -> int:
-    """Runs or resumes an experiment; returns the exit status."""
+    """Runs or resumes an experiment, and writes what it has; returns the exit status."""
     common.use_compilation_cache()
-    the_plan = plan.experiment(args.experiment, args.size)
     try:
+        the_plan = plan.experiment(args.experiment, args.size)
         the_plan = plan.narrowed(the_plan, args.strategies, args.runs)
     except ValueError as error:
         sys.exit(f"error: {error}")
     overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
     the_scene = scene.load(args.scene, overrides=overrides)
-    print(f"{args.experiment}: {the_plan.grasps:,} grasps", flush=True)
     path = args.out / f"{args.experiment}.json"
-    before = json.loads(path.read_text()) if path.exists() and not args.fresh else None
-    settings = results.settings_of(the_plan, the_scene, args.engine, args.seed)
-    if before and _of_runs(before["settings"]) != _of_runs(json.loads(json.dumps(settings))):
-        sys.exit(f"error: {path} belongs to another experiment; choose another --out, or --fresh")
-    if args.fresh:
-        (args.out / f"{args.experiment}.processes").unlink(missing_ok=True)
-    start = time.perf_counter()
-    if isinstance(the_plan, plan.Landscape):
-        return _landscape(args, the_plan, the_scene, before, start)
-    return _strategies(args, the_plan, the_scene, before, start)
+    settings = json.loads(
+        json.dumps(results.settings_of(the_plan, the_scene, args.engine, args.seed))
+    )
+    if path.exists() and not args.fresh:
+        if _of_runs(json.loads(path.read_text())["settings"]) != _of_runs(settings):
+            sys.exit(f"error: {path} belongs to another experiment; choose another --out")
+    print(f"{args.experiment}: {the_plan.grasps:,} grasps", flush=True)
+    run = _landscape if isinstance(the_plan, plan.Landscape) else _strategies
+    code, kept, grasps = run(args, the_plan, the_scene)
+    if kept is not None:
+        notes = provenance.results(args.commit) | {"settings": settings, "grasps": grasps}
+        results.write(args.out, args.experiment, kept, notes)
+    return code
 
 
 def _of_runs(settings: dict[str, Any]) -> dict[str, Any]:
@@ -101,84 +92,44 @@ def _of_runs(settings: dict[str, Any]) -> dict[str, Any]:
     return settings | {"plan": {k: v for k, v in settings["plan"].items() if k != "strategies"}}
 
 
-def _strategies(
-    args: argparse.Namespace,
-    the_plan: plan.Strategies,
-    the_scene: Scene,
-    before: dict[str, Any] | None,
-    start: float,
-) -> int:
+Found = tuple[int, strategies.Arrays | None, int]
+"""Exit status, results if there are some, and their grasps."""
+
+
+def _strategies(args: argparse.Namespace, the_plan: plan.Strategies, the_scene: Scene) -> Found:
     folder = args.out / args.experiment
     plans = strategies.plans(the_plan, the_scene, args.engine, folder, args.seed)
     first, count = (int(n) for n in args.share.split("/"))
     plans = dict([*plans.items()][first - 1 :: count]) if not args.gather else {}
     how = {"fresh": args.fresh, "every": args.every, "devices": args.devices, "chunk": args.chunk}
-    done = runs.optimize(plans, sys.argv, **how) if plans else runs.Results({}, Timing())
-    problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
-    for place, error in problems.items():
-        print(f"error: {place}: {error}", file=sys.stderr)
-    code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
-    timing, seconds = done.timing, time.perf_counter() - start
-    rate = timing.grasps / max(timing.seconds, 1e-9)
-    process = results.Process(timing.grasps, seconds, timing.compile_seconds, rate)
-    log = results.log(args.out / f"{args.experiment}.processes", process, args.commit)
+    code = 0
+    if plans:
+        done = runs.optimize(plans, sys.argv, **how)
+        problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
+        for place, error in problems.items():
+            print(f"error: {place}: {error}", file=sys.stderr)
+        code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
     found = strategies.gather(the_plan, folder, args.seed) if count == 1 else None
     if found is None or not found["cost"].shape[2]:
-        return code
+        return code, None, 0
     space = parameters.design_space(the_scene.hand, the_plan.preset)
+    tested = the_plan.worlds * the_plan.rounds if "test_status" in found else 0
     kept = results.of_strategies(the_plan, the_scene, space, found)
-    screened = strategies.screened(the_plan, found)
-    grasps = found["status"].size
-    grasps += the_plan.worlds * the_plan.rounds if "test_status" in found else 0
-    _write(args, kept, found, log, before, (the_plan, the_scene), (grasps, screened))
-    return code
+    return code, kept, found["status"].size + tested
 
 
-def _landscape(
-    args: argparse.Namespace,
-    the_plan: plan.Landscape,
-    the_scene: Scene,
-    before: dict[str, Any] | None,
-    start: float,
-) -> int:
+def _landscape(args: argparse.Namespace, the_plan: plan.Landscape, the_scene: Scene) -> Found:
     console, part = Console(highlight=False, soft_wrap=True), args.out / f"{args.experiment}.part"
     if args.fresh:
         part.unlink(missing_ok=True)
     how = {"seed": args.seed, "chunk": args.chunk, "devices": args.devices, "console": console}
     try:
-        found, earlier = landscape.simulate(the_plan, the_scene, args.engine, part, **how)
+        found, _ = landscape.simulate(the_plan, the_scene, args.engine, part, **how)
     except KeyboardInterrupt:
         print("stopped; the same command goes on")
-        return 130
+        return 130, None, 0
     space = parameters.design_space(the_scene.hand, the_plan.preset)
-    kept, seconds = results.of_landscape(the_scene, space, found), time.perf_counter() - start
-    grasps = the_plan.grasps - earlier
-    process = results.Process(grasps, seconds, 0.0, grasps / seconds)
-    log = results.log(args.out / f"{args.experiment}.processes", process, args.commit)
-    sizes = the_plan.grasps, 0
-    _write(args, kept, found, log, before, (the_plan, the_scene), sizes)
-    return 0
-
-
-def _write(
-    args: argparse.Namespace,
-    kept: strategies.Arrays,
-    found: strategies.Arrays,
-    log: list[dict[str, Any]],
-    before: dict[str, Any] | None,
-    subject: tuple[Any, Scene],
-    grasps: tuple[int, int],
-) -> None:
-    """Writes the results; where nothing is new, who made them stays noted."""
-    notes = before or {}
-    settings = json.loads(json.dumps(results.settings_of(*subject, args.engine, args.seed)))
-    new = log and notes.get("processes") != log
-    if before is None or new or before["settings"] != settings:
-        notes = results.describe(settings, log, *grasps, commit=args.commit)
-        for path in results.write(args.out, args.experiment, kept, notes):
-            print(path)
-    if args.trials:
-        print(output.write_arrays(args.trials, found))
+    return 0, results.of_landscape(the_scene, space, found), the_plan.grasps
 
 
 def main() -> int:

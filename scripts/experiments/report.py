@@ -187,11 +187,10 @@ def _grasps_row(studies: dict[str, Study | None], grid) -> tuple[str, str]:
     notes |= {"landscape": grid[1]} if grid else {}
     counts = ", ".join(f"{name} {n['grasps']:,}" for name, n in notes.items())
     total = sum(n["grasps"] for n in notes.values())
-    minutes = sum(n["wall_seconds"] for n in notes.values()) / 60
     paper = ", ".join(f"{name} {count:,}" for name, count in PAPER_GRASPS.items())
     return (
         f"grasps: {paper}; {TOTAL_GRASPS:,} in all",
-        f"{counts or 'none'}; {total:,} in all, {minutes:.1f} minutes summed over the experiments",
+        f"{counts or 'none'}; {total:,} in all",
     )
 
 

@@ -1,12 +1,8 @@
 """From what was simulated to what is kept: small arrays, and where they come from."""
 
 import dataclasses
-import datetime
-import json
-import time
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -86,71 +82,6 @@ def of_landscape(scene: Scene, space: DesignSpace, found: Arrays) -> Arrays:
     }
 
 
-class Process(NamedTuple):
-    """What a process did.
-
-    Attributes:
-      grasps: Grasps that it simulated.
-      seconds: Its wall time, with compilation.
-      compile_seconds: Time to compile, as far as that is known.
-      rate: Grasps a second, without compilation as far as that is known.
-    """
-
-    grasps: int
-    seconds: float
-    compile_seconds: float
-    rate: float
-
-
-def log(path: Path, process: Process, commit: str | None) -> list[dict[str, Any]]:
-    """Notes a process that simulated something; several at once may do so.
-
-    Returns:
-      Every process that the file has.
-    """
-    if process.grasps:
-        made = provenance.results(commit)
-        line = {name: made[name] for name in ("command", "commit", "device", "num_devices")}
-        line |= {"ended": round(time.time(), 1)}
-        line |= {name: round(value, 1) for name, value in process._asdict().items()}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as file:  # a line at once: others append as well
-            file.write(json.dumps(line) + "\n")
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return [json.loads(line) for line in lines]
-
-
-def wall_seconds(processes: Sequence[Mapping[str, Any]]) -> float:
-    """Time in which at least one of the processes ran [s]."""
-    total, until = 0.0, -np.inf
-    for start, end in sorted((p["ended"] - p["seconds"], p["ended"]) for p in processes):
-        total += max(0.0, end - max(start, until))
-        until = max(until, end)
-    return round(total, 1)
-
-
-def describe(
-    settings: dict[str, object],
-    processes: list[dict[str, Any]],
-    grasps: int,
-    screened: int,
-    *,
-    commit: str | None = None,
-) -> dict[str, object]:
-    """Returns what a result depends on, and what it took."""
-    notes = provenance.results(commit)
-    commits = dict.fromkeys(str(p["commit"]) for p in processes)
-    return {
-        **notes,
-        "commit": ", ".join(commits) or notes["commit"],
-        "settings": settings,
-        "grasps": grasps,
-        "grasps_that_screened_seeds": screened,
-        "wall_seconds": wall_seconds(processes),
-        "processes": processes,
-    }
-
-
 def settings_of(plan: Any, scene: Scene, engine: str, seed: int) -> dict[str, object]:
     """What determines the numbers of an experiment, beside code, versions and device."""
     return {
@@ -163,10 +94,7 @@ def settings_of(plan: Any, scene: Scene, engine: str, seed: int) -> dict[str, ob
     }
 
 
-def write(folder: Path, name: str, arrays: Arrays, notes: dict[str, object]) -> list[Path]:
-    """Writes NAME.npz and NAME.json; returns their paths."""
-    made = {"written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
-    return [
-        output.write_arrays(folder / f"{name}.npz", arrays),
-        output.write_json(folder / f"{name}.json", notes | made, indent=2),
-    ]
+def write(folder: Path, name: str, arrays: Arrays, notes: dict[str, object]) -> None:
+    """Writes NAME.npz and NAME.json."""
+    output.write_arrays(folder / f"{name}.npz", arrays)
+    output.write_json(folder / f"{name}.json", notes, indent=2)

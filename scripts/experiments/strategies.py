@@ -84,9 +84,3 @@ def _one(record: Record, done: int, tested: bool) -> Arrays:
             "test_status": np.asarray(test["status"]).astype(np.uint8),
         }
     return found
-
-
-def screened(plan: Strategies, found: Arrays) -> int:
-    """Grasps that screened the candidates of all strategies' seeds."""
-    rounds = -(-found["seed_candidates"] // plan.particles)
-    return int(rounds.sum()) * plan.particles * plan.trials * len(plan.strategies)

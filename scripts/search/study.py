@@ -107,7 +107,6 @@ class Study:
         marks: int = 9,
         at: Sequence[int] = (),
         first_seed: int = 0,
-        shapes: np.ndarray | None = None,
         chunk: int,
         path: Path,
     ):
@@ -116,9 +115,8 @@ class Study:
         self.tests, self.chunk, self.path = tests, chunk, path
         self.keys = jax.vmap(jax.random.key)(first_seed + jnp.arange(seeds))
         self.mask = jnp.ones(space.num_parameters, bool)
-        every = np.tile(np.arange(len(scene.objects.object)), (seeds, 1))
-        self.shapes = every if shapes is None else np.asarray(shapes)
-        self.rounds = -(-case.tests // self.shapes.shape[1]) * self.shapes.shape[1]
+        objects = len(scene.objects.object)
+        self.rounds = -(-case.tests // objects) * objects
         self.batch = min(chunk, seeds * case.worlds)
         self.simulate = jax.jit(self._simulate)
         self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
@@ -242,7 +240,7 @@ class Study:
 
     def _all(self, populations: jax.Array, keys: jax.Array, trials: int) -> Outcome:
         """Outcomes of shape (seed, particle, trial) in the trials of these keys."""
-        return self.outcomes(populations, self.drawn(keys, trials, self.shapes, self.scene))
+        return self.outcomes(populations, self.drawn(keys, trials))
 
     def outcomes(self, populations: jax.Array, trials: Trial) -> Outcome:
         """Outcomes of shape (seed, particle, trial), by one program whatever the shape."""
@@ -257,15 +255,9 @@ class Study:
         found = jax.tree.map(lambda *v: np.concatenate(v)[: len(seed)], *parts)
         return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), found)
 
-    def drawn(self, keys: jax.Array, trials: int, shapes: np.ndarray, scene: Scene) -> Trial:
-        """Trials of each key with a scene's noise, of objects that take turns.
-
-        Returns:
-          Trials with leading axes (seed, trial).
-        """
-        drawn = jax.vmap(lambda key: rollout.sample_trials(scene, key, trials))(keys)
-        turns = shapes[:, np.arange(trials) % shapes.shape[1]]
-        return drawn._replace(shape=jnp.asarray(turns, drawn.shape.dtype))
+    def drawn(self, keys: jax.Array, trials: int) -> Trial:
+        """Trials of each key, of objects that take turns, with leading axes (seed, trial)."""
+        return jax.vmap(lambda key: rollout.sample_trials(self.scene, key, trials))(keys)
 
     def _simulate(self, designs: jax.Array, trials: Trial) -> Outcome:
         hands = jax.vmap(self.space.params)(designs)

@@ -1,1 +1,0 @@
-"""What each effect of a scene costs and decides."""

@@ -1,7 +1,6 @@
 """Tables and figure of docs/notes/search.md, from the files that `scripts.search` wrote.
 
-Cases that change more than an optimiser's sizes are in the table of parts, beside the default on
-the same seeds.
+Cases that change more than an optimiser's sizes are in neither.
 """
 
 import argparse
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib import ticker
 
-from codesign_jax.optimize import DEFAULT, NAMES
+from codesign_jax.optimize import NAMES
 from codesign_jax.report.statistics import wilson
 from codesign_jax.report.verdicts import RELIABLE
 from scripts.shared import figures, tables
@@ -103,33 +102,6 @@ def share_of(kept: np.ndarray) -> str:
     return f"{good / kept.size:.2f} ({share.low:.2f} to {share.high:.2f})"
 
 
-def parts(rows: list[dict[str, Any]]) -> str:
-    """Rows for each part of the default that is left out, beside the default on the same seeds.
-
-    A variant has a row at each of its marks, beside the default's mark that is nearest.
-    """
-    found = [["without", "seeds", "grasps of a seed", "median kept"]]
-    found[0] += ["share of seeds that keep 95 % (95 % interval)", "the default on these seeds"]
-    found[0] += ["median of the default", "only the default keeps 95 %, only the variant does"]
-    whole = {_question(row)[1:]: row for row in rows if row["optimizer"] == DEFAULT}
-    for row in sorted((r for r in rows if variant(r["optimizer"])), key=order):
-        name, beside = row["optimizer"].partition(":")[2], whole.get(_question(row)[1:])
-        if beside is None or not row["optimizer"].startswith(f"{DEFAULT}:"):
-            continue
-        start = row.get("first_seed", 0) - beside.get("first_seed", 0)
-        for grasps, shares in zip(row["grasps"], row["kept"], strict=True):
-            kept = np.array(shares)
-            near = np.abs(np.array(beside["grasps"]) - grasps).argmin()
-            same = np.array(beside["kept"][near])[max(0, start) :][: kept.size]
-            if start < 0 or same.size < kept.size:
-                continue  # the default has not these seeds
-            good, other = kept >= RELIABLE, same >= RELIABLE
-            cells = [f"`{name}`", str(kept.size), f"{grasps:,}", f"{np.median(kept):.3f}"]
-            cells += [share_of(kept), share_of(same), f"{np.median(same):.3f}"]
-            found.append([*cells, f"{int((other & ~good).sum())}, {int((good & ~other).sum())}"])
-    return tables.markdown(found)
-
-
 def variant(name: str) -> bool:
     """Whether a case's name changes more than an optimiser's sizes."""
     changes = {pair.split("=")[0] for pair in name.partition(":")[2].split(",") if pair}
@@ -207,7 +179,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {args.folder} has no results of scripts.search", file=sys.stderr)
         return 2
     tables.fill(args.page, table(rows), "search")
-    tables.fill(args.page, parts(rows), "parts")
     print(args.page, draw(rows, args.figure))
     return 0
 

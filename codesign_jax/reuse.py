@@ -40,10 +40,7 @@ _UNTRACED = ("compiler", "files", "reuse", "store")
 
 
 def _state() -> dict[str, tuple[int, ...]]:
-    """What the file system says of each file of code that a simulation depends on.
-
-    With the time of the inode's last change, which no program can set back.
-    """
+    """Each file of code, with the time of its inode's last change, which no program sets back."""
     found, folders = {}, [""]
     with contextlib.suppress(OSError):  # a file goes away while its state is read
         while folders:
@@ -133,10 +130,7 @@ def digest(*parts: object) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-# Caches on disk.
-
-MOST = str(512 * 2**20)
-"""Most bytes of each, if the environment does not say."""
+MOST = str(512 * 2**20)  # bytes of each cache on disk, if the environment does not say
 
 
 def folder() -> Path:
@@ -311,8 +305,7 @@ def memory_problem() -> str | None:
     )
 
 
-forgetters: list[Callable[[], object]] = []
-"""What drops the programs that `shared` keeps."""
+forgetters: list[Callable[[], object]] = []  # drop the programs that `shared` keeps
 
 
 def _relieve() -> None:

@@ -130,6 +130,9 @@ class Evaluate(Command, RunOrDesign):
     """With a run: a final particle, as in its tests.csv, instead of the one that tested best."""
     out: File = None
     """Write a table of the trials, with their noise and how they ended (.csv)."""
+    stress: Flag = False
+    """Then the same trials with heavier objects, less friction, the other bending law and other
+    constants, and warnings of the design itself (docs/command_line.md); best with --trials 24."""
     render: File = None
     """Draw the first trial of each object: a film (.gif, .mp4) or a strip of pictures (.png)."""
     dry_run: Flag = False

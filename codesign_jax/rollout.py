@@ -21,6 +21,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.stats import norm
 
 from codesign_jax import axes, control, model, reuse
 from codesign_jax.cost import outcome, shown
@@ -103,7 +104,7 @@ def _draw(num_trials: int, shapes: int, key: jax.Array, noises: Any) -> Trial:
             position=noise.position * z[:2],
             yaw=angles[0],
             arm_tilt=angles[1:],
-            mass=1.0 + noise.mass * z[5],
+            mass=(1.0 + noise.mass * z[5]) * noise.mass_range ** norm.cdf(every[2, 1]),
             size=1.0 + noise.size * z[6],
             friction=jnp.exp(noise.friction * later[0]),
             stiffness=jnp.exp(noise.stiffness * later[1]),

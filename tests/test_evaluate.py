@@ -37,7 +37,11 @@ def test_what_is_not_given_is_said_to_be_a_default(capsys):
     every = ["--preset", "23d", "--design", "length=95", "arm_z=30"]
     assert command("evaluate", "--dry-run", *every) == 0
     shown = capsys.readouterr().out
-    assert "length[0]=95 mm length[1]=95 mm length[2]=95 mm length[3]=95 mm" in shown
+    rows = [line.split() for line in shown.splitlines()]
+    assert ["finger", "length", "height", "wall", "pressure"] in rows
+    assert ["mm", "mm", "mm", "kPa"] in rows and ["3", "95", "20", "5", "120"] in rows
+    assert ["45", "0", "0", "15", "30", "-20", "0"] in rows, "spread, then the arm's"
+    assert max(map(len, shown.splitlines())) < 100
     assert "defaults: height, wall, spread, arm_roll" in shown
     twice = ["--preset", "23d", "--design", "length=95", "length[1]=90"]
     assert command("evaluate", "--dry-run", *twice) == 2

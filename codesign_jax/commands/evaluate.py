@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import engines, rollout, runs, types
-from codesign_jax.commands import common
+from codesign_jax.commands import common, stress
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.report import verdicts
@@ -35,7 +35,7 @@ def main(options: "Evaluate") -> int:
     if options.run_folder:
         which = "best final design" if options.particle is None else f"particle {options.particle}"
         console.print(f"{which} of {options.run_folder}", markup=False)
-    console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
+    console.print(runs.describe(case.space, case.design), markup=False)
     if not options.run_folder:
         pairs = [*chain.from_iterable(options.design)]
         if note := common.by_default(case.space, pairs):
@@ -43,9 +43,14 @@ def main(options: "Evaluate") -> int:
     for note in [*_untried(case, options), *notes, *common.mesh_notes(case.scene)]:
         console.print(note, markup=False)
     if options.dry_run:
-        console.print(f"grasps: {options.trials}")
+        more = f", {stress.sets(case.scene) * options.trials} more" if options.stress else ""
+        console.print(f"grasps: {options.trials}{more}")
         return 0
     one = simulate(case, options, console)
+    if options.stress:
+        with Busy(console, "simulating other conditions"):
+            found = stress.simulate(case, options.trials, jax.random.key(options.seed))
+        stress.tell(case, found, console)
     if options.render:
         draw(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import engines, files, provenance, rollout, runs
-from codesign_jax.commands import common, drift
+from codesign_jax.commands import common, drift, reference, stress
 from codesign_jax.commands.case import Case, find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain, process, tables
@@ -42,7 +42,7 @@ def main(options: "Export") -> int:
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
         console.print(f"best final design of {options.run_folder}", markup=False)
-    console.print(f"design: {runs.describe(case.space, case.design)}", markup=False)
+    console.print(runs.describe(case.space, case.design), markup=False)
     for note in notes:
         console.print(note, markup=False)
     try:
@@ -194,6 +194,14 @@ def _trials(case: Case, options: "Export") -> list[tuple[str, Trial]]:
     return [(name, jax.tree.map(np.asarray, trial)) for name, trial in found]
 
 
+def _tested(folder: Path) -> "sheet.Tested":
+    """What a run kept of its design's tests: the verdict, and grasps under other conditions."""
+    scene, settings = runs.read_run(folder)
+    fresh, _ = reference.stored(folder, settings)
+    verdict = None if fresh is None else str(reference.judged(scene, fresh))
+    return verdict, stress.stored(folder, settings)
+
+
 def _sheet(
     case: Case,
     params: Params,
@@ -204,14 +212,15 @@ def _sheet(
 ) -> None:
     from codesign_jax.export import drawing, sheet  # needs the extra
 
-    content = sheet.sheet_sections(case.scene, params, sizes, found)
+    tested = _tested(options.run_folder) if options.run_folder else (None, None)
+    content = sheet.sheet_sections(case.scene, params, sizes, found, tested)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
     code = provenance.git_state()
     version = provenance.environment()["versions"]["codesign-jax"]  # type: ignore[index]
+    objects = ", ".join(s.name for s in case.scene.objects.object)
     lines = [
-        f"{source}: {runs.describe(case.space, case.design)}",
-        f"Scene {case.scene.name}, objects {', '.join(s.name for s in case.scene.objects.object)}; "
+        f"{source}; scene {case.scene.name}, objects {objects}; "
         f"codesign-jax {version}, commit {code['commit'] or 'unknown'}"
         f"{' with changes' if code.get('modified') else ''}. Predictions of a simulation, not "
         "measurements.",

@@ -35,7 +35,7 @@ def main(path: Path, engine: str | None) -> int:
     common.check_engine(name)
     space = design_space(scene.hand, settings.preset)
     h = scene.discretization.timestep
-    print(f"design: {runs.describe(space, failure.design)}")
+    print(runs.describe(space, failure.design))
     print(f"recorded by {settings.engine}: {_verdict(failure.status, failure.bad_step, h)}")
     for bit in Status(failure.status):
         print(f"  {bit.name}: {MEANINGS[bit]}")

@@ -89,7 +89,7 @@ def description(asked: Asked, shown: "Replay") -> list[str]:
     again = choice.ending(shown.outcome)
     ending = f"in the run: {asked.recorded}; here: {again}" if asked.recorded else again
     design = runs.describe(asked.case.space, asked.case.design)
-    lines = [f"design: {design}", f"{asked.text}; {ending}"]
+    lines = [design, f"{asked.text}; {ending}"]
     if asked.recorded not in (None, again):
         lines.append(
             "The two differ: contact is chaotic, and a batch of another size, another machine or "

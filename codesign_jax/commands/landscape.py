@@ -52,7 +52,7 @@ def main(options: "Options") -> int:
     console = Console(highlight=False, soft_wrap=True)
     others = [k for k in range(case.space.num_parameters) if k not in made.columns]
     if others:
-        console.print(f"around: {runs.describe(case.space, case.design)}", markup=False)
+        console.print(runs.describe(case.space, case.design, "around"), markup=False)
     for note in common.mesh_notes(case.scene):
         console.print(note, markup=False)
     if options.dry_run:

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, files, optimize, runs
-from codesign_jax.commands import common, compare, hosts, reference, status
+from codesign_jax.commands import common, compare, hosts, reference, status, stress
 from codesign_jax.commands.compare import Compared
 from codesign_jax.own import is_own
 from codesign_jax.report import verdicts
@@ -140,6 +140,8 @@ def _tell(
             fresh = reference.judged(own.scene, found)
         if result.test is not None:
             _judge(own, result, fresh, folder, console)
+            if fresh is not None:
+                stress.of_run(folder, own.settings, console)
         _say_places(result, folder, console)
 
 
@@ -179,6 +181,7 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
+        print(f"other conditions: {stress.TRIALS * stress.sets(scene)} grasps")
     print("time: `codesign check` measures it on this machine")
 
 
@@ -202,7 +205,7 @@ def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
         console.print(f"converged from episode {converged + 1} on, after {grasps} grasps")
     if result.test is not None:
         best = particles[int(np.asarray(result.test.cost).argmin())]
-        console.print(f"best final particle: {runs.describe(plan.space, best)}")
+        console.print(runs.describe(plan.space, best, "best final particle"), markup=False)
 
 
 def _judge(

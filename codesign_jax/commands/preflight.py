@@ -97,7 +97,7 @@ def _sections(scene: Scene, one: Params, name: str) -> list[str]:
     """Why a design's numbers are no hand."""
     if not all(np.isfinite(v).all() for v in one):
         return [f"{name}: a parameter is not a finite number"]
-    found, limit = [], scene.hand.pressure_limit.per_wall
+    found = []
     for f in range(scene.num_fingers):
         where = f"{name}: finger {f}"
         length, height, wall = (float(v[f]) for v in (one.length, one.height, one.wall))
@@ -108,10 +108,11 @@ def _sections(scene: Scene, one: Params, name: str) -> list[str]:
                 f"{where}: walls of {wall:g} m leave no air chamber in a section of {height:g} m "
                 f"by {scene.hand.section.width:g} m"
             )
-        if one.pressure[f] > limit * wall * (1 + 1e-6):
+            continue
+        if one.pressure[f] > (limit := scene.hand.pressure_limit.of(height, wall)) * (1 + 1e-6):
             found.append(
                 f"{where}: pressure {one.pressure[f]:.4g} Pa is above the limit of "
-                f"{limit * wall:.4g} Pa for a wall of {wall:g} m"
+                f"{limit:.4g} Pa for a wall of {wall:g} m"
             )
     return found
 

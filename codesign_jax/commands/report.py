@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from rich.console import Console
 
 from codesign_jax import runs
-from codesign_jax.commands import common, reference
+from codesign_jax.commands import common, reference, stress
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.manifest import read_provenance
@@ -45,7 +45,17 @@ def main(options: "Report") -> int:
     provenance = read_provenance(options.folder)
     found, why = reference.stored(options.folder, settings)
     fresh = None if found is None else reference.judged(scene, found)
-    run = Run(options.folder, scene, settings, record, chosen, provenance, fresh, tuple(notes))
+    run = Run(
+        options.folder,
+        scene,
+        settings,
+        record,
+        chosen,
+        provenance,
+        fresh,
+        tuple(notes),
+        stress.stored(options.folder, settings),
+    )
     console = Console(highlight=False, soft_wrap=True)
     if why:
         console.print(f"{options.folder / reference.FILE} {why}: left out", markup=False)

@@ -10,7 +10,9 @@ from codesign_jax.export.process import Size
 from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
+from codesign_jax.report import stress
 from codesign_jax.report.statistics import Interval
+from codesign_jax.report.stress import Stress
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -24,6 +26,9 @@ class SheetSection(NamedTuple):
     head: tuple[str, ...]
     rows: list[tuple[str, ...]]
     notes: list[str]
+
+
+Tested = tuple[str | None, Stress | None]
 
 
 class Drift(NamedTuple):
@@ -47,7 +52,11 @@ class Drift(NamedTuple):
 
 
 def sheet_sections(
-    scene: Scene, params: Params, sizes: Sequence[Size], drift: Drift | None
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    drift: Drift | None,
+    tested: Tested = (None, None),
 ) -> list[SheetSection]:
     """The sheet's content.
 
@@ -56,18 +65,35 @@ def sheet_sections(
       params: Parameters of the design as concrete arrays.
       sizes: Dimensions of the fingers.
       drift: Tolerances, or None if they were not asked for.
+      tested: The verdict of the run that found the design, and its grasps under other conditions.
     """
-    found = [_fingers(scene, params, sizes), _mounts(scene, params), _material(scene)]
+    found = [
+        _tests(scene, params, *tested),
+        _fingers(scene, params, sizes),
+        _mounts(scene, params),
+        _material(scene),
+    ]
     found.append(_control(scene, params))
     return [*found, tolerance_section(drift)]
+
+
+def _tests(scene: Scene, params: Params, verdict: str | None, found: Stress | None) -> SheetSection:
+    title = f"Verdict: {verdict or 'not judged at accuracy reference'}"
+    warnings = stress.of_design(scene, params) + [*(found.warnings if found else ())]
+    notes = [f"Warning: {words}." for words in warnings]
+    if not found:
+        return SheetSection(title, (), [], notes)
+    return SheetSection(title, found.head, found.rows, notes)
 
 
 def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
     density = scene.hand.material.density
     rows = []
-    for i, (size, angle) in enumerate(zip(sizes, bends(scene, params), strict=True)):
+    for i, (size, angle) in enumerate(
+        zip(sizes, morphology.free_bends(scene.hand, params), strict=True)
+    ):
         pressure = float(params.pressure[i])
-        limit = scene.hand.pressure_limit.per_wall * float(params.wall[i])
+        limit = scene.hand.pressure_limit.of(float(params.height[i]), float(params.wall[i]))
         chamber = " x ".join(f"{v:.1f}" for v in size.chamber)
         numbers = [size.length, size.width, size.height]
         rows.append(
@@ -97,13 +123,6 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
 def _castable(thickness: float) -> str:
     """A thickness [mm] to what a mould can be made to."""
     return f"{round(20 * thickness) / 20:.2f}"
-
-
-def bends(scene: Scene, params: Params) -> np.ndarray:
-    """Angles by which the free fingers bend at their pressures [rad], by the linear law."""
-    beam = morphology.finger_beams(scene.hand, Params(*(np.asarray(v, float) for v in params)))
-    curvature = np.asarray(params.pressure) * beam.moment_per_pressure / beam.bending
-    return np.asarray(curvature * np.asarray(params.length))
 
 
 def places(scene: Scene, params: Params) -> tuple[np.ndarray, np.ndarray]:

@@ -153,9 +153,9 @@ def _limits(
         for j, name in enumerate(space.names):
             for i in np.nonzero([n.split("[")[0] == name.split("[")[0] for n in whole.names])[0]:
                 low[i], high[i] = min(low[i], space.low[j]), max(high[i], space.high[j])
-    per_wall = whole.hand.pressure_limit.per_wall
-    params = whole.params(centre)
-    caps, floors = per_wall * np.asarray(params.wall), np.asarray(params.pressure) / per_wall
+    limit, params = whole.hand.pressure_limit, whole.params(centre)
+    caps = limit.of(np.asarray(params.height), np.asarray(params.wall))
+    floors = np.asarray(params.pressure) / limit.per_wall
     for i, name in enumerate(whole.names):
         row, _, index = name.partition("[")
         fingers = slice(int(index[:-1]), int(index[:-1]) + 1) if index else slice(None)

@@ -3,10 +3,11 @@
 import jax
 import numpy as np
 
-from codesign_jax.report import markup, verdicts
+from codesign_jax.report import markup, stress, verdicts
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.statistics import wilson
 from codesign_jax.report.verdicts import Judged
+from codesign_jax.runs import tables
 
 
 def design(run: Run) -> str:
@@ -25,9 +26,21 @@ def design(run: Run) -> str:
         *(markup.paragraph(words, "note") for words in verdicts.solver(judged.outcomes)),
         markup.paragraph(note + "More fresh trials: ", "note", again),
         _by_object(run, judged),
+        *_builder(run),
         _parameters(run),
     ]
     return markup.section("Chosen design", *parts)
+
+
+def _builder(run: Run) -> list[str]:
+    """What the design keeps under other conditions, and warnings of it."""
+    warnings = stress.of_design(run.scene, run.space.params(run.chosen.design))
+    parts = []
+    if found := run.stress:
+        warnings += found.warnings
+        words = f"Under other conditions, {found.trials} grasps each at the run's accuracy:"
+        parts = [markup.paragraph(words), markup.table(found.head, found.rows, (1, 2))]
+    return [*parts, *(markup.paragraph(f"Warning: {words}.", "warning") for words in warnings)]
 
 
 def _by_object(run: Run, judged: Judged) -> str:
@@ -49,19 +62,29 @@ def _by_object(run: Run, judged: Judged) -> str:
 
 
 def _parameters(run: Run) -> str:
-    """The design's parameters, a row each."""
+    """The design's parameters: a row for each finger, and one for each of the hand's others."""
     space = run.space
     values, low, high = (
         space.in_units(np.asarray(v)) for v in (run.chosen.design, space.low, space.high)
     )
-    rows = []
-    for k, name in enumerate(space.names):
+    own, others = tables.by_finger(space)
+
+    def scale(k: int) -> markup.Html:
         at = 100 * float((values[k] - low[k]) / (high[k] - low[k]))
-        bar = markup.Html(
-            f"<div class='scale'><i style='left:{min(max(at, 0), 100):.1f}%'></i></div>"
-        )
-        domain = "morphology" if space.is_morphology[k] else "control"
-        number = (f"{v:.4g}" for v in (values[k], low[k], high[k]))
-        rows.append((name, *number, space.units[k], domain, bar))
-    head = ("parameter", "value", "lowest", "highest", "unit", "domain", "within its range")
-    return markup.table(head, rows, (1, 2, 3))
+        bar = f"<div class='scale'><i style='left:{min(max(at, 0), 100):.1f}%'></i></div>"
+        span = f"{low[k]:.4g} to {high[k]:.4g} {space.units[k]}"
+        return markup.Html(f"<span title='{markup.text(span)}'>{values[k]:.4g}{bar}</span>")
+
+    def named(name: str, k: int) -> str:
+        return f"{name} {space.units[k]}"
+
+    parts = [markup.paragraph("Below each value its place in its range.", "note")]
+    if own:
+        head = ("finger", *(named(name, at[0]) for name, at in own.items()))
+        count = len(next(iter(own.values())))
+        rows = [(str(f), *(scale(at[f]) for at in own.values())) for f in range(count)]
+        parts.append(markup.table(head, rows, (*range(1, len(head)),)))
+    if others:
+        head = [named(space.names[k], k) for k in others]
+        parts.append(markup.table(head, [[scale(k) for k in others]], (*range(len(head)),)))
+    return "".join(parts)

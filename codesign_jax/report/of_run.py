@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from codesign_jax.report.stress import Stress
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings
 from codesign_jax.runs.choice import Chosen
@@ -25,6 +26,7 @@ class Run(NamedTuple):
       provenance: Content of its provenance.json.
       reference: The design's fresh trials at the end of the run; None without them.
       notes: What is amiss with the run, in sentences.
+      stress: The design's grasps under other conditions; None without them.
     """
 
     folder: Path
@@ -35,6 +37,7 @@ class Run(NamedTuple):
     provenance: dict[str, Any]
     reference: Judged | None = None
     notes: tuple[str, ...] = ()
+    stress: Stress | None = None
 
     @property
     def judged(self) -> Judged:

@@ -93,10 +93,8 @@ def _solved(run: Run) -> str:
     test = run.record.test
     first = np.unique(np.asarray(run.record.state.particles), axis=0, return_index=True)[1]
     good = verdicts.good(jax.tree.map(lambda v: np.asarray(v)[first], test))
-    trials = test.cost.shape[1]
-    return (
-        f"{good.sum()} of {good.size} different ones are good in {trials} trials of its final test"
-    )
+    trials = f"{test.cost.shape[1]} trials of the final test"
+    return f"{good.sum()} of {good.size} are good in {trials}; copies count once"
 
 
 def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
@@ -154,7 +152,7 @@ def _landscape(run: Run) -> str:
             figure = charts.designs(run.history, space, run.chosen.design, found)
         else:
             own = np.allclose(found.design, run.chosen.design)
-            around = "the chosen design" if own else tables.describe(space, found.design)
+            around = "the chosen design" if own else "another design, which landscape.npz has"
             words = f"In grey {grey} The other parameters are those of {around}."
             figure = charts.landscape_figure(found)
     section = markup.paragraph(words, "", command), charts.html(figure, "landscape")

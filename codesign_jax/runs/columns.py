@@ -214,6 +214,7 @@ FILES = {
     "reference.npz": "outcomes of the chosen design's fresh trials at accuracy `reference`, arrays "
     "of shape (trial,), and the digest of what determines them",
     REFERENCE: "the same trials as a table, with their noise, see below",
+    "stress.npz": "what the design keeps under other conditions, and warnings of it",
     "replay.html": "a grasp in 3D, of `codesign replay`: opens in any browser, without a network",
     "report.html": "the report of `codesign report`: opens in any browser, without a network",
 }

@@ -281,8 +281,8 @@ class Loop:
                 seed, cost, drawn = yield from self._evaluated(search)
             except NoSeed as error:
                 raise RunError(str(error)) from error
-        design = tables.describe(plan.space, np.asarray(seed))
-        self._say(f"seed {design}: cost {cost:.3f}, candidate {drawn} ({watch.seconds:.1f} s)")
+        found = f"cost {cost:.3f}, candidate {drawn} ({watch.seconds:.1f} s)"
+        self._say(f"seed particle: {found}")
         return Start(np.asarray(seed), np.asarray(cost, np.float32), np.asarray(drawn))
 
     def _evaluated(

@@ -132,10 +132,38 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
     _replace(path, written([*MORE[REFERENCE].columns], rows))
 
 
-def describe(space: DesignSpace, design: np.ndarray) -> str:
-    """Formats a design [SI units] in the hand file's units, e.g. "length=110 mm arm_z=20 mm"."""
-    values = zip(space.names, space.in_units(design), space.units, strict=True)
-    return " ".join(f"{name}={value:.4g} {unit}" for name, value, unit in values)
+def by_finger(space: DesignSpace) -> tuple[dict[str, list[int]], list[int]]:
+    """Indices of the parameters that each finger has of its own, by name, and of the others."""
+    own: dict[str, list[int]] = {}
+    for k, name in enumerate(space.names):
+        if name.endswith("]"):
+            own.setdefault(name.partition("[")[0], []).append(k)
+    fingers = {k for places in own.values() for k in places}
+    return own, [k for k in range(space.num_parameters) if k not in fingers]
+
+
+def describe(space: DesignSpace, design: np.ndarray, title: str = "design") -> str:
+    """A design [SI units] in the hand file's units, such as "design: length=110 mm arm_z=20 mm".
+
+    Where fingers have parameters of their own, a table with a row for each finger, and one of the
+    other parameters.
+    """
+    own, others = by_finger(space)
+    values, units = [f"{value:.4g}" for value in space.in_units(design)], space.units
+    if not own:
+        pairs = zip(space.names, values, units, strict=True)
+        return f"{title}: " + " ".join(f"{name}={value} {unit}" for name, value, unit in pairs)
+    fingers = [[name, units[at[0]], *(values[k] for k in at)] for name, at in own.items()]
+    index = ["finger", "", *map(str, range(len(fingers[0]) - 2))]
+    hand = [[space.names[k], units[k], values[k]] for k in others]
+    return "\n".join([f"{title}:", *_aligned([index, *fingers]), *_aligned(hand)])
+
+
+def _aligned(columns: list[list[str]]) -> list[str]:
+    """Rows of a table whose columns are given, its numbers one below the other."""
+    widths = [max(map(len, column)) for column in columns]
+    rows = zip(*columns, strict=True)
+    return ["  ".join(["", *map(str.rjust, row, widths)]) for row in rows]
 
 
 def status_names(status: int) -> str:

@@ -135,6 +135,7 @@ class Scene(SceneFile):
             fixed,
             name="",
             description="",
+            limits=dataclasses.replace(fixed.limits, strain=None),
             phases=Phases(*ends, deflate_time=step),
             hand=hand.structure(fixed.hand),
             objects=objects.structure(fixed.objects),

@@ -31,6 +31,7 @@ from codesign_jax.scene.hand_tables import (
     Section,
     Wrist,
     per_finger,
+    with_strain,
 )
 
 
@@ -276,4 +277,5 @@ __all__ = [
     "Wrist",
     "load",
     "structure",
+    "with_strain",
 ]

@@ -8,6 +8,7 @@ import dataclasses
 import math
 from typing import Any, NamedTuple
 
+from codesign_jax.scene.beams import strain_pressure
 from codesign_jax.scene.schema import choice, quantity
 
 # Unit of a file -> (SI unit, factor).
@@ -208,6 +209,27 @@ class PressureLimit:
     """
 
     per_wall: float = quantity("Pa/m", 1e5, 1e9, structure=True)
+    # What `limits.strain` of the scene needs; see `with_strain`.
+    strain: tuple[float, float, float, bool] | None = dataclasses.field(
+        default=None, metadata={"in_file": False}
+    )
+
+    def of(self, height: Any, wall: Any) -> Any:
+        """Highest pressure of fingers of a height and wall [m], any shape [Pa]."""
+        highest = self.per_wall * wall
+        if self.strain is None:
+            return highest
+        strain, width, modulus, neo_hookean = self.strain
+        how = {"width": width, "shear_modulus": modulus, "neo_hookean": neo_hookean}
+        stretched = strain_pressure(strain, height, wall, **how)
+        return highest + (stretched - highest) * (stretched < highest)
+
+
+def with_strain(hand: "Hand", strain: float | None, *, neo_hookean: bool) -> "Hand":
+    """A hand whose pressures stretch no wall of a free finger by more than a strain, if any."""
+    own = (strain, hand.section.width, hand.material.shear_modulus, neo_hookean)
+    limit = dataclasses.replace(hand.pressure_limit, strain=None if strain is None else own)
+    return dataclasses.replace(hand, pressure_limit=limit)
 
 
 @dataclasses.dataclass(frozen=True)

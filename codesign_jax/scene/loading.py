@@ -62,6 +62,8 @@ def load(
     if problems or parsed is None:
         raise schema.InputError(problems)
     parts["objects"] = reach.fit(parts["objects"], parts["hand"])
+    law = parsed.effects.neo_hookean
+    parts["hand"] = hand.with_strain(parts["hand"], parsed.limits.strain, neo_hookean=law)
     names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
     return Scene(**parts, **{n: getattr(parsed, n) for n in names})
 

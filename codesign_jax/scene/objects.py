@@ -41,6 +41,8 @@ class Noise:
       friction: Of the friction of all contacts, relative.
       stiffness: Of the fingers' shear modulus, relative.
       hand_mass: Of the masses of fingers and palm, relative.
+      mass_range: Largest factor by which an object is heavier besides, drawn log-uniformly from 1;
+        1 for none. No standard deviation.
     """
 
     position: float = quantity("m", 0, 0.1)
@@ -50,6 +52,7 @@ class Noise:
     friction: float = quantity("", 0, 1, default=0.0)
     stiffness: float = quantity("", 0, 1, default=0.0)
     hand_mass: float = quantity("", 0, 1, default=0.0)
+    mass_range: float = quantity("", 1, 100, default=1.0)
 
 
 ROBUST = Noise(
@@ -60,10 +63,12 @@ ROBUST = Noise(
     friction=0.2,
     stiffness=0.15,
     hand_mass=0.1,
+    mass_range=10.0,
 )
-"""Noise of `--robust` [ours]: placement and size twice the paper's, mass three times, and what the
-paper keeps: friction, of which two materials differ by more, stiffness as between two castings of
-one silicone, and the masses of fingers and palm."""
+"""Noise of `--robust` [ours]: placement and size twice the paper's, mass three times and up to ten
+times the object's, 50 to 500 g for the paper's, and what the paper keeps: friction, of which two
+materials differ by more, stiffness as between two castings of one silicone, and the masses of
+fingers and palm."""
 
 
 @dataclasses.dataclass(frozen=True)

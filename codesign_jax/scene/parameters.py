@@ -113,6 +113,9 @@ class DesignSpace:
     def project(self, design: jax.typing.ArrayLike) -> jax.Array:
         """Lowers free pressures under their limit p_i < per_wall * d_i (Table I).
 
+        If the scene has `limits.strain`, also under the pressure at which the walls of a free
+        finger have that strain.
+
         Args:
           design: Design vector [SI], shape (parameter,).
 
@@ -223,7 +226,8 @@ class DesignSpace:
         source, start = np.asarray(self.source), _offsets(self.hand)
         full = np.where(source >= 0, rows[:, np.maximum(source, 0)], np.asarray(self.base))
         fingers = np.arange(len(self.hand.finger))
-        caps = self.hand.pressure_limit.per_wall * full[:, start["wall"] + fingers]
+        sizes = (full[:, start[name] + fingers] for name in ("height", "wall"))
+        caps = self.hand.pressure_limit.of(*sizes)
         # A pressure at its limit is a legal one, also as a float32.
         above = full[:, start["pressure"] + fingers] > caps * (1 + 1e-6)
         return int(above.any(1).sum())
@@ -293,8 +297,8 @@ class DesignSpace:
 def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
     """`DesignSpace.project` of a design whose units are known to be right; one program a space."""
     full, offsets = space.expand(design), _offsets(space.hand)
-    wall = full[offsets["wall"] : offsets["wall"] + len(space.hand.finger)]
-    caps = space.hand.pressure_limit.per_wall * wall * _STRICT
+    height, wall = (full[offsets[n] :][: len(space.hand.finger)] for n in ("height", "wall"))
+    caps = space.hand.pressure_limit.of(height, wall) * _STRICT
     start = offsets["pressure"]
     for i in range(len(space.hand.finger)):
         j = space.source[start + i]

@@ -245,7 +245,10 @@ class Limits:
     Attributes:
       speed: Largest velocity of any joint.
       penetration: How far the object's centre may be below the table.
+      strain: Largest strain of the walls of a free finger at its pressure; pressures of a search
+        are lowered to it, as to the hand's pressure limit. Not given: no such limit.
     """
 
     speed: float = quantity("rad/s or m/s", 1, 1e9)
     penetration: float = quantity("m", 1e-4, 1)
+    strain: float | None = quantity("", 0.05, 10, structure=True, default=None)

@@ -1,0 +1,109 @@
+"""What poses of a hand say of its design: where fingers overlap, and how far their walls stretch.
+
+A link reaches from its joint to the next one, the last to the tip's flat face, with the outline
+|y/a|^4 + |z/b|^4 = 1.  A depth is the distance to it, to first order, or to the tip's face where
+that is nearer.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codesign_jax.model.layout import first_on_palm, layout
+from codesign_jax.scene import Scene
+from codesign_jax.types import Params
+
+_AROUND, _ALONG, _INNER = 16, (0.0, 0.25, 0.5, 0.75, 1.0), (0.9, 0.5, 0.0)
+"""Points of an outline, its places on a link as shares of the link, and outlines of the tip's face
+as shares of the section."""
+_APART = 3
+"""Links of one finger that are so far apart stand in one another only where it coils."""
+
+
+class Overlaps(NamedTuple):
+    """Depths of the deepest points of surfaces [m], 0 where there is no overlap.
+
+    Attributes:
+      fingers: Of finger i in finger j, shape (state, i, j); on the diagonal that of a finger in
+        itself.
+      palm: Of each finger in the palm's disc, shape (state, finger), without its first quarter,
+        which is fixed to the palm.
+    """
+
+    fingers: np.ndarray
+    palm: np.ndarray
+
+
+def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) -> Overlaps:
+    """Overlaps in states of one hand.
+
+    Args:
+      scene: The scene.
+      params: The hand.
+      place: Origins of the bodies' frames [m], shape (state, body, 3).
+      turn: Their orientations, shape (state, body, 3, 3).
+    """
+    lay, disc = layout(scene), scene.hand.palm
+    links, count = lay.links, scene.num_fingers
+    whole = np.where(np.arange(links) < links - 1, 1, 0.5)
+    angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
+    unit = np.stack([np.cos(angle), np.sin(angle)], 1)
+    unit /= ((unit**4).sum(1) ** 0.25)[:, None]
+    points, owners, sizes = [], [], []
+    for f, bodies in enumerate(lay.bodies):
+        half = np.array([scene.hand.section.width, float(params.height[f])]) / 2
+        span = float(params.length[f]) / links * whole
+        local = [
+            np.c_[np.full(_AROUND, part * s), unit * half + [0, half[1]]]
+            for s in span
+            for part in _ALONG
+        ]
+        face = np.concatenate([unit * half * part for part in _INNER]) + [0, half[1]]
+        local.append(np.c_[np.full(len(face), span[-1]), face])
+        own = np.repeat(np.arange(links), _AROUND * len(_ALONG))
+        own = np.append(own, np.full(len(face), links - 1))
+        at = np.array(bodies)[own]
+        moved = np.einsum("spij,pj->spi", turn[:, at], np.concatenate(local))
+        points.append(place[:, at] + moved)
+        owners.append(own)
+        sizes.append((span, *half))
+    found = np.zeros((len(place), count, count))
+    palm = np.zeros((len(place), count))
+    for i, own in enumerate(owners):
+        free = points[i][:, own >= first_on_palm(links) - 1]
+        x, y, z = np.moveaxis((free - place[:, None, 1]) @ turn[:, 1], -1, 0)
+        inside = np.minimum(disc.radius - np.hypot(x, y), np.minimum(z, disc.thickness - z))
+        palm[:, i] = np.maximum(inside.max(1), 0)
+        for j, bodies in enumerate(lay.bodies):
+            away = points[i][:, None] - place[:, bodies, None]
+            depth = _depths(away @ turn[:, bodies], *sizes[j])
+            if i == j:
+                near = np.abs(own - np.arange(links)[:, None]) < _APART
+                depth = np.where(near, 0.0, depth)
+            found[:, i, j] = depth.max((1, 2))
+    return Overlaps(found, palm)
+
+
+def _depths(local: np.ndarray, span: np.ndarray, a: float, b: float) -> np.ndarray:
+    """Depths of points in the frames of links, shape (state, link, point, 3), in these links."""
+    x, y, z = np.moveaxis(local, -1, 0)
+    units = np.abs([y / a, (z - b) / b])
+    phi = np.maximum((units**4).sum(0) ** 0.25, 1e-9)
+    slope = np.sqrt((units[0] / phi) ** 6 / a**2 + (units[1] / phi) ** 6 / b**2)
+    slope = np.where(slope > 0, slope, 1 / min(a, b))  # on the axis
+    inside = (x >= 0) & (x <= span[:, None]) & (phi < 1)
+    last = np.arange(len(span)) == len(span) - 1
+    to_face = np.where(last[:, None], span[:, None] - x, np.inf)
+    return np.where(inside, np.minimum((1 - phi) / slope, to_face), 0.0)
+
+
+def bend_angles(scene: Scene, qpos: Any) -> np.ndarray:
+    """Bends of the fingers' joints [rad], (..., finger, link), of positions (..., nq)."""
+    lay = layout(scene)
+    return np.asarray(qpos)[..., lay.dofs[:, :, lay.axes.index("bend")]]
+
+
+def wall_strain(scene: Scene, params: Params, bends: np.ndarray) -> np.ndarray:
+    """Strain of the walls farthest from the bottom layer, kappa h, shaped as `bends`."""
+    segment = np.asarray(params.length) / layout(scene).links
+    return bends * (np.asarray(params.height) / segment)[:, None]

@@ -1,0 +1,198 @@
+"""A design under other conditions, and what is amiss with the design itself."""
+
+import io
+import re
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy import integrate, optimize
+
+from codesign_jax import codesign, constants, model, runs, scene
+from codesign_jax.commands import stress as commands_stress
+from codesign_jax.model import morphology, overlap
+from codesign_jax.report import stress
+from codesign_jax.scene import beams, parameters
+from tests.helpers.command_runs import command, finished_run, own_workplace  # noqa: F401
+from tests.helpers.toy_engine import TINY
+
+PAPER = scene.load("paper")
+SPACE = parameters.design_space(PAPER.hand, "full")
+HAND = jax.tree.map(np.asarray, SPACE.params(SPACE.default()))
+
+
+def test_conditions_are_numbers_within_the_files_ranges():
+    """Masses are four and ten times as large, at most 500 g; what is not named stays."""
+    found = [*commands_stress.variants(PAPER)]
+    names = [name for name, _ in found]
+    assert names[:3] == ["objects of 200 g", "objects of 500 g", "friction 0.4 on the hand"]
+    assert len(names) == 3 + commands_stress.DRAWS and len({*names[3:]}) == 1
+    usual = PAPER.constants()
+    for _, numbers in found:
+        constants.check(PAPER, numbers)
+        assert numbers.phases == usual.phases and numbers.hand.palm == usual.hand.palm
+    assert [o.mass for o in found[1][1].objects.object] == [0.5] * 3
+    ratio = [c.contact.normal_stiffness / usual.contact.normal_stiffness for _, c in found[3:]]
+    low, high = commands_stress.FACTORS["contact", "normal_stiffness"]
+    assert len({*ratio}) == len(ratio) and low <= min(ratio) and max(ratio) <= high
+    masses = {f"objects.object.{o.name}.mass": 0.18 for o in PAPER.objects.object}
+    heavy = scene.load("paper", overrides=masses | {"objects.object.sphere.mass": 0.7})
+    [(name, numbers), (after, _), *_] = commands_stress.variants(heavy)
+    assert (name, after) == ("objects of 500 to 700 g", "friction 0.4 on the hand")
+    assert [o.mass for o in numbers.objects.object] == [0.5, 0.5, 0.7]
+
+
+def placed():
+    """Poses (state, body, 3), all turned alike: fingers a metre apart, links in a row."""
+    lay = model.layout(PAPER)
+    place = np.zeros((1, len(lay.centre_weights), 3))
+    for f, bodies in enumerate(lay.bodies):
+        segment = HAND.length[f] / lay.links
+        place[0, bodies] = np.c_[segment * np.arange(lay.links), np.full((lay.links, 2), f + 1.0)]
+    return lay, place, np.broadcast_to(np.eye(3), (*place.shape[:2], 3, 3))
+
+
+def test_overlaps_are_depths_of_sections():
+    """A bottom face that is d below another section's top is d deep, in itself and in others."""
+    lay, place, turn = placed()
+    alone = overlap.overlaps(PAPER, HAND, place, turn)
+    assert not alone.fingers.any() and not alone.palm.any()
+    depth, height = 0.004, float(HAND.height[0])
+    place[0, lay.bodies[1]] = place[0, lay.bodies[0]] + [0, 0, height - depth]
+    found = overlap.overlaps(PAPER, HAND, place, turn).fingers[0]
+    # To first order: the rounded outline is 1 % nearer beside the middle.
+    assert found[1, 0] == pytest.approx(depth, rel=0.02) == found[0, 1]
+    found[1, 0] = found[0, 1] = 0
+    assert not found.any()
+    lay, place, turn = placed()
+    place[0, lay.bodies[2][7]] = place[0, lay.bodies[2][1]] + [0, 0, height - depth]
+    place[0, lay.bodies[3][5]] = [0, 0, PAPER.hand.palm.thickness - depth]
+    found = overlap.overlaps(PAPER, HAND, place, turn)
+    assert found.fingers[0, 2, 2] == pytest.approx(depth, rel=0.02)
+    assert found.palm[0] == pytest.approx([0, 0, 0, depth])
+    words = stress.of_overlaps(PAPER, HAND, [found])
+    assert words[0].startswith("finger 2 stands 4 mm deep in itself")
+    assert words[1] == "finger 3 stands 4 mm deep in the palm" and len(words) == 2
+
+
+def test_strain_is_curvature_times_height():
+    bends = np.full((1, 1, 4, 10), np.radians(40.0))  # 400 degrees each
+    strain = overlap.wall_strain(PAPER, HAND, bends)
+    np.testing.assert_allclose(strain[0, 0, 0], np.radians(400) / HAND.length[0] * HAND.height[0])
+    words = stress.of_bends(strain, bends)
+    assert len(words) == 8 and words[0].startswith(
+        f"finger 0: its walls stretch by {100 * strain.max():.0f} %"
+    )
+    assert words[4] == "finger 0 bends by 400° in grasps, more than a turn"
+    assert stress.of_bends(strain[:0], bends[:0]) == [] == stress.of_overlaps(PAPER, HAND, [])
+
+
+@pytest.mark.parametrize("neo_hookean", [False, True])
+def test_the_strain_s_pressure_is_that_of_the_wall_s_stress(neo_hookean):
+    """By SciPy: the curvature at which the integral of the stress over the section balances
+    the pressure's moment; 4 G e of the linear law, G (l - l^-3) of the neo-Hookean one."""
+    height, wall, width, modulus, strain = 0.02, 0.004, 0.024, 35e3, 1.3
+    how = {"width": width, "shear_modulus": modulus, "neo_hookean": neo_hookean}
+    pressure = beams.strain_pressure(strain, np.array(height), np.array(wall), **how)
+
+    def stress_at(e):
+        return modulus * (1 + e - (1 + e) ** -3) if neo_hookean else 4 * modulus * e
+
+    def moment(curvature):
+        def block(breadth, low, high):
+            return breadth * integrate.quad(lambda y: stress_at(curvature * y) * y, low, high)[0]
+
+        return block(width, 0, height) - block(width - 2 * wall, wall, height - wall)
+
+    chamber = (width - 2 * wall) * (height - 2 * wall) * height / 2
+    curvature = optimize.brentq(lambda k: moment(k) - pressure * chamber, 1.0, 500.0)
+    assert curvature * height == pytest.approx(strain, rel=1e-6)
+
+
+@pytest.mark.parametrize("law", ["false", "true"])
+def test_no_design_of_a_space_is_beyond_the_strain(law):
+    """Those that are drawn, projected and proposed; pressures alone change. Without the limit
+    Table I allows more."""
+    limited = scene.load(
+        "paper", overrides={"limits.strain": 1.0, "effects.neo_hookean": law == "true"}
+    )
+    space = parameters.design_space(limited.hand, "full")
+    drawn = {s: np.asarray(s.sample(jax.random.key(1), 200)) for s in (space, SPACE)}
+
+    def highest(design):
+        own = SPACE.params(design)
+        how = {
+            "width": PAPER.hand.section.width,
+            "shear_modulus": PAPER.hand.material.shear_modulus,
+        }
+        caps = beams.strain_pressure(1.0, own.height, own.wall, neo_hookean=law == "true", **how)
+        return np.asarray(own.pressure / caps)
+
+    before = np.array([highest(d).max() for d in drawn[SPACE]])
+    after = np.array([highest(d).max() for d in drawn[space]])
+    assert before.max() > 1.2 and after.max() <= 1 and (after[before > 1] > 0.999).all()
+    same = [k for k, name in enumerate(space.names) if not name.startswith("pressure")]
+    np.testing.assert_array_equal(drawn[space][:, same], drawn[SPACE][:, same])
+    with pytest.warns(UserWarning, match="pressure above the limit"):
+        space.check(drawn[SPACE])
+    optimizer = codesign.make_optimizer("cma-es", space)
+    state = optimizer.init(jax.random.key(0), space.default(), 8)
+    mask = np.ones(space.num_parameters, bool)
+    for _ in range(4):  # the highest pressures cost least
+        population = optimizer.ask(state, mask)
+        cost = -np.asarray(population)[:, -4:].sum(1) / 1e5
+        state, _ = optimizer.tell(state, population, cost, mask)
+        assert max(highest(d).max() for d in population) <= 1
+    assert max(highest(d).max() for d in state.particles) <= 1
+
+
+def test_warnings_of_a_design():
+    assert stress.of_design(PAPER, HAND) == []
+    limit = PAPER.hand.pressure_limit.per_wall * 0.003
+    changed = HAND._replace(
+        wall=HAND.wall * 0 + 0.003,
+        length=HAND.length * 0 + [0.05, 0.05, 0.05, 0.175],
+        pressure=np.array([0.0, 0.9 * limit, limit, 0.9 * limit]),
+        arm=np.array([0, 0, -0.02, np.radians(40), 0, 0]),
+    )
+    free = np.degrees(morphology.free_bends(PAPER.hand, changed))
+    palm = 45 * np.sin(np.radians(40)) + 20 - 1e3 * PAPER.arm.zero_height
+    assert stress.of_design(PAPER, changed) == [
+        "finger 2: its pressure is at its limit, 120 kPa",
+        f"finger 3 bends by {free[3]:.0f}° without load, more than a turn",
+        f"the palm's rim is commanded {palm:.0f} mm below the table",
+    ]
+
+
+def test_stress_is_told_kept_and_reported(finished, capsys):
+    """Kept grasps of each condition are those of `codesign evaluate` with its numbers."""
+    settings = runs.read_run(finished)[1]
+    assert commands_stress.stored(finished, settings) is None
+    text = io.StringIO()
+    commands_stress.of_run(finished, settings, Console(file=text, width=100))
+    found = commands_stress.stored(finished, settings)
+    assert [*dict.fromkeys(found.conditions)][-1] == "neo-Hookean bending law"
+    assert "under other conditions, 12 grasps each" in text.getvalue()
+    for line in found.lines():
+        assert line.strip() in text.getvalue()
+    (finished / "report.html").unlink(missing_ok=True)
+    assert command("report", finished, "--no-replay") == 0
+    page = (finished / "report.html").read_text(encoding="utf-8")
+    assert "Under other conditions, 12 grasps each" in page and "neo-Hookean bending law" in page
+    other = settings.__class__(**{**vars(settings), "seed": settings.seed + 1})
+    assert commands_stress.stored(finished, other) is None
+
+
+def test_evaluate_stresses_a_design(capsys):
+    """The row of another mass is what an evaluation with that mass finds, in the same trials."""
+    design = ["--scene", TINY, "--engine", "mujoco", "--design", "length=100", "--trials", "3"]
+    assert command("evaluate", *design, "--stress") == 0
+    tiny = scene.load(TINY)
+    name, numbers = next(commands_stress.variants(tiny))
+    kept = re.search(rf"{name} +(\d+ %) of 3 ", capsys.readouterr().out)
+    assert kept and name.startswith("objects of ")
+    pairs = zip(tiny.objects.object, numbers.objects.object, strict=True)
+    masses = [f"objects.object.{o.name}.mass={n.mass}" for o, n in pairs]
+    assert command("evaluate", *design, "--set", *masses) == 0
+    assert f"keeps {kept[1]} of 3 fresh grasps" in capsys.readouterr().out

@@ -13,7 +13,7 @@ from codesign_jax.types import Params
 from tests.helpers import beams, grasps
 from tests.helpers.beams import Finger, finger_scene
 from tests.stability.bench import bench
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 
 HEIGHT, WALL = 0.020, 0.005
 
@@ -111,9 +111,9 @@ def undamped(links):
     1,
     "cantilever, small load",
     "order of the tip's error over N = 5, 10, 20, 40",
-    engine="mujoco",
+    engines=("mujoco",),
     lower=True,
-    quick=((1.0, "float64"),),
+    quick="mujoco",
 )
 def cantilever_order(engine, step, precision):
     """The load is small enough (alpha = 1e-4) for the linear closed form P L^3 / 3 E I."""
@@ -141,6 +141,7 @@ def by_quadrature(rod):
     return 4 * rod.bench.scene.hand.material.shear_modulus * second, first
 
 
+@case(2, "roll-up to a full circle", "tip to root over length", engines=BOTH, quick="mujoco")
 def roll_up(engine, step, precision):
     """M = 2 pi E I / L closes the midpoint chain exactly; pressure grows for 2 s, rests for 3.
 
@@ -156,21 +157,11 @@ def roll_up(engine, step, precision):
     return Found(gap, {"float64": 1e-7, "float32": 1e-5}[precision])
 
 
-case(2, "roll-up to a full circle", "tip to root over length")(roll_up)
-case(
-    2,
-    "roll-up to a full circle",
-    "tip to root over length",
-    engine="mujoco",
-    quick=((1.0, "float64"),),
-)(roll_up)
-
-
 @case(
     3,
     "elastica, alpha = 1, 2, 10",
     "largest error of w/L, u/L, extrapolated from 10 and 20 links, relative",
-    engine="mujoco",
+    engines=("mujoco",),
     steps=(0.2, 0.1, 0.05),
 )
 def elastica_error(engine, step, precision):
@@ -195,7 +186,7 @@ def elastica_error(engine, step, precision):
     3,
     "45 degree bend, P = 300 and 600",
     "largest error of a tip component, relative",
-    engine="mujoco",
+    engines=("mujoco",),
     steps=(0.2, 0.1, 0.05),
 )
 def bend_45(engine, step, precision):

@@ -11,7 +11,7 @@ from tests.helpers import grasps
 from tests.helpers.tables import GRAVITY
 from tests.stability.bench import bench
 from tests.stability.oracle import TIGHT
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 
 RADIUS, FRICTION, LINKS = 0.05, 0.3, 30
 RUN_UP, HANGING = 0.03, 0.05  # straight parts before and behind the cylinder [m]
@@ -79,6 +79,13 @@ def laid_over(b):
     return fields, params.arm
 
 
+@case(
+    32,
+    "belt of 30 links over a turning cylinder",
+    "tension ratio against e^(mu theta), relative",
+    engines=BOTH,
+    steps=(1.0, 0.5),
+)
 def capstan(engine, step, precision):
     """The cylinder turns under the belt, whose root is held: (T1 - T2) R is what slows it.
 
@@ -100,12 +107,3 @@ def capstan(engine, step, precision):
     # A chain's links of 9 degrees hold 0.1 % more than a belt; the hops of a second average out.
     note = f"holds {ratio:.2f} times, e^(mu pi) {expected:.2f}"
     return Found(abs(ratio / expected - 1), 0.01, note)
-
-
-rope = (
-    32,
-    "belt of 30 links over a turning cylinder",
-    "tension ratio against e^(mu theta), relative",
-)
-case(*rope, steps=(1.0, 0.5))(capstan)
-case(*rope, steps=(1.0, 0.5), engine="mujoco")(capstan)

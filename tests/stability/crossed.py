@@ -133,6 +133,10 @@ def against_quadrature(b, roll):
 
 # --- the force at a depth ------------------------------------------------------------------------
 
+ONCE = {"steps": (1.0,), "precisions": ("float64",)}  # a force at rest does not know the step
+FINGERS = "two crossed hull fingers"
+HALF = f"{FINGERS} that hold by friction_memory, half the friction limit"
+BY = "error of the force against the quadrature of the overlap, relative"
 EXACT = 1e-24
 """Newton decrement: steps are solved to rounding."""
 MESHES = ((2, 8), (4, 16), (8, 32))
@@ -146,6 +150,7 @@ def exact(step, precision, *size):
     return bench(crossed(*size), "structured", step, precision, EXACT)
 
 
+@case(34, f"{FINGERS}, flat on flat", f"{BY}; default mesh", precisions=("float64",))
 def on_flat(engine, step, precision):
     """The default mesh, and beside it the force of faces without rounding, k d A / w^2."""
     error, wanted = against_quadrature(exact(step, precision), 0.0)
@@ -153,6 +158,14 @@ def on_flat(engine, step, precision):
     return Found(error, WITHIN, f"{forces} N at 0.5 and 1 mm; sharp edges would have 2 and 4 N")
 
 
+@case(
+    34,
+    f"{FINGERS}, flat on flat",
+    f"{BY}; worst of 5, 10 and 20 links",
+    fails="with five links rings of vertices stand 11 mm apart, twice as far as by default: the "
+    "error falls with the square of that",
+    **ONCE,
+)
 def by_links(engine, step, precision):
     """Straight fingers are the same with any number of links: worst of 5, 10 and 20."""
     errors = [against_quadrature(exact(step, precision, n), 0.0)[0] for n in (5, 10, 20)]
@@ -282,6 +295,7 @@ def pulled(share, seconds, step, precision, *, memory=True):
     return way[:, first:] - way[:, first - 1 : first]
 
 
+@case(34, HALF, "way in 4.5 s under 5 and 15 N", unit="m", precisions=("float64",))
 def creeps(engine, step, precision):
     """Half the limit holds; above it the finger slides off and turns away."""
     way = pulled(0.5, CREEPS, step, precision)
@@ -290,54 +304,23 @@ def creeps(engine, step, precision):
     return Found(np.abs(way).max(), 1e-3, f"{1e9 * last:.2g} nm in the last second")
 
 
+@case(34, HALF, "way in a second without that effect", unit="m", lower=True, **ONCE)
 def creeps_without(engine, step, precision):
     """A damper: 12 to 21 mm/s; after a second the finger turns away."""
     return Found(pulled(0.5, 1.0, step, precision, memory=False)[:, -1].min(), 5e-3)
 
 
-once = {"steps": (1.0,), "precisions": ("float64",)}  # a force at rest does not know the step
-fingers = "two crossed hull fingers"
-by = "error of the force against the quadrature of the overlap, relative"
-case(34, f"{fingers}, flat on flat", f"{by}; default mesh", precisions=("float64",))(on_flat)
-coarse = (
-    "with five links rings of vertices stand 11 mm apart, twice as far as by default: the error "
-    "falls with the square of that"
-)
-case(
-    34,
-    f"{fingers}, flat on flat",
-    f"{by}; worst of 5, 10 and 20 links",
-    failures={(1.0, "float64"): coarse},
-    **once,
-)(by_links)
 for kind, turn in ROLLED.items():
-    title, own = f"{fingers}, {kind}", kind.split()[0]
-    case(34, title, f"{by}; 256 points a link", name=f"mesh_{own}", **once)(
-        functools.partial(by_mesh, turn)
-    )
-    case(34, title, "fall of the force with the depth, relative", name=f"falls_{own}", **once)(
-        functools.partial(falls, turn)
-    )
-    loaded = {"steps": (1.0, 0.5, 0.25), "precisions": ("float64",)}
-    case(34, title, "depth under 15 N over that of meeting axes", name=f"sinks_{own}", **loaded)(
-        functools.partial(sinks, turn)
-    )
-    case(
-        34,
-        title,
-        "depth under a growing and a falling load of 1 to 15 N, largest difference",
-        name=f"snaps_{own}",
-        unit="m",
-        **loaded,
-    )(functools.partial(snaps, turn))
-
-half = "two crossed hull fingers that hold by friction_memory, half the friction limit"
-case(34, half, "way in 4.5 s under 5 and 15 N", unit="m", **loaded)(creeps)
-case(
-    34,
-    half,
-    "way in a second without that effect",
-    unit="m",
-    lower=True,
-    **once,
-)(creeps_without)
+    title, own = f"{FINGERS}, {kind}", kind.split()[0]
+    for function, what, more in (
+        (by_mesh, f"{BY}; 256 points a link", ONCE),
+        (falls, "fall of the force with the depth, relative", ONCE),
+        (sinks, "depth under 15 N over that of meeting axes", {"precisions": ("float64",)}),
+        (
+            snaps,
+            "depth under a growing and a falling load of 1 to 15 N, largest difference",
+            {"precisions": ("float64",), "unit": "m"},
+        ),
+    ):
+        name = f"{function.__name__.removeprefix('by_')}_{own}"
+        case(34, title, what, name=name, **more)(functools.partial(function, turn))

@@ -72,6 +72,17 @@ def millimetres(depths):
     return ", ".join(f"{1e3 * d:.1f}" for d in depths) + " mm"
 
 
+ONE = {"unit": "m", "precisions": ("float32",)}
+CURL = (35, "fingers of the default scene curl onto the palm")
+
+
+@case(
+    *CURL,
+    "deepest point of a finger in the palm",
+    fails="thin fingers that roll up within half a second strike the palm; at rest they are at "
+    "most 2.2 mm deep",
+    **ONE,
+)
 def curls(engine, step, precision):
     depths, end = deepest(step, precision)
     # What was asked for of winners: no link more than 2 mm inside the palm.
@@ -80,24 +91,8 @@ def curls(engine, step, precision):
     )
 
 
+@case(*CURL, "the same without that contact", lower=True, steps=(1.0,), **ONE)
 def without(engine, step, precision):
     """The same without the contact: the case would see it missing."""
     depths, _ = deepest(step, precision, palm=False)
     return Found(depths.max(), 4e-3, f"{millimetres(depths)} by hand")
-
-
-one = {"unit": "m", "precisions": ("float32",)}
-curl = (35, "fingers of the default scene curl onto the palm")
-STRIKES = (
-    "thin fingers that roll up within half a second strike the palm; at rest they are at most "
-    "2.2 mm deep"
-)
-failing = {(step, "float32"): STRIKES for step in (1.0, 0.5, 0.25)}
-case(
-    *curl,
-    "deepest point of a finger in the palm",
-    steps=(1.0, 0.5, 0.25),
-    failures=failing,
-    **one,
-)(curls)
-case(*curl, "the same without that contact", lower=True, steps=(1.0,), **one)(without)

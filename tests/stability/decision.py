@@ -1,8 +1,6 @@
-"""Hard cases 24, 25 and 37: what refinement decides, random particles of Table I, and STUCK."""
+"""Hard cases 24 and 25: what refinement decides of late designs, and random designs of Table I."""
 
 import functools
-import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +9,10 @@ from scipy import stats
 
 from codesign_jax import rollout, scene
 from codesign_jax.cost import particle_cost
-from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
+from codesign_jax.types import WARNINGS, Status
+from tests.helpers import grasps
 from tests.stability.bench import floats, refined
 from tests.stability.table import Found, case
 
@@ -21,23 +20,20 @@ DESIGNS, TRIALS, TRIALS_IN_C = 40, 24, 6
 """MuJoCo C simulates 8 grasps a second: it is compared with over fewer trials."""
 RANKS = 0.9
 """Bound of rank correlations, which was set before any was measured."""
-DATA = Path(__file__).parents[2] / "docs" / "data"
 LATE = np.array([[0.050, -0.055], [0.130, 0.060]])
 """Length and arm height [m] among which an optimisation ends: most designs there keep some of their
 objects and lose others.  Of designs of the whole space most lose all of them and tie."""
 
 
 @functools.cache
-def evaluated(engine, step, precision, links=10, num_trials=TRIALS):
-    """Costs (design, trial) of late 2D designs, and what the particle filter makes of them."""
-    base = refined(
-        scene.load("paper_spheres", overrides={"discretization": {"links": links}}), step
-    )
-    space = parameters.design_space(base.hand, "2d")
-    unit = np.random.default_rng(24).random((DESIGNS, 2))
+def evaluated(engine="structured", step=1.0, precision="float32", links=10, num_trials=TRIALS):
+    """Whether late 2D designs keep their trials (design, trial), and the designs' costs."""
+    loaded = scene.load("paper_spheres", overrides={"discretization": {"links": links}})
+    base, unit = refined(loaded, step), np.random.default_rng(24).random((DESIGNS, 2))
     wide = precision == "float64" and engine == "structured"
     with floats(wide):
         dtype = jnp.float64 if wide else jnp.float32
+        space = parameters.design_space(base.hand, "2d")
         params = jax.vmap(space.params)(jnp.asarray(LATE[0] + (LATE[1] - LATE[0]) * unit, dtype))
         # Drawn in float32 in either case: the same noise.
         with jax.enable_x64(False):
@@ -45,244 +41,101 @@ def evaluated(engine, step, precision, links=10, num_trials=TRIALS):
         trials = jax.tree.map(
             lambda v: jnp.asarray(np.asarray(v), v.dtype if v.dtype == jnp.int32 else dtype), drawn
         )
-        chosen = StructuredEngine(base) if engine == "structured" else MujocoEngine(base)
-        run = jax.jit(lambda p, t: rollout.evaluate(base, chosen, p, t))
-        result = jax.tree.map(np.asarray, run(params, trials))
-        return result.cost, np.asarray(particle_cost(base, jax.tree.map(jnp.asarray, result)))
+        chosen = make_engine(engine, base)
+        result = jax.jit(lambda p, t: rollout.evaluate(base, chosen, p, t))(params, trials)
+        return np.asarray(result.cost == 0), np.asarray(particle_cost(base, result))
+
+
+def compared(measured, bound, one, two):
+    kept, costs = [v[0] for v in (one, two)], [len(np.unique(v[1].round(3))) for v in (one, two)]
+    note = f"{costs[0]} and {costs[1]} different costs, "
+    note += f"{kept[0].mean():.3f} and {kept[1].mean():.3f} kept, "
+    return Found(measured, bound, note + f"{np.mean(kept[0] != kept[1]):.1%} of the verdicts flip")
 
 
 def ranks(one, two):
-    return stats.spearmanr(one[1], two[1])[0]
+    return compared(stats.spearmanr(one[1], two[1])[0], RANKS, one, two)
 
 
 def rates(one, two):
     """Difference of the success rates over the half width of its 95 % interval (paired)."""
-    kept = [(v[0] == 0).astype(float) for v in (one, two)]
-    change = (kept[1] - kept[0]).ravel()
+    change = two[0].astype(float) - one[0]
     half = 1.96 * max(change.std() / np.sqrt(change.size), 1 / change.size)
-    return abs(change.mean()) / half
+    return compared(abs(change.mean()) / half, 1.0, one, two)
 
 
-def other(step, links=10):
-    """The engine that ships at the paper's setting, and at another one."""
-    coarse = evaluated("structured", 1.0, "float32")
-    return coarse, evaluated("structured", step, "float32", links)
+def in_c(precision):
+    """MuJoCo C and the structured engine in the trials that the former simulates."""
+    return [
+        evaluated(engine, 1.0, width, num_trials=TRIALS_IN_C)
+        for engine, width in (("mujoco", "float64"), ("structured", precision))
+    ]
 
 
-def ties(one, two) -> str:
-    costs = [len(np.unique(np.round(v[1], 3))) for v in (one, two)]
-    kept = [np.mean(v[0] == 0) for v in (one, two)]
-    flips = np.mean((one[0] == 0) != (two[0] == 0))
-    return (
-        f"{costs[0]} and {costs[1]} different costs, {kept[0]:.3f} and {kept[1]:.3f} kept, "
-        f"{flips:.1%} of the verdicts flip"
-    )
-
-
-def compare(measure, one, two, bound):
-    return Found(measure(one, two), bound, ties(one, two))
-
-
+many = f"{DESIGNS} late designs, {TRIALS} trials"
+fewer = f"decision of the structured engine, {DESIGNS} late designs, {TRIALS_IN_C} trials"
+ours, once = {"precisions": ("float32",)}, {"steps": (1.0,)}
+correlation, change = "rank correlation", "success rate: change over interval"
 optimistic = (
     "the paper's time step flips verdicts, more to success than to failure; final tests belong to "
     "the preset reference (docs/accuracy.md)"
 )
-many = f"{DESIGNS} late designs, {TRIALS} trials"
-fewer = f"{DESIGNS} late designs, {TRIALS_IN_C} trials"
-ours = {"precisions": ("float32",)}
+finer = (24, f"decision at a smaller step, {many}")
+smaller = {"steps": (0.5, 0.25), **ours}
 
 
-@case(
-    24,
-    f"decision at a smaller step, {many}",
-    "rank correlation",
-    lower=True,
-    steps=(0.5, 0.25),
-    **ours,
-)
+# The engine that ships at the paper's setting, and at another one.
+@case(*finer, correlation, lower=True, **smaller)
 def ranks_by_step(engine, step, precision):
-    return compare(ranks, *other(step), RANKS)
+    return ranks(evaluated(), evaluated(engine, step))
 
 
-@case(
-    24,
-    f"decision at a smaller step, {many}",
-    "success rate: change over interval",
-    steps=(0.5, 0.25),
-    failures={(0.5, "float32"): optimistic, (0.25, "float32"): optimistic},
-    **ours,
-)
+@case(*finer, change, fails=optimistic, **smaller)
 def rates_by_step(engine, step, precision):
-    return compare(rates, *other(step), 1.0)
+    return rates(evaluated(), evaluated(engine, step))
 
 
-@case(
-    24,
-    f"decision at 20 links, {many}",
-    "rank correlation",
-    lower=True,
-    steps=(1.0,),
-    **ours,
-)
+@case(24, f"decision at 20 links, {many}", correlation, lower=True, **once, **ours)
 def ranks_by_links(engine, step, precision):
-    return compare(ranks, *other(1.0, 20), RANKS)
+    return ranks(evaluated(), evaluated(links=20))
 
 
-@case(
-    24, f"decision at 20 links, {many}", "success rate: change over interval", steps=(1.0,), **ours
-)
+@case(24, f"decision at 20 links, {many}", change, **once, **ours)
 def rates_by_links(engine, step, precision):
-    return compare(rates, *other(1.0, 20), 1.0)
+    return rates(evaluated(), evaluated(links=20))
 
 
-def in_c():
-    return evaluated("mujoco", 1.0, "float64", num_trials=TRIALS_IN_C)
-
-
-def ours_of_these(precision):
-    """The structured engine in the trials that MuJoCo C simulates."""
-    return evaluated("structured", 1.0, precision, num_trials=TRIALS_IN_C)
-
-
-@case(
-    24,
-    f"decision of the structured engine, {fewer}",
-    "rank correlation with C",
-    steps=(1.0,),
-    lower=True,
-)
+@case(24, fewer, f"{correlation} with C", lower=True, **once)
 def ranks_by_engine(engine, step, precision):
-    return compare(ranks, in_c(), ours_of_these(precision), RANKS)
+    return ranks(*in_c(precision))
 
 
-@case(
-    24,
-    f"decision of the structured engine, {fewer}",
-    "success rate: change over interval with C",
-    steps=(1.0,),
-)
+@case(24, fewer, f"{change} with C", **once)
 def rates_by_engine(engine, step, precision):
-    return compare(rates, in_c(), ours_of_these(precision), 1.0)
+    return rates(*in_c(precision))
 
 
-@case(
-    24,
-    f"the best design stays good, {many}",
-    "its rank at h/4, of 40",
-    steps=(1.0,),
-    **ours,
-)
+@case(24, f"the best design stays good, {many}", "its rank at h/4, of 40", **once, **ours)
 def best_stays(engine, step, precision):
-    one, two = other(0.25)
-    best = one[1] == one[1].min()
+    (_, one), (_, two) = evaluated(), evaluated(step=0.25)
+    best = one == one.min()
     # Several designs may share the lowest cost; the worst of them by the finer step counts.
-    rank = (two[1] < two[1][best].max()).sum() + 1
+    rank = (two < two[best].max()).sum() + 1
     return Found(float(rank), DESIGNS / 4, f"{best.sum()} share the lowest cost at h")
-
-
-def failures(file, *but):
-    """Share of the trials of a stored run that failed, and a note."""
-    data = json.loads((DATA / file).read_text())
-    bad = sum(v for k, v in data["failed"].items() if k not in ("SOLVER_CAP", *but))
-    made = f", commit {data['commit']}" if data.get("commit") else ""
-    return Found(bad / data["worlds"], 1e-4, f"{bad} of {data['worlds']:,}, stored result{made}")
-
-
-stored = {"steps": (1.0,), "precisions": ("float32",)}
-stuck = (
-    "171 objects were not let go of: the hand's grip, not the numbers, and each is flagged; "
-    "numerical failures alone are 1e-6"
-)
-wedged = (
-    "209 objects were wedged between fingers that straighten, see docs/hull.md; numerical failures "
-    "alone are 9e-6"
-)
-million = "a million random particles of Table I, spheres"
-everything = "114,688 random particles of Table I, hull and contact between fingers"
-
-
-@case(25, million, "share of numerical failures", quick=((1.0, "float32"),), **stored)
-def random_failures(engine, step, precision):
-    """From the run on one H200; see docs/stability.md for its one failure."""
-    return failures("random_particles_spheres.json", "STUCK")
-
-
-@case(
-    25, million, "share of failed trials, with STUCK", failures={(1.0, "float32"): stuck}, **stored
-)
-def random_stuck(engine, step, precision):
-    return failures("random_particles_spheres.json")
-
-
-@case(25, everything, "share of failures but STUCK", **stored)
-def random_hulls(engine, step, precision):
-    """From the run on 48 cores."""
-    return failures("random_particles.json", "STUCK")
 
 
 @case(
     25,
-    everything,
-    "share of failed trials, with STUCK",
-    failures={(1.0, "float32"): wedged},
-    **stored,
+    "2,048 random designs of Table I, default scene",
+    "share of numerical failures",
+    **once,
+    **ours,
 )
-def random_stuck_hulls(engine, step, precision):
-    return failures("random_particles.json")
-
-
-# --- 24 and 37: late designs of the default scene ------------------------------------------------
-
-
-@functools.cache
-def late():
-    """What `python -m scripts.accuracy.late_designs` found of final particles of 23D searches."""
-    return json.loads((DATA / "late_designs.json").read_text())
-
-
-def made():
-    return f"stored result, commit {late()['commit'][:7]}"
-
-
-def verdicts(setting):
-    """Letters of the trials of a setting, shape (design, trial)."""
-    return np.array([list(row) for row in late()["settings"][setting]["trials"]])
-
-
-def refinements(finer):
-    """What a finer setting decides of the trials that it shares with the default one."""
-    two = verdicts(finer)
-    one = verdicts("h")[:, : two.shape[1]]
-    kept = [(v == "k").astype(float) for v in (one, two)]
-    change = kept[1] - kept[0]
-    # Trials of one design are alike: the interval is of the designs' means.
-    half = 1.96 * max(change.mean(1).std(ddof=1) / np.sqrt(len(change)), 1 / change.size)
-    shares = f"{kept[0].mean():.1%} and {kept[1].mean():.1%} kept"
-    flips = f"{(change != 0).mean():.1%} of the verdicts flip"
-    stuck = f"STUCK {(one == 's').mean():.2%} and {(two == 's').mean():.2%}"
-    size = f"{one.shape[0]} designs in {one.shape[1]} trials"
-    note = f"{size}: {shares}, {flips}, {stuck}; {made()}"
-    return Found(abs(change.mean()) / half, 1.0, note)
-
-
-@case(
-    24,
-    "late designs of the default scene at h/4",
-    "success rate: change over interval",
-    **stored,
-)
-def late_by_step(engine, step, precision):
-    return refinements("h/4")
-
-
-@case(
-    37,
-    "late designs of the default scene",
-    "share of STUCK",
-    failures={(1.0, "float32"): "objects stay wedged between fingers that straighten"},
-    **stored,
-)
-def late_stuck(engine, step, precision):
-    stuck = verdicts("h") == "s"
-    # What was asked for of late trials at this setting.
-    return Found(stuck.mean(), 3e-3, f"{stuck.sum()} of {stuck.size}; {made()}")
+def random_failures(engine, step, precision):
+    """Of a million and of 114,688 such grasps 1e-6 and 9e-6 failed (docs/notes/stability.md)."""
+    base = scene.load("paper")
+    run = jax.jit(lambda p, t: rollout.simulate(base, make_engine(engine, base), p, t)[0].status)
+    found = [np.asarray(run(*grasps.random_worlds(base, seed, 256))) for seed in range(8)]
+    counted = np.concatenate(found) & ~int(WARNINGS)
+    stuck = np.mean(counted == Status.STUCK)
+    return Found(np.mean((counted & ~int(Status.STUCK)) != 0), 1e-4, f"{stuck:.2%} are STUCK")

@@ -6,12 +6,21 @@ import numpy as np
 
 from tests.stability.beam import Rod
 from tests.stability.bench import History
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 
 LONG = {"links": 5, "length": 0.18, "height": 0.015, "wall": 0.002}
 """The slowest finger of Table I."""
 
 
+FINE = {"steps": (0.1, 0.05, 0.025), "engines": BOTH}
+
+
+@case(
+    4,
+    "free vibration, up to 100 periods",
+    "loss of energy against the scheme's, relative",
+    **FINE,
+)
 def free_vibration(engine, step, precision):
     """The energy of the first mode falls as implicit Euler's: (1 + h^2 omega^2)^-1 a step.
 
@@ -34,16 +43,13 @@ def free_vibration(engine, step, precision):
     return Found(abs(lost / (rate * steps) - 1), 0.01, f"{periods:.0f} periods")
 
 
-fine = {"steps": (0.1, 0.05, 0.025)}
-vibration = (
+@case(
     4,
-    "free vibration, up to 100 periods",
-    "loss of energy against the scheme's, relative",
+    "free vibration",
+    "first frequency against that of implicit Euler, relative",
+    quick="mujoco",
+    **FINE,
 )
-case(*vibration, **fine)(free_vibration)
-case(*vibration, engine="mujoco", **fine)(free_vibration)
-
-
 def vibration_frequency(engine, step, precision):
     """Zero crossings of the first periods against the chain's own frequency."""
     rod = Rod(engine, step, precision, damped=False, **LONG)
@@ -61,11 +67,13 @@ def vibration_frequency(engine, step, precision):
     return Found(abs(found / scheme - 1), 1e-4, note)
 
 
-frequency = (4, "free vibration", "first frequency against that of implicit Euler, relative")
-case(*frequency, **fine)(vibration_frequency)
-case(*frequency, engine="mujoco", quick=((0.1, "float64"),), **fine)(vibration_frequency)
-
-
+@case(
+    5,
+    "damped release",
+    "largest rise of energy in a step over the first",
+    engines=BOTH,
+    quick="mujoco",
+)
 def damped_release(engine, step, precision):
     """Let go from half a circle of the paper's finger, with its damping."""
     rod = Rod(engine, step, precision)
@@ -76,11 +84,7 @@ def damped_release(engine, step, precision):
     return Found(rise / energy[0], {"float64": 1e-12, "float32": 1e-6}[precision])
 
 
-release = (5, "damped release", "largest rise of energy in a step over the first")
-case(*release)(damped_release)
-case(*release, engine="mujoco", quick=((1.0, "float64"),))(damped_release)
-
-
+@case(5, "damped release", "energy against the mode's recurrence", engines=BOTH, quick="mujoco")
 def damping_law(engine, step, precision):
     """The first mode at 0.01 rad against its recurrence, for the time in which half of it is lost.
 
@@ -102,11 +106,10 @@ def damping_law(engine, step, precision):
     return Found(error, 1e-3, f"{len(expected)} steps")
 
 
-law = (5, "damped release", "energy against the mode's recurrence")
-case(*law)(damping_law)
-case(*law, engine="mujoco", quick=((1.0, "float64"),))(damping_law)
+JUMP = (8, "pressure step of 120 kPa in one time step")
 
 
+@case(*JUMP, "error of the angles at rest, relative", engines=BOTH, quick="mujoco")
 def pressure_step(engine, step, precision):
     """120 kPa in one time step; settles at the free curvature M / E I in every joint."""
     rod = Rod(engine, step, precision)
@@ -130,6 +133,7 @@ def converged_peak():
     return kinetic_peak(Rod("mujoco", 1 / 64, "float64"))
 
 
+@case(*JUMP, "largest kinetic energy over C's at h/64", engines=BOTH)
 def pressure_speed(engine, step, precision):
     """Implicit springs damp what the jump excites; a step must not add to it.
 
@@ -137,11 +141,3 @@ def pressure_speed(engine, step, precision):
     """
     found = kinetic_peak(Rod(engine, step, precision)) / converged_peak()
     return Found(found, 1.02)
-
-
-jump = (8, "pressure step of 120 kPa in one time step", "error of the angles at rest, relative")
-case(*jump)(pressure_step)
-case(*jump, engine="mujoco", quick=((1.0, "float64"),))(pressure_step)
-jump = (8, "pressure step of 120 kPa in one time step", "largest kinetic energy over C's at h/64")
-case(*jump)(pressure_speed)
-case(*jump, engine="mujoco")(pressure_speed)

@@ -16,7 +16,7 @@ from tests.helpers import grasps
 from tests.helpers.grasps import GOOD
 from tests.stability.bench import CREEP, FIRM, bench, floats, refined
 from tests.stability.oracle import Reader, along
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 
 
 @functools.cache
@@ -35,14 +35,6 @@ def design(the_scene, **changes) -> Params:
     values = space.from_units(np.array([named.get(n.split("[")[0], 0.0) for n in space.names]))
     with floats(True):
         return jax.tree.map(np.asarray, space.params(jnp.asarray(values)))
-
-
-def whole(the_bench, designs, shapes=(0,)):
-    """Histories of whole grasps, designs times objects."""
-    params = [p for p in designs for _ in shapes]
-    trials = [grasps.still(s) for _ in designs for s in shapes]
-    fields = the_bench.fields(params, trials)
-    return the_bench.run(fields, the_bench.commands(params, trials))
 
 
 def whole_inputs(the_bench, designs, shapes=(0,)):
@@ -153,9 +145,8 @@ def register(number, title, base, inputs, *, energy=True, steps=(1.0, 0.5), roun
     case(number, title, AGAINST_C, name=f"{name}_accelerations", steps=steps)(accelerations)
     if energy:
         what = number, title, "largest kinetic energy over MuJoCo C's at h/8"
-        as_shipped = {"name": f"{name}_energy", "precisions": ("float32",)}
-        case(*what, **as_shipped)(energies)
-        case(*what, name=f"{name}_energy", engine="mujoco")(energies)
+        as_shipped = {"engines": BOTH, "precisions": ("float32",)}
+        case(*what, name=f"{name}_energy", **as_shipped)(energies)
 
 
 AGAINST_C = "accelerations along the path against MuJoCo C, relative"
@@ -165,20 +156,32 @@ register(6, f"stiffest {corner}", paper, stiffest, energy=False)
 register(7, f"softest {corner}", paper, softest, rounding=2.0)
 register(16, "shake of 90 degrees at 3 Hz", shaken, good)
 register(17, "all fingers on the object and the table", paper, pressing, energy=False)
+register(20, "ten times the episode, 90 s", slow, good, energy=False, steps=(1.0,))
 register(23, "edges of the parameters", paper, edge_designs)
 
 
+@case(
+    6,
+    f"stiffest {corner}",
+    "largest joint speed at rest on the object",
+    unit="rad/s",
+    engines=BOTH,
+    quick="mujoco",
+)
 def stiff_and_still(engine, step, precision):
     """Joints of 500 rad/s that the palm presses onto the object do not rattle."""
     b = bench(paper(), engine, step, precision)
     return resting(b, *stiffest(b), 3.5, 0.3)
 
 
-still = (6, f"stiffest {corner}", "largest joint speed at rest on the object")
-case(*still, unit="rad/s")(stiff_and_still)
-case(*still, unit="rad/s", engine="mujoco", quick=((1.0, "float64"),))(stiff_and_still)
-
-
+@case(
+    23,
+    "tips start on the table, gap zero",
+    "largest joint speed after 0.7 s",
+    unit="rad/s",
+    engines=BOTH,
+    quick="mujoco",
+)
 def zero_gap(engine, step, precision):
     """A start whose lowest sphere is a rounding above the table, held for a second."""
     reach = 180e-3 * np.sin(np.deg2rad(paper().hand.finger[0].tilt))
@@ -195,11 +198,11 @@ def zero_gap(engine, step, precision):
     return resting(b, fields, ctrl, 1.0, 0.3)
 
 
-gap = (23, "tips start on the table, gap zero", "largest joint speed after 0.7 s")
-case(*gap, unit="rad/s")(zero_gap)
-case(*gap, unit="rad/s", engine="mujoco", quick=((1.0, "float64"),))(zero_gap)
+LETTING_GO = (19, "release", "held objects neither free nor flagged STUCK")
 
 
+@case(*LETTING_GO, engines=("mujoco",))
+@case(*LETTING_GO, steps=(1.0, 0.5))
 def release(engine, step, precision):
     """27 good grasps; where the object is comes from the last state, not from the cost."""
     base = refined(paper(), step)
@@ -220,11 +223,14 @@ def release(engine, step, precision):
     return Found(float(wrong), 0.0, f"{held.sum()} of {len(held)} held to the end")
 
 
-letting_go = (19, "release", "held objects neither free nor flagged STUCK")
-case(*letting_go, steps=(1.0, 0.5))(release)
-case(*letting_go, engine="mujoco")(release)
-
-
+@case(
+    20,
+    "ten times the episode, 90 s",
+    "creep of held objects in the palm",
+    unit="m",
+    steps=(1.0, 0.5),
+    engines=BOTH,
+)
 def long_hold(engine, step, precision):
     """How far objects creep in the palm's frame in 34.5 s from the end of the lift on."""
     b = bench(slow(), engine, step, precision)
@@ -240,9 +246,3 @@ def long_hold(engine, step, precision):
             places.append(data.xmat[1].reshape(3, 3).T @ away)
         worst = max(worst, np.linalg.norm(places[1] - places[0]))
     return Found(worst, 34.5 * CREEP)
-
-
-creeping = (20, "ten times the episode, 90 s", "creep of held objects in the palm")
-case(*creeping, unit="m", steps=(1.0, 0.5))(long_hold)
-case(*creeping, unit="m", steps=(1.0, 0.5), engine="mujoco")(long_hold)
-register(20, "ten times the episode, 90 s", slow, good, energy=False, steps=(1.0,))

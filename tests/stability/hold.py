@@ -5,9 +5,9 @@ import numpy as np
 from codesign_jax import model
 from tests.helpers import grasps
 from tests.helpers.tables import GRAVITY
-from tests.stability.bench import CHUNK, CREEP, FIRM, bench, pinch
+from tests.stability.bench import CHUNK, CREEP, FIRM, bench, loaded, pinch
 from tests.stability.oracle import Reader, along
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 from tests.stability.touch import at_height
 
 # --- 12: pinch -------------------------------------------------------------------------------
@@ -35,6 +35,7 @@ def hanging(history):
     return history.qpos[0, :, 2] - history.qpos[0, :, -5]
 
 
+@case(12, "pinch held for 60 s", "slip of the object", unit="m", engines=BOTH)
 def pinch_holds(engine, step, precision):
     """For a minute, from a second after the lift on."""
     b = bench(firm(), engine, step, precision)
@@ -57,6 +58,13 @@ def grip(reader):
     return sum(loads)
 
 
+@case(
+    12,
+    "pinch, mass ramped until it drops",
+    "load when it slips over mu N, error",
+    engines=BOTH,
+    quick="mujoco",
+)
 def pinch_drops(engine, step, precision):
     """The object's mass grows by 20 g/s; slip is a relative speed of 20 mm/s, far above creep."""
     b = bench(firm(), engine, step, precision)
@@ -72,27 +80,13 @@ def pinch_drops(engine, step, precision):
     when = start + int(np.argmax(fast))
     load = mass * masses[when // CHUNK] * GRAVITY
     factor = masses[when // CHUNK]
-    heavier = fields._replace(
-        **{n: getattr(fields, n).copy() for n in ("body_mass", "body_inertia", "dof_M0")}
-    )
-    heavier.body_mass[:, -1] *= factor
-    heavier.body_inertia[:, -1] *= factor
-    heavier.dof_M0[:, -6:] *= factor
-    reader, grips = Reader(b.scene, heavier), []
+    reader, grips = Reader(b.scene, loaded(fields, factor)), []
     # A sliding contact hops, so the grip is the mean over the last tenth of a second.
     for k in range(when - round(0.1 / b.h), when):
         reader.at(history.qpos[0, k], history.qvel[0, k], ctrl[0, k + 1])
         grips.append(grip(reader))
     ratio = load / np.mean(grips)
     return Found(abs(ratio - 1), 0.1, f"slips at {load:.2f} N, {ratio:.3f} mu N")
-
-
-minute = (12, "pinch held for 60 s", "slip of the object")
-case(*minute, unit="m")(pinch_holds)
-case(*minute, unit="m", engine="mujoco")(pinch_holds)
-ramp = (12, "pinch, mass ramped until it drops", "load when it slips over mu N, error")
-case(*ramp)(pinch_drops)
-case(*ramp, engine="mujoco", quick=((1.0, "float64"),))(pinch_drops)
 
 
 # --- 13: mass ratio --------------------------------------------------------------------------
@@ -110,11 +104,16 @@ def pressed(b):
     return fields, np.concatenate([ctrl, np.repeat(ctrl[:, -1:], round(1.5 / b.h), 1)], 1)
 
 
+HEAVY = (13, "mass ratio 2000 between object and link")
+
+
+@case(*HEAVY, "accelerations along the path against MuJoCo C, relative")
 def heavy_object(engine, step, precision):
     # Four corners on the table and a finger on either side.
     return along(pinch(discretization__links=10), step, precision, pressed, least=6)
 
 
+@case(*HEAVY, "largest speed at rest", unit="rad/s", engines=BOTH, quick="mujoco")
 def heavy_rest(engine, step, precision):
     """Speed after 1.2 s of rest, of joints and of the object."""
     b = bench(pinch(discretization__links=10), engine, step, precision)
@@ -123,17 +122,17 @@ def heavy_rest(engine, step, precision):
     return Found(history.speed[0, -round(0.3 / b.h) :].max(), 0.05)
 
 
-heavy = (13, "mass ratio 2000 between object and link")
-case(*heavy, "accelerations along the path against MuJoCo C, relative")(heavy_object)
-case(*heavy, "largest speed at rest", unit="rad/s")(heavy_rest)
-case(*heavy, "largest speed at rest", unit="rad/s", engine="mujoco", quick=((1.0, "float64"),))(
-    heavy_rest
-)
-
-
 # --- 18: no limit cycle ----------------------------------------------------------------------
 
 
+@case(
+    18,
+    "opposed fingers squeeze the box",
+    "largest joint speed after 3.5 s of rest",
+    unit="rad/s",
+    engines=BOTH,
+    quick="structured",
+)
 def squeeze(engine, step, precision):
     """Opposed fingers on the box from 3.5 s on; largest finger speed from 7 to 8 s."""
     b = bench(pinch(), engine, step, precision)
@@ -146,8 +145,3 @@ def squeeze(engine, step, precision):
     late = np.abs(history.qvel[0, -round(1 / b.h) :, 6:-6]).max()
     # Creep of 1 mm/s at 100 mm is 0.01 rad/s; a limit cycle has rad/s.
     return Found(late, 0.05)
-
-
-cycle = (18, "opposed fingers squeeze the box", "largest joint speed after 3.5 s of rest")
-case(*cycle, unit="rad/s", quick=((1.0, "float32"),))(squeeze)
-case(*cycle, unit="rad/s", engine="mujoco")(squeeze)

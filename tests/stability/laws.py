@@ -10,7 +10,7 @@ from tests.helpers import grasps
 from tests.helpers.closed_forms import moment
 from tests.stability.bench import bench, pinch
 from tests.stability.oracle import Reader, along, exact
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 from tests.stability.touch import SPHERE, at_height, held
 
 AGAINST_C = "accelerations along the path against MuJoCo C, relative"
@@ -34,6 +34,7 @@ def curling(b):
     return b.fields([params], [trial]), b.commands([params], [trial])
 
 
+@case(29, "whole grasp of fingers that cross", AGAINST_C, steps=TWO)
 def crossing_fingers(engine, step, precision):
     """From the approach to the release, wherever fingers meet, slide and let go of each other."""
     # In float32 both ends of such a contact are light, and what rounding makes of it adds up.
@@ -51,9 +52,6 @@ def between(step, precision):
         count += any(all("finger" in name for name in names) for names, *_ in reader.pushes())
     assert count > 20, "the fingers hardly touch: the case would be vacuous"
     return count
-
-
-case(29, "whole grasp of fingers that cross", AGAINST_C, steps=TWO)(crossing_fingers)
 
 
 # --- 30: lateral joint near 90 degrees -------------------------------------------------------
@@ -74,10 +72,15 @@ def sideways(b):
     return fields, held(b, fields, 1.0), qpos, qvel
 
 
+NEAR = (30, "lateral joints near 90 degrees")
+
+
+@case(*NEAR, AGAINST_C, steps=TWO)
 def lateral(engine, step, precision):
     return along(pinch(), step, precision, sideways, least=4)
 
 
+@case(*NEAR, "energy of a released finger over its springs' first", engines=BOTH)
 def through_ninety(engine, step, precision):
     """Energy that a finger gains while a joint springs back through 90 degrees, in the air.
 
@@ -99,12 +102,6 @@ def through_ninety(engine, step, precision):
     return Found(worst, 1.05)
 
 
-near = (30, "lateral joints near 90 degrees")
-case(*near, AGAINST_C, steps=TWO)(lateral)
-case(*near, "energy of a released finger over its springs' first")(through_ninety)
-case(*near, "energy of a released finger over its springs' first", engine="mujoco")(through_ninety)
-
-
 # --- 31: neo-Hookean -------------------------------------------------------------------------
 
 
@@ -120,10 +117,15 @@ def squeezing(b):
     return b.fields([params], [trial]), b.commands([params], [trial])
 
 
+LAW = (31, "neo-Hookean fingers")
+
+
+@case(*LAW, f"whole grasp: {AGAINST_C}", steps=TWO)
 def softening(engine, step, precision):
     return along(rubber(), step, precision, squeezing, least=5)
 
 
+@case(*LAW, "free curvature against SciPy's quadrature, relative", steps=TWO, engines=BOTH)
 def free_curvature(engine, step, precision):
     """Free fingers at rest at 60 kPa against the law's stress integrated over the section."""
     b = bench(rubber(), engine, step, precision)
@@ -144,11 +146,3 @@ def free_curvature(engine, step, precision):
 
     expected = optimize.brentq(excess, 1, 50) * fields.section[0, 0, 2]
     return Found(np.abs(found / expected - 1).max(), {"float32": 1e-5, "float64": 1e-6}[precision])
-
-
-law = (31, "neo-Hookean fingers")
-case(*law, f"whole grasp: {AGAINST_C}", steps=TWO)(softening)
-case(*law, "free curvature against SciPy's quadrature, relative", steps=TWO)(free_curvature)
-case(*law, "free curvature against SciPy's quadrature, relative", steps=TWO, engine="mujoco")(
-    free_curvature
-)

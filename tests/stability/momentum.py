@@ -11,7 +11,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.scene import hand
 from tests.helpers import grasps
 from tests.stability.bench import bench, pinch
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 from tests.stability.touch import SPHERE, held, worlds
 
 
@@ -56,6 +56,18 @@ def collision(base, engine, step, precision, *, bend=0.0):
 MOMENTUM = {"float32": 1e-4, "float64": 1e-10}
 
 
+FREE = "free hand and object collide"
+
+
+@case(
+    9,
+    FREE,
+    "drift of linear momentum, relative",
+    engines=BOTH,
+    fails="semi-implicit Euler changes the fingers' inertia matrix after the step's impulse: "
+    "linear momentum is kept to first order in h only, in MuJoCo C as well; contact forces are "
+    "equal and opposite",
+)
 def momentum(engine, step, precision):
     """Momentum of the state after each step."""
     compiled, history, first = collision(floating(), engine, step, precision)
@@ -97,27 +109,9 @@ def impulses(base, engine, step, precision, **start):
     return worst / np.linalg.norm(first)
 
 
-def impulse(engine, step, precision):
-    """Contact forces act in pairs."""
-    return Found(impulses(floating(), engine, step, precision)[0], MOMENTUM[precision])
-
-
-def angular_impulse(engine, step, precision):
-    """Contact forces act in pairs and on one line."""
-    return Found(impulses(floating(), engine, step, precision)[1], MOMENTUM[precision])
-
-
 def skin():
     """The hull, whose vertices follow two links, and contact between fingers; MuJoCo C has none."""
     return floating(surface="hull", finger_finger=True)
-
-
-def hull_impulse(engine, step, precision):
-    return Found(impulses(skin(), engine, step, precision)[0], MOMENTUM[precision])
-
-
-def hull_angular_impulse(engine, step, precision):
-    return Found(impulses(skin(), engine, step, precision)[1], MOMENTUM[precision])
 
 
 CROSSED = 0.9
@@ -136,40 +130,29 @@ def meeting(step, precision):
     return impulses(skin(), "structured", step, precision, bend=CROSSED)
 
 
-def meeting_impulse(engine, step, precision):
-    return Found(meeting(step, precision)[0], MOMENTUM[precision])
+def register(column, kind, what):
+    """Contact forces act in pairs, and their moments too as they act on one line."""
+
+    def found(values, precision):
+        return Found(values[column], MOMENTUM[precision])
+
+    @case(9, FREE, f"{what} that a step adds, relative", name=kind, engines=BOTH, quick="mujoco")
+    def spheres(engine, step, precision):
+        return found(impulses(floating(), engine, step, precision), precision)
+
+    hull = {"steps": (1.0, 0.5)}
+    title = "free hand with the hull and object collide"
+
+    @case(9, title, f"{what} that a step adds, relative", name=f"hull_{kind}", **hull)
+    def hulls(engine, step, precision):
+        return found(impulses(skin(), engine, step, precision), precision)
+
+    title = "free hand with the hull whose fingers push one another"
+
+    @case(9, title, f"{what} that a step adds, relative", name=f"meeting_{kind}", **hull)
+    def fingers(engine, step, precision):
+        return found(meeting(step, precision), precision)
 
 
-def meeting_angular_impulse(engine, step, precision):
-    return Found(meeting(step, precision)[1], MOMENTUM[precision])
-
-
-FIRST_ORDER = (
-    "semi-implicit Euler changes the fingers' inertia matrix after the step's impulse: linear "
-    "momentum is kept to first order in h only, in MuJoCo C as well; contact forces are equal and "
-    "opposite"
-)
-free = (9, "free hand and object collide", "impulse that a step adds, relative")
-case(*free)(impulse)
-case(*free, engine="mujoco", quick=((1.0, "float64"),))(impulse)
-free = (9, "free hand and object collide", "angular impulse that a step adds, relative")
-case(*free)(angular_impulse)
-case(*free, engine="mujoco", quick=((1.0, "float64"),))(angular_impulse)
-free = (9, "free hand and object collide", "drift of linear momentum, relative")
-failing = {(s, p): FIRST_ORDER for s in (1.0, 0.5, 0.25) for p in ("float32", "float64")}
-case(*free, failures=failing)(momentum)
-case(*free, engine="mujoco", failures=failing)(momentum)
-free = (9, "free hand with the hull and object collide", "impulse that a step adds, relative")
-case(*free, steps=(1.0, 0.5))(hull_impulse)
-free = (
-    9,
-    "free hand with the hull and object collide",
-    "angular impulse that a step adds, relative",
-)
-case(*free, steps=(1.0, 0.5))(hull_angular_impulse)
-
-crossed = "free hand with the hull whose fingers push one another"
-case(9, crossed, "impulse that a step adds, relative", steps=(1.0, 0.5))(meeting_impulse)
-case(9, crossed, "angular impulse that a step adds, relative", steps=(1.0, 0.5))(
-    meeting_angular_impulse
-)
+register(0, "impulse", "impulse")
+register(1, "angular_impulse", "angular impulse")

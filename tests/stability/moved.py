@@ -12,15 +12,17 @@ from tests.helpers.tables import GRAVITY, MU
 from tests.stability.bench import bench, pinch
 from tests.stability.hold import lifted
 from tests.stability.oracle import Reader, along
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 from tests.stability.touch import CUBOID, SPHERE, at_height, held, worlds
 
+AGAINST_C = "accelerations along the path against MuJoCo C, relative"
 HALF = 0.030  # half a side of the cuboid, and radius of the sphere [m]
 
 
 # --- 11: sliding -----------------------------------------------------------------------------
 
 
+@case(11, "cuboid slides to rest", "error of v / mu g, relative", engines=BOTH, quick="mujoco")
 def slides_to_rest(engine, step, precision):
     """The cuboid, pushed at 2 m/s over the table, stops after v / mu g = 0.41 s.
 
@@ -36,11 +38,6 @@ def slides_to_rest(engine, step, precision):
     assert speed[-1] < 0.01, "it never stops"
     # As on the incline: the elliptic cone makes a sliding object hop.
     return Found(abs(stopped * MU * GRAVITY / 2.0 - 1), 0.15, f"stops after {stopped:.2f} s")
-
-
-sliding = (11, "cuboid slides to rest", "error of v / mu g, relative")
-case(*sliding)(slides_to_rest)
-case(*sliding, engine="mujoco", quick=((1.0, "float64"),))(slides_to_rest)
 
 
 # --- 26: tipping and flipping ----------------------------------------------------------------
@@ -75,6 +72,11 @@ def rocking(angle, time):
     return path.y[0, -1]
 
 
+OVER = (26, "cuboid let go on its edge, 10 % from balance")
+TWICE = {"engines": BOTH, "quick": "mujoco"}
+
+
+@case(*OVER, "turn in 0.1 s against a rigid body's, relative", **TWICE)
 def tips(engine, step, precision):
     """A tenth of a second after it is let go 10 % before and beyond the balance of 45 degrees."""
     b, worst = bench(rough(), engine, step, precision), 0.0
@@ -86,6 +88,7 @@ def tips(engine, step, precision):
     return Found(worst, 0.15)
 
 
+@case(*OVER, "angle of the face it comes to rest on, error", unit="rad", **TWICE)
 def flips(engine, step, precision):
     """Before the balance it falls back onto its face, beyond it onto the next one, and rests."""
     b, worst = bench(rough(), engine, step, precision), 0.0
@@ -93,15 +96,6 @@ def flips(engine, step, precision):
         angle = tilted(b, share * np.pi / 4, 3.0)
         worst = max(worst, abs(angle[-1] - expected))
     return Found(worst, 1e-3)
-
-
-over = (26, "cuboid let go on its edge, 10 % from balance")
-for what, unit, function in (
-    ("turn in 0.1 s against a rigid body's, relative", "", tips),
-    ("angle of the face it comes to rest on, error", "rad", flips),
-):
-    case(*over, what, unit=unit)(function)
-    case(*over, what, unit=unit, engine="mujoco", quick=((1.0, "float64"),))(function)
 
 
 # --- 27: edges -------------------------------------------------------------------------------
@@ -115,17 +109,10 @@ def edge_first(b):
     return b.fields([params], [trial]), b.commands([params], [trial])
 
 
+@case(27, "cuboid grasped by two edges", AGAINST_C, steps=(1.0, 0.5))
 def edges(engine, step, precision):
     """Spheres of the fingers on an edge, where the normal turns by 90 degrees."""
     return along(pinch(), step, precision, edge_first, least=5)
-
-
-case(
-    27,
-    "cuboid grasped by two edges",
-    "accelerations along the path against MuJoCo C, relative",
-    steps=(1.0, 0.5),
-)(edges)
 
 
 # --- 28: spin --------------------------------------------------------------------------------
@@ -136,6 +123,12 @@ def full():
     return pinch(effects__friction="full")
 
 
+@case(
+    28,
+    "full friction: a sphere spins on the table",
+    "error of its slowing, relative",
+    engines=BOTH,
+)
 def torsion(engine, step, precision):
     """A sphere that spins on the table: d omega / dt = -torsional_friction g / (2/5 r^2)."""
     base = full()
@@ -164,21 +157,7 @@ def spun(b):
     return fields, np.repeat(ctrl[:, -1:], round(1 / b.h), 1), qpos, qvel
 
 
+@case(28, "full friction: a held box is spun", AGAINST_C, steps=(1.0, 0.5))
 def held_spin(engine, step, precision):
     """Torsion and rolling in six dimensions of the cone, while the object turns in the grip."""
     return along(full(), step, precision, spun, least=2)
-
-
-case(28, "full friction: a sphere spins on the table", "error of its slowing, relative")(torsion)
-case(
-    28,
-    "full friction: a sphere spins on the table",
-    "error of its slowing, relative",
-    engine="mujoco",
-)(torsion)
-case(
-    28,
-    "full friction: a held box is spun",
-    "accelerations along the path against MuJoCo C, relative",
-    steps=(1.0, 0.5),
-)(held_spin)

@@ -69,6 +69,11 @@ def pointing(size, up):
     return np.roll(Rotation.align_vectors([up], [corner])[0].as_quat(), 1)
 
 
+AT_REST = {"steps": (1.0,), "precisions": ("float64",)}
+ERROR = "error of the force, 256 points a link, against a continuous skin, relative"
+
+
+@case(33, "sphere pressed into the hull", ERROR, **AT_REST)
 def hull_force(engine, step, precision):
     """A stiffness k / w^2 per area, along the sphere's radii, adds up to pi k (r - d) d^2 / w^2."""
     errors = []
@@ -82,15 +87,6 @@ def hull_force(engine, step, precision):
     assert errors[0] > errors[1] > errors[2], note
     # Points 2.5 mm apart on a patch of 19 mm; one more or less of its 60 is 2 %.
     return Found(errors[-1], 0.02, note)
-
-
-case(
-    33,
-    "sphere pressed into the hull",
-    "error of the force, 256 points a link, against a continuous skin, relative",
-    steps=(1.0,),
-    precisions=("float64",),
-)(hull_force)
 
 
 # --- 36: a corner between vertices ---------------------------------------------------------------
@@ -109,6 +105,10 @@ def corners(rings, points, step, precision):
     return force / (stiffness * CORNER**3 / 2 / np.sqrt(3))
 
 
+BOX = "corner of a box, 5 mm in the hull, between its vertices"
+
+
+@case(36, BOX, ERROR, **AT_REST)
 def corner_force(engine, step, precision):
     """Root mean square error of the finest mesh."""
     errors = [np.sqrt(np.mean((corners(*m, step, precision) - 1) ** 2)) for m in DENSITIES]
@@ -118,25 +118,15 @@ def corner_force(engine, step, precision):
     return Found(errors[-1], 0.2, note)
 
 
+@case(
+    36,
+    BOX,
+    "places at which the default mesh does not feel it",
+    fails="vertices of the default mesh stand 5 mm apart along a finger, 10 mm around it, and a "
+    "corner between them meets nothing; a finer mesh does (docs/hull.md)",
+    **AT_REST,
+)
 def corner_unseen(engine, step, precision):
     """Share of the places at which a corner meets no vertex of the default mesh."""
     found = corners(*DENSITIES[0], step, precision)
     return Found(np.mean(found < 0.01), 0.0, f"up to {found.max():.1f} times the skin's force")
-
-
-unseen = (
-    "vertices of the default mesh stand 5 mm apart along a finger, 10 mm around it, and a corner "
-    "between them meets nothing; a finer mesh does (docs/hull.md)"
-)
-at_rest = {"steps": (1.0,), "precisions": ("float64",)}
-box = "corner of a box, 5 mm in the hull, between its vertices"
-case(
-    36, box, "error of the force, 256 points a link, against a continuous skin, relative", **at_rest
-)(corner_force)
-case(
-    36,
-    box,
-    "places at which the default mesh does not feel it",
-    failures={(1.0, "float64"): unseen},
-    **at_rest,
-)(corner_unseen)

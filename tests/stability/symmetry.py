@@ -10,7 +10,7 @@ from codesign_jax import model
 from codesign_jax.scene import hand
 from tests.helpers import grasps
 from tests.stability.bench import bench, pinch
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 
 LIFTED = 4.5
 """End of the lift [s]: the object hangs in the hand.  The shaking would turn the arm, whose Euler
@@ -78,6 +78,11 @@ def mirror_pose(pose):
     return pose * np.array([1, -1, 1, -1, -1, 1])
 
 
+SAME_SCENE = {"unit": "m or rad", "engines": BOTH, "quick": "mujoco"}
+DIFFERENCE = "largest difference of places"
+
+
+@case(21, "mirrored scene", DIFFERENCE, **SAME_SCENE)
 def mirrored(engine, step, precision):
     """Mirrored in the plane of the two fingers: each is its own image."""
     b = bench(rigid(), engine, step, precision, EXACTLY[precision])
@@ -103,6 +108,7 @@ def turn_pose(pose):
     return np.concatenate([TURN.apply(flat[:, :3]), turned], 1).reshape(np.shape(pose))
 
 
+@case(21, "scene turned by 37 degrees", DIFFERENCE, **SAME_SCENE)
 def turned(engine, step, precision):
     """Turned by 37 degrees, which no float is exact in."""
     b = bench(rigid(), engine, step, precision, EXACTLY[precision])
@@ -119,15 +125,6 @@ def turned(engine, step, precision):
 
     # MuJoCo C has a wrist of 1e9 kg in the place of none: 1e-16 of that weighs on the joints.
     return compare(b, turn_pose, places, bound=1e-6 if engine == "mujoco" else None)
-
-
-for number, title, function in (
-    (21, "mirrored scene", mirrored),
-    (21, "scene turned by 37 degrees", turned),
-):
-    what = number, title, "largest difference of places"
-    case(*what, unit="m or rad")(function)
-    case(*what, unit="m or rad", engine="mujoco", quick=((1.0, "float64"),))(function)
 
 
 def scaled_mount(finger, s):
@@ -202,6 +199,7 @@ def three_times():
     return scaled_scene(exact(), 3.0)
 
 
+@case(22, "lengths times three, everything else to scale", DIFFERENCE, **SAME_SCENE)
 def unit_scaling(engine, step, precision):
     """Three times as large, lengths over three: the same motion, and no number is exact."""
     found = []
@@ -226,8 +224,3 @@ def unit_scaling(engine, step, precision):
         found.append(q.astype(float) / scale)
     error = np.abs(found[0] - found[1]).max()
     return Found(error, SAME[precision], "to the end of inflation")
-
-
-units = (22, "lengths times three, everything else to scale", "largest difference of places")
-case(*units, unit="m or rad")(unit_scaling)
-case(*units, unit="m or rad", engine="mujoco", quick=((1.0, "float64"),))(unit_scaling)

@@ -1,7 +1,7 @@
 """The hard cases of numerical stability: every invariant, time step and precision is a test.
 
 The quick variants run with `make test`; all of them with `make stability`, which also writes
-docs/stability.md.  A case that fails stands in the table with its cause.
+docs/notes/stability.md.  A case that fails stands in the table with its cause.
 """
 
 import pytest
@@ -28,18 +28,16 @@ from tests.stability import (  # noqa: F401  (they register their cases)
 def variants():
     for case in table.CASES.values():
         for variant in case.variants:
-            marks = [pytest.mark.stability]
-            if variant not in case.quick:
-                marks.append(pytest.mark.slow)
-            step, precision = variant
-            part = table.step_name(step).replace("/", "_")
-            name = f"{case.number}-{case.name}-{part}-{precision}"
+            slow = case.quick != case.engine or variant != case.variants[0]
+            marks = [pytest.mark.stability, *[pytest.mark.slow] * slow]
+            part = "h" if variant[0] == 1 else f"h_{1 / variant[0]:g}"
+            name = f"{case.number}-{case.name}-{part}-{variant[1]}"
             yield pytest.param(case, variant, marks=marks, id=name)
 
 
 @pytest.mark.parametrize("case, variant", list(variants()))
 def test_hard_case(case, variant, rows):
-    row = case.run(variant)
+    row = case.run(*variant)
     rows.append(row)
     text = f"{row['measured']:.4g} {row['unit']} against {row['bound']:.4g}: {row['note']}"
     if row["failure"]:

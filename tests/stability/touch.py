@@ -11,7 +11,7 @@ from codesign_jax.engines.mujoco import world_model
 from tests.helpers import grasps
 from tests.helpers.tables import GRAVITY, MASS, MU, Table
 from tests.stability.bench import bench, pinch
-from tests.stability.table import Found, case
+from tests.stability.table import BOTH, Found, case
 
 CUBOID, CYLINDER, SPHERE = range(3)
 
@@ -47,6 +47,7 @@ def middle_of_finger(compiled, data, qpos):
 # --- 10: rest --------------------------------------------------------------------------------
 
 
+@case(10, "objects at rest for 90 s", "drift", unit="m", engines=BOTH)
 def rest(engine, step, precision):
     """All three objects for 90 s; sideways and vertical drift after the first five."""
     b = bench(pinch(), engine, step, precision)
@@ -56,6 +57,7 @@ def rest(engine, step, precision):
     return Found(np.abs(late - late[:, :1]).max(), 1e-4)
 
 
+@case(10, "objects at rest for 90 s", "penetration", unit="m", engines=BOTH, quick="structured")
 def sunk(engine, step, precision):
     """Depth of the lowest point below the table at rest."""
     b = bench(pinch(), engine, step, precision)
@@ -64,14 +66,7 @@ def sunk(engine, step, precision):
     return Found((fields.start[:, -5] - history.object[:, -1, 2]).max(), 5e-4)
 
 
-resting = (10, "objects at rest for 90 s")
-case(*resting, "drift", unit="m")(rest)
-case(*resting, "drift", unit="m", engine="mujoco")(rest)
-case(*resting, "penetration", unit="m", quick=((1.0, "float32"),))(sunk)
-case(*resting, "penetration", unit="m", engine="mujoco")(sunk)
-
-
-@case(10, "objects at rest", "sum of contact forces over weight, error", engine="mujoco")
+@case(10, "objects at rest", "sum of contact forces over weight, error", engines=("mujoco",))
 def weight(engine, step, precision):
     worst = 0.0
     for shape in grasps.SHAPES:
@@ -93,8 +88,8 @@ def weight(engine, step, precision):
     "incline at 0.9 of the friction angle",
     "speed after 3 s",
     unit="m/s",
-    engine="mujoco",
-    quick=((1.0, "float64"),),
+    engines=("mujoco",),
+    quick="mujoco",
 )
 def incline_holds(engine, step, precision):
     angle, worst = 0.9 * np.arctan(MU), 0.0
@@ -109,7 +104,7 @@ def incline_holds(engine, step, precision):
     11,
     "incline at 1.1 of the friction angle",
     "error of g (sin - mu cos), relative",
-    engine="mujoco",
+    engines=("mujoco",),
 )
 def incline_slides(engine, step, precision):
     angle, worst = 1.1 * np.arctan(MU), 0.0
@@ -130,6 +125,14 @@ def weightless():
     return dataclasses.replace(pinch(), gravity=0.0)
 
 
+@case(
+    14,
+    "spawned 10 mm inside table, finger or palm",
+    "speed at which it leaves",
+    unit="m/s",
+    engines=BOTH,
+    quick="mujoco",
+)
 def spawned(engine, step, precision):
     """A sphere 10 mm deep in the table, in a finger's side, in the palm; without gravity, 1 s."""
     b = bench(weightless(), engine, step, precision)
@@ -149,12 +152,10 @@ def spawned(engine, step, precision):
     return Found(speed.max(), 1.0, note)
 
 
-inside = (14, "spawned 10 mm inside table, finger or palm", "speed at which it leaves")
-case(*inside, unit="m/s")(spawned)
-case(*inside, unit="m/s", engine="mujoco", quick=((1.0, "float64"),))(spawned)
-
-
 # --- 15: no tunnelling -----------------------------------------------------------------------
+
+
+FAST = (15, "5 m/s at a finger with 2 mm walls")
 
 
 def thrown(the_bench):
@@ -179,6 +180,7 @@ def converged_throw():
     return received(bench(weightless(), "mujoco", 1 / 64, "float64"))
 
 
+@case(*FAST, "impulse over the one at h/64 in C", lower=True, engines=BOTH, quick="mujoco")
 def tunnelling(engine, step, precision):
     """It moves 50 mm in a step of 10 ms; the finger's contacts reach over 80 mm."""
     found = received(bench(weightless(), engine, step, precision))
@@ -192,24 +194,15 @@ def converged_velocity():
     return thrown(bench(weightless(), "mujoco", 1 / 64, "float64")).object_velocity[0, -1]
 
 
+@case(
+    *FAST,
+    "error of the velocity over that of passing through",
+    engines=BOTH,
+    fails="it moves 50 mm in a step and touches for two steps: half a step is needed",
+    fails_at=(1.0,),
+)
 def passing(engine, step, precision):
     """Error of the sphere's velocity afterwards over that of passing through unhindered."""
     found = thrown(bench(weightless(), engine, step, precision)).object_velocity[0, -1]
     unhindered = np.linalg.norm([0, -5, 0] - converged_velocity())
     return Found(np.linalg.norm(found - converged_velocity()) / unhindered, 0.5)
-
-
-fast = (15, "5 m/s at a finger with 2 mm walls")
-case(*fast, "impulse over the one at h/64 in C", lower=True)(tunnelling)
-case(
-    *fast,
-    "impulse over the one at h/64 in C",
-    lower=True,
-    engine="mujoco",
-    quick=((1.0, "float64"),),
-)(tunnelling)
-fast = (*fast, "error of the velocity over that of passing through")
-coarse = "it moves 50 mm in a step and touches for two steps: half a step is needed"
-missed = {(1.0, p): coarse for p in ("float32", "float64")}
-case(*fast, failures=missed)(passing)
-case(*fast, failures=missed, engine="mujoco")(passing)

@@ -29,18 +29,6 @@ def test_small_load_cantilever(links):
     assert -frame[2, 0] == pytest.approx(slope, rel=1e-6)  # exact for every N: joints average L/2
 
 
-def test_convergence_is_of_second_order():
-    """Tip error against the continuum falls with the square of the number of links."""
-    counts, errors = np.array([3, 5, 10, 20]), []
-    for links in counts:
-        finger = Finger(int(links))
-        load = 1e-4 * finger.beam.bending / finger.length**2
-        position, _ = finger.settle(force=(0, 0, -load))
-        errors.append(1 + position[2] * 3 * finger.beam.bending / (load * finger.length**3))
-    slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
-    assert slope == pytest.approx(-2.0, abs=0.01)
-
-
 @pytest.mark.parametrize(
     "alpha, continuum, chain",
     [

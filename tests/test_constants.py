@@ -120,28 +120,6 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     assert len(compiled) == 2 and len(set(compiled)) == 1
 
 
-@pytest.mark.slow  # quick: the fields of changed numbers are those of a fresh compile (test_model)
-@pytest.mark.parametrize("engine", ["mujoco", "structured"])
-def test_constants_equal_a_scene_file_with_those_numbers(engine):
-    """The programs differ in what XLA folds and fuses; MuJoCo C gets fields in float32."""
-    the_scene, wide = short(), engine != "mujoco"
-    constants = random_constants(the_scene, 3)
-    other = as_file(the_scene, constants)
-    world = hand_world(the_scene)
-    worlds = jax.tree.map(lambda v: np.broadcast_to(v, (2, *v.shape)), world)
-
-    def run(s, **more):
-        made = make_engine(engine, s)
-        result = jax.jit(lambda p, t: rollout.simulate(s, made, p, t, **more))(*worlds)
-        return jax.tree.map(np.asarray, result)
-
-    with jax.enable_x64(wide):
-        changed, read = run(the_scene, constants=constants), run(other)
-    tolerance = 1e-9 if wide else 1e-4
-    for a, b in zip(jax.tree.leaves(changed), jax.tree.leaves(read), strict=True):
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
-
-
 @pytest.mark.slow
 def test_mjx_with_changed_constants_equals_mujoco_with_a_file_of_those_numbers():
     """One program of stock MJX, called with two sets of numbers, and MuJoCo C in float64."""
@@ -203,27 +181,6 @@ def test_numbers_of_a_batch_equal_those_of_single_worlds():
     friction = np.asarray(hand.cones.hand_object.friction)[0]
     wanted = constants.objects.object[0].friction * np.asarray(trials.friction)
     np.testing.assert_allclose(friction, wanted, rtol=1e-6)
-
-
-@pytest.mark.slow  # quick: worlds with numbers of their own (test_model)
-def test_mujoco_worlds_with_own_friction_equal_separate_runs():
-    """A batch of three frictions against three batches of one each."""
-    the_scene = short()
-    engine = make_engine("mujoco", the_scene)
-    params, trial = jax.tree.map(jnp.asarray, hand_world(the_scene))
-    worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (3, *v.shape)), (params, trial))
-    constants = random_constants(the_scene, 6, 3)
-
-    @jax.jit
-    def run(params, trials, constants):
-        result = rollout.simulate(the_scene, engine, params, trials, constants=constants)
-        return result[1].distance
-
-    together = run(*worlds, constants)
-    for i in range(3):
-        alone = run(*repeat(nth((*worlds, constants), i), 3))
-        np.testing.assert_allclose(alone[0], together[i], rtol=1e-6)
-    assert not np.allclose(together[0], together[1])
 
 
 def test_derivatives_equal_differences():

@@ -101,7 +101,7 @@ def test_every_step_of_a_batch_equals_mujocos(grasp):
         engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
         found = oracles.path(engine, fields, ctrl)
     errors, far, touching = oracles.against_mujoco(scene, fields, np.asarray(ctrl), found)
-    # As in test_structured: a difference of velocities, and MuJoCo's own rounding.
+    # As in test_effects: a difference of velocities, and MuJoCo's own rounding.
     assert errors.max() < 1e-8 and far.max() < 1e-12
     assert touching.max() > 4  # more than the object on the table
 

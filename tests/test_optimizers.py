@@ -10,7 +10,7 @@ import optax
 import pytest
 from scipy import stats
 
-from codesign_jax import codesign, optimize
+from codesign_jax import optimize
 from codesign_jax.optimize import (
     EVOSAX,
     NAMES,
@@ -28,8 +28,6 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import make_settings
-from tests.helpers import episodes
-from tests.helpers.toy_engine import tiny
 
 # As many parameters as in the paper, of different ranges.  Each optimiser has two programs for all
 # tests: its `ask` and `tell` at this size.
@@ -304,40 +302,6 @@ def test_steps_of_cma_es_do_not_shrink_on_a_plateau():
     state, *_ = run(made, start(made), OPEN[:40], lambda population: lost)
     # The logarithm of the step is a random walk; told equal costs, evosax has 2e-4 here.
     assert 0.2 < float(state.memory["strategy"]["std"]) / 0.25 < 5
-
-
-# The same of the particle filter is one of the quick tests (test_codesign).
-@pytest.mark.slow
-@pytest.mark.parametrize("name", EVOSAX)
-def test_a_whole_run_is_its_episodes_with_one_compile(name):
-    """Toy engine, a cost of one's own: a loop, `Task.run`, and a batch of seeds."""
-    the_scene, space, engine = tiny()
-
-    def seconds_held(scene, trace, ctrl):
-        return 2.0 - (trace.distance < 0.5).sum() * scene.discretization.timestep
-
-    made = codesign.make_optimizer(name, space)
-    how = {"stop_when_lost": True, "cost": seconds_held}
-    task = codesign.Task(the_scene, space, 3, engine, **how)
-    episode = partial(task.episode, made)
-    masks = optimize.schedule("switch-1", np.array(space.is_morphology), 4)
-    states = [made.init(jax.random.key(s), np.array([0.05, 0.0]), 8) for s in range(2)]
-    costs, state, traced = [], states[0], []
-    for mask in masks:
-        state, info = episode(state, mask)
-        costs.append(info.selection.cost)
-        traced.append(engine.traced)
-    assert len(set(traced)) == 1
-    by_episode = episodes.evaluate_by(episode, made)(state.particles, jax.random.key(5))
-    assert engine.traced == traced[0] and np.asarray(by_episode.cost).shape == (8, 3)
-    run = partial(task.run, made)
-    batch = jax.tree.map(lambda *v: jnp.stack(v), *states)
-    _, infos = jax.vmap(run, (0, None))(batch, masks)
-    # A cost is a number of time steps, and two programs may round a loss to the next one.
-    step = the_scene.discretization.timestep
-    np.testing.assert_allclose(infos.selection.cost[0], costs, atol=1.01 * step)
-    assert (np.asarray(costs) != infos.selection.cost[1]).any(), "another seed is another run"
-    assert np.ptp(costs) > 0.1
 
 
 def test_unknown_names_and_wrong_numbers_are_answered_in_words():

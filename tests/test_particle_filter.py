@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from codesign_jax.optimize import (
     ParticleFilter,
     Space,
-    State,
     answer,
     candidates,
     reflect,
@@ -262,47 +261,6 @@ def test_concurrent_optimisation_converges():
     assert info.mean_cost[-20:].max() < 0.15
     assert info.best_cost.min() < 0.01
     assert np.all((final.particles >= LOW) & (final.particles <= HIGH))
-
-
-def test_single_domain_cannot_leave_its_plane():
-    state = FILTER.init(jax.random.key(0), CORNER, 60)
-    final, _ = run(state, schedule("control", IS_MORPHOLOGY, 128))
-    np.testing.assert_array_equal(
-        final.particles[:, IS_MORPHOLOGY], np.tile(CORNER[IS_MORPHOLOGY], (60, 1))
-    )
-
-
-def test_resumed_run_equals_the_uninterrupted_one():
-    masks = schedule("switch-2", IS_MORPHOLOGY, 12)
-    state = FILTER.init(jax.random.key(2), CORNER, 4)
-    step = jax.jit(episode)
-    uninterrupted = state
-    for mask in masks:
-        uninterrupted, _ = step(uninterrupted, mask)
-    for mask in masks[:5]:
-        state, _ = step(state, mask)
-    saved = [np.asarray(x) for x in (state.particles, state.episode)]
-    root = np.asarray(jax.random.key_data(state.key))
-    state = State(
-        jnp.asarray(saved[0]), jnp.asarray(saved[1]), jax.random.wrap_key_data(jnp.asarray(root))
-    )
-    for mask in masks[5:]:
-        state, _ = step(state, mask)
-    assert_same_bits(state, uninterrupted)
-
-
-@pytest.mark.slow
-def test_jit_equals_eager():
-    """Draws and ancestors bitwise; a move may round once less where jit fuses multiply and add."""
-    state = FILTER.init(jax.random.key(4), TARGET, 4)
-    eager, jitted = FILTER.ask(state, OPEN), ask(state, OPEN)
-    tolerance = 4 * np.finfo(np.float32).eps * (np.abs(TARGET) + HIGH - LOW)
-    assert np.all(np.abs(eager - jitted) <= tolerance)
-    cost = quadratic(eager)
-    (one, info), (other, info_jitted) = FILTER.tell(state, eager, cost), tell(state, eager, cost)
-    assert_same_bits(one, other)
-    np.testing.assert_array_equal(info.ancestors, info_jitted.ancestors)
-    np.testing.assert_allclose(info.weight, info_jitted.weight, rtol=1e-6)
 
 
 def test_runs_in_one_batch_equal_runs_alone():

@@ -23,7 +23,7 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.runs.progress import Busy, GroupProgress, Progress, Ticker, duration
+from codesign_jax.runs.progress import Busy, Progress, Ticker, Voice, duration
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import effects, library, parameters
@@ -241,19 +241,16 @@ def test_tables_hold_the_history_with_units(run, tmp_path):
     assert [np.float32(r["test_cost"]) for r in rows] == np.asarray(test.cost).tolist()
 
 
-def test_every_file_and_column_is_described_on_the_reference_page(run, tmp_path):
+def test_every_file_and_column_is_described_on_the_page(run, tmp_path):
     the_scene, space, record, test = run
     tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
     tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
     assert {p.name for p in tmp_path.iterdir()} == {*columns.TABLES}
-    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
-    assert page == columns.page(), "run python -m scripts.files_page"
-    for name, table in columns.TABLES.items():
-        section = page.split(f"## {name}\n")[1].split("\n## ")[0]
-        designs = {f"{table.designs}{d}" for d in tables.design_columns(space)}
-        own = {*read(tmp_path / name)[0]} - designs
-        assert own and all(f"| `{column}` | " in section for column in own)
-    assert all(f"## {name}\n" in page for name in columns.MORE)
+    head, *sections = (ROOT / "docs" / "files.md").read_text(encoding="utf-8").split("\n## ")
+    assert {*re.findall(r"^\| `(\S+)` \|", head, re.M)} == columns.FILES | {*columns.TABLES}
+    named = {s.split("\n")[0]: re.findall(r"^\| `(\w+)` \|", s, re.M) for s in sections}
+    assert named.pop("The Parquet file of `codesign sample`") == [*columns.GRASPS]
+    assert named == {n: [*t.columns] for n, t in (columns.TABLES | columns.MORE).items()}
 
 
 def test_tables_by_episode_equal_tables_at_once(run, tmp_path):
@@ -330,37 +327,40 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
 
 def test_progress_line(capsys):
     with Progress(64) as progress:
-        line = progress.episode(16, mean=1.5, best=0.25, failed=1, grasps=60, seconds=10.0)
-    assert "episode 16/64  mean 1.500  best 0.250  failed 1/60  6.0 grasps/s" in line
-    assert line.endswith("ETA 8:00")  # 48 episodes of 10 s
-    assert line in capsys.readouterr().out
+        found = {"mean": 1.5, "best": 0.25, "failed": 1, "grasps": 60, "causes": "STUCK 1"}
+        line = Voice(progress).episode(16, **found)
+        progress.round(10.0)
+    assert line == "episode 16/64  mean 1.500  best 0.250  failed 1/60 (STUCK 1)"
+    told = f"{line}  6.0 grasps/s  ETA 8:00"  # 48 episodes of 10 s
+    assert capsys.readouterr().out == f"{told}\n"
 
 
 def test_time_left_includes_the_tests(capsys):
     """At 6 grasps/s: 48 episodes of 60 grasps, 600 of the final test, and what comes afterwards."""
     with Progress(64, test=600, after=120) as progress:
-        line = progress.episode(16, mean=1.5, best=0.25, failed=1, grasps=60, seconds=10.0)
-        assert line.endswith("ETA 10:00")
-        progress.episode(64, mean=1.5, best=0.25, failed=1, grasps=60, seconds=10.0)
-        progress.tested(300, 50.0)
-        progress.tested(300, 50.0)
+        for done in (16, 64):
+            Voice(progress).episode(done, mean=1.5, best=0.25, failed=1, grasps=60)
+            progress.round(10.0)
+        for _ in range(2):
+            progress.tested(300)
+            progress.round(50.0)
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1].endswith("ETA 2:00")
+    assert lines[0].endswith("ETA 10:00") and lines[1].endswith("ETA 2:00")
     assert lines[2] == "final test 300/600 grasps  6.0 grasps/s  ETA 1:10"
     assert len(lines) == 3  # the second part came at once: a line now and then
 
 
 def test_time_left_of_many_runs(capsys):
     """Two runs, at 2 x 60 grasps in 10 s: two episodes are left, and 60 of the test for each."""
-    with GroupProgress(3, 2, test=60) as group:
-        each = [group.one(f"seed {k}") for k in (0, 1)]
-        for one in each:
-            one.episode(1, mean=1.0, best=0.5, failed=0, grasps=60, seconds=10.0)
-        group.round(10.0)
-        for one in each:
-            one.tested(60, 10.0)
-        group.round(10.0)
+    with Progress(3, 2, test=60) as progress:
+        for k in (0, 1):
+            Voice(progress, f"seed {k}").episode(1, mean=1.0, best=k, failed=0, grasps=60)
+        progress.round(10.0)
+        for _ in range(2):
+            progress.tested(60)
+        progress.round(10.0)
     lines = capsys.readouterr().out.splitlines()
+    assert "1/3  2 runs  mean 1.000 to 1.000  best 0.000 to 1.000  failed 0/120  " in lines[0]
     assert lines[0].endswith("12.0 grasps/s  ETA 0:30")
     assert lines[1] == "final test 120/120 grasps  12.0 grasps/s  ETA 0:00"
 

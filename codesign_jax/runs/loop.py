@@ -26,7 +26,7 @@ from codesign_jax.runs.checkpoint import Checkpoints, Restored
 from codesign_jax.runs.directory import RunDirectory
 from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.interrupts import Stopped
-from codesign_jax.runs.progress import Progress, Stopwatch
+from codesign_jax.runs.progress import Voice
 from codesign_jax.runs.record import History, Record, Start
 from codesign_jax.runs.settings import SCENE_COST, Settings, masks_of
 from codesign_jax.scene import Scene
@@ -167,7 +167,7 @@ class Loop:
         plan: Plan,
         run: RunDirectory,
         store: Checkpoints,
-        progress: Progress,
+        progress: Voice,
         *,
         every: int = 1,
     ):
@@ -302,10 +302,6 @@ class Loop:
             answer,
         )
 
-    def _tested_some(self, watch: Stopwatch, grasps: int) -> None:
-        """Tells that a part of the final test is done."""
-        self.progress.tested(grasps, watch.lap())
-
     def _episodes(self, record: Record) -> Asking:
         for e in range(record.done, self.plan.settings.episodes):
             with self.progress.busy("simulating") as watch:
@@ -362,8 +358,7 @@ class Loop:
         )
         batch = len(particles) * settings.trials
         with self.progress.busy("testing the final particles") as watch:
-            told = partial(self._tested_some, watch, batch)
-            test = yield from self._evaluated(testing, told)
+            test = yield from self._evaluated(testing, partial(self.progress.tested, batch))
         record.test = jax.tree.map(lambda v: np.asarray(v)[same], test.outcomes)
         self._save(settings.episodes + 1, record)
         self._write_tables(record, settings.episodes)
@@ -381,7 +376,6 @@ class Loop:
             causes=tables.failure_counts(status),
             warnings=tables.warning_counts(status),
             grasps=status.size,
-            seconds=seconds,
         )
         self.run_directory.log(f"{line}  {seconds:.2f} s")
 

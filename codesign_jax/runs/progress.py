@@ -107,24 +107,30 @@ class Busy(Live):
 
 
 class Progress(Live):
-    """Reports a run's episodes and its final test; use as a context manager."""
+    """Reports the episodes and final tests of one or several runs, a line a round for all of them.
+
+    A context manager; each run speaks by its `Voice`.
+    """
 
     def __init__(
         self,
         total: int,
+        runs: int = 1,
         *,
         test: int = 0,
         after: float = 0.0,
         console: rich.console.Console | None = None,
     ):
-        """Takes what there is to do."""
-        self.total, self._test, self._after = total, test, after
+        """Takes episodes, grasps of the test and of what comes afterwards, of each of the runs."""
+        self.total, self._test, self._after = total, runs * test, runs * after
         self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
         columns = rich.progress.BarColumn(), rich.progress.TextColumn("{task.description}")
         super().__init__(self.console, *columns, rich.progress.TimeElapsedColumn())
         self._task = self._bar.add_task("", total=None)
         self._watches: list[Stopwatch] = []
-        self._seconds, self._grasps, self._tested, self._told = 0.0, 0, 0, 0.0
+        self._entries: list[_Entry] = []
+        self._seconds, self._grasps, self._told = 0.0, 0, 0.0
+        self._part, self._tested = 0, 0
 
     def message(self, text: str) -> None:
         """Prints a line above the bar."""
@@ -144,40 +150,44 @@ class Progress(Live):
         for watch in self._watches:
             watch.restart()
 
-    def episode(
-        self,
-        done: int,
-        *,
-        mean: float,
-        best: float,
-        failed: int,
-        grasps: int,
-        seconds: float,
-        causes: str = "",
-        warnings: str = "",
-    ) -> str:
-        """Reports a finished episode and returns the line."""
-        left = (self.total - done) * grasps + self._test + self._after
-        pace = self._pace(grasps, seconds, left)
-        reasons = f" ({causes})" if causes else ""
-        reasons += f"  warnings: {warnings}" if warnings else ""
-        count = f"{done:>{len(str(self.total))}}/{self.total}"
-        line = (
-            f"episode {count}  mean {mean:.3f}  best {best:.3f}  failed {failed}/{grasps}"
-            f"{reasons}  {pace}"
-        )
-        self._show(_Entry(done, mean, best, failed, grasps), line, pace)
-        return line
+    def add(self, entry: "_Entry") -> None:
+        """Takes a run's report of an episode for the line of this round."""
+        self._entries.append(entry)
 
-    def tested(self, grasps: int, seconds: float) -> None:
-        """Reports a part of the final test."""
-        self._tested += grasps
-        pace = self._pace(grasps, seconds, max(self._test - self._tested, 0) + self._after)
-        line = f"final test {self._tested}/{self._test} grasps  {pace}"
-        self._bar.update(self._task, description=line)
-        if not self.console.is_terminal and time.monotonic() - self._told >= Ticker.SILENCE:
-            self._told = time.monotonic()
-            self.message(line)
+    def tested(self, grasps: int) -> None:
+        """Takes a part of a run's final test for the line of this round."""
+        self._part += grasps
+
+    def round(self, seconds: float) -> None:
+        """Tells of a round that took so long: its episodes in a line, or its part of the test."""
+        entries, self._entries = self._entries, []
+        tested, self._part = self._part, 0
+        self._tested += tested
+        left = max(self._test - self._tested, 0) + self._after
+        if entries:
+            grasps, first = sum(e.grasps for e in entries), min(e.done for e in entries)
+            pace = self._pace(grasps + tested, seconds, left + (self.total - first) * grasps)
+            self.message(f"{self._line(entries, first, grasps)}  {pace}")
+            self._bar.update(self._task, description=pace)
+        elif tested:
+            pace = self._pace(tested, seconds, left)
+            line = f"final test {self._tested}/{self._test} grasps  {pace}"
+            self._bar.update(self._task, description=line)
+            if not self.console.is_terminal and time.monotonic() - self._told >= Ticker.SILENCE:
+                self._told = time.monotonic()
+                self.message(line)
+
+    def _line(self, entries: "list[_Entry]", first: int, grasps: int) -> str:
+        if len(entries) == 1:
+            return entries[0].line
+        last, failed = max(e.done for e in entries), sum(e.failed for e in entries)
+        means, bests = ([getattr(e, k) for e in entries] for k in ("mean", "best"))
+        count = f"{first:>{len(str(self.total))}}" + (f" to {last}" if last > first else "")
+        return (
+            f"episode {count}/{self.total}  {len(entries)} runs  "
+            f"mean {min(means):.3f} to {max(means):.3f}  best {min(bests):.3f} to {max(bests):.3f}"
+            f"  failed {failed}/{grasps}"
+        )
 
     def _pace(self, grasps: int, seconds: float, left: float) -> str:
         """Counts grasps that took so long; the rate so far and the time left, in words."""
@@ -186,15 +196,11 @@ class Progress(Live):
         rate = self._grasps / max(self._seconds, 1e-9)
         return f"{rate:.1f} grasps/s  ETA {duration(left / rate)}"
 
-    def _show(self, entry: "_Entry", line: str, pace: str) -> None:
-        """Shows a finished episode."""
-        self._bar.update(self._task, description=pace)
-        self.message(line)
-
 
 class _Entry(NamedTuple):
     """What a run reported of an episode."""
 
+    line: str
     done: int
     mean: float
     best: float
@@ -202,87 +208,42 @@ class _Entry(NamedTuple):
     grasps: int
 
 
-class GroupProgress(Progress):
-    """Progress of several runs at once: a line for all of them after each round."""
+class Voice:
+    """What one of the runs says; its name precedes its messages where there are several."""
 
-    def __init__(
-        self,
-        total: int,
-        runs: int,
-        *,
-        test: int = 0,
-        after: float = 0.0,
-        console: rich.console.Console | None = None,
-    ):
-        """Takes the number of runs; the others are of each run, as of `Progress`."""
-        super().__init__(total, test=runs * test, after=runs * after, console=console)
-        self._entries: list[_Entry] = []
-        self._part = 0
-
-    def one(self, name: str) -> "OneOfMany":
-        """The progress of one of the runs."""
-        return OneOfMany(self, name)
-
-    def add(self, entry: _Entry) -> None:
-        """Takes a run's report of an episode for the line of this round."""
-        self._entries.append(entry)
-
-    def tested(self, grasps: int, seconds: float) -> None:
-        """Takes a run's report of a part of its final test, which took the round's time."""
-        self._part += grasps
-
-    def round(self, seconds: float) -> None:
-        """Tells of a round that took so long: its episodes in a line, if any ended in it."""
-        entries, self._entries = self._entries, []
-        tested, self._part = self._part, 0
-        if not entries:
-            if tested:
-                super().tested(tested, seconds)
-            return
-        self._tested += tested
-        grasps, failed = (sum(getattr(e, k) for e in entries) for k in ("grasps", "failed"))
-        first, last = min(e.done for e in entries), max(e.done for e in entries)
-        left = (self.total - first) * grasps + max(self._test - self._tested, 0) + self._after
-        pace = self._pace(grasps + tested, seconds, left)
-        means, bests = ([getattr(e, k) for e in entries] for k in ("mean", "best"))
-        count = f"{first:>{len(str(self.total))}}" + (f" to {last}" if last > first else "")
-        self._bar.update(self._task, description=pace)
-        self.message(
-            f"episode {count}/{self.total}  {len(entries)} runs  "
-            f"mean {min(means):.3f} to {max(means):.3f}  best {min(bests):.3f} to {max(bests):.3f}"
-            f"  failed {failed}/{grasps}  {pace}"
-        )
-
-
-class OneOfMany(Progress):
-    """Progress of a run among others: messages with its name; its lines are its log's alone."""
-
-    def __init__(self, group: GroupProgress, name: str):
+    def __init__(self, progress: Progress, name: str = ""):
         """Takes the runs' common progress and what to call this one."""
-        super().__init__(group.total, console=group.console)
-        self._group, self._name = group, name
+        self._progress, self._name = progress, f"{name}: " if name else ""
+        self.busy, self.tested = progress.busy, progress.tested
 
     def message(self, text: str) -> None:
         """Prints a line that begins with the run's name."""
-        self._group.message(f"{self._name}: {text}")
+        self._progress.message(f"{self._name}{text}")
 
-    def busy(self, text: str) -> "Stopwatch":
-        """As of the group."""
-        return self._group.busy(text)
-
-    def tested(self, grasps: int, seconds: float) -> None:
-        """As of the group."""
-        self._group.tested(grasps, seconds)
-
-    def _show(self, entry: _Entry, line: str, pace: str) -> None:
-        """Leaves it to the group, which prints one line for all runs of a round."""
-        self._group.add(entry)
+    def episode(
+        self,
+        done: int,
+        *,
+        mean: float,
+        best: float,
+        failed: int,
+        grasps: int,
+        causes: str = "",
+        warnings: str = "",
+    ) -> str:
+        """Reports a finished episode and returns the line."""
+        total = self._progress.total
+        line = f"episode {done:>{len(str(total))}}/{total}  mean {mean:.3f}  best {best:.3f}"
+        line += f"  failed {failed}/{grasps}" + (f" ({causes})" if causes else "")
+        line += f"  warnings: {warnings}" if warnings else ""
+        self._progress.add(_Entry(line, done, mean, best, failed, grasps))
+        return line
 
 
 class Stopwatch:
     """Measures the wall time of a block."""
 
-    seconds, _start, _lap = 0.0, 0.0, 0.0
+    seconds, _start = 0.0, 0.0
 
     def __enter__(self) -> "Stopwatch":
         """Starts."""
@@ -292,11 +253,6 @@ class Stopwatch:
     def restart(self) -> None:
         """Starts again: what was until now does not count."""
         self._start = time.perf_counter()
-
-    def lap(self) -> float:
-        """Seconds since the start or the last lap."""
-        before, self._lap = max(self._lap, self._start), time.perf_counter()
-        return self._lap - before
 
     def __exit__(self, *exception: object) -> None:
         """Stops."""

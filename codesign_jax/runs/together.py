@@ -17,7 +17,7 @@ from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.loop import Loop, Plan, RunResult, begin_fetch, variant
-from codesign_jax.runs.progress import GroupProgress, Progress
+from codesign_jax.runs.progress import Progress, Voice
 from codesign_jax.runs.settings import Settings
 
 MOST = 100
@@ -125,20 +125,16 @@ def _group(
 ) -> Results:
     """`optimize` of as many runs as fit into one process; `begun` is how to open the folders."""
     plan = next(iter(plans.values()))
-    settings, many = plan.settings, len(plans) > 1
-    ahead = {"test": plan.test_grasps, "after": after}
     called = run_names({folder: own.settings for folder, own in plans.items()})
     with contextlib.ExitStack() as stack:
-        total = settings.episodes
-        progress = GroupProgress(total, len(plans), **ahead) if many else Progress(total, **ahead)
+        ahead = {"test": plan.test_grasps, "after": after}
+        progress = Progress(plan.settings.episodes, len(plans), **ahead)
         stack.enter_context(progress)
         loops = {}
         for folder, own in plans.items():
             how = folder, own.scene, own.settings, command
             run, notes = stack.enter_context(open_run(*how, **begun))
-            voice = (
-                progress.one(called[folder]) if isinstance(progress, GroupProgress) else progress
-            )
+            voice = Voice(progress, called[folder] if len(plans) > 1 else "")
             store = stack.enter_context(run.store(tell=voice.message))
             for note in notes:
                 voice.message(note)
@@ -176,11 +172,11 @@ class _Together:
                 self._round()
         except Stopped as stop:
             self._throw(stop)
-            self._show()
+            self.progress.round(self.seconds)
             self.progress.message(f"stopped by signal {stop.signum}; the same command resumes")
         except Exception as error:  # what simulates all of them
             self._throw(error)
-        self._show()
+        self.progress.round(self.seconds)
         signum = self.interrupts.signum
         ended = {
             folder: r._replace(signum=signum) if isinstance(r, RunResult) else r
@@ -228,7 +224,7 @@ class _Together:
         asked = {folder: request for folder, (_, request) in self.waiting.items()}
         answers = self.interrupts.begin(self.batch.begin, list(asked.values()))
         self._save()
-        self._show()
+        self.progress.round(self.seconds)
         replies = answers()
         begin_fetch(replies)
         for folder, reply in zip(asked, replies, strict=True):
@@ -249,11 +245,6 @@ class _Together:
             except Exception as error:
                 self.waiting.pop(folder)[0].close()
                 self._fail(folder, error)
-
-    def _show(self) -> None:
-        """Reports what was saved since the last round."""
-        if isinstance(self.progress, GroupProgress):
-            self.progress.round(self.seconds)
 
     def _throw(self, error: Exception) -> None:
         """Ends every run that still waits."""

@@ -5,6 +5,8 @@ are first asked for, so that importing the package costs a millisecond and sets 
 """
 
 import importlib
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 from codesign_jax import reuse as _reuse  # noqa: F401  # notes the state of the files first
@@ -76,6 +78,24 @@ __all__ = [
     "types",
     "use_compilation_cache",
 ]
+
+
+def _import_mujoco() -> None:
+    """Imports MuJoCo, without OpenGL where MUJOCO_GL names a way that is not there.
+
+    Nothing but `report.renderer`, in a process of its own, draws with OpenGL.
+    """
+    way = os.environ["MUJOCO_GL"]
+    try:
+        importlib.import_module("mujoco")
+    except Exception:  # each way has errors of its own, of ctypes and PyOpenGL among them
+        os.environ["MUJOCO_GL"] = "disable"
+        importlib.import_module("mujoco")
+        os.environ["MUJOCO_GL"] = way
+
+
+if os.environ.get("MUJOCO_GL") and "mujoco" not in sys.modules:
+    _import_mujoco()
 
 
 def __getattr__(name: str) -> Any:

@@ -134,8 +134,8 @@ MOST = str(512 * 2**20)  # bytes of each cache on disk, if the environment does 
 
 
 def folder() -> Path:
-    """Folder of all caches; it may not exist yet."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "codesign-jax"
+    """Folder of all caches; it may not exist yet, and begins with `~` for a user without a home."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "codesign-jax")
 
 
 def _environment() -> tuple[str, str]:
@@ -153,7 +153,7 @@ def problems() -> list[str]:
 
 
 def limit() -> int | None:
-    """The most bytes of each cache; None if caches are off.
+    """The most bytes of each cache; None if caches are off or there is no folder for them.
 
     Raises:
       ValueError: If an environment variable has a wrong value.
@@ -161,7 +161,7 @@ def limit() -> int | None:
     if wrong := problems():
         raise ValueError("; ".join(wrong))
     switch, most = _environment()
-    return int(most) if switch == "on" else None
+    return int(most) if switch == "on" and folder().parts[0] != "~" else None
 
 
 def kernel_file(name: str) -> Path | None:
@@ -381,14 +381,23 @@ process = {"begun": False, "forked": False}
 os.register_at_fork(after_in_child=lambda: process.update(forked=process["begun"]))
 
 
-def _run(call: Callable[[], Any]) -> Any:
-    """Returns call(); Ctrl-C while JAX traces may leave a mark that it takes for a recursion."""
+def begin() -> None:
+    """A program is about to run.
+
+    Raises:
+      RuntimeError: If the process was forked from one in which programs had run.
+    """
     if process["forked"]:
         raise RuntimeError(
             "this process was forked from one that had simulated, and would wait for ever for "
             "XLA's threads, which it has not: begin processes by multiprocessing's `spawn`"
         )
     process["begun"] = True
+
+
+def _run(call: Callable[[], Any]) -> Any:
+    """Returns call(); Ctrl-C while JAX traces may leave a mark that it takes for a recursion."""
+    begin()
     try:
         return call()
     except RecursionError as error:

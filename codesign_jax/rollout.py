@@ -81,6 +81,7 @@ def sample_trials(
       InputError: If `key` is not one typed key, `num_trials` is no whole number or below 1, or the
         constants do not fit the scene or the trials.
     """
+    reuse.begin()
     axes.refuse_draws(key, num_trials)
     constants = scene.numbers(constants)
     axes.refuse_constants(constants, num_trials, "trial")
@@ -265,7 +266,11 @@ def prepare(
     Returns:
       Model fields, controls of shape (world, time, nu), and bits of `Status` that the worlds start
       with, shape (world,).
+
+    Raises:
+      RuntimeError: In a process that was forked from one that had simulated.
     """
+    reuse.begin()
     constants = jax.tree.map(lambda v: jnp.asarray(v, float), constants)
     every = (0, 0, batch_axes(constants))
     world = partial(_world, scene.structure)
@@ -389,7 +394,7 @@ def evaluate_to_end(
     cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> tuple[Outcome, jax.Array | None]:
-    """As `evaluate`, with the states at the end, shape (particle, trial, nq + nv).
+    """As `evaluate`, with the states at the end, `Trace.last`, shape (particle, trial, n).
 
     They are None if the engine does not tell them.
     """

@@ -169,8 +169,8 @@ class Trace(NamedTuple):
       status: Bits that only the engine knows of the step taken from each state (SOLVER_CAP if it
         ended at the limit of iterations, CONTACT_OVERFLOW), shape (time,) int32, or None if it does
         not tell.
-      last: Generalized positions and velocities at the end, those in which a decided world stays,
-        shape (nq + nv,), or None.
+      last: The state at the end, in which a decided world stays, shape (n,), or None: positions,
+        velocities, and what else a rollout that goes on from there needs, see `model.State`.
       residual: Residual of the step taken from each state, see `Outcome`, 0 of one that converged,
         shape (time,), or None if the engine does not tell.
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import rollout
+from codesign_jax import model, rollout
 from codesign_jax.engines.structured import StructuredEngine
 from tests.helpers import grasps
 
@@ -55,9 +55,10 @@ def grasp(dtype, **settings):
         worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (count, *v.shape)), (hand, trial))
         # `evaluate` would do: what is differentiated are the coordinates at the end.
         _, trace = rollout.simulate(scene, engine, *worlds, record_qpos=True, constants=constants)
-        size = trace.last.shape[1]
+        end = jnp.concatenate(model.split(scene, trace.last)[:2], 1)
+        size = end.shape[1]
         weights = np.random.default_rng(0).normal(size=size) / np.sqrt(size)
-        return trace.last @ jnp.asarray(weights, dtype)
+        return end @ jnp.asarray(weights, dtype)
 
     return jax.tree.map(lambda v: jnp.asarray([v], dtype), scene.constants()), losses
 

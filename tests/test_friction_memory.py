@@ -4,16 +4,19 @@ The kernel's steps are compared with a dense solve in `test_planted_contacts`, i
 differences in `test_reverse`; hard case 34 has the creep of two crossed fingers.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import scene
+from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.laws import holding
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, constraint_update
 from codesign_jax.model.layout import pairings_held
+from codesign_jax.scene import parameters
 
 MU = 0.8
 
@@ -84,3 +87,54 @@ def test_spheres_keep_nothing():
         chosen = scene.load("paper", overrides={"effects.surface": surface})
         assert chosen.effects.friction_memory and pairings_held(chosen) == held
     make_engine("mujoco", chosen)
+
+
+@pytest.fixture(scope="module")
+def crossed():
+    """Crossed fingers of the default scene that hold one another: the state, and in pieces on.
+
+    A function of start, controls and steps of a piece: a sum of the end, the end, and the traces.
+    """
+    chosen = scene.load("paper", overrides={"discretization": {"links": 3}})
+    engine, space = make_engine("structured", chosen), parameters.design_space(chosen.hand, "2d")
+    trial = rollout.nominal_trial(chosen)._replace(position=np.array([0.0, 0.4]))  # out of reach
+    with jax.enable_x64(True):
+        hand = space.params(space.from_units(np.array([150.0, 120.0])))
+        worlds = jax.tree.map(lambda v: jnp.asarray(v)[None], (hand, trial))
+        fields, ctrl, _ = rollout.prepare(chosen, *worlds, chosen.constants())
+        start = jax.jit(engine.rollout)(fields, ctrl[:, :340]).last
+    assert np.abs(model.split(chosen, start).held).max() > 0.1
+
+    def one(start, ctrl):
+        trace = engine.rollout(fields._replace(start=start), ctrl)
+        return trace.last, (trace.distance, trace.height, trace.speed)
+
+    def pieces(start, ctrl, size):
+        parts = jnp.moveaxis(ctrl.reshape(1, -1, size, ctrl.shape[2]), 1, 0)
+        last, shown = jax.lax.scan(one, start, parts)
+        shown, end = jnp.stack(shown).reshape(3, -1), model.split(chosen, last)
+        return shown.sum() + end.qpos.sum() + end.held.sum(), (last, shown)
+
+    return start, ctrl[:, 340:360], pieces
+
+
+def test_a_rollout_in_pieces_is_that_of_one_piece(crossed):
+    """What fingers hold, the solver's warm start and the time of the grasp pass on: equal bits."""
+    start, ctrl, pieces = crossed
+    with jax.enable_x64(True):
+        found = [jax.jit(partial(pieces, size=n))(start, ctrl)[1] for n in (20, 1)]
+    jax.tree.map(np.testing.assert_array_equal, *found)
+
+
+@pytest.mark.slow  # four kernels; quick: the test before, and derivatives of a piece (test_reverse)
+def test_pieces_have_one_derivative(crossed):
+    """By the start and by every command."""
+    start, ctrl, pieces = crossed
+    with jax.enable_x64(True):
+        slope = partial(jax.value_and_grad, argnums=(0, 1), has_aux=True)
+        found = [jax.jit(slope(partial(pieces, size=n)))(start, ctrl) for n in (20, 1)]
+    jax.tree.map(np.testing.assert_array_equal, found[0][0], found[1][0])
+    for a, b in zip(found[0][1], found[1][1], strict=True):
+        # Sums over steps are rounded in another order.
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * np.abs(a).max())
+    assert np.abs(found[0][1][0][:, -36:]).max() > 0  # by what the fingers hold

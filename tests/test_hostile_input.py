@@ -1,6 +1,7 @@
 """Input that was made to do harm, or looks so: refused by the project's own error, in seconds."""
 
 import base64
+import codecs
 import functools
 import json
 import os
@@ -30,6 +31,42 @@ def refusals(call, *arguments, **options):
     with pytest.raises(InputError) as caught:
         call(*arguments, **options)
     return caught.value.problems
+
+
+# --- files of another kind ------------------------------------------------------------------------
+
+FOREIGN = {
+    "a Git LFS pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 684084\n",
+    "a web page": b"\n<!DOCTYPE html><html><head><title>404</title></head></html>\n",
+    "text in UTF-16": "solid a".encode("utf-16"),
+}
+
+
+@pytest.mark.parametrize("said", FOREIGN)
+@pytest.mark.parametrize("kind", ["toml", *reading.FORMATS])
+def test_files_of_another_kind_are_named(tmp_path, kind, said):
+    path = tmp_path / f"file.{kind}"
+    path.write_bytes(FOREIGN[said])
+    call = scene.load if kind == "toml" else reading.read
+    [problem] = refusals(call, path)
+    assert said in problem
+
+
+@pytest.mark.parametrize("kind", ["toml", "obj", "off", "ply", "stl"])
+def test_a_byte_order_mark_is_no_part_of_a_text(tmp_path, kind):
+    """Editors of Windows write one."""
+    path = tmp_path / f"file.{kind}"
+    if kind == "toml":
+        path.write_bytes(PAPER.read_bytes())
+        read = scene.load
+    else:
+        how = {"ply": {"encoding": "ascii"}, "stl": {"file_type": "stl_ascii"}}.get(kind, {})
+        text = box().export(**({"file_type": kind} | how))
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        read = lambda p: reading.read(p).faces.shape  # noqa: E731
+    plain = read(path)
+    path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
+    assert read(path) == plain
 
 
 # --- TOML ----------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """Meshes: mass and distance against closed forms, what is refused, what a repair says."""
 
-import itertools
+import contextlib
 
 import jax
 import jax.numpy as jnp
@@ -111,7 +111,7 @@ def test_exact_distance_is_the_least_over_all_faces():
 def test_voxel_error_is_what_is_said(bound):
     """On an L, at points that the grid was not chosen by."""
     mesh = bracket()
-    built = grid.build(mesh.vertices, mesh.faces, bound)
+    built = grid.build(mesh.vertices, mesh.faces, bound, 0.014)
     assert built.error <= bound < built.worst
     rng = np.random.default_rng(2)
     points, face = trimesh.sample.sample_surface(mesh, 2000, seed=3)[:2]
@@ -126,22 +126,6 @@ def test_voxel_error_is_what_is_said(bound):
     convex = exact > 0.005  # not in the L's inner corner
     error = np.abs(grid.interpolate(built, far) - exact)[convex]
     assert np.quantile(error, 0.99) < 0.3 * bound
-
-
-def test_grids_are_stored_and_damaged_files_are_not_used(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    mesh = box()
-    times = itertools.count(0.0, 2.0)  # every call of the clock is two seconds later
-    monkeypatch.setattr(grid.time, "perf_counter", lambda: next(times))
-    first = grid.cached("key", mesh.vertices, mesh.faces, 2e-3)
-    [path] = (tmp_path / "codesign-jax" / "meshes").iterdir()
-    monkeypatch.setattr(grid, "build", lambda *_: pytest.fail("built again"))
-    again = grid.cached("key", mesh.vertices, mesh.faces, 2e-3)
-    np.testing.assert_array_equal(first.values, again.values)
-    assert first.cell == again.cell and first.error == again.error
-    path.write_bytes(path.read_bytes()[:-100])
-    monkeypatch.setattr(grid, "build", lambda *_: first)
-    assert grid.cached("key", mesh.vertices, mesh.faces, 2e-3) is first
 
 
 # --- what is refused -----------------------------------------------------------------------------
@@ -218,6 +202,59 @@ def test_a_surface_that_cuts_through_itself(tmp_path):
         _ = found.grid
 
 
+def disc(radius, height, bore=0.0):
+    """A plate with or without a hole, turned out of the axes of its grid's cells."""
+    make = trimesh.creation
+    mesh = make.annulus(bore, radius, height) if bore else make.cylinder(radius, height)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5, [1, 2, 3]))
+    return mesh
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [box(120, 120, 2), box(80, 4, 4), box(7, 7, 7).subdivide(), disc(40, 1.5), disc(8, 50, 7.2)],
+    ids=["plate", "rod", "cube", "disc", "tube"],
+)
+def test_bodies_that_are_thin_for_the_cells_do_not_cut_through_themselves(tmp_path, mesh):
+    mesh.export(tmp_path / "thin.stl")
+    thin = meshes.load(tmp_path / "thin.stl", unit="mm", repaired=False, voxel_error=5e-4)
+    assert thin.grid.error <= 5e-4
+
+
+def test_winding_of_bodies_in_one_another():
+    """One in a ball, two in a second one inside of it, none in a cavity and outside."""
+    outer, inner = (trimesh.creation.icosphere(2, r).triangles for r in (0.03, 0.02))
+    points = np.array([[0.0, 0.001, 0.0], [0.0, 0.0, 0.024], [0.05, 0.0, 0.0]])
+    twice = surface.winding(np.concatenate([outer, inner]), points)
+    np.testing.assert_allclose(twice, [2, 1, 0], atol=1e-9)
+    hollow = surface.winding(np.concatenate([outer, inner[:, ::-1]]), points)
+    np.testing.assert_allclose(hollow, [0, 1, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "overhang"), [(0, 0.0), (10, 0.0), (35, 60 * np.sin(0.6109) - 20 * np.cos(0.6109))]
+)
+def test_a_body_that_topples_is_said(tmp_path, degrees, overhang):
+    """A box of 40 x 40 x 120 mm on an edge: its centre beside it, by geometry; 0.6109 is 35 deg."""
+    mesh = box(40, 40, 120)
+    turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [1, 0, 0])
+    mesh.apply_transform(turn)
+    mesh.export(tmp_path / "box.stl")
+    entry = 'name = "a"; type = "mesh"; file = "box.stl"; unit = "mm"; friction = 0.8; mass = 0.1'
+    said = pytest.warns(UserWarning, match="topples") if degrees else contextlib.nullcontext()
+    with said:
+        shape = objects.load(object_file(tmp_path, entry)).object[0]
+    if degrees != 10:
+        assert shape.mesh.overhang == pytest.approx(1e-3 * overhang, abs=1e-4)
+
+
+def test_bodies_that_rest_do_not_topple(tmp_path):
+    """On a face, on a point below the centre, and on the rim of a tube."""
+    for mesh in (bracket(), trimesh.creation.icosphere(3, 0.03), trimesh.creation.cone(0.03, 0.05)):
+        assert solid(tmp_path, mesh).overhang < 5e-4
+    assert solid(tmp_path, trimesh.creation.annulus(0.02, 0.03, 0.05)).overhang == 0
+
+
 def test_too_fine_a_grid(tmp_path, monkeypatch):
     monkeypatch.setattr(grid, "MAX_NODES", 1000)
     with pytest.raises(schema.InputError, match="more than 1,000"):
@@ -267,6 +304,20 @@ def test_repair_of_a_good_mesh_changes_nothing(tmp_path):
     assert solid(tmp_path, inverted, repaired=True).repairs == (
         "turned 20 of 20 faces, so that all point outwards",
     )
+
+
+def test_repair_keeps_and_makes_cavities(tmp_path):
+    """A ball in the cavity of a ball, beside another one: right and with every part turned."""
+    parts = [trimesh.creation.icosphere(2, r) for r in (0.03, 0.02, 0.01, 0.008)]
+    parts[1].invert()
+    parts[3].apply_translation([0.05, 0, 0])
+    right = trimesh.util.concatenate(parts)
+    faces, report = repair.repair(right.vertices, right.faces)[1:]
+    assert not report
+    np.testing.assert_array_equal(faces, right.faces)
+    turned = repair.repair(right.vertices, right.faces[:, ::-1])[1]
+    mended = trimesh.Trimesh(right.vertices, turned, process=False)
+    assert mended.volume == pytest.approx(right.volume, rel=1e-12)
 
 
 def test_what_cannot_be_repaired_is_still_refused(tmp_path):

@@ -115,3 +115,13 @@ def test_extras_that_are_named_exist():
         for name in names.split(",")
     }
     assert {"report", "export", "parquet"} <= named <= extras
+
+
+@pytest.mark.parametrize("way", ["osmesa", "no way"])
+def test_simulation_needs_no_opengl(way):
+    """Ways that are named and not there (or, osmesa, may be): MuJoCo is imported all the same."""
+    script = "import codesign_jax, mujoco, os; codesign_jax.model; print(os.environ['MUJOCO_GL'])"
+    environment = os.environ | {"MUJOCO_GL": way, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"{way}\n"), done.stderr

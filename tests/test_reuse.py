@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from codesign_jax import cli, codesign, reuse
+from codesign_jax import cli, codesign, reuse, rollout
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.engines.structured import lanewise
 from codesign_jax.scene import parameters
@@ -237,9 +237,17 @@ def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     if not child:
         os._exit(3 if reuse.process["forked"] else 4)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
+    scene = grasps.pinch("sphere", 2)
+    worlds = jax.tree.map(lambda v: v[None], grasps.hand_world(scene))
+    key, numbers = jax.random.key(0), scene.constants()
     monkeypatch.setitem(reuse.process, "forked", True)
-    with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
-        program(0, 0)
+    for call in (
+        lambda: program(0, 0),
+        lambda: rollout.sample_trials(scene, key, 3),
+        lambda: rollout.prepare(scene, *worlds, numbers),
+    ):
+        with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
+            call()
 
 
 @pytest.mark.slow  # test_programs_go_when_many_maps_are_taken keeps the idea
@@ -314,13 +322,14 @@ def use_all(monkeypatch):
     jax.jit(lambda v: v * 3.25)(jnp.ones(7))
     reuse.kept(reuse.kernel_file("kernel"), lambda: b"code")
     monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
-    return grid.cached("cube", *cube(), 1e-3)
+    return grid.cached("cube", *cube(), 1e-3, 0.03)
 
 
 def test_one_switch_turns_all_caches_off(place, monkeypatch):
     monkeypatch.setenv("CODESIGN_CACHE", "off")
     found = use_all(monkeypatch)
     assert not place.exists() and not jax.config.jax_enable_compilation_cache
+    np.testing.assert_allclose(found.origin, -0.04)  # as far out as asked for
     monkeypatch.setenv("CODESIGN_CACHE", "on")
     jax.config.update("jax_enable_compilation_cache", True)
     compilation_cache.reset_cache()  # another process
@@ -329,6 +338,16 @@ def test_one_switch_turns_all_caches_off(place, monkeypatch):
     names = {(p.parent.name, p.name.rpartition("-")[2]) for p in place.rglob("*") if p.is_file()}
     assert {("jax", "cache"), ("jax", "atime")} <= names
     assert len([*place.glob("meshes/*.kept")]) == len([*place.glob("jax/kernels/*.kept")]) == 1
+
+
+def test_a_user_without_a_home_has_no_caches(monkeypatch):
+    """No HOME, and no entry in passwd: commands and the library work without."""
+    for variable in ("HOME", "XDG_CACHE_HOME", "CODESIGN_CACHE"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 4_000_000_000)
+    assert reuse.limit() is None
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    assert reuse.limit()
 
 
 def test_jax_deletes_what_was_not_used_for_the_longest_time(place, monkeypatch):
@@ -349,13 +368,14 @@ def test_jax_deletes_what_was_not_used_for_the_longest_time(place, monkeypatch):
 def test_a_grid_in_the_place_of_another_is_not_taken(place, monkeypatch):
     monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
     vertices, faces = cube()
-    first = grid.cached("a", vertices, faces, 1e-3)
-    grid.cached("b", 0.5 * vertices, faces, 1e-3)
+    first = grid.cached("a", vertices, faces, 1e-3, 0.014)
+    grid.cached("b", 0.5 * vertices, faces, 1e-3, 0.014)
     one, other = sorted((place / "meshes").iterdir(), key=lambda p: p.stat().st_size)
     content = one.read_bytes()
     one.write_bytes(other.read_bytes())
     other.write_bytes(content)
-    np.testing.assert_array_equal(grid.cached("a", vertices, faces, 1e-3).values, first.values)
+    again = grid.cached("a", vertices, faces, 1e-3, 0.014)
+    np.testing.assert_array_equal(again.values, first.values)
 
 
 def test_what_is_kept_is_found_and_damage_is_seen(folder):

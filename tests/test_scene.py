@@ -205,6 +205,7 @@ def test_eighteen_for_a_width_of_0_018_m(tmp_path):
     [
         (30.0, "mm", 0.0, 10.0),  # nobody gives micrometres
         (0.1, "s", 1e-5, 0.05),  # nor a tenth of a millisecond for 0.0001 s
+        (200.0, "kPa", 0.0, 150.0),  # nor 0.2 kPa, which moves nothing
     ],
 )
 def test_no_slip_is_guessed_that_nobody_makes(value, unit, low, high):

@@ -35,8 +35,8 @@ class EpisodeInfo(NamedTuple):
       population: Particles as simulated [SI units], shape (particle, parameter).
       outcomes: Cost, status, time of loss and first bad step, each of shape (particle, trial).
       selection: Particle costs, and weights and ancestors of a resampling; see `optimize.Info`.
-      last: States at which the worlds ended, failed ones frozen at their last good one, shape
-        (particle, trial, nq + nv), or None if the engine does not report them.
+      last: States at which the worlds ended, failed ones frozen at their last good one, see
+        `model.State`, shape (particle, trial, n), or None if the engine does not report them.
       drawn: The trials themselves, leading axis (trial,), of episodes that `batch.Batch` ran.
     """
 

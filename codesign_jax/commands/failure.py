@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from codesign_jax import rollout, runs
+from codesign_jax import model, rollout, runs
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain
@@ -97,7 +97,8 @@ def _where(trace: Trace, k: int) -> str:
 
 def _one_step(scene: Scene, space: DesignSpace, failure: Failure) -> None:
     """Takes the step after the last good state in MuJoCo C: is it the state or the engine?"""
-    if not np.isfinite(failure.state).all():
+    state = model.split(scene, failure.state)
+    if not np.isfinite([*state.qpos, *state.qvel]).all():
         print("the world was not finite from its start")
         return
     data = _last_state(scene, space, failure)
@@ -117,8 +118,8 @@ def _last_state(scene: Scene, space: DesignSpace, failure: Failure) -> mujoco.Mj
     """The last good state in MuJoCo C, with the controls of the step that follows it."""
     params, trial = jax.tree.map(np.asarray, _world(scene, space, failure))
     data = mujoco.MjData(grasps.world(scene, params, trial))
-    nq = data.model.nq
-    data.qpos[:], data.qvel[:] = failure.state[:nq], failure.state[nq:]
+    state = model.split(scene, failure.state)
+    data.qpos[:], data.qvel[:] = state.qpos, state.qvel
     controls = grasps.timed_controls(scene, params, trial)[:, 1:]
     # Entry k of a trace is the state before step k, so that step k - 1 led to a bad state k.
     step = failure.bad_step - 1 if failure.bad_step >= 0 else len(controls) - 1

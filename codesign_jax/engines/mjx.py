@@ -3,7 +3,6 @@
 import contextlib
 import io
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,19 +14,16 @@ with contextlib.redirect_stdout(io.StringIO()):
 
 from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
-from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
+from codesign_jax.model import (
+    ModelFields,
+    State,
+    compile_template,
+    layout,
+    softening_moments,
+    split,
+)
 from codesign_jax.scene import Scene, effects
 from codesign_jax.types import Trace
-
-
-class _Carry(NamedTuple):
-    """What passes from step to step; the rest of mjx.Data follows from it."""
-
-    qpos: jax.Array
-    qvel: jax.Array
-    warmstart: jax.Array
-    speed: jax.Array
-    alive: jax.Array
 
 
 class MjxEngine(Equal):
@@ -74,29 +70,23 @@ class MjxEngine(Equal):
         build again what JAX has traced of a step.
         """
 
-        def start(fields: ModelFields) -> _Carry:
-            zero = jnp.zeros(self.template.nv, ctrl.dtype)
-            velocity = zero + fields.qvel
-            return _Carry(fields.qpos, velocity, zero, jnp.abs(velocity).max(), jnp.array(True))
+        def body(carry: State, u: jax.Array) -> tuple[State, Trace]:
+            return jax.vmap(partial(self._advance, trajectory))(fields, carry, u)
 
-        def body(carry: _Carry, x: tuple[jax.Array, jax.Array]) -> tuple[_Carry, Trace]:
-            step = jax.vmap(partial(self._advance, trajectory), in_axes=(0, 0, 0, None))
-            return step(fields, carry, *x)
-
+        start = split(self.scene, jnp.asarray(fields.start, ctrl.dtype))
         with jax.default_matmul_precision("highest"):  # TF32 would spoil the solver on a GPU
-            steps = jnp.moveaxis(ctrl, 1, 0), jnp.arange(ctrl.shape[1])
-            end, trace = jax.lax.scan(body, jax.vmap(start)(fields), steps)
+            end, trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 1, 0))
         trace = jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), trace)
-        return trace._replace(last=jnp.concatenate([end.qpos, end.qvel], 1))
+        return trace._replace(last=jnp.concatenate(end, 1))
 
     def _advance(
-        self, trajectory: bool, fields: ModelFields, carry: _Carry, u: jax.Array, step: jax.Array
-    ) -> tuple[_Carry, Trace]:
+        self, trajectory: bool, fields: ModelFields, carry: State, u: jax.Array
+    ) -> tuple[State, Trace]:
         """One time step of a world, and the trace's entry of the state before it."""
         lay = layout(self.scene)
         bounds = verdict.bounds(self.scene.with_constants(fields.constants))
         data = self.reset(fields).replace(
-            qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.warmstart
+            qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.acc
         )
         new = self.step(fields, data, u)
         # Positions computed by a step belong to the state before it.
@@ -104,13 +94,14 @@ class MjxEngine(Equal):
         centre, middle = weights @ new.xipos, new.xipos[lay.object]
         distance, height = jnp.linalg.norm(middle - centre), middle[2]
         qpos = carry.qpos if trajectory else carry.qpos[:0]
-        entry = Trace(distance, height, carry.speed, qpos)
+        step, going, before = carry.step[0], carry.going[0] > 0, carry.speed[0]
+        entry = Trace(distance, height, before, qpos)
         # The sum makes the speed not finite if any position is not.
         speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()
-        goes_on = carry.alive & verdict.goes_on(
-            bounds, distance, height, carry.speed, step, to_end=trajectory
-        )
+        goes_on = going & verdict.goes_on(bounds, distance, height, before, step, to_end=trajectory)
         moved = goes_on & verdict.slow(bounds, speed)
-        state = _Carry(new.qpos, new.qvel, new.qacc_warmstart, speed, moved)
-        kept = carry._replace(speed=jnp.where(goes_on, speed, carry.speed), alive=moved)
-        return jax.tree.map(lambda a, b: jnp.where(moved, a, b), state, kept), entry
+        state = carry._replace(qpos=new.qpos, qvel=new.qvel, acc=new.qacc_warmstart)
+        state = jax.tree.map(lambda a, b: jnp.where(moved, a, b), state, carry)
+        now = jnp.where(goes_on, speed, before)
+        numbers = {"step": step + 1, "going": moved.astype(step.dtype), "speed": now}
+        return state._replace(**{name: value[None] for name, value in numbers.items()}), entry

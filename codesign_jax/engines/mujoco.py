@@ -10,7 +10,7 @@ import numpy as np
 
 from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
-from codesign_jax.model import ModelFields, compile_template, layout, softening_moments
+from codesign_jax.model import ModelFields, compile_template, layout, softening_moments, split
 from codesign_jax.scene import Constants, Scene, effects
 from codesign_jax.types import Status, Trace
 
@@ -49,16 +49,15 @@ class MujocoEngine(Equal):
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`."""
-        worlds, steps = ctrl.shape[:2]
+        (worlds, steps), (nq, nv) = ctrl.shape[:2], (self.template.nq, self.template.nv)
         like = jax.ShapeDtypeStruct((worlds, steps), ctrl.dtype)
-        nq = self.template.nq if trajectory else 0
         shapes = Trace(
             like,
             like,
             like,
-            jax.ShapeDtypeStruct((worlds, steps, nq), ctrl.dtype),
+            jax.ShapeDtypeStruct((worlds, steps, nq * trajectory), ctrl.dtype),
             jax.ShapeDtypeStruct((worlds, steps), np.int32),
-            jax.ShapeDtypeStruct((worlds, self.template.nq + self.template.nv), ctrl.dtype),
+            jax.ShapeDtypeStruct((worlds, nq + 2 * nv + 3), ctrl.dtype),
         )
         # Of the constants C needs the bounds alone: each argument is an array for XLA to fill.
         inputs = (
@@ -91,13 +90,16 @@ class MujocoEngine(Equal):
         (worlds, steps), scene, nq = ctrl.shape[:2], self.scene, self.template.nq
         batch = self._batch(worlds)
         write_fields(batch, fields)
+        start = split(scene, fields.start)
+        last = np.concatenate(start, 1)
+        end = split(scene, last)  # views
+        batch.bind("qacc_warmstart")[:] = start.acc
         distance, height, speed = np.zeros((3, worlds, steps))
         status, qpos = (
             np.zeros((worlds, steps), np.int32),
             np.zeros((worlds, steps, nq * trajectory)),
         )
         series = (distance, height, speed, qpos, status)
-        last = np.concatenate([fields.qpos, fields.qvel], 1)
         bounds = verdict.Bounds(*(v[:, None] for v in bounds))
         going = np.arange(worlds)
         chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
@@ -115,24 +117,34 @@ class MujocoEngine(Equal):
             full = batch.warning[:, _FULL, 0].any(1)[going]
             status[going[full], first + taken[full] - 1] |= int(Status.CONTACT_OVERFLOW)
             mine = verdict.Bounds(*(v[going] for v in bounds))
-            entry, kept = _decisions(mine, new, first, to_end=trajectory)
+            entry, kept = _decisions(mine, new, start.step[going] + first, to_end=trajectory)
+            if not first:  # worlds that were decided before
+                stay = start.going[:, 0] == 0
+                entry[stay], kept[stay] = 0, 0
+                speed[stay, 0], status[stay, 0] = start.speed[stay, 0], 0
             done = (entry < count) | stopped
             here = kept >= 0
-            last[going[here]] = states[here, kept[here]]
+            last[going[here], : states.shape[-1]] = states[here, kept[here]]
             for world, at, state in zip(going[done], entry[done], kept[done], strict=True):
                 rest = slice(first + at, None)
                 for array in (distance, height, qpos):
                     array[world, rest] = array[world, max(first + state, 0)]
                 # What MuJoCo told of the deciding step stays, also where its state does not.
                 status[world, rest] = status[world, first + at if at < count else first + state]
-                speed[world, rest] = speed[world, first + at] if at < count else np.nan
+                speed[world, rest] = end.speed[world] = (
+                    speed[world, first + at] if at < count else np.nan
+                )
+                end.acc[world], end.going[world] = 0, 0
             going = going[~done]
             if not going.size:
                 break
-        state = np.concatenate([batch.bind("qpos")[going], batch.bind("qvel")[going]], 1)
-        slow = verdict.slow(verdict.Bounds(*(v[going] for v in bounds)), np.abs(state[:, nq:]))
-        good = np.isfinite(state).all(1) & slow.all(1)
-        last[going[good]] = state[good]
+        state = [batch.bind(name)[going] for name in ("qpos", "qvel", "qacc_warmstart")]
+        end.speed[going] = np.abs(state[1]).max(1, keepdims=True)
+        state = np.concatenate(state, 1)
+        mine = verdict.Bounds(*(v[going] for v in bounds))
+        good = np.isfinite(state).all(1) & verdict.slow(mine, end.speed[going])[:, 0]
+        last[going[good], : state.shape[1]] = state[good]
+        end.going[going], end.step[:] = good[:, None], start.step + steps
         return Trace(*series, last)
 
     def advance(
@@ -175,14 +187,14 @@ def _bounds(structure: Scene, constants: Constants) -> verdict.Bounds:
 
 
 def _decisions(
-    bounds: verdict.Bounds, new: Trace, first: int, *, to_end: bool
+    bounds: verdict.Bounds, new: Trace, first: np.ndarray, *, to_end: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """When worlds are decided within a chunk, and where they stay.
 
     Args:
       bounds: Bounds of the worlds, of shape (world, 1).
       new: The chunk's trace, arrays of shape (world, step).
-      first: Index of its first step.
+      first: Index of each world's first step, shape (world, 1).
       to_end: As in `verdict.goes_on`.
 
     Returns:

@@ -29,10 +29,12 @@ from codesign_jax.model.fields import (
 )
 from codesign_jax.model.layout import Layout, contact_invweight, joint_axes, layout
 from codesign_jax.model.spec import build_spec, compile_model, compile_template
+from codesign_jax.model.state import State, split
 
 __all__ = [
     "Layout",
     "ModelFields",
+    "State",
     "build_spec",
     "compile_model",
     "compile_template",
@@ -42,4 +44,5 @@ __all__ = [
     "layout",
     "model_fields",
     "softening_moments",
+    "split",
 ]

@@ -30,9 +30,9 @@ class ModelFields(NamedTuple):
     """The fields of mjModel that depend on parameters, trial and constants, and the start state.
 
     Every array has MuJoCo's name and shape for one world, `gravity` and `impratio` those of
-    mjOption, but for three: `start` is the initial qpos, shape (nq,), or qpos and qvel, (nq + nv,),
-    as `Trace.last` has them; `section` has height, wall, segment length and width of the fingers
-    [m], shape (finger, 4), with the effect `neo_hookean` or the surface "hull", None without;
+    mjOption, but for four: `start` is the initial qpos, shape (nq,), or the state in which another
+    rollout ended, `Trace.last`, see `State`; `section` has height, wall, segment length and width
+    of the fingers [m], shape (finger, 4), with the effect `neo_hookean` or the surface "hull";
     `threshold` has the numbers of `morphology.thresholds`, with the effect `lateral_threshold`; and
     `constants` are the world's numbers with the trial's factors, from which engines take what
     MuJoCo has no field for: limits, the cost's window, and friction by pair of bodies.
@@ -73,7 +73,8 @@ class ModelFields(NamedTuple):
     @property
     def qvel(self) -> Any:
         """Generalized velocities at the start, shape (..., nv); zero unless `start` has them."""
-        given = self.start[..., self.dof_damping.shape[-1] + 1 :]
+        nv = self.dof_damping.shape[-1]
+        given = self.start[..., nv + 1 : 2 * nv + 1]
         return given if given.shape[-1] else np.zeros(self.dof_damping.shape, self.start.dtype)
 
     @property

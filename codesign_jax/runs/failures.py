@@ -22,8 +22,7 @@ class Failure(NamedTuple):
     Attributes:
       design: Design as simulated [SI units], shape (parameter,).
       trial: Its trial.
-      state: Generalized positions and velocities at which it was frozen, shape (nq + nv,); empty
-        if the engine does not tell.
+      state: State in which it was frozen, see `model.State`; empty if the engine does not tell.
       status: Bits of `Status`.
       bad_step: First bad time step, or -1 (STUCK).
       place: Number of the episode, from 1, and indices of particle and trial.

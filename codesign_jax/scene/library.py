@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax.scene import schema
+from codesign_jax.scene import schema, texts
 
 _PACKAGE = Path(__file__).parents[1]
 # In a checkout the folders lie beside the package; a wheel carries them inside it.
@@ -98,8 +98,10 @@ def read(path: Path) -> dict[str, Any]:
         raise schema.InputError([f"{path.name}: {error.strerror}"]) from error
     if len(data) > MOST_BYTES:
         raise schema.InputError([f"{path.name}: has more than {MOST_BYTES:,} bytes"])
+    if foreign := texts.foreign(data):
+        raise schema.InputError([f"{path.name}: {foreign}"])
     try:
-        table = parse(data.decode("utf-8"))
+        table = parse(data.decode("utf-8-sig"))
     except (ValueError, OverflowError, RecursionError) as error:
         raise schema.InputError([f"{path.name}: not valid TOML: {why_not(error)}"]) from error
     return table

@@ -7,6 +7,7 @@
 
 import contextlib
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -278,4 +279,11 @@ def _mesh_shape(values: dict, path: Path, where: str, problems: list[str]) -> Sh
     if problem := schema.range_problem(f"{where}: mass", mass, *_MASS):
         problems.append(problem)
         return None
+    if mesh.overhang > 0.002:
+        warnings.warn(
+            f"object {values['name']!r} does not stand as in its file and topples before the hand "
+            f"comes: its centre of mass is {1e3 * mesh.overhang:.0f} mm beside its support; turn "
+            "the mesh so that it rests on a side (z is up)",
+            stacklevel=2,
+        )
     return Shape(**values | {"mass": mass, "density": None, "mesh": mesh})

@@ -103,7 +103,7 @@ def choice(*options: str, **kwargs: Any) -> Any:
 def nearest(name: str, names: typing.Iterable[str]) -> str:
     """Returns a hint naming the valid name closest to a misspelt one, or the whole list."""
     names = list(names)
-    close = difflib.get_close_matches(name[:SHOWN], names, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(name[:SHOWN], names, n=1, cutoff=0.65)
     return f"did you mean {close[0]!r}?" if close else "valid: " + ", ".join(sorted(names))
 
 
@@ -125,7 +125,10 @@ def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, 
             (f, why)
             for f, why in _slips(unit)
             # In a unit a thousand times smaller than the right one, numbers are large.
-            if low <= value * f <= high and (abs(value) >= 1 or f not in _SMALLER)
+            if low <= value * f <= high
+            and (abs(value) >= 1 or f not in _SMALLER)
+            # Where a range begins at zero, next to nothing is in it and not what is meant.
+            and (low > 0 or abs(value * f) >= 0.01 * high)
         ),
         None,
     )

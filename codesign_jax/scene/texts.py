@@ -1,5 +1,6 @@
 """Texts of files and messages: what may stand in them, and how they are shown."""
 
+import codecs
 import unicodedata
 from typing import Any
 
@@ -44,4 +45,15 @@ def problem(path: str, text: str, *, lines: bool = False) -> str | None:
     for c in text:
         if unicodedata.category(c) in _CONTROL and c not in allowed:
             return f"{path} = {shown(text)} has a character that is no text, U+{ord(c):04X}"
+    return None
+
+
+def foreign(content: bytes) -> str | None:
+    """Why a file's bytes are not what its name says, if they begin as other files do."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "is text in UTF-16; save it as UTF-8"
+    if content.startswith(b"version https://git-lfs"):
+        return "is a Git LFS pointer in place of the file: `git lfs pull` fetches it"
+    if content[:200].lstrip().lower().startswith((b"<!doctype html", b"<html")):
+        return "is a web page (HTML), most likely of an error, in place of the file"
     return None

@@ -3,20 +3,19 @@
 import jax
 import jax.numpy as jnp
 
+from codesign_jax import model
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.model import ModelFields, layout
-from codesign_jax.model.layout import pairings_held
 from codesign_jax.scene import Scene
 
 
 def reset(scene: Scene, fields: ModelFields) -> State:
     """Start states of a batch, fields with leading axis (world,)."""
-    qvel = jnp.asarray(fields.qvel)
-    return make(scene, fields.qpos, qvel, jnp.zeros_like(qvel))
+    return _in_lanes(scene, model.split(scene, fields.start))
 
 
 def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> State:
-    """The state at MuJoCo's coordinates.
+    """The state at MuJoCo's coordinates, at the beginning of a grasp.
 
     Args:
       scene: The scene.
@@ -25,9 +24,14 @@ def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> Stat
       acc: Accelerations, the solver's warm start, in the order of qvel, the object's as in
         `kinematics.Acc`, shape (world, nv).
     """
-    lay, held = layout(scene), pairings_held(scene)
+    start = model.split(scene, jnp.concatenate([qpos, qvel], 1))
+    return _in_lanes(scene, start._replace(acc=acc))
+
+
+def _in_lanes(scene: Scene, start: model.State) -> State:
+    lay = layout(scene)
     end = 6 + lay.dofs.size
-    q, v, a = (x.T[:, None] for x in (qpos, qvel, acc))
+    q, v, a, step, going, speed = (jnp.asarray(x).T[:, None] for x in start[:6])
 
     def finger(x: jax.Array) -> jax.Array:
         return jnp.moveaxis(x[6:end, 0].reshape(*lay.dofs.shape, -1), 0, 2)
@@ -42,7 +46,10 @@ def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> Stat
         linear_vel=v[end : end + 3],
         angular_vel=v[end + 3 :],
         acc=Acc(a[:6], finger(a), a[end:]),
-        grip=jnp.zeros((held, 3, len(lay.dofs), len(qpos)), q.dtype) if held else None,
+        step=step,
+        going=going,
+        speed=speed,
+        grip=start.held.T.reshape(-1, 3, len(lay.dofs), q.shape[-1]) if start.held.size else None,
     )
 
 
@@ -71,6 +78,10 @@ def flat(state: State) -> jax.Array:
     return jnp.concatenate([qpos(state), qvel(state)], 1)
 
 
-def speed(state: State) -> jax.Array:
-    """Largest absolute generalized velocity; not finite if any velocity or position is not."""
-    return jnp.abs(qvel(state)).max(1) + 0.0 * qpos(state).sum(1)
+def whole(state: State) -> jax.Array:
+    """The state as `Trace.last` has it, see `model.State`."""
+    # A step of a decided world leaves accelerations that nothing reads and that may be no numbers.
+    acc = jnp.where(state.going[0, 0, :, None] > 0, flat_acc(state.acc), 0.0)
+    numbers = (x[0].T for x in (state.step, state.going, state.speed))
+    held = [] if state.grip is None else [state.grip.reshape(-1, state.grip.shape[-1]).T]
+    return jnp.concatenate([flat(state), acc, *numbers, *held], 1)

@@ -259,7 +259,7 @@ class StructuredEngine(Equal):
         # step that converged leaves is rounding.
         left = jnp.where(found["residual"] > self.limits.tolerance, found["residual"], 0.0)
         return Trace(
-            *series, qpos, self._status(found), coordinates.flat(end), residual=jnp.sqrt(left)
+            *series, qpos, self._status(found), coordinates.whole(end), residual=jnp.sqrt(left)
         )
 
     @staticmethod

@@ -58,8 +58,7 @@ def reverse(
     def segment(ends: tuple, given: tuple) -> tuple[tuple, tuple]:
         number, start, commands, shown = given
         taken = jnp.clip(path.taken - number * size, 0, size)
-        moved = _later(program, world, number * size, taken)
-        own = (hand, moved, *start, *commands, *grid)
+        own = (hand, world, *start, *commands, *grid)
         out = again.execute(own, trajectory=trajectory, states=1)
         here = recorded(out, taken)
         finger_bar, state_bar, *sums = ends
@@ -85,19 +84,3 @@ def reverse(
     state = (x[:, 0] for x in ends)
     none = [jnp.zeros_like(x) for x in grid]
     return hand_bar, program.summed(world_bar), *state, *map(join, commands), *none
-
-
-def _later(program: Program, world: jax.Array, step: jax.Array, taken: jax.Array) -> jax.Array:
-    """The table of the worlds' constants for a rollout that begins at a later step.
-
-    Args:
-      program: Whose table it is.
-      world: The table, shape (block, row, world).
-      step: The step.
-      taken: Number of steps that each world takes from then on, shape (block, 1, 1, world).
-    """
-    row = jnp.arange(world.shape[1])[:, None]
-    place = program.world.offset
-    times = (row == place["start"]) | (row == place["end"])
-    alive = (taken[:, 0] > 0).astype(world.dtype)
-    return jnp.where(row == place["alive"], alive * world, jnp.where(times, world - step, world))

@@ -146,7 +146,7 @@ def _adjoint(
     found = segments.reverse(engine, program, tables, path, bars, trajectory=trajectory)
     sound = program.sound  # pyright: ignore[reportAttributeAccessIssue]  # an AdjointProgram here
     fields_bar, ctrl_bar = pull_inputs(sound(found, path.taken))
-    # A world that never moved, such as one of fields that are not numbers, has no derivative.
+    # A world of fields that are not numbers never moved, and has no derivative.
     return jax.tree.map(partial(_of_worlds, taken[:, 0] > 0), (fields_bar, ctrl_bar))
 
 
@@ -164,5 +164,5 @@ def _gathered(taken: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def _of_worlds(keep: jax.Array, x: jax.Array) -> jax.Array:
-    """Zeros for the worlds, on the leading axis, that are not kept."""
-    return jnp.where(keep.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0)
+    """Zeros for what is no number of worlds, on the leading axis, that are not kept."""
+    return jnp.where(keep.reshape(-1, *[1] * (x.ndim - 1)) | jnp.isfinite(x), x, 0.0)

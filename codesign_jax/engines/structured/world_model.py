@@ -136,7 +136,9 @@ def world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
 
     A rollout asks for them at its start and in the engine, and traces them once.
     """
-    return _world_constants(scene.structure, fields)
+    # Apart from what is around it, XLA rounds it alike in every program.
+    apart = jax.lax.optimization_barrier
+    return apart(_world_constants(scene.structure, apart(fields)))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -9,7 +9,6 @@ import trimesh
 from codesign_jax import reuse, store
 from codesign_jax.scene.meshes import surface as surfaces
 from codesign_jax.scene.meshes.surface import Surface
-from codesign_jax.scene.reach import LEAST
 
 # The error grows in proportion to the cell at edges and with its square elsewhere.
 COARSEST = 0.0025
@@ -40,7 +39,7 @@ class Grid(NamedTuple):
     worst: float
 
 
-def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = LEAST) -> Grid:
+def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -> Grid:
     """Builds the coarsest grid whose error near the surface stays under a bound.
 
     The error is measured, not derived: trilinear interpolation against the exact distance at random
@@ -85,11 +84,18 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = 
         cell *= 0.9
 
 
-def near_surface(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
-    """Random points within 2 mm of the surface, uniform over its area, shape (point, 3)."""
+def near_surface(
+    vertices: np.ndarray, faces: np.ndarray, count: int, outside: float | None = None
+) -> np.ndarray:
+    """Random points within 2 mm of the surface, uniform over its area, shape (point, 3).
+
+    With `outside` all are so far outside of it [m].
+    """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     points, face = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
-    offset = np.random.default_rng(0).uniform(-_NEAR, _NEAR, (count, 1))
+    offset = outside
+    if offset is None:
+        offset = np.random.default_rng(0).uniform(-_NEAR, _NEAR, (count, 1))
     return np.asarray(points) + offset * mesh.face_normals[face]
 
 
@@ -150,9 +156,7 @@ def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
-def cached(
-    key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float = LEAST
-) -> Grid:
+def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -> Grid:
     """As `build`, but what took longer than a tenth of a second is kept on disk.
 
     Args:

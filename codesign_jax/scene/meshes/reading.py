@@ -4,6 +4,7 @@ A file is a stranger's: the parsers see bytes that were looked at before, no arc
 that this one names, and no picture.
 """
 
+import codecs
 import hashlib
 import io
 import json
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from codesign_jax.scene import library
+from codesign_jax.scene import library, texts
 from codesign_jax.scene.schema import InputError, shown
 
 # What trimesh logs, tracebacks of what it tried first among it, is no message for a terminal.
@@ -64,8 +65,10 @@ def read(path: Path) -> Read:
         raise InputError([f"{path.name}: {error.strerror}"]) from error
     if len(content) > MOST_BYTES:
         raise InputError([f"{path.name}: has more than {MOST_BYTES >> 20} MiB; use fewer faces"])
+    if foreign := texts.foreign(content):
+        raise InputError([f"{path.name}: {foreign}"])
     try:
-        vertices, faces = _parse(content, kind)
+        vertices, faces = _parse(content.removeprefix(codecs.BOM_UTF8), kind)
     except Exception as error:  # every format has its own parser with its own exceptions
         why = shown(str(error))[1:-1] or type(error).__name__
         raise InputError([f"{path.name}: cannot be read as a mesh: {why}"]) from error

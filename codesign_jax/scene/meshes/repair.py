@@ -10,6 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from codesign_jax.scene.meshes.surface import winding
+
 _MERGE = 1e-5  # vertices closer than this fraction of the size are one
 
 
@@ -112,8 +114,17 @@ def _close(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, report: li
 
 
 def _turn_outwards(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray):
-    """Turns every part that encloses a negative volume; also which faces were turned."""
-    a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
-    volume = np.einsum("fi,fi->f", a, np.cross(b, c))
-    inward = np.bincount(part, weights=volume, minlength=len(faces))[part] < 0
+    """Turns parts inside out but cavities, parts in an odd number of others; also which faces."""
+    corner = vertices[faces] - vertices.mean(0)
+    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+    names, own = np.unique(part, return_inverse=True)
+    volume = np.bincount(own, weights=np.einsum("fi,fi->f", a, np.cross(b, c)))
+    each = [corner[own == k] for k in range(len(names))]
+    low, high = (np.array([f(x, (0, 1)) for x in each]) for f in (np.min, np.max))
+    cavity = np.zeros(len(names), bool)
+    for k, mine in enumerate(each):
+        around = np.flatnonzero((low < low[k]).all(1) & (high > high[k]).all(1))
+        enclosed = [abs(winding(each[j], mine[0, :1])[0]) > 0.5 for j in around]
+        cavity[k] = sum(enclosed) % 2 == 1
+    inward = ((volume < 0) != cavity)[own]
     return np.where(inward[:, None], faces[:, ::-1], faces), inward

@@ -153,3 +153,25 @@ def _sign(surface: Surface, face: np.ndarray, points: np.ndarray) -> np.ndarray:
     inside = ((away * surface.inward[face]).sum(2) >= 0).all(1)
     side = np.where(inside, (away[:, 0] * surface.normal[face]).sum(1), side)
     return np.where(side < 0, -1.0, 1.0)
+
+
+def winding(corner: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How often a closed surface encloses each point, shape (point,): its solid angle over 4 pi.
+
+    Args:
+      corner: Corners of each face, shape (face, 3, 3).
+      points: Positions, shape (point, 3).
+    """
+    found = []
+    for point in points:
+        away = corner - point
+        long = np.linalg.norm(away, axis=2)
+        a, b, c = away[:, 0], away[:, 1], away[:, 2]
+        # Van Oosterom and Strackee (1983).
+        over = np.einsum("fi,fi->f", a, np.cross(b, c))
+        under = long.prod(1) + sum(
+            np.einsum("fi,fi->f", away[:, i], away[:, j]) * long[:, k]
+            for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+        )
+        found.append(np.arctan2(over, under).sum() / (2 * np.pi))
+    return np.array(found)

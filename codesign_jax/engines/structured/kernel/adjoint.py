@@ -130,11 +130,17 @@ class AdjointProgram(Program):
         return world.reshape(*world.shape[:2], self.fingers, self.block).sum(2)
 
     def sound(self, bars: tuple, taken: jax.Array) -> tuple:
-        """Cotangents of the inputs, zero for worlds that took no step; `taken` of blocks."""
+        """Cotangents of the inputs, zero where a world took no step and they are no numbers.
+
+        Args:
+          bars: The cotangents.
+          taken: As in `Path`, of blocks.
+        """
         some = taken[:, 0] > 0
         lane = jnp.tile(some, (1, 1, self.fingers))
         masks = lane, some, lane, some, some[:, None], lane
-        found = [jnp.where(mask, x, 0.0) for mask, x in zip(masks, bars, strict=False)]
+        pairs = zip(masks, bars, strict=False)
+        found = [jnp.where(mask | jnp.isfinite(x), x, 0.0) for mask, x in pairs]
         return (*found, *bars[6:])
 
     def _arguments(

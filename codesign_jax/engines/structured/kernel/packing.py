@@ -16,7 +16,7 @@ class Packing(Tables):
     """Packs the constants, states and controls of worlds; unpacks states and recorded rows."""
 
     def pack_hand(self, hand: WorldModel) -> tuple[jax.Array, jax.Array]:
-        """The hand's tables; padded worlds are not alive, padded fingers have no mass."""
+        """The hand's tables; padded fingers have no mass."""
         worlds, n = hand.object_id.shape[1], self.num_fingers
         dtype, lane = hand.mass.dtype, (n, worlds)
         links_first = ("centre", "inertia", "sphere")
@@ -52,16 +52,13 @@ class Packing(Tables):
                 pad = [(0, 0)] * (hand.radius.ndim - 2) + [(0, extra), (0, 0)]
                 arrays["radius"] = jnp.pad(hand.radius, pad, constant_values=-1e3)
         wide = {k: self._widen(arrays[k]) for k in self.hand.groups}
-        arrays["alive"] = jnp.ones((1, worlds), dtype)
         arrays["object_id"] = hand.object_id.astype(dtype)
         narrow = {k: arrays[k] for k in self.world.groups}
         if self.team > 1:  # XLA rounds alike however many worlds it lays out
             wide, narrow = jax.lax.optimization_barrier((wide, narrow))
-        packed = self.world.pack(1, self.block, **narrow)
-        ids = np.arange(packed.shape[0] * self.block).reshape(-1, 1, self.block)
-        alive = np.arange(self.world.rows)[:, None] == self.world.offset["alive"]
-        packed = jnp.where(alive & (ids >= worlds), 0, packed)
-        return self.hand.pack(self.fingers, self.block, **wide), packed
+        return self.hand.pack(self.fingers, self.block, **wide), self.world.pack(
+            1, self.block, **narrow
+        )
 
     def _widen(self, array: jax.Array) -> jax.Array:
         """Fingers up to a power of two."""
@@ -79,7 +76,7 @@ class Packing(Tables):
         }
 
     def pack_state(self, state: State) -> tuple[jax.Array, jax.Array]:
-        """The state's tables."""
+        """The state's tables; padded worlds do not go on."""
         arrays = state._asdict() | {"acc_wrist": state.acc.wrist, "acc_object": state.acc.object}
         finger_state = {
             "finger": state.finger,
@@ -90,9 +87,11 @@ class Packing(Tables):
             finger_state["grip"] = state.grip
         wide = {k: self._widen(v) for k, v in finger_state.items()}
         narrow = {k: arrays[k] for k in self.world_state.groups}
-        return self.finger_state.pack(self.fingers, self.block, **wide), self.world_state.pack(
-            1, self.block, **narrow
-        )
+        packed = self.world_state.pack(1, self.block, **narrow)
+        ids = np.arange(packed.shape[0] * self.block).reshape(-1, 1, self.block)
+        going = np.arange(self.world_state.rows)[:, None] == self.world_state.offset["going"]
+        packed = jnp.where(going & (ids >= state.wrist.shape[-1]), 0, packed)
+        return self.finger_state.pack(self.fingers, self.block, **wide), packed
 
     def pack_controls(self, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Commands: arm (block, time, 6, world) and pressure (block, time, lane)."""
@@ -145,9 +144,15 @@ class Packing(Tables):
         return jnp.pad(jnp.concatenate(joints, 2), fill), jnp.concatenate(others, 2)[..., None]
 
     def rows_of_end(self, last: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """`rows_of` of cotangents (world, nq + nv) of the last state; none of accelerations."""
-        nq = 13 + self.lay.dofs.size
-        found = self.rows_of(last[:, None, :nq], last[:, None, nq:])
+        """`rows_of` of cotangents of `Trace.last`, or of its beginning without what is held.
+
+        Only positions, velocities and what is held have some.
+        """
+        nq, nv = 13 + self.lay.dofs.size, 12 + self.lay.dofs.size
+        fingers, worlds = self.rows_of(last[:, None, :nq], last[:, None, nq : nq + nv])
+        held = last[:, nq + 2 * nv + 3 :].reshape(len(last), 1, -1, self.num_fingers)
+        fill = [(0, 0)] * 3 + [(0, self.fingers - self.num_fingers)]
+        found = jnp.concatenate([fingers, jnp.pad(held, fill)], 2), worlds
         rows = self.path_rows(states=True)
         return tuple(
             jnp.pad(x, [(0, 0), (0, 0), (0, n - x.shape[2]), (0, 0)])

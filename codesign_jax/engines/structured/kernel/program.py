@@ -16,7 +16,7 @@ from jax.experimental import pallas as pl
 from codesign_jax import reuse, verdict
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.kernel import speed, teams
+from codesign_jax.engines.structured.kernel import teams
 from codesign_jax.engines.structured.kernel.memory import Block, anywhere
 from codesign_jax.engines.structured.kernel.packing import Packing
 from codesign_jax.engines.structured.kernel.step import Step
@@ -220,9 +220,14 @@ class Program(Packing):
         bounds = verdict.Bounds(
             *(self.world.read(world, n, 0, own).lane for n in verdict.Bounds._fields)
         )
-        start, end = (v.astype(jnp.int32) for v in (bounds.start, bounds.end))
-        bounds = bounds._replace(start=start, end=end)
-        alive = self.world.read(world, "alive", 0, own).lane
+
+        def number(name: str) -> jax.Array:
+            return self.world_state.read(world_state, name, 0, own).lane
+
+        def keep(**numbers: jax.Array) -> None:
+            for name, value in numbers.items():
+                value = lanes([value], (), wide=False)
+                self.world_state.write(world_state, name, value, 0, own)
 
         def store(place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
             angles, places = self.path_rows(whole)
@@ -235,38 +240,43 @@ class Program(Packing):
                 if stride == 1:
                     store(t, whole, *target)
                 else:
-                    put = partial(store, jax.lax.div(t, stride), whole, *target)
-                    jax.lax.cond(jax.lax.rem(t, stride) == 0, put, lambda: None)
+                    every = jnp.int32(stride)
+                    put = partial(store, jax.lax.div(t, every), whole, *target)
+                    jax.lax.cond(jax.lax.rem(t, every) == 0, put, lambda: None)
 
         def body(carry: tuple) -> tuple:
-            t, alive, fastest = carry
+            t, going = carry
+            now, fastest = number("step"), number("speed")
 
             def undecided(distance: jax.Array, height: jax.Array) -> jax.Array:
-                return verdict.goes_on(bounds, distance, height, fastest, t, to_end=to_end)
+                return verdict.goes_on(bounds, distance, height, fastest, now, to_end=to_end)
 
             record(t)
             commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)
             chamber = lanes([pressure[t]], (), wide=True)
-            entry, new_speed, moved = step.advance(commands, chamber, undecided, alive > 0, fastest)
-            alive = jnp.where(moved, alive, 0.0)
-            for k, value in enumerate((*entry[:2], fastest, *entry[2:4], alive, *entry[4:])):
+            entry, new_speed, moved = step.advance(commands, chamber, undecided, going > 0, fastest)
+            going = jnp.where(moved, going, 0.0)
+            for k, value in enumerate((*entry[:2], fastest, *entry[2:4], going, *entry[4:])):
                 trace[t, k, own] = value
-            return t + 1, alive, new_speed
+            keep(step=now + 1.0, going=going, speed=new_speed)
+            return t + 1, going
 
-        def going(carry: tuple) -> jax.Array:
-            return (carry[0] < steps) & anywhere(carry[1] > 0)
+        def goes_on(carry: tuple) -> jax.Array:
+            # The first step also tells where worlds are that were decided before.
+            return (carry[0] < steps) & (anywhere(carry[1] > 0) | (carry[0] == 0))
 
-        moving = {n: self.world_state.read(world_state, n, 0, own) for n in speed.VELOCITIES}
-        first = speed.largest(step, moving).lane
-        done, _, last_speed = jax.lax.while_loop(going, body, (jnp.int32(0), alive, first))
+        done, _ = jax.lax.while_loop(goes_on, body, (jnp.int32(0), number("going")))
 
         # As for decided worlds of a block that goes on: no residual, and the speed that they have.
-        ended = {"speed": last_speed, "residual": jnp.zeros_like(last_speed)}
+        last_speed = number("speed")
+        none = jnp.zeros_like(last_speed)
+        ended = {"speed": last_speed, "residual": none, "overflow": none}
 
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
             record(t)
             for k, name in enumerate(self.trace):
-                trace[t, k, own] = ended.get(name, trace[jnp.maximum(done - 1, 0), k, own])
+                trace[t, k, own] = ended.get(name, trace[done - 1, k, own])
+            keep(step=number("step") + 1.0)
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))

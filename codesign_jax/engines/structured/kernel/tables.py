@@ -146,7 +146,6 @@ class Tables:
             object_inertia=(1, (3,)),
             object_size=(1, (3,)),
             object_id=(1, one),
-            alive=(1, one),
             **grid,
             **dict.fromkeys(verdict.Bounds._fields, (1, one)),
             **some,
@@ -155,7 +154,7 @@ class Tables:
         joint = n, (a,)
         self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **held, acc=joint)
         world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
-        world_state |= dict(acc_wrist=6, acc_object=6)
+        world_state |= dict(step=1, going=1, speed=1, acc_wrist=6, acc_object=6)
         self.world_state = MemoryLayout(
             False, **{name: (1, (size,)) for name, size in world_state.items()}
         )

@@ -8,7 +8,7 @@ moment of inertia a million times the object's own about its centre.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,9 @@ class State(NamedTuple):
       linear_vel: Object velocity, world frame, shape (3, 1, world).
       angular_vel: Object angular velocity, body frame as in MuJoCo, shape (3, 1, world).
       acc: Accelerations of the last step, the solver's warm start.
+      step: Number of steps since the beginning of the grasp, shape (1, 1, world).
+      going: Zero for a world that is decided, else one, likewise.
+      speed: Largest absolute velocity, for a failed world that of the failed step, likewise.
       grip: Friction that fingers hold on one another, see `holding.held`, of each pairing of the
         kernel, shape (pairing, 3, finger, world); None without `effects.friction_memory`.
     """
@@ -59,6 +62,9 @@ class State(NamedTuple):
     linear_vel: jax.Array
     angular_vel: jax.Array
     acc: "Acc"
+    step: Any = None
+    going: Any = None
+    speed: Any = None
     grip: jax.Array | None = None
 
 

@@ -68,10 +68,10 @@ def statements(tree, *, inside=True):
             yield from statements(node, inside=inside)
 
 
-def imports(tree, names, *, inside=True):
-    """Modules that a syntax tree imports; what only the type checker sees is left out."""
+def imports(tree, names, *, inside=True, types=True):
+    """Modules that a syntax tree imports; `types`: also what only the type checker sees."""
     for node in inner(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING" and not types:
             continue
         if isinstance(node, ast.Import):
             yield from (a.name for a in node.names if a.name in names)
@@ -82,14 +82,41 @@ def imports(tree, names, *, inside=True):
                 if found in names:
                     yield found
         elif inside or not isinstance(node, ast.FunctionDef):
-            yield from imports(node, names, inside=inside)
+            yield from imports(node, names, inside=inside, types=types)
 
 
 @functools.cache
-def graph(*, inside=True):
+def graph(**which):
     """Modules that each module imports; `inside`: also those that functions import when called."""
     names = modules()
-    return {n: set(imports(parse(path), names, inside=inside)) for n, path in names.items()}
+    return {n: set(imports(parse(path), names, **which)) for n, path in names.items()}
+
+
+def for_types(name, other):
+    """Whether an import is one of those that only the type checker sees and that may go back.
+
+    The kernel is one circle until its modules are one subject each. Commands are given the options
+    that `cli` declares; the others are given the object whose method they are.
+    """
+    if other in graph(types=False)[name]:
+        return False
+    mine, theirs = (n.removeprefix("codesign_jax.") for n in (name, other))
+    kernel = mine.startswith(KERNEL) and theirs.startswith(KERNEL)
+    return (
+        kernel
+        or theirs in GIVEN.get(mine, ())
+        or (mine.startswith("commands.") and theirs == "cli")
+    )
+
+
+KERNEL = "engines.structured.kernel."
+GIVEN = {
+    "compiler.rules": ["compiler.writer"],
+    "compiler.trigonometry": ["compiler.writer"],
+    "engines.structured.segments": ["engines.structured.engine"],
+    "engines.structured.transforms": ["engines.structured.engine"],
+    "report.sketch": ["report.animation"],
+}
 
 
 # Within the engine `structured`: what stands in a folder may import those before it.
@@ -144,7 +171,7 @@ def test_imports_point_one_way():
         f"{name} imports {other}: {problem}"
         for name, others in graph().items()
         for other in sorted(others)
-        if (problem := wrong(name, other))
+        if (problem := wrong(name, other)) and not for_types(name, other)
     ]
     assert not problems, "\n".join(problems)
 
@@ -179,7 +206,7 @@ def test_no_modules_import_in_a_circle():
     names = modules()
     lists = {n for n, path in names.items() if path.name == "__init__.py"}
     links = {
-        name: {other for other in others if other not in lists and other != name}
+        name: {o for o in others if o not in lists and o != name and not for_types(name, o)}
         for name, others in graph(inside=False).items()
         if name not in lists
     }
@@ -193,7 +220,7 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
     """Kept kernels are known by the digest of the code that writes them."""
     folders = {path.name for path in (ROOT / "codesign_jax").iterdir() if path.is_dir()}
     assert set(reuse.UNRELATED) <= folders
-    links, found = graph(), set()
+    links, found = graph(types=False), set()
     left = ["codesign_jax.engines.structured.kernel.program"]
     while left:
         name = left.pop()
@@ -243,12 +270,45 @@ def test_what_is_imported_is_there():
     assert not missing, "\n".join(missing)
 
 
+# As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
+# there what users have of it, and what could go in its place.
+MOST_LINES = {
+    "codesign_jax": 39_600,
+    "codesign_jax/codesign": 600,
+    "codesign_jax/commands": 3_900,
+    "codesign_jax/compiler": 3_100,
+    "codesign_jax/engines": 12_800,
+    "codesign_jax/export": 1_800,
+    "codesign_jax/model": 1_600,
+    "codesign_jax/optimize": 1_400,
+    "codesign_jax/report": 2_100,
+    "codesign_jax/runs": 4_100,
+    "codesign_jax/scene": 4_500,
+    "scripts": 5_800,
+    "tests": 26_200,
+}
+
+
+@pytest.mark.parametrize("folder", MOST_LINES)
+def test_no_folder_grows_unseen(folder):
+    lines = sum(path.read_bytes().count(b"\n") for path in (ROOT / folder).rglob("*.py"))
+    assert lines <= MOST_LINES[folder]
+
+
+def test_every_folder_has_its_most_lines():
+    package = ROOT / "codesign_jax"
+    folders = {path.parts[len(package.parts)] for path in package.rglob("*/*.py")}
+    wanted = {"codesign_jax", "scripts", "tests"} | {f"codesign_jax/{name}" for name in folders}
+    assert set(MOST_LINES) == wanted
+
+
 def test_what_imports_are_seen_in_a_file():
     text = "import a.b\nfrom a import b, c\nif TYPE_CHECKING:\n    from a import d\n"
     text += "def f():\n    from a import d\n"
     names = {"a", "a.b", "a.d"}
-    assert list(imports(ast.parse(text), names)) == ["a.b", "a.b", "a", "a.d"]
-    assert list(imports(ast.parse(text), names, inside=False)) == ["a.b", "a.b", "a"]
+    assert list(imports(ast.parse(text), names)) == ["a.b", "a.b", "a", "a.d", "a.d"]
+    assert list(imports(ast.parse(text), names, types=False)) == ["a.b", "a.b", "a", "a.d"]
+    assert list(imports(ast.parse(text), names, inside=False)) == ["a.b", "a.b", "a", "a.d"]
 
 
 def imported(tree):

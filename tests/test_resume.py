@@ -84,19 +84,6 @@ def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
     assert_same_run(folder, finished)
 
 
-@pytest.mark.parametrize("left_out", ["tests.csv", "the last rows", "trials.csv"])
-def test_a_run_killed_before_its_last_rows_writes_them(left_out, finished, tmp_path):
-    """All checkpoints are there, and the process ended between the last one and the tables."""
-    folder = shutil.copytree(finished, tmp_path / "run")
-    if left_out == "the last rows":
-        text = (folder / "trials.csv").read_text()
-        (folder / "trials.csv").write_text(text[:-30])
-    else:
-        (folder / left_out).unlink()
-    assert command(*RUN, "--out", folder) == 0
-    assert_same_run(folder, finished)
-
-
 @pytest.mark.parametrize(
     ("number", "status"),
     [
@@ -139,22 +126,6 @@ def test_run_killed_again_and_again_resumes_bit_for_bit(tmp_path):
         assert process.returncode == -signal.SIGKILL, before
     assert kills > 5
     assert_same_run(folder, tmp_path / "whole")
-
-
-@pytest.mark.parametrize("damage", ["flip", "truncate"])
-def test_damaged_checkpoint_is_said_and_the_older_one_used(damage, finished, tmp_path, capsys):
-    folder = shutil.copytree(finished, tmp_path / "run")
-    newest = EPISODES + 1  # the final test
-    largest = max(
-        (folder / "checkpoints" / str(newest)).rglob("d/*"), key=lambda p: p.stat().st_size
-    )
-    content = bytearray(largest.read_bytes())
-    content[len(content) // 2] ^= 1
-    largest.write_bytes(content if damage == "flip" else content[: len(content) // 2])
-    assert command(*RUN, "--out", folder) == 0
-    assert f"checkpoint {newest} is lost" in capsys.readouterr().out
-    assert f"checkpoint {newest} is lost" in (folder / "events.log").read_text()
-    assert_same_run(folder, finished)
 
 
 @pytest.mark.parametrize("lost", ["*.sha256", "folder"])
@@ -304,9 +275,9 @@ def test_the_default_search_goes_on_and_a_run_keeps_its_optimiser(finished, tmp_
     usual = without([*RUN], "--optimizer")
     run = [*usual, "--particles", "8"]
     long, grown = tmp_path / "long", tmp_path / "grown"
-    assert command(*run, "--episodes", "8", "--out", long) == 0
+    assert command(*run, "--episodes", "7", "--out", long) == 0
     assert "seed" not in capsys.readouterr().out, "it looks for its start by itself"
-    for episodes in ("2", "4", "6", "8"):  # within the random designs, and after them
+    for episodes in ("2", "6", "7"):  # within the random designs, and after them
         assert command(*run, "--episodes", episodes, "--out", grown) == 0
     assert_same_run(grown, long)
     assert runs.read_run(grown)[1].optimizer == "screened-es"

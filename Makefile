@@ -22,7 +22,7 @@ help:
 	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make quick       a minute of them, for another Python: PYTHON=python3.13 VENV=.venv-other MUJOCO='mujoco<4'"
-	@echo "make test-gpu    what needs an NVIDIA GPU: tests and rates, GPU=file.json"
+	@echo "make test-gpu    the tests that need an NVIDIA GPU, GPU=file.json"
 	@echo "make test-ptx    kernels for GPUs, assembled without one"
 	@echo "make test-browser  the report in a headless Chromium"
 	@echo "make stability   the hard cases and their margins, docs/notes/stability.md"
@@ -53,7 +53,7 @@ test-browser: $(STAMP)
 test-ptx: $(STAMP)
 	$(BIN)/python -m pytest -q -rs -m slow tests/test_reverse.py -k assembler
 
-# Everything that needs a GPU; GPU=docs/data/gpu_suite_h200.json keeps what it found.
+# Tests that need a GPU; GPU is the file that says how each ended.
 GPU ?= runs/gpu_suite.json
 test-gpu: $(STAMP)
 	mkdir -p $(dir $(GPU))

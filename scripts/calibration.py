@@ -351,7 +351,6 @@ def score(costs: np.ndarray, maximum: np.ndarray, space: DesignSpace) -> dict[st
 
 
 def main() -> int:
-    """Runs the command and returns the exit status."""
     parser = provenance.parser(__doc__)
     parser.add_argument("command", choices=("wave", "score"))
     parser.add_argument("file", type=Path, nargs="?", help="file of a wave to score")

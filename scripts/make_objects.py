@@ -182,7 +182,6 @@ def finish(part: Part) -> trimesh.Trimesh:
 
 
 def main() -> None:
-    """Writes the meshes and the object file."""
     parser = argparse.ArgumentParser(description="Makes the household object set.")
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder of object files")
     folder = parser.parse_args().out

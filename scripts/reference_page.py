@@ -83,7 +83,6 @@ Controls `ctrl`, a row for each time step, held over it:
 
 
 def page() -> str:
-    """The reference page, Markdown."""
     parts = [_HEAD]
     for heading, schema, folder, use in FILES:
         parts.append(

@@ -26,11 +26,6 @@ PAGES |= {
     f"notebooks/{path.name}": f"notebooks/{path.stem}.md"
     for path in sorted((ROOT / "notebooks").glob("*.py"))
 }
-# Grasps that move, for the front page, with what each shows.
-MOVING = {
-    "figures/grasp_type_1.gif": "Top grasp: short fingers close on the object's sides.",
-    "figures/grasp_type_2.gif": "Wrap: long fingers reach past the object and curl around it.",
-}
 
 _LINK = re.compile(r"(\]\(|^\[[^\]]+\]: )([^)\s#]+)", re.M)
 _FILE_NAME = re.compile(r"\[`?(?:docs/)?([\w-]+)(?:/README)?\.md`?\](?=[(\[])")
@@ -60,27 +55,11 @@ def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Files) -> 
 
 
 def _page(path: Path) -> str:
-    """The Markdown of a file outside of docs/."""
     if path.suffix == ".py":
         import jupytext  # it takes longer to import than everything else here
 
         return jupytext.writes(jupytext.read(path), "md")
-    text = path.read_text(encoding="utf-8")
-    if path.name == "README.md" and path.parent == ROOT:
-        blocks = text.split("\n\n")
-        caption = next(i for i, block in enumerate(blocks) if block.startswith("![")) + 1
-        text = "\n\n".join([*blocks[: caption + 1], _moving(), *blocks[caption + 1 :]])
-    return text
-
-
-def _moving() -> str:
-    """The pictures that move and are there, side by side."""
-    found = {name: text for name, text in MOVING.items() if (ROOT / "docs" / name).is_file()}
-    figures = [f"![{text}](docs/{name})" for name, text in found.items()]
-    if not figures:
-        return ""
-    heads, rule = " | ".join(found.values()), " | ".join("---" for _ in found)
-    return f"| {heads} |\n| {rule} |\n| {' | '.join(figures)} |\n"
+    return path.read_text(encoding="utf-8")
 
 
 def _sources() -> list[Path]:

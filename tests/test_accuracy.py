@@ -14,8 +14,8 @@ from codesign_jax.commands import optimize
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import parameters, schema
-from scripts.accuracy import budget, report, tip
-from scripts.shared import figures, work
+from scripts.accuracy import budget, report
+from scripts.shared import output, work
 from tests.helpers.grasps import pinch, still
 
 DATA = Path(__file__).parents[1] / "docs" / "data" / "experiments"
@@ -119,7 +119,7 @@ def test_tips_lie_a_segment_behind_the_last_joint():
     data.qpos[:] = fields.start
     mujoco.mj_kinematics(compiled, data)
     roots = data.xpos[model.layout(small).stubs]
-    away = np.linalg.norm(tip.tips(small, compiled, fields.start) - roots, axis=1)
+    away = np.linalg.norm(budget.tips(small, compiled, fields.start) - roots, axis=1)
     # The default lengths are float32 of the table's millimetres.
     np.testing.assert_allclose(away, params.length, rtol=1e-6)
 
@@ -127,13 +127,13 @@ def test_tips_lie_a_segment_behind_the_last_joint():
 @pytest.mark.slow  # quick: the variants' settings, below; MuJoCo's step is MuJoCo's
 def test_tips_of_a_shorter_step_come_closer_to_the_reference():
     """The error of the implicit Euler step falls at first order; both engines err alike."""
-    exact = tip.motion((5e-4, 2, "least"), "mujoco", 1, 0.4)
-    found = {s: tip.motion((s, 2, "added"), "mujoco", 1, 0.4) for s in (0.005, 0.01)}
-    errors = [tip.error(tips, exact) for tips in found.values()]
+    exact = budget.motion((5e-4, 2, "least"), "mujoco", 1, 0.4)
+    found = {s: budget.motion((s, 2, "added"), "mujoco", 1, 0.4) for s in (0.005, 0.01)}
+    errors = [budget.error(tips, exact) for tips in found.values()]
     # The reference's own step is a tenth of the smaller one: the ratio is 9.5 / 4.5 at first order.
     assert errors[1] / errors[0] == pytest.approx(9.5 / 4.5, rel=0.2)
-    ours = tip.motion((0.01, 2, "added"), "structured", 1, 0.4)
-    assert tip.error(ours, found[0.01]) < 0.05 * errors[1]  # float32, and a solver's tolerance
+    ours = budget.motion((0.01, 2, "added"), "structured", 1, 0.4)
+    assert budget.error(ours, found[0.01]) < 0.05 * errors[1]  # float32, and a solver's tolerance
 
 
 # --- verdicts ------------------------------------------------------------------------------------
@@ -254,7 +254,7 @@ def test_tables_and_figures_have_what_was_planted(found, tmp_path):
 
 
 def test_names_that_would_meet_are_moved_apart():
-    axis = figures.new(4, 3).subplots()
+    axis = output.new_figure(4, 3).subplots()
     axis.set(xlim=(1, 10), ylim=(0, 1), xscale="log")
     heights = report._apart(axis, [(2, 0.5), (3, 0.51), (2, 0.9), (4, 0.5)], least=0.1)
     assert heights == pytest.approx([0.405, 0.605, 0.9, 0.505], abs=0.02)

@@ -9,9 +9,10 @@ import scipy.stats
 
 from codesign_jax import rollout, scene
 from codesign_jax.engines import make_engine
-from scripts.benchmark import __main__ as benchmark
-from scripts.benchmark import report
+from scripts import benchmark
 from scripts.shared import statistics, work
+
+LINKS = {"discretization": {"links": 2}}
 
 
 @pytest.mark.parametrize("ties", (False, True))
@@ -27,39 +28,25 @@ def test_rank_correlation_of_constants_is_undefined():
     assert np.isnan(statistics.spearman([1, 1, 1], [1, 2, 3]))
 
 
-def test_agreement_counts_verdicts_and_whole_designs():
-    reference = np.array([0.0, 3.0, 0.0, 1.0, 1.0, 2.5, 0.5])
-    cost = np.array([0.0, 3.0, 1.0, 1.0, 1.0, 2.5])
-    found = statistics.agreement(cost, reference, trials=2)
-    assert found["worlds"] == 6 and found["designs"] == 3
-    assert found["same_verdict"] == pytest.approx(5 / 6)
-    assert found["success"] == pytest.approx(1 / 6)
-    assert found["success_reference"] == pytest.approx(2 / 6)
-    assert found["mean_abs_cost_difference"] == pytest.approx(1 / 6)
-    assert found["spearman"] == pytest.approx(1.0)  # means 1.5, 1, 1.75 against 1.5, 0.5, 1.75
-
-
 def test_a_small_batch_is_the_start_of_a_large_one():
     """The same worlds whatever the batch, so that engines and sizes compare."""
-    scene = work.variant()
-    few, many = (work.make_worlds(scene, n) for n in (7, 31))
+    chosen = scene.load("paper_spheres")
+    few, many = (work.make_worlds(chosen, n) for n in (7, 31))
     for a, b in zip(jax.tree.leaves(few), jax.tree.leaves(many), strict=True):
         np.testing.assert_array_equal(a, b[:7])
-    again = work.make_worlds(scene, 20, repeat=5)
-    np.testing.assert_array_equal(again.params.length[5:10], again.params.length[:5])
 
 
-@pytest.mark.parametrize("change", ({"fingers": 3}, {"links": 5}, {"hand_name": "tripod3"}))
-def test_variants_have_good_designs(change):
+@pytest.mark.parametrize("change", ({"overrides": LINKS}, {"hand_name": "tripod3"}))
+def test_other_hands_have_good_designs(change):
     """Every second design is a good one of that hand, the first of them the middle itself."""
-    scene = work.variant(**change)
-    worlds = work.make_worlds(scene, 12)
-    assert worlds.params.length.shape == (12, scene.num_fingers)
+    chosen = scene.load("paper_spheres", **change)
+    worlds = work.make_worlds(chosen, 12)
+    assert worlds.params.length.shape == (12, chosen.num_fingers)
     np.testing.assert_allclose(worlds.params.length[6:], work.GOOD["length"][0] * 1e-3, rtol=1e-6)
 
 
 def test_a_micrometre_moves_the_objects_and_nothing_else():
-    worlds = work.make_worlds(work.variant(links=2), 60)
+    worlds = work.make_worlds(scene.load("paper_spheres", overrides=LINKS), 60)
     moved = work.nudged(worlds.trials)
     difference = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(), moved, worlds.trials)
     assert float(difference.position) == pytest.approx(1e-6, rel=0.02)  # float32 of centimetres
@@ -87,7 +74,7 @@ def test_winners_are_the_best_final_particle_of_each_concurrent_run():
 def test_a_batch_is_measured_and_judged(monkeypatch):
     """Its verdicts are those of the engine; the rate is that of the shortest call."""
     monkeypatch.setattr(benchmark, "SECONDS", 0.0)
-    chosen = work.variant(links=2)
+    chosen = scene.load("paper_spheres", overrides=LINKS)
     record = benchmark.measured(chosen, "mixed", "mujoco", 12, calls=3)
     worlds = work.make_worlds(chosen, 12)
     outcomes, _ = rollout.simulate(chosen, make_engine("mujoco", chosen), *worlds)
@@ -108,28 +95,28 @@ def record(engine, rate, **more):
 def test_tables_are_those_of_the_records_and_a_second_measurement_replaces_the_first():
     records = []
     for new in (record("structured", 1.0), record("structured", 44.4, verdicts="0011")):
-        records = report.replaced(records, new)
-    records = report.replaced(records, record("MuJoCo C 4.0.0", 8.0, verdicts="0111"))
+        records = benchmark.replaced(records, new)
+    records = benchmark.replaced(records, record("MuJoCo C 4.0.0", 8.0, verdicts="0111"))
     gpu = {**RUN, "platform": "gpu", "device": "NVIDIA H100 80GB HBM3"}
     larger = {"runs": [gpu], "records": [record("structured", 1234.0, worlds=16384)]}
     files = [{"runs": [RUN], "records": records}, larger]
-    assert report.rates(files).splitlines() == [
+    assert benchmark.rates(files).splitlines() == [
         "| grasps a second (time of a batch) | 2 CPU cores, winners | one H100, winners |",
         "| --- | --- | --- |",
         "| 60 grasps, an episode of the paper's 2D | 44 (1.4 s) | – |",
         "| 16,384 grasps | – | 1,200 (13 s) |",
     ]
-    assert report.measured(files) == (
+    assert benchmark.machines(files) == (
         "Measured on 2 CPU cores, JAX 0.1, 2026-01-02; on one H100, JAX 0.1, 2026-01-02 "
         "(`docs/data/rates_*.json`)."
     )
     row = "| paper | 2 CPU cores, 60 grasps | MuJoCo C 4.0.0 | 8.0 | 44 | 6 | 3 of 4 |"
-    assert report.peers(files).splitlines()[2:] == [row]
+    assert benchmark.peers(files).splitlines()[2:] == [row]
 
 
-@pytest.mark.parametrize("page", report.PAGES)
+@pytest.mark.parametrize("page", benchmark.PAGES)
 def test_tables_of_the_pages_are_those_of_the_data(page):
-    text, files = (report.ROOT / page).read_text(encoding="utf-8"), report.read()
-    for mark in report.PAGES[page]:
+    text, files = (benchmark.ROOT / page).read_text(encoding="utf-8"), benchmark.read()
+    for mark in benchmark.PAGES[page]:
         [shown] = re.findall(f"<!-- {mark}:begin -->\n\n(.*?)\n\n<!-- {mark}:end -->", text, re.S)
-        assert shown == getattr(report, mark)(files)
+        assert shown == benchmark.TABLES[mark](files)

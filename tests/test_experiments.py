@@ -21,8 +21,8 @@ from codesign_jax.scene import InputError
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
 from scripts.experiments import __main__ as experiments
-from scripts.experiments import figures, landscape, plan, report, results, strategies, study
-from scripts.experiments.plan import PAPER, TOTAL_GRASPS, Landscape, Strategies
+from scripts.experiments import report, simulate
+from scripts.experiments.simulate import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
 from tests.helpers import episodes
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
@@ -38,14 +38,14 @@ def toy():
     """A toy engine in the place of every one that is made."""
     engine = ToyEngine(scenes.load(TINY))
     with pytest.MonkeyPatch.context() as patch:
-        for module in (runs.loop, landscape):
+        for module in (runs.loop, simulate):
             patch.setattr(module, "make_engine", lambda name, scene: engine)
         yield engine
 
 
 def optimize(folder, **how):
     """Runs the experiment with the toy, or goes on with it; a seed's name is its folder's."""
-    plans = strategies.plans(PLAN, scenes.load(TINY), "structured", folder, SEED)
+    plans = simulate.plans(PLAN, scenes.load(TINY), "structured", folder, SEED)
     return runs.optimize(plans, ["test"], **how)
 
 
@@ -54,13 +54,13 @@ def finished(toy, tmp_path_factory):
     """Folder of the experiment's runs, and what they have."""
     folder = tmp_path_factory.mktemp("whole")
     assert not any(isinstance(r, Exception) for r in optimize(folder).runs.values())
-    return folder, strategies.gather(PLAN, folder, SEED)
+    return folder, simulate.gather(PLAN, folder, SEED)
 
 
 def points(part, seed=SEED):
     """The landscape with the toy, in calls of six points."""
     how = {"seed": seed, "chunk": 30, "devices": None, "console": Console(quiet=True)}
-    return landscape.simulate(GRID, scenes.load(TINY), "structured", part, **how)
+    return simulate.landscape(GRID, scenes.load(TINY), "structured", part, **how)
 
 
 @pytest.fixture(scope="module")
@@ -73,13 +73,10 @@ def single():
 
 
 def test_counts_are_the_papers():
-    assert {name: p.grasps for name, p in PAPER.items()} == plan.PAPER_GRASPS
-    assert plan.PAPER_GRASPS == {"2d": 1_008_000, "23d": 4_536_000, "landscape": 129_600}
+    assert {name: p.grasps for name, p in PAPER.items()} == simulate.PAPER_GRASPS
+    assert simulate.PAPER_GRASPS == {"2d": 1_008_000, "23d": 4_536_000, "landscape": 129_600}
     assert TOTAL_GRASPS == 5_673_600
     assert (PAPER["2d"].worlds, PAPER["23d"].worlds) == (14_400, 32_400)
-    for size in plan.OVERRIDES:
-        for name in PAPER:
-            assert plan.experiment(name, size).preset in ("2d", "23d")
 
 
 @pytest.mark.parametrize("name", ["2d", "23d"])
@@ -87,7 +84,7 @@ def test_masks_open_one_domain_and_start_equally_often_in_either(name, monkeypat
     scene = scenes.load("paper")
     monkeypatch.setattr(runs.loop, "make_engine", lambda name, scene: ToyEngine(scene))
     space = design_space(scene.hand, "2d" if name == "2d" else "full")
-    plans = strategies.plans(PAPER[name], scene, "structured", Path(), 0)
+    plans = simulate.plans(PAPER[name], scene, "structured", Path(), 0)
     shape = len(PAPER[name].strategies), 30, PAPER[name].episodes, space.num_parameters
     masks, names = np.array([p.mask for p in plans.values()]).reshape(shape), PAPER[name].strategies
     assert [p.settings.seed for p in plans.values()] == [*range(30)] * len(names)
@@ -101,19 +98,6 @@ def test_masks_open_one_domain_and_start_equally_often_in_either(name, monkeypat
         expected = 0 if strategy == "single" else int(strategy.removeprefix("switch-"))
         np.testing.assert_array_equal(switches.sum(-1), expected)
     assert names[-1] == "concurrent" and masks[-1].all()
-
-
-def test_an_experiment_of_fewer_strategies_and_other_runs():
-    fewer = plan.narrowed(PAPER["2d"], ["single", "concurrent"], 60)
-    assert isinstance(fewer, Strategies) and fewer.grasps == 2 * 60 * 60 * (64 + 6)
-    assert plan.narrowed(PAPER["2d"], None, None) is PAPER["2d"]
-    for name, names, count, words in (
-        ("landscape", ["single"], None, "neither strategies nor runs"),
-        ("2d", ["singel"], None, "singel"),
-        ("2d", None, 0, "0 runs"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            plan.narrowed(PAPER[name], names, count)
 
 
 @pytest.mark.parametrize(("strategy", "run"), [(0, 1), (1, 0), (2, 1)])
@@ -183,32 +167,32 @@ def test_a_run_that_is_killed_between_checkpoints_repeats_what_came_after(
     with pytest.raises(Killed):
         optimize(tmp_path, every=3)
     monkeypatch.setattr(Batch, "begin", begin)
-    part = strategies.gather(PLAN, tmp_path, SEED)
+    part = simulate.gather(PLAN, tmp_path, SEED)
     assert part["cost"].shape[2] == 3 and "test_cost" not in part
-    kept = results.of_strategies(PLAN, *tiny()[:2], part)
-    stopped = study.Study(dataclasses.asdict(PLAN), {}, kept)
+    kept = simulate.of_strategies(PLAN, *tiny()[:2], part)
+    stopped = report.Study(dataclasses.asdict(PLAN), {}, kept)
     assert stopped.episodes == 3 and not stopped.tested and not stopped.success().any()
     optimize(tmp_path, every=3)
-    again, whole = strategies.gather(PLAN, tmp_path, SEED), finished[1]
+    again, whole = simulate.gather(PLAN, tmp_path, SEED), finished[1]
     assert again.keys() == whole.keys() and len(whole) == 10
     for name, value in whole.items():
         np.testing.assert_array_equal(again[name], value, err_msg=name)
 
 
 def test_runs_that_are_no_variants_of_one_are_refused(toy, tmp_path):
-    plans = strategies.plans(PLAN, scenes.load(TINY), "structured", tmp_path, SEED)
+    plans = simulate.plans(PLAN, scenes.load(TINY), "structured", tmp_path, SEED)
     folder, last = [*plans.items()][-1]
     plans[folder] = last._replace(settings=dataclasses.replace(last.settings, trials=5))
     with pytest.raises(ValueError, match="differs from"):
         runs.optimize(plans, ["test"])
     assert not any(tmp_path.iterdir())
-    assert strategies.gather(PLAN, tmp_path / "nothing", SEED) is None
+    assert simulate.gather(PLAN, tmp_path / "nothing", SEED) is None
 
 
 def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
     whole, found = points(tmp_path / "whole.part")
     assert found == 0 and whole["status"].shape == (4, 4, 5)
-    append, written = landscape.calls.Store.append, []
+    append, written = simulate.calls.Store.append, []
 
     def dies(parts, arrays):
         if len(written) == 2:
@@ -216,7 +200,7 @@ def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
         written.append(arrays)
         append(parts, arrays)
 
-    monkeypatch.setattr(landscape.calls.Store, "append", dies)
+    monkeypatch.setattr(simulate.calls.Store, "append", dies)
     with pytest.raises(KeyboardInterrupt):
         points(tmp_path / "x.part")
     monkeypatch.undo()
@@ -226,7 +210,7 @@ def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="x.part is of another design or other settings"):
         points(tmp_path / "x.part", seed=1)
     scene, space, _ = tiny()
-    kept = results.of_landscape(scene, space, whole)
+    kept = simulate.of_landscape(scene, space, whole)
     ends = space.in_units(np.array([space.low, space.high]))
     np.testing.assert_allclose(kept["first_axis"][[0, -1]], ends[:, 0], rtol=1e-5)
     np.testing.assert_allclose(kept["second_axis"][[0, -1]], ends[:, 1], rtol=1e-5)
@@ -239,12 +223,12 @@ def test_means_by_either_rule():
     scene, *_ = tiny()
     cost = np.array([[0.0, 1.0, 3.0], [3.0, 3.0, 3.0]], np.float32)
     status = np.array([[0, 0, 1], [1, 2, 64]], np.uint8)
-    means = results.both_means(scene, cost, status)
+    means = simulate.both_means(scene, cost, status)
     np.testing.assert_allclose(means["exclude"], [0.5, 3.0])
     np.testing.assert_allclose(means["worst"], [4 / 3, 3.0], rtol=1e-6)
     trials = Outcome(cost, status.astype(np.int32), cost, status)
     np.testing.assert_allclose(means["exclude"], codesign.particle_cost(scene, trials))
-    bits = dict(zip(results.BITS, results.failures(status, (0, 1)), strict=True))
+    bits = dict(zip(simulate.BITS, simulate.failures(status, (0, 1)), strict=True))
     assert [bits[b] for b in (1, 2, 64)] == [2, 1, 1] and sum(bits.values()) == 4
 
 
@@ -289,7 +273,7 @@ def test_several_comparisons():
 def test_both_readings_of_converged():
     """Below 1 in the second episode, above in the third, and below from the fourth on."""
     means = np.array([[[2.0, 0.5, 1.5, 0.9, 0.2], [2.0] * 5]])
-    one = study.Study({}, {}, {"mean_exclude": means})
+    one = report.Study({}, {}, {"mean_exclude": means})
     np.testing.assert_array_equal(one.first_below(), [[2.0, np.inf]])
     np.testing.assert_array_equal(one.convergence(), [[4.0, np.inf]])
 
@@ -299,16 +283,16 @@ def test_regions_are_counted_and_specks_are_not():
     cost = np.full((20, 10), 3.0)
     cost[2:5, 2:5], cost[10:18, 6:9], cost[0, 9] = 0.5, 0.2, 0.0
     data = {"first_axis": x, "second_axis": y, "exclude": cost}
-    found = study.regions(data, 1.0, smallest=0.02)
+    found = report.regions(data, 1.0, smallest=0.02)
     assert [r.points.sum() for r in found] == [24, 9]
     np.testing.assert_allclose(found[0].low, [10, 6])
     np.testing.assert_allclose(found[0].high, [17, 8])
-    assert len(study.regions(data, 0.3, smallest=0.0)) == 2
+    assert len(report.regions(data, 0.3, smallest=0.0)) == 2
 
 
 def summarized(finished):
     """What is kept of the toy's runs."""
-    return results.of_strategies(PLAN, *tiny()[:2], finished[1])
+    return simulate.of_strategies(PLAN, *tiny()[:2], finished[1])
 
 
 def write_small(finished, folder):
@@ -317,10 +301,10 @@ def write_small(finished, folder):
         plan = dataclasses.asdict(PLAN) | {"name": name}
         notes = {"settings": {"plan": plan, "scene": "paper"}, "commit": "0123abc"}
         notes |= {"grasps": PLAN.grasps}
-        results.write(folder, name, summarized(finished), notes)
-    kept = results.of_landscape(*tiny()[:2], points(folder / "landscape.part")[0])
+        simulate.write(folder, name, summarized(finished), notes)
+    kept = simulate.of_landscape(*tiny()[:2], points(folder / "landscape.part")[0])
     notes = {"grasps": 80, "commit": "0123abc"}
-    results.write(folder, "landscape", kept, notes)
+    simulate.write(folder, "landscape", kept, notes)
 
 
 def test_figures_and_page_are_made_from_files_alone(finished, tmp_path):
@@ -342,42 +326,18 @@ def test_figures_and_page_are_made_from_files_alone(finished, tmp_path):
 def test_what_was_not_run_is_said(tmp_path):
     text = report.make(tmp_path, tmp_path / "figures")
     assert text.count("not run") == 3
-    assert figures.label("switch-16") == "16"
+    assert report.label("switch-16") == "16"
 
 
-def test_shares_of_several_processes_make_the_whole(toy, finished, tmp_path, monkeypatch):
-    """Each takes every second run; the list of strategies may grow."""
-    monkeypatch.setitem(plan.SMALL["tiny"], "2d", PLAN)
-    monkeypatch.setitem(plan.OVERRIDES, "tiny", ())
-    base = [
-        "scripts.experiments",
-        "2d",
-        "--size",
-        "tiny",
-        "--scene",
-        str(TINY),
-        "--out",
-        str(tmp_path),
-    ]
-    base += ["--seed", str(SEED)]
-
-    def call(*more):
-        monkeypatch.setattr(sys, "argv", [*base, *more])
-        code = experiments.main()
-        path = tmp_path / "2d.json"
-        return code, json.loads(path.read_text()) if path.exists() else None
-
-    some = ["--strategies", "single,switch-2"]
-    assert call(*some, "--share", "1/2", "--commit", "abc") == (0, None)
-    assert call(*some, "--gather") == (0, None), "some runs have not begun"
-    call(*some, "--share", "2/2", "--commit", "abc")
-    code, notes = call(*some, "--gather", "--commit", "xyz")
-    assert code == 0 and (notes["commit"], notes["grasps"]) == ("xyz", 2 * 2 * 18 * 7)
-    assert notes["settings"]["plan"]["strategies"] == ["single", "switch-2"]
-    assert call("--commit", "def")[1]["grasps"] == PLAN.grasps
-    arrays, _ = study.load(tmp_path, "2d")
-    space = design_space(scenes.load(TINY).hand, "2d")
-    whole = results.of_strategies(PLAN, scenes.load(TINY), space, finished[1])
+def test_the_command_writes_what_the_runs_have(toy, finished, tmp_path, monkeypatch):
+    monkeypatch.setitem(simulate.SIZES, "tiny", ({"2d": PLAN}, ()))
+    command = ["scripts.experiments", "2d", "--size", "tiny", "--scene", str(TINY)]
+    command += ["--out", str(tmp_path), "--seed", str(SEED), "--commit", "xyz"]
+    monkeypatch.setattr(sys, "argv", command)
+    assert experiments.main() == 0
+    arrays, notes = report.load(tmp_path, "2d")
+    assert (notes["commit"], notes["grasps"]) == ("xyz", PLAN.grasps)
+    whole = simulate.of_strategies(PLAN, *tiny()[:2], finished[1])
     assert all(np.array_equal(arrays[name], value) for name, value in whole.items())
 
 
@@ -387,17 +347,8 @@ def test_the_script_simulates_and_draws(tmp_path):
         command = [sys.executable, "-m", "scripts.experiments", *arguments]
         return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
-    run = [
-        "2d",
-        "--size",
-        "tiny",
-        "--engine",
-        "mujoco",
-        "--scene",
-        "paper_spheres",
-        "--out",
-        str(tmp_path),
-    ]
+    run = ["2d", "--size", "tiny", "--engine", "mujoco", "--scene", "paper_spheres"]
+    run += ["--out", str(tmp_path)]
     done = call(*run, "--commit", "abc")
     assert done.returncode == 0, done.stderr
     notes = json.loads((tmp_path / "2d.json").read_text())

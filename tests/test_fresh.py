@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from codesign_jax import scene
-from scripts.experiments import fresh, results
-from scripts.experiments.plan import Strategies
+from scripts.experiments import fresh
+from scripts.experiments.simulate import Strategies, write
 from tests.helpers.toy_engine import TINY
 
 PLAN = Strategies("2d", "2d", ("single", "concurrent"), 2, 3, 2, 3, 3)
@@ -25,7 +25,7 @@ def experiment(folder, tested=True):
         "mean": np.zeros((2, 2, 2)),
     }
     plan = {"name": "2d", "runs": 2, "particles": 3, "trials": 3, "episodes": 2}
-    results.write(folder, "2d", arrays, {"settings": {"plan": plan}})
+    write(folder, "2d", arrays, {"settings": {"plan": plan}})
     return particles[1] * 1.01
 
 

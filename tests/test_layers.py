@@ -187,8 +187,8 @@ def test_imports_point_one_way():
         (f"{ENGINE}.laws.hull", f"{ENGINE}.linear.elimination", True),
         (f"{ENGINE}.linear.elimination", f"{ENGINE}.kernel.skin", True),
         (f"{ENGINE}.kernel.skin", f"{ENGINE}.laws.hull", False),
-        ("scripts.shared.output", "scripts.experiments.plan", True),
-        ("scripts.accuracy.report", "scripts.benchmark.report", True),
+        ("scripts.shared.output", "scripts.experiments.report", True),
+        ("scripts.accuracy.report", "scripts.benchmark", True),
         ("scripts.accuracy.budget", "scripts.calibration", False),
     ],
 )

@@ -8,8 +8,8 @@ import pytest
 
 from codesign_jax import codesign
 from codesign_jax.cost import particle_cost
-from scripts.search import report, study
-from scripts.search.study import Study, make_case
+from scripts import search
+from scripts.search import Study, make_case
 from tests.helpers.toy_engine import tiny
 
 SIZES = "particles=4,trials=2"
@@ -56,14 +56,14 @@ def test_seeds_are_runs_of_the_library_and_go_on(name, tmp_path):
     # All grasps are counted: those that find a poor seed, the episodes, and the test.
     before = 8 if name == "particle-filter" else 0
     assert whole.row()["grasps"][-1] == before + 8 * whole.done + whole.tested
-    assert whole.tested == (4 * study.ROUNDS if name == "particle-filter" else 4 * 36)
+    assert whole.tested == (4 * search.ROUNDS if name == "particle-filter" else 4 * 36)
 
 
 def test_what_is_recommended_was_chosen_by_fresh_trials(tmp_path):
     """The particle of the lowest cost in the mark's own trials, by the library's evaluation."""
     made = finish(make(tmp_path / "one.npz", "particle-filter"))
     the_scene, space, engine = tiny()
-    task = codesign.Task(the_scene, space, study.ROUNDS, engine)
+    task = codesign.Task(the_scene, space, search.ROUNDS, engine)
     assert made.last is not None
     candidates = made.last[0][2][np.argsort(made.last[1][2], stable=True)]
     noise = codesign.stream_key(made.keys[2], codesign.STREAM_TEST, made.done)
@@ -76,29 +76,19 @@ def test_the_page_gets_a_table_and_a_figure(tmp_path):
     row |= {"provenance": {"commit": "abc12345"}}
     row["kept"] = [[0.5, 0.96, 0.2, 0.96], [0.96, 0.97, 1.0, 0.99], [0.96, 0.97, 1.0, 0.5]]
     (tmp_path / "2d-ours.json").write_text(json.dumps(row))
-    whole = row | {"optimizer": "screened-es", "preset": "23d", "first_seed": 100}
-    part = whole | {"optimizer": "screened-es:tests=0", "first_seed": 102}
+    whole = row | {"optimizer": "screened-es", "preset": "23d"}
+    part = whole | {"optimizer": "screened-es:tests=0"}
     (tmp_path / "23d-screened-es.json").write_text(json.dumps(whole))
     (tmp_path / "23d-tests0.json").write_text(json.dumps(part))
     page = tmp_path / "page.md"
     page.write_text("<!-- search:begin -->\n<!-- search:end -->\n")
     figure = tmp_path / "search.png"
-    assert report.main([str(tmp_path), "--page", str(page), "--figure", str(figure)]) == 0
+    command = ["--report", str(tmp_path), "--page", str(page), "--figure", str(figure)]
+    assert search.main(command) == 0
     lines = page.read_text().splitlines()
     assert lines[4].startswith("| `screened-es` | 23d |"), "23 parameters first"
     line = lines[5]
     assert "| `ours` | 2d | three | 4 | 40 | 0.965 |" in line and "0.75 (0.30 to 0.95)" in line
     assert not [text for text in lines if "tests=0" in text], "a part of it left out"
     assert line.endswith("| not reached | abc1234 |") and figure.exists()
-    assert report.reached(row | {"kept": row["kept"][:2]}, 0.9) == "20"
-    later = row | {"first_seed": 4, "kept": [[0.1], [0.2], [0.3]]}
-    [whole] = report.merged([later, row])
-    assert whole["kept"][0] == [0.5, 0.96, 0.2, 0.96, 0.1] and len(whole["kept"]) == 3
-    with pytest.raises(ValueError, match="overlap"):
-        report.merged([row, later | {"first_seed": 3}])
-    sooner = row | {"grasps": [5, 30], "kept": [[0.0] * 4, [0.6] * 4]}
-    [joined] = report.merged([row, sooner])
-    assert joined["grasps"] == [5, 10, 20, 30, 40] and joined["kept"][3] == [0.6] * 4
-    with pytest.raises(ValueError, match="other seeds"):
-        report.merged([row, sooner | {"first_seed": 1}])
-    assert row["kept"][0] == [0.5, 0.96, 0.2, 0.96], "what is merged stays as it was"
+    assert search.reached(row | {"kept": row["kept"][:2]}, 0.9) == "20"

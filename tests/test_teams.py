@@ -1,11 +1,14 @@
 """Teams of lanes, a GPU's way to share a finger's work, against a lane a finger; both on a CPU."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
 from codesign_jax import scene as scenes
 from codesign_jax.compiler import launch
+from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program, teams
 from codesign_jax.engines.structured.world_model import world_constants
@@ -37,9 +40,12 @@ def test_teams_follow_the_same_path_in_contact():
     with jax.enable_x64(True):
         scene = scenes.load("paper", overrides={"effects": {"friction_memory": True}})
         plain = scenes.load("paper", overrides={"effects": {"surface": "spheres"}})
-        starts, ctrl = work.window(plain, 8, 20, distinct=8)
-        made, _ = work.inputs(scene, work.make_worlds(scene, 8))
-        made = made._replace(start=starts.start)
+        worlds = work.make_worlds(scene, 8)
+        fields, ctrl = work.inputs(plain, worlds)
+        first = round(plain.phases.inflate / plain.discretization.timestep)
+        curled = MujocoEngine(plain).rollout(fields, ctrl[:, :first], trajectory=True)
+        made = work.inputs(scene, worlds)[0]._replace(start=curled.qpos[:, -1])
+        ctrl = ctrl[:, first : first + 20]
         fields, ctrl = jax.tree.map(lambda x: np.asarray(x, np.float64), (made, ctrl))
         got, want = rollouts(scene, fields, ctrl, (64, 16))
     assert (want["iterations"] > 6).any() and (want["distance"][:, -1] < 0.2).any()
@@ -51,7 +57,9 @@ def test_teams_follow_the_same_path_in_contact():
 def test_one_finger_is_one_team():
     """Teams depend on the scene's structure and the backend, and nothing on the batch."""
     paper, spheres = scenes.load("paper"), scenes.load("paper_spheres")
-    eight = work.variant(fingers=8)
+    fingers = tuple(dataclasses.replace(f, azimuth=f.azimuth + 20) for f in spheres.hand.finger)
+    hand = dataclasses.replace(spheres.hand, finger=spheres.hand.finger + fingers)
+    eight = dataclasses.replace(spheres, hand=hand)
     limits = Limits(8, 8, 1e-6)
     for scene, backend, want in (
         (paper, "gpu", teams.TEAM),

@@ -17,12 +17,11 @@ import sys
 from pathlib import Path
 
 from codesign_jax import use_compilation_cache
-from scripts.accuracy import budget, report, tip
-from scripts.shared import output, provenance, tables
+from scripts.accuracy import budget, report
+from scripts.shared import output, provenance
 
 
 def main() -> int:
-    """Runs the command and returns the exit status."""
     parser = provenance.parser(__doc__)
     parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--out", type=Path, default=Path("runs/budget"), help="folder of the files")
@@ -30,7 +29,6 @@ def main() -> int:
     parser.add_argument("--trials", type=int, default=budget.TRIALS)
     parser.add_argument("--share", default="1/1", metavar="I/N", help="every N-th variant")
     parser.add_argument("--only", default="", help="these variants, with ; between")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--time", action="store_true", help="measure rates")
     parser.add_argument("--tip", action="store_true", help="measure errors of the finger tip")
     parser.add_argument("--merge", type=Path, help="write the files into this one and stop")
@@ -42,7 +40,7 @@ def main() -> int:
         found = report.Budget(json.loads(args.merge.read_text()))
         for mark, text in found.tables().items():
             print(f"{text}\n")
-            tables.fill(args.docs / "accuracy.md", text, mark)
+            output.fill(args.docs / "accuracy.md", text, mark)
         print(report.draw_budget(found, args.docs / "figures" / "budget.png"))
         print(report.draw_against_time(found, args.docs / "figures" / "accuracy_time.png"))
         return 0
@@ -51,9 +49,9 @@ def main() -> int:
         return 0
     args.out.mkdir(parents=True, exist_ok=True)
     if args.tip:
-        tip.measure(args.out, args.commit)
+        budget.measure_tips(args.out, args.commit)
         return 0
-    study = budget.Study(args.data, args.designs, args.trials, tuple(args.set))
+    study = budget.Study(args.data, args.designs, args.trials)
     first, count = (int(n) for n in args.share.split("/"))
     chosen = args.only.split(";") if args.only else budget.TIMED if args.time else budget.VARIANTS
     run = budget.measure if args.time else budget.simulate

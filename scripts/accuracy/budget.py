@@ -1,20 +1,27 @@
-"""The same designs in the same trials by every variant of the default scene: verdicts and rates."""
+"""The same designs in the same trials by every variant of the default scene: verdicts and rates.
+
+And finger tips in a fast motion in the air, against MuJoCo C with a short step and many links.
+"""
 
 import base64
 import dataclasses
 import json
+import os
 import time
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
-from codesign_jax import rollout, scene
+from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
+from codesign_jax.engines.mujoco import world_model
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.types import Status, Trial, failed
 from scripts import calibration
@@ -47,9 +54,8 @@ class Variant:
     few: bool = False
     engine: str = "structured"
 
-    def scene(self, more: tuple[str, ...] = ()) -> Scene:
-        """The default scene so changed."""
-        overrides = keypaths.parse([*self.changes, *more])
+    def scene(self) -> Scene:
+        overrides = keypaths.parse(self.changes)
         return scene.load("paper", accuracy=self.accuracy, overrides=overrides)
 
 
@@ -113,14 +119,14 @@ DEAR = ("reference", "spheres, MuJoCo C")
 class Study:
     """Designs and trials, and what variants make of them."""
 
-    def __init__(self, data: Path, designs: int, trials: int, more: tuple[str, ...] = ()):
-        """Reads the designs from 23d.npz of a folder; `more` changes every variant."""
-        self.trials, self.more, self.designs = trials, more, late_designs(data, designs)
+    def __init__(self, data: Path, designs: int, trials: int):
+        """Reads the designs from 23d.npz of a folder."""
+        self.trials, self.designs = trials, late_designs(data, designs)
 
     def run(self, name: str, commit: str | None = None) -> dict[str, Any]:
         """Simulates a variant; what its file holds."""
         variant = VARIANTS[name]
-        the_scene = variant.scene(self.more)
+        the_scene = variant.scene()
         call, took = self._call(variant, the_scene)
         start = time.perf_counter()
         outcome = jax.tree.map(np.asarray, call())
@@ -143,7 +149,7 @@ class Study:
     def rate(self, name: str) -> dict[str, float]:
         """Grasps a second of a variant, the best of some calls, compiled before."""
         variant = VARIANTS[name]
-        call, _ = self._call(variant, variant.scene(self.more))
+        call, _ = self._call(variant, variant.scene())
         seconds = []
         for _ in range(1 if name in DEAR else 3):
             start = time.perf_counter()
@@ -226,7 +232,6 @@ def costs(the_scene: Scene, record: dict[str, Any]) -> np.ndarray:
 
 
 def path_of(folder: Path, name: str) -> Path:
-    """File of a variant."""
     return folder / f"{''.join(c if c.isalnum() or c in '.-' else '_' for c in name)}.json"
 
 
@@ -254,7 +259,6 @@ def measure(study: Study, names: list[str], folder: Path, commit: str | None) ->
 
 
 def merged(folder: Path) -> dict[str, Any]:
-    """The files of all variants in one."""
     every = {name: path_of(folder, name) for name in VARIANTS}
     times = {p.stem.split("_")[1]: json.loads(p.read_text()) for p in folder.glob("times_*.json")}
     found: dict[str, Any] = {
@@ -264,3 +268,98 @@ def merged(folder: Path) -> dict[str, Any]:
     if (path := folder / "tips.json").exists():
         found["tips"] = json.loads(path.read_text())
     return found
+
+
+# --- finger tips in the air -----------------------------------------------------------------------
+
+# A quick grasp in the air: the arm comes down in 0.3 s, the fingers are inflated in the next 0.3 s,
+# and the hand is shaken. Nothing touches, and no world ends early.
+IN_THE_AIR = {
+    "effects": {
+        **dict.fromkeys(("finger_finger", "finger_palm", "finger_object", "finger_table"), False),
+        **dict.fromkeys(("palm_object", "palm_table", "ungrasp"), False),
+    },
+    "phases": {"approach": 0.3, "inflate": 0.6, "lift": 0.9, "disturb": 2.4, "ungrasp": 3.0},
+    "cost": {"lost_distance": 1.0},
+}
+EVERY = 0.02
+"""Time between compared states [s]: a multiple of every time step."""
+HANDS, SECONDS = 12, 2.4
+REFERENCE = (1e-4, 40, "least")
+"""Time step [s], links and damping of the motion that stands for the truth, by MuJoCo C."""
+
+
+def motion(
+    setting: tuple[float, int, str], engine: str = "structured", hands: int = HANDS,
+    seconds: float = SECONDS,
+) -> np.ndarray:  # fmt: skip
+    """Tips of hands in the air [m], shape (hand, time, finger, 3), every `EVERY` from the start."""
+    step, links, damping = setting
+    sizes = {"timestep": step, "links": links, "spring_damping": damping}
+    the_scene = scene.load("paper", overrides={**IN_THE_AIR, "discretization": sizes})
+    stride, count = round(EVERY / step), round(seconds / step)
+    vectors = np.asarray(work.designs(the_scene, hands))
+    drawn = rollout.sample_trials(the_scene, jax.random.key(work.SEED), work.TRIALS)
+    with jax.enable_x64(engine == "mujoco"):
+        float_type = np.float64 if engine == "mujoco" else np.float32
+        params = jax.vmap(lambda v: parameters.unflatten(the_scene.hand, v))(vectors)
+        trials = jax.tree.map(lambda x: np.asarray(x)[np.arange(hands) % work.TRIALS], drawn)
+        cast = lambda x: np.asarray(x).astype(float_type) if x.dtype.kind == "f" else x  # noqa: E731
+        made = work.inputs(the_scene, work.Worlds(*jax.tree.map(cast, (params, trials))))
+        fields, ctrl = jax.tree.map(np.asarray, made)
+        ctrl = ctrl[:, :count]
+        if engine != "mujoco":
+            run = jax.jit(
+                lambda f, c: make_engine(engine, the_scene).rollout(f, c, trajectory=True).qpos
+            )
+            qpos = np.asarray(run(fields, ctrl)[:, ::stride], np.float64)
+
+    def of_world(world: int) -> np.ndarray:
+        compiled = world_model(the_scene, jax.tree.map(lambda x: x[world], fields))
+        if engine != "mujoco":
+            return np.array([tips(the_scene, compiled, state) for state in qpos[world]])
+        # The object on the table is the only contact: without it there is nothing to solve.
+        compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        data, found = mujoco.MjData(compiled), []
+        data.qpos[:] = fields.start[world]
+        for k in range(ctrl.shape[1]):
+            if k % stride == 0:
+                found.append(tips(the_scene, compiled, data.qpos))
+            data.ctrl[:] = ctrl[world, k]
+            mujoco.mj_step(compiled, data)
+        return np.array(found)
+
+    return np.array(_each(of_world, hands))
+
+
+def _each(function: Callable[[int], Any], count: int) -> list[Any]:
+    """Results of worlds in threads: MuJoCo frees Python's lock."""
+    with ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), count)) as pool:
+        return list(pool.map(function, range(count)))
+
+
+def tips(the_scene: Scene, compiled: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Finger tips of a state [m], shape (finger, 3), on the bottom layer."""
+    data, last = mujoco.MjData(compiled), model.layout(the_scene).bodies[:, -1]
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(compiled, data)
+    # A half segment follows the last joint; its centre of mass lies halfway along it.
+    along = 2 * compiled.body_ipos[last, 0]
+    return data.xpos[last] + data.xmat[last].reshape(-1, 3, 3)[:, :, 0] * along[:, None]
+
+
+def error(found: np.ndarray, exact: np.ndarray) -> float:
+    """Root mean square distance of tips [mm]."""
+    return float(1e3 * np.sqrt((np.linalg.norm(found - exact, axis=-1) ** 2).mean()))
+
+
+def measure_tips(folder: Path, commit: str | None) -> None:
+    """Writes the error of every variant's step, links and damping to tips.json."""
+    named = {}
+    for name, variant in VARIANTS.items():
+        found = variant.scene().discretization
+        named[name] = (found.timestep, found.links, found.spring_damping)
+    exact = motion(REFERENCE, "mujoco")
+    errors = {s: error(motion(s), exact) for s in dict.fromkeys(named.values())}
+    content = {"tip_rms_mm": {n: errors[s] for n, s in named.items()}}
+    output.write_json(folder / "tips.json", content | {"made": provenance.measurement(commit)})

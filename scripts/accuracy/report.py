@@ -12,7 +12,7 @@ from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import load
 from scripts.accuracy import budget
-from scripts.shared import figures, tables
+from scripts.shared import output
 from scripts.shared.statistics import spearman, two_way
 
 RESAMPLES = 500
@@ -114,7 +114,6 @@ class Budget:
         return self._compared[of, to]
 
     def row(self, name: str, words: str) -> list[str]:
-        """A setting beside the truth."""
         beside, moved = self.compared(name, "truth"), self.compared(name, f"{name}, moved")
         rates = [self.rates.get(machine, {}).get(name) for machine in RATED]
         cells = [words, *["–"] * 5]
@@ -129,27 +128,24 @@ class Budget:
 
     def tables(self) -> dict[str, str]:
         """Markdown by the name of its marks on docs/accuracy.md."""
-        found = {"budget": f"{tables.markdown(budget_table(self))}\n\n{luck(self)}"}
+        found = {"budget": f"{output.markdown(budget_table(self))}\n\n{luck(self)}"}
         if "truth" in self.costs:
-            found["against-truth"] = tables.markdown(presets_table(self))
+            found["against-truth"] = output.markdown(presets_table(self))
         return found
 
 
 def interval(value: Interval, form: str = ".1%") -> str:
-    """A value with its interval; a dash where it is not defined."""
     if not np.isfinite(value.value):
         return "–"
     return f"{value.value:{form}} [{value.low:{form}}, {value.high:{form}}]"
 
 
 def points(value: Interval) -> str:
-    """A difference of success in points, with its interval."""
     middle, low, high = (100 * v for v in value)
     return f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
 def presets_table(found: Budget) -> list[list[str]]:
-    """Presets and candidates beside the truth."""
     head = ["setting", "success, points from the truth", "verdicts that flip", "rank correlation"]
     head += ["flips by a micrometre", "finger tip in the air"]
     rows = [[*head, *(f"grasps/s, {m}" for m in RATED.values())]]
@@ -159,7 +155,6 @@ def presets_table(found: Budget) -> list[list[str]]:
 
 
 def budget_table(found: Budget) -> list[list[str]]:
-    """What each change moves."""
     rows = [["change", "verdicts that flip", "success, points", "rank correlation", "of"]]
     for change in CHANGES:
         if beside := found.compared(change.to, change.of):
@@ -185,7 +180,7 @@ def luck(found: Budget) -> str:
 def draw_budget(found: Budget, path: Path) -> Path:
     """The budget as bars with their intervals, by kind."""
     shown = [(c, r) for c in CHANGES if (r := found.compared(c.to, c.of))]
-    figure = figures.new(7.5, 0.28 * len(shown) + 1.0)
+    figure = output.new_figure(7.5, 0.28 * len(shown) + 1.0)
     axes = figure.subplots()
     for place, (change, result) in enumerate(shown):
         middle, low, high = (100 * v for v in result["flipped"])
@@ -197,7 +192,7 @@ def draw_budget(found: Budget, path: Path) -> Path:
     handles = [Patch(color=color, alpha=0.8) for color in COLORS.values()]
     axes.legend(handles, list(COLORS), frameon=False, fontsize=8, loc="upper right")
     axes.set(xlabel="verdicts that flip [%]", xlim=(0, None))
-    return figures.save(figure, path)
+    return output.save_figure(figure, path)
 
 
 # --- accuracy against time ------------------------------------------------------------------------
@@ -266,7 +261,7 @@ def marks(found: Budget) -> tuple[list[Place], list[Place]]:
 def draw_against_time(found: Budget, path: Path) -> Path:
     """Errors of verdicts and of finger tips against grasps a second, side by side."""
     left, right = marks(found)
-    figure = figures.new(12.5, 5.8)
+    figure = output.new_figure(12.5, 5.8)
     verdict, tip = figure.subplots(1, 2)
     words = "grasps a second: whole grasps of designs that hold"
     _marks(verdict, [p._replace(error=Interval(*(100 * v for v in p.error))) for p in left])
@@ -301,7 +296,7 @@ def draw_against_time(found: Budget, path: Path) -> Path:
         if who in shown
     ]
     figure.legend(handles=key, loc="outside lower center", ncols=4, frameon=False)
-    return figures.save(figure, path)
+    return output.save_figure(figure, path)
 
 
 def _marks(axis: Axes, places: list[Place]) -> None:

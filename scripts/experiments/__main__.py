@@ -2,9 +2,7 @@
 
 python -m scripts.experiments 2d --out runs/reproduction           # on a GPU; again to resume
 timeout -s INT 500 python -m scripts.experiments 2d --out runs/reproduction    # stop after a time
-python -m scripts.experiments 2d --out runs/big --share 1/4        # beside 2/4, 3/4 and 4/4
-python -m scripts.experiments 2d --out runs/big --gather           # then: results of all shares
-python -m scripts.experiments 2d --out runs/small --size cpu       # minutes on a CPU
+python -m scripts.experiments 2d --out runs/tiny --size tiny       # seconds on a CPU
 python -m scripts.experiments figures                                # of docs/data/experiments
 """
 
@@ -12,7 +10,6 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -22,23 +19,16 @@ from codesign_jax.commands import common
 from codesign_jax.engines import NAMES
 from codesign_jax.scene import Scene, keypaths, parameters
 from codesign_jax.scene.schema import InputError
-from scripts.experiments import landscape, plan, report, results, strategies
+from scripts.experiments import report, simulate
 from scripts.shared import provenance
 
 
 def parse() -> argparse.Namespace:
-    """Reads the command line."""
     parser = provenance.parser(__doc__)
-    parser.add_argument("experiment", choices=[*plan.PAPER, "figures"])
+    parser.add_argument("experiment", choices=[*simulate.PAPER, "figures"])
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
     parser.add_argument("--scene", default="paper", help="built-in scene or file")
-    parser.add_argument("--size", choices=list(plan.OVERRIDES), default="paper")
-    parser.add_argument(
-        "--strategies",
-        type=lambda s: s.split(","),
-        help="only these, for example single,concurrent",
-    )
-    parser.add_argument("--runs", type=int, help="runs of each strategy")
+    parser.add_argument("--size", choices=list(simulate.SIZES), default="paper")
     parser.add_argument("--engine", choices=NAMES, default="structured")
     parser.add_argument("--seed", type=int, default=0, help="seed of run 0")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -46,96 +36,73 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--devices", type=int, help="by default all that are visible")
     parser.add_argument("--every", type=int, default=4, help="episodes between checkpoints")
     parser.add_argument("--fresh", action="store_true", help="delete what is there of it")
-    parser.add_argument(
-        "--share",
-        default="1/1",
-        metavar="I/N",
-        help="every N-th run from the I-th on, beside other processes; --gather writes the results",
-    )
-    parser.add_argument(
-        "--gather", action="store_true", help="simulate nothing: write what the runs have"
-    )
     parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
     return parser.parse_args()
 
 
-def simulate(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Runs or resumes an experiment, and writes what it has; returns the exit status."""
     common.use_compilation_cache()
-    try:
-        the_plan = plan.experiment(args.experiment, args.size)
-        the_plan = plan.narrowed(the_plan, args.strategies, args.runs)
-    except ValueError as error:
-        sys.exit(f"error: {error}")
-    overrides = keypaths.parse([*plan.OVERRIDES[args.size], *args.set])
+    plans, changes = simulate.SIZES[args.size]
+    the_plan, overrides = plans[args.experiment], keypaths.parse([*changes, *args.set])
     the_scene = scene.load(args.scene, overrides=overrides)
     path = args.out / f"{args.experiment}.json"
-    settings = json.loads(
-        json.dumps(results.settings_of(the_plan, the_scene, args.engine, args.seed))
-    )
+    settings = simulate.settings_of(the_plan, the_scene, args.engine, args.seed)
+    settings = json.loads(json.dumps(settings))
     if path.exists() and not args.fresh:
-        if _of_runs(json.loads(path.read_text())["settings"]) != _of_runs(settings):
+        if json.loads(path.read_text())["settings"] != settings:
             sys.exit(f"error: {path} belongs to another experiment; choose another --out")
     print(f"{args.experiment}: {the_plan.grasps:,} grasps", flush=True)
-    run = _landscape if isinstance(the_plan, plan.Landscape) else _strategies
-    code, kept, grasps = run(args, the_plan, the_scene)
+    begin = _landscape if isinstance(the_plan, simulate.Landscape) else _strategies
+    code, kept, grasps = begin(args, the_plan, the_scene)
     if kept is not None:
         notes = provenance.results(args.commit) | {"settings": settings, "grasps": grasps}
-        results.write(args.out, args.experiment, kept, notes)
+        simulate.write(args.out, args.experiment, kept, notes)
     return code
 
 
-def _of_runs(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings of an experiment but the list of strategies: each has folders of its own."""
-    return settings | {"plan": {k: v for k, v in settings["plan"].items() if k != "strategies"}}
-
-
-Found = tuple[int, strategies.Arrays | None, int]
+Found = tuple[int, simulate.Arrays | None, int]
 """Exit status, results if there are some, and their grasps."""
 
 
-def _strategies(args: argparse.Namespace, the_plan: plan.Strategies, the_scene: Scene) -> Found:
+def _strategies(args: argparse.Namespace, the_plan: simulate.Strategies, the_scene: Scene) -> Found:
     folder = args.out / args.experiment
-    plans = strategies.plans(the_plan, the_scene, args.engine, folder, args.seed)
-    first, count = (int(n) for n in args.share.split("/"))
-    plans = dict([*plans.items()][first - 1 :: count]) if not args.gather else {}
+    plans = simulate.plans(the_plan, the_scene, args.engine, folder, args.seed)
     how = {"fresh": args.fresh, "every": args.every, "devices": args.devices, "chunk": args.chunk}
-    code = 0
-    if plans:
-        done = runs.optimize(plans, sys.argv, **how)
-        problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
-        for place, error in problems.items():
-            print(f"error: {place}: {error}", file=sys.stderr)
-        code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
-    found = strategies.gather(the_plan, folder, args.seed) if count == 1 else None
+    done = runs.optimize(plans, sys.argv, **how)
+    problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
+    for place, error in problems.items():
+        print(f"error: {place}: {error}", file=sys.stderr)
+    code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
+    found = simulate.gather(the_plan, folder, args.seed)
     if found is None or not found["cost"].shape[2]:
         return code, None, 0
     space = parameters.design_space(the_scene.hand, the_plan.preset)
     tested = the_plan.worlds * the_plan.rounds if "test_status" in found else 0
-    kept = results.of_strategies(the_plan, the_scene, space, found)
+    kept = simulate.of_strategies(the_plan, the_scene, space, found)
     return code, kept, found["status"].size + tested
 
 
-def _landscape(args: argparse.Namespace, the_plan: plan.Landscape, the_scene: Scene) -> Found:
+def _landscape(args: argparse.Namespace, the_plan: simulate.Landscape, the_scene: Scene) -> Found:
     console, part = Console(highlight=False, soft_wrap=True), args.out / f"{args.experiment}.part"
     if args.fresh:
         part.unlink(missing_ok=True)
     how = {"seed": args.seed, "chunk": args.chunk, "devices": args.devices, "console": console}
     try:
-        found, _ = landscape.simulate(the_plan, the_scene, args.engine, part, **how)
+        found, _ = simulate.landscape(the_plan, the_scene, args.engine, part, **how)
     except KeyboardInterrupt:
         print("stopped; the same command goes on")
         return 130, None, 0
     space = parameters.design_space(the_scene.hand, the_plan.preset)
-    return 0, results.of_landscape(the_scene, space, found), the_plan.grasps
+    return 0, simulate.of_landscape(the_scene, space, found), the_plan.grasps
 
 
 def main() -> int:
     args = parse()
     if args.experiment != "figures":
-        return simulate(args)
+        return run(args)
     print(report.make(args.data, args.figures, args.page))
     return 0
 

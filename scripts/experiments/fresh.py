@@ -21,14 +21,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import rollout, scene
+from codesign_jax import rollout, scene, use_compilation_cache
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import NAMES, make_engine
 from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import keypaths, parameters
 from codesign_jax.types import failed
-from scripts.experiments import figures, results, study
-from scripts.shared import provenance, statistics, tables
+from scripts.experiments import report
+from scripts.experiments.simulate import write
+from scripts.shared import output, provenance, statistics
 
 STREAM_FRESH = 0x66726573
 """Stream of the noise of these trials ("fres"): none of them was met in a run."""
@@ -42,7 +43,7 @@ def winners(data: Path, name: str) -> tuple[list[str], np.ndarray]:
     Returns:
       Names of the strategies, and particles [SI units] of shape (strategy, run, parameter).
     """
-    found = study.load_study(data, name)
+    found = report.load_study(data, name)
     if found is None or not found.tested:
         raise FileNotFoundError(f"{data} holds no {name} with a final test")
     best = np.argmin(found.data["test_exclude"], axis=-1)
@@ -100,13 +101,13 @@ def run(args: argparse.Namespace) -> None:
             name, what = key.split("|")
             arrays[f"{name}|{label}|{what}"] = value
         notes["runs"].append({"label": label, **provenance.results(args.commit)})
-        results.write(args.data, "fresh", arrays, notes)
+        write(args.data, "fresh", arrays, notes)
         print(f"{label}: {sum(new[f'{n}|cost'].size for n in every):,} grasps", flush=True)
 
 
-def report(data: Path) -> str:
+def summary(data: Path) -> str:
     """The tables of what was simulated, one an experiment."""
-    found = study.load(data, "fresh")
+    found = report.load(data, "fresh")
     if found is None:
         raise FileNotFoundError(f"{data} holds no fresh.npz")
     arrays, text = found[0], []
@@ -129,7 +130,7 @@ def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> s
     rows = [head]
     for s, strategy in enumerate(arrays[f"{name}|strategies"]):
         kept = [_kept(arrays, name, label)[s] for label in labels]
-        cells = [figures.label(str(strategy))]
+        cells = [report.label(str(strategy))]
         for i, share in enumerate(kept):
             whole = wilson(int((share == 1).sum()), share.size)
             cells += [f"{100 * share.mean():.1f} %"]
@@ -142,7 +143,7 @@ def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> s
                 cells += [f"{middle.value:+.1f} [{middle.low:+.1f}, {middle.high:+.1f}]"]
         rows.append(cells)
     trials = arrays[f"{name}|{labels[0]}|cost"].shape[-1]
-    return f"{name}: {trials} fresh trials of each run's best particle\n\n{tables.markdown(rows)}"
+    return f"{name}: {trials} fresh trials of each run's best particle\n\n{output.markdown(rows)}"
 
 
 def _kept(
@@ -155,7 +156,6 @@ def _kept(
 
 
 def parse() -> argparse.Namespace:
-    """Reads the command line."""
     parser = provenance.parser(__doc__)
     names = lambda text: text.split(",")  # noqa: E731 - three options read the same
     parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
@@ -169,25 +169,21 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--label", help="what --set changes, in the names of the results")
     parser.add_argument("--report", action="store_true", help="print the tables and stop")
     parser.add_argument("--page", type=Path, help="page whose table is filled in")
-    parser.add_argument("--table", default="fresh", help="name of that table's marks")
     return parser.parse_args()
 
 
 def main() -> int:
-    """Runs the command and returns the exit status."""
-    from codesign_jax.commands import common
-
     args = parse()
     try:
         if not args.report:
-            common.use_compilation_cache()
+            use_compilation_cache()
             run(args)
-        text = report(args.data)
+        text = summary(args.data)
     except (scene.InputError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
     print(text)
     if args.page:
-        tables.fill(args.page, text, args.table)
+        output.fill(args.page, text, "fresh")
     return 0
 
 

@@ -1,17 +1,243 @@
-"""From committed results to figures and the table of the paper's statements beside ours."""
+"""Success, convergence and regions of committed results (Sec. VI.3): figures 6 to 9 and tables."""
 
+import dataclasses
+import json
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
+from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST, convergence_episode
+from codesign_jax.report.figures import cost_evolution
 from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.types import WARNINGS
-from scripts.experiments import figures
-from scripts.experiments.plan import PAPER_GRASPS, TOTAL_GRASPS
-from scripts.experiments.results import BITS
-from scripts.experiments.study import RULES, Study, load, load_study, regions
-from scripts.shared import statistics
-from scripts.shared.tables import fill
+from scripts.experiments.simulate import BITS, PAPER_GRASPS, TOTAL_GRASPS
+from scripts.shared import output, statistics
+from scripts.shared.output import fill
+
+RULES = ("exclude", "worst")
+"""Rules for failed trials under which results are evaluated; see `cost.particle_cost`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """The committed results of an experiment on strategies.
+
+    Attributes:
+      plan: Sizes; see `simulate.Strategies`.
+      notes: Provenance.
+      data: Arrays; see `simulate.of_strategies`.
+    """
+
+    plan: dict[str, Any]
+    notes: dict[str, Any]
+    data: dict[str, np.ndarray]
+
+    @property
+    def strategies(self) -> list[str]:
+        return [str(s) for s in self.data["strategies"]]
+
+    @property
+    def per_episode(self) -> int:
+        return self.plan["particles"] * self.plan["trials"]
+
+    @property
+    def tested(self) -> bool:
+        """Whether the final test was made; an experiment that was stopped before has none."""
+        return not np.isnan(self.data["test_exclude"]).all()
+
+    @property
+    def episodes(self) -> int:
+        return self.data["mean"].shape[-1]
+
+    def success(self, rule: str = "exclude") -> np.ndarray:
+        """Whether any final particle's mean test cost is below 0.01, bool, (strategy, run)."""
+        return np.any(self.data[f"test_{rule}"] < SUCCESS_COST, axis=-1)
+
+    def convergence(self, rule: str = "exclude") -> np.ndarray:
+        """Episodes simulated when the mean cost is below 1.0 for good, (strategy, run).
+
+        The episode that converged is counted; infinite where a run did not converge.
+        """
+
+        def count(means: np.ndarray) -> float:
+            episode = convergence_episode(means)
+            return np.inf if episode is None else episode + 1.0
+
+        return np.apply_along_axis(count, -1, self.data[f"mean_{rule}"])
+
+    def first_below(self, rule: str = "exclude") -> np.ndarray:
+        """Episodes simulated when the mean cost is below 1.0 for the first time, (strategy, run).
+
+        The paper's "converged" may be read so as well; infinite where a run never got there.
+        """
+        below = self.data[f"mean_{rule}"] < CONVERGED_COST
+        return np.where(below.any(-1), below.argmax(-1) + 1.0, np.inf)
+
+
+def load(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+    """Reads NAME.npz and NAME.json of a folder; None where there are none."""
+    path = folder / f"{name}.npz"
+    if not path.exists():
+        return None
+    with np.load(path, allow_pickle=False) as file:
+        data = {key: file[key] for key in file.files}
+    return data, json.loads((folder / f"{name}.json").read_text())
+
+
+def load_study(folder: Path, name: str) -> Study | None:
+    """Reads an experiment on strategies; None where its files are missing."""
+    found = load(folder, name)
+    if found is None:
+        return None
+    data, notes = found
+    return Study(notes["settings"]["plan"], notes, data)
+
+
+class Region(NamedTuple):
+    """A connected region of the landscape.
+
+    Attributes:
+      share: Its part of the grid's points.
+      centre: Mean of its points in the parameters' units, shape (2,).
+      low: Lower ends, shape (2,).
+      high: Upper ends, shape (2,).
+      mean: Mean cost in it.
+      points: Its points, bool, shape (point, point).
+    """
+
+    share: float
+    centre: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    mean: float
+    points: np.ndarray
+
+
+def regions(
+    data: dict[str, np.ndarray], threshold: float, rule: str = "exclude", smallest: float = 0.005
+) -> list[Region]:
+    """Connected components with cost below a threshold, largest first; points meet at edges."""
+    cost = data[rule]
+    labels, count = ndimage.label(cost < threshold)  # type: ignore[misc]
+    axes = np.meshgrid(data["first_axis"], data["second_axis"], indexing="ij")
+    found = []
+    for label in range(1, count + 1):
+        points = labels == label
+        where = np.stack([a[points] for a in axes])
+        mean = float(cost[points].mean())
+        found.append(
+            Region(float(points.mean()), where.mean(1), where.min(1), where.max(1), mean, points)
+        )
+    return sorted((r for r in found if r.share >= smallest), key=lambda r: -r.share)
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+LABELS = {"single": "s.d.", "concurrent": "conc."}
+_COLORS = {"exclude": "tab:blue", "worst": "tab:orange"}
+_RULE_LABELS = {"exclude": "failed trials excluded", "worst": "failed trials cost the maximum"}
+
+LANDSCAPE_THRESHOLD = CONVERGED_COST
+"""Cost below which a point of the landscape belongs to a region."""
+
+
+def label(strategy: str) -> str:
+    """The paper's name of a strategy: s.d., the number of switches, or conc."""
+    return LABELS.get(strategy, strategy.removeprefix("switch-"))
+
+
+def typical_run(study: Study) -> int:
+    """Run of the last strategy whose convergence is the median one."""
+    episodes = study.convergence()[-1]
+    return int(np.argsort(episodes, kind="stable")[(len(episodes) - 1) // 2])
+
+
+def draw_evolution(study: Study, path: Path) -> Path:
+    """Draws Fig. 6: the particle costs of the run that converges at the median speed."""
+    run = typical_run(study)
+    title = f"{study.strategies[-1]}, run {run} of {study.plan['runs']}"
+    return cost_evolution(study.data["particle_cost"][run].astype(float), path, title=title)
+
+
+def draw_success(study: Study, path: Path) -> Path:
+    """Draws Figs. 7a and 9a: the ratio of successful runs with Wilson's 95 % intervals."""
+    figure, axes = _axes()
+    for offset, rule in zip((-0.18, 0.18), RULES, strict=True):
+        rates = [wilson(int(s.sum()), s.size) for s in study.success(rule)]
+        value, low, high = np.array(rates).T
+        at = np.arange(len(rates)) + offset
+        axes.bar(at, value, 0.36, color=_COLORS[rule], alpha=0.75, label=_RULE_LABELS[rule])
+        axes.errorbar(at, value, [value - low, high - value], fmt="none", color="black", capsize=3)
+    axes.set(ylabel="ratio of successful runs", ylim=(0, 1.2), yticks=np.linspace(0, 1, 6))
+    _strategies(axes, study)
+    axes.legend(frameon=False, fontsize=8, loc="upper center", ncols=2)  # above the bars
+    return output.save_figure(figure, path)
+
+
+def draw_convergence(study: Study, path: Path) -> Path:
+    """Draws Figs. 7b and 9b: median episodes to convergence, with the quartiles.
+
+    Runs that did not converge take part as slower than all others; above the upper line is where
+    they are.  Hollow dots are medians of the converged runs alone, whose number
+    stands under the strategy.
+    """
+    figure, axes = _axes()
+    episodes, limit = study.convergence(), study.plan["episodes"]
+    never = 1.08 * limit
+    low, middle, high = (
+        np.minimum(statistics.quantile(episodes, q), never) for q in (0.25, 0.5, 0.75)
+    )
+    at = np.arange(len(episodes))
+    axes.errorbar(at, middle, [middle - low, high - middle], fmt="o", capsize=4, label="all runs")
+    converged = np.isfinite(episodes)
+    alone = [
+        np.median(e[c]) if c.any() else np.nan for e, c in zip(episodes, converged, strict=True)
+    ]
+    axes.plot(at, alone, "o", mfc="none", color="tab:orange", ms=9, label="converged runs alone")
+    axes.axhline(limit, color="black", lw=1, ls="--")
+    axes.text(len(at) - 0.55, limit, "not converged", ha="right", va="bottom", fontsize=8)
+    axes.set(ylabel="episodes until converged", ylim=(0, 1.15 * limit), xlim=(-0.5, len(at) - 0.5))
+    _strategies(axes, study, [f"{n}/{episodes.shape[1]}" for n in converged.sum(1)])
+    axes.legend(frameon=False, fontsize=8, loc="best")
+    return output.save_figure(figure, path)
+
+
+def draw_landscape(data: dict[str, np.ndarray], path: Path) -> Path:
+    """Draws Fig. 8: the mean cost, white where low, with the regions below the threshold."""
+    figure, axes = _axes(5.4, 4.4)
+    x, y = data["first_axis"], data["second_axis"]
+    image = axes.pcolormesh(x, y, data["exclude"].T, cmap="gray_r", shading="nearest", vmin=0)
+    figure.colorbar(image, label="mean cost")
+    for letter, region in zip("abcdefgh", regions(data, LANDSCAPE_THRESHOLD), strict=False):
+        if not region.points.all():
+            axes.contour(x, y, region.points.T.astype(float), [0.5], colors="tab:red", linewidths=1)
+        # Inside the region, also where its mean lies outside.
+        inside = np.argwhere(region.points)
+        axis = np.stack([x[inside[:, 0]], y[inside[:, 1]]], -1)
+        scale = np.array([np.ptp(x), np.ptp(y)])
+        nearest = axis[np.argmin((((axis - region.centre) / scale) ** 2).sum(1))]
+        axes.text(nearest[0], nearest[1], f"({letter})", color="tab:red", ha="center", va="center")
+    names, units = data["parameters"], data["units"]
+    axes.set(xlabel=f"{names[0]} [{units[0]}]", ylabel=f"{names[1]} [{units[1]}]")
+    return output.save_figure(figure, path)
+
+
+def _axes(width: float = 6.0, height: float = 3.4):
+    figure = output.new_figure(width, height)
+    return figure, figure.add_subplot()
+
+
+def _strategies(axes, study: Study, below: list[str] | None = None) -> None:
+    labels = [label(s) for s in study.strategies]
+    if below:
+        labels = [f"{name}\n{text}" for name, text in zip(labels, below, strict=True)]
+    axes.set_xticks(range(len(labels)), labels)
+    axes.set_xlabel("strategy (s.d.: single domain; number of switches; conc.: concurrent)")
+
+
+# --- tables ---------------------------------------------------------------------------------------
 
 _THRESHOLDS = (0.1, 0.5, 1.0)
 _HEAD = "| the paper | here |\n|---|---|"
@@ -32,19 +258,18 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     if page:
         fill(page, text, "results")
     if grid:
-        figures.landscape(grid[0], pictures / "fig8_landscape.png")
+        draw_landscape(grid[0], pictures / "fig8_landscape.png")
     return text
 
 
 def _draw(study: Study, pictures: Path) -> None:
-    """Draws the figures of an experiment on strategies."""
     name = study.plan["name"]
     if name == "2d":
-        figures.evolution(study, pictures / "fig6_cost_evolution.png")
+        draw_evolution(study, pictures / "fig6_cost_evolution.png")
     number = {"2d": 7, "23d": 9}[name]
     if study.tested:
-        figures.success(study, pictures / f"fig{number}a_success.png")
-    figures.convergence(study, pictures / f"fig{number}b_convergence.png")
+        draw_success(study, pictures / f"fig{number}a_success.png")
+    draw_convergence(study, pictures / f"fig{number}b_convergence.png")
 
 
 def comparison(studies: dict[str, Study | None], grid) -> str:
@@ -78,7 +303,7 @@ def details(study: Study) -> str:
     trials = study.per_episode * study.plan["runs"] * study.episodes
     for s, strategy in enumerate(study.strategies):
         cells = [
-            figures.label(strategy),
+            label(strategy),
             *(
                 _percent(wilson(int(v[s].sum()), v[s].size)) if study.tested else "not tested"
                 for v in (good, strict)
@@ -109,7 +334,7 @@ def _against_last(study: Study) -> list[str]:
         "|---|---|---|",
     ]
     for s in others:
-        cells = [figures.label(study.strategies[s]), *(_p(float(c[s])) for c in columns)]
+        cells = [label(study.strategies[s]), *(_p(float(c[s])) for c in columns)]
         cells[1] = cells[1] if study.tested else "–"
         lines.append(f"| {' | '.join(cells)} |")
     return lines
@@ -124,8 +349,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     paper = {"2d": 420, "23d": 6120}[name]
     success, episodes = study.success(), study.convergence()
     ratios = ", ".join(
-        f"{figures.label(s)} {100 * r.mean():.0f} %"
-        for s, r in zip(study.strategies, success, strict=True)
+        f"{label(s)} {100 * r.mean():.0f} %" for s, r in zip(study.strategies, success, strict=True)
     )
     ratios += f"; Page's trend test p {_p(statistics.trend(1.0 * success))}"
     if len(success) > 4:
@@ -133,7 +357,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     ratios = ratios if study.tested else "not tested: the runs have not ended"
     finite = np.minimum(episodes, study.plan["episodes"] + 1)
     medians = ", ".join(
-        f"{figures.label(s)} {_number(float(statistics.quantile(e, 0.5)))}"
+        f"{label(s)} {_number(float(statistics.quantile(e, 0.5)))}"
         for s, e in zip(study.strategies, episodes, strict=True)
     )
     both = [statistics.median(study.convergence(r)[-1] * study.per_episode) for r in RULES]
@@ -201,7 +425,7 @@ def _regions(grid) -> str:
         shares = ", ".join(f"{100 * r.share:.1f} %" for r in found)
         parts.append(f"cost < {threshold:g}: {len(found)}" + (f" ({shares})" if found else ""))
     units, names = grid[0]["units"], grid[0]["parameters"]
-    found = regions(grid[0], figures.LANDSCAPE_THRESHOLD)
+    found = regions(grid[0], LANDSCAPE_THRESHOLD)
     for letter, region in zip("abcdefgh", found, strict=False):
         ends = ", ".join(
             f"{names[i]} {region.low[i]:.0f} to {region.high[i]:.0f} {units[i]}" for i in (0, 1)

@@ -8,6 +8,7 @@ import platform
 import shlex
 import sys
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 import jax
@@ -34,13 +35,8 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     """A command line with the module's docstring and the option --commit."""
     raw = argparse.RawDescriptionHelpFormatter
     made = argparse.ArgumentParser(description=description, formatter_class=raw)
-    add_commit(made)
+    made.add_argument("--commit", help="commit of the code where there is no repository to ask")
     return made
-
-
-def add_commit(parser: argparse.ArgumentParser) -> None:
-    """Adds the option --commit to a command line."""
-    parser.add_argument("--commit", help="commit of the code where there is no repository to ask")
 
 
 def results(commit: str | None = None) -> dict[str, object]:
@@ -65,7 +61,7 @@ def measurement(commit: str | None = None) -> dict:
         "jax": jax.__version__,
         "mujoco": mujoco.__version__,
         "numpy": np.__version__,
-        "warp": _warp_version(),
+        "warp": metadata.version("warp-lang") if find_spec("warp") else None,
         "platform": device.platform,
         "device": device.device_kind,
         "cpu": _cpu_name(),
@@ -74,16 +70,7 @@ def measurement(commit: str | None = None) -> dict:
     }
 
 
-def _warp_version() -> str | None:
-    """Warp's version if it is installed."""
-    try:
-        return metadata.version("warp-lang")
-    except metadata.PackageNotFoundError:
-        return None
-
-
 def _cpu_name() -> str:
-    """The processor's name as the system gives it."""
     try:
         with open("/proc/cpuinfo") as file:
             names = [line.split(":", 1)[1].strip() for line in file if "model name" in line]

@@ -9,7 +9,6 @@ import numpy as np
 import scipy.stats
 from numpy.typing import ArrayLike
 
-from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.report.statistics import Interval
 
 RESAMPLES = 10_000
@@ -26,30 +25,6 @@ def spearman(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     norm = np.sqrt((x**2).sum(-1) * (y**2).sum(-1))
     with np.errstate(invalid="ignore", divide="ignore"):
         return (x * y).sum(-1) / norm
-
-
-def agreement(cost: ArrayLike, reference: ArrayLike, trials: int) -> dict:
-    """Compares costs of the same worlds, trials of a design following each other.
-
-    Returns:
-      Counts and shares by name: the verdicts are cost < `SUCCESS_COST`.
-    """
-    a = np.asarray(cost, float)
-    b = np.asarray(reference, float)[: a.size]
-    a = a[: b.size]
-    whole = a.size // trials * trials
-    means = [x[:whole].reshape(-1, trials).mean(1) for x in (a, b)]
-    kept, expected = a < SUCCESS_COST, b < SUCCESS_COST
-    rank = float(spearman(*means)) if whole >= 3 * trials else None
-    return {
-        "worlds": int(a.size),
-        "same_verdict": float((kept == expected).mean()),
-        "success": float(kept.mean()),
-        "success_reference": float(expected.mean()),
-        "mean_abs_cost_difference": float(np.abs(a - b).mean()),
-        "designs": int(whole // trials),
-        "spearman": None if rank is None or np.isnan(rank) else rank,
-    }
 
 
 def quantile(values: np.ndarray, q: float) -> np.ndarray:

@@ -1,17 +1,15 @@
-"""What a benchmark simulates: designs, trials, start states in contact, and variants of a scene."""
+"""What a benchmark simulates: designs in trials, and the fields and controls of these worlds."""
 
-import dataclasses
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import control, model, rollout, scene
-from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax import control, model, rollout
 from codesign_jax.model import ModelFields
-from codesign_jax.scene import Scene, hand, parameters
+from codesign_jax.scene import Scene, parameters
 from codesign_jax.types import Params, Trial
 
 TRIALS = 6
@@ -28,34 +26,6 @@ class Worlds(NamedTuple):
 
     params: Params
     trials: Trial
-
-
-def variant(
-    *,
-    hand_name: str | None = None,
-    fingers: int | None = None,
-    links: int | None = None,
-    spheres: int | None = None,
-    solver: dict[str, Any] | None = None,
-) -> Scene:
-    """The scene `paper_spheres` with parts of it changed."""
-    sizes = {"links": links, "spheres_per_link": spheres}
-    table = {k: v for k, v in sizes.items() if v is not None}
-    chosen = scene.load(
-        "paper_spheres",
-        hand_name=hand_name,
-        overrides={"discretization": table, "solver": solver or {}},
-    )
-    return chosen if fingers is None else _with_fingers(chosen, fingers)
-
-
-def _with_fingers(chosen: Scene, count: int) -> Scene:
-    first = chosen.hand.finger[0]
-    azimuths = 45.0 + np.arange(count) * 360.0 / count
-    ring = {"spread": 0.0, "radius": first.base_distance, "tilt": first.tilt}
-    mounts = tuple(hand.Finger(azimuth=float(a), **ring) for a in azimuths)
-    changed = dataclasses.replace(chosen.hand, name=f"{chosen.hand.name}-{count}", finger=mounts)
-    return dataclasses.replace(chosen, hand=changed)
 
 
 def designs(chosen: Scene, count: int) -> jax.Array:
@@ -80,13 +50,12 @@ def designs(chosen: Scene, count: int) -> jax.Array:
     return jnp.where((jnp.arange(count) % 2 == 0)[:, None], *every).astype(jnp.float32)
 
 
-def make_worlds(chosen: Scene, count: int, *, repeat: int | None = None) -> Worlds:
+def make_worlds(chosen: Scene, count: int) -> Worlds:
     """The first worlds of designs x trials, design by design, every design in the same trials."""
-    distinct = min(count, repeat or count)
-    vectors = designs(chosen, -(-distinct // TRIALS))
+    vectors = designs(chosen, -(-count // TRIALS))
     params = jax.vmap(lambda v: parameters.unflatten(chosen.hand, v))(vectors)
     trials = rollout.sample_trials(chosen, jax.random.key(SEED), TRIALS)
-    index = np.arange(count) % distinct
+    index = np.arange(count)
     return Worlds(
         jax.tree.map(lambda x: np.asarray(x)[index // TRIALS], params),
         jax.tree.map(lambda x: np.asarray(x)[index % TRIALS], trials),
@@ -109,24 +78,3 @@ def _inputs(chosen: Scene, params: Params, trials: Trial) -> tuple[ModelFields, 
         jax.vmap(partial(model.model_fields, chosen))(params, trials),
         jax.vmap(partial(control.commands, chosen))(params, trials),
     )
-
-
-def window(
-    chosen: Scene, count: int, steps: int, *, distinct: int
-) -> tuple[ModelFields, jax.Array]:
-    """Model fields and controls of short rollouts that begin with inflated fingers.
-
-    The start states are those of MuJoCo C at the end of the inflation, at rest.  A rollout of less
-    than the time to the cost window decides no world, so that every engine simulates every step.
-
-    Returns:
-      Fields, whose start states are in contact, and controls, shape (world, steps, nu).
-    """
-    first = round(chosen.phases.inflate / chosen.discretization.timestep)
-    some = make_worlds(chosen, min(count, distinct))
-    fields, ctrl = inputs(chosen, some)
-    engine = MujocoEngine(chosen)
-    run = jax.jit(lambda f, c: engine.rollout(f, c, trajectory=True).qpos[:, -1])
-    fields = fields._replace(start=run(fields, ctrl[:, :first]))
-    index = np.arange(count) % min(count, distinct)
-    return jax.tree.map(lambda x: x[index], (fields, ctrl[:, first : first + steps]))

@@ -13,7 +13,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,14 @@ from codesign_jax import cost, rollout, sampling, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import Scene, parameters
 from codesign_jax.types import Outcome, failed
-from scripts.benchmark import report
 from scripts.shared import output, provenance, work
 
+ROOT = Path(__file__).parents[1]
+FILES = "docs/data/rates_*.json"
+PAGES = {"README.md": ("rates",), "docs/performance.md": ("rates", "measured", "peers")}
+"""Pages with the marks of the tables that they hold."""
+BATCHES = {60: ", an episode of the paper's 2D", 360: ", of its 23D experiment"}
+DESIGNS = {"random": "random designs", "winners": "winners"}
 SPHERES = {"surface": "spheres"}
 """What engines without the skinned hull can simulate of the default scene."""
 CASES: dict[str, tuple[str, dict[str, Any], tuple[str, ...], tuple[str, ...]]] = {
@@ -44,7 +49,7 @@ SECONDS = 10.0
 """Time after which no further call begins."""
 JUDGED = 360
 """Grasps whose verdicts are kept, to be compared between engines."""
-WINNERS = report.ROOT / "docs/data/experiments/23d.npz"
+WINNERS = ROOT / "docs/data/experiments/23d.npz"
 
 
 def winners(chosen: Scene) -> np.ndarray:
@@ -86,7 +91,6 @@ class JaxProgram:
     """A function of arrays, compiled in `compile_s`."""
 
     def __init__(self, function: Callable, *args: Any):
-        """Compiles the function for its arguments."""
         begin = time.perf_counter()
         self.args, self.compiled = args, jax.jit(function).lower(*args).compile()
         self.compile_s = time.perf_counter() - begin
@@ -101,7 +105,7 @@ class JaxProgram:
 def _program(chosen: Scene, engine: str, worlds: work.Worlds) -> Any:
     """What runs the grasps: `run` returns outcomes, or a trace of Warp's, and seconds."""
     if engine == "warp":
-        from scripts.benchmark.warp import WarpProgram
+        from scripts.benchmark_warp import WarpProgram
 
         fields, ctrl = work.inputs(chosen, worlds)
         return WarpProgram(chosen, fields, np.asarray(ctrl))
@@ -143,8 +147,116 @@ def named(engine: str) -> str:
     return peers.get(engine, engine) + (f" {metadata.version(package)}" if package else "")
 
 
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def replaced(records: list[dict[str, Any]], new: dict[str, Any]) -> list[dict[str, Any]]:
+    """The records with a new one in place of the same case's older one."""
+
+    def key(record: dict[str, Any]) -> list:
+        return [record[k] for k in ("scene", "designs", "engine", "worlds")]
+
+    return [r for r in records if key(r) != key(new)] + [new]
+
+
+def read() -> list[dict[str, Any]]:
+    return [json.loads(path.read_text()) for path in sorted(ROOT.glob(FILES))]
+
+
+def machine(run: dict[str, Any]) -> str:
+    """What measured, such as "2 CPU cores" and "one H100"."""
+    if run["platform"] == "cpu":
+        return f"{run['cpus']} CPU cores"
+    return f"one {run['device'].removeprefix('NVIDIA ').split()[0]}"
+
+
+def rates(files: list[dict[str, Any]]) -> str:
+    """Grasps a second in the default scene: batches against machines and designs, in Markdown."""
+    cells: dict[tuple[str, str], dict[int, str]] = {}
+    for found in files:
+        for record in found["records"]:
+            if record["scene"] == "paper" and record["engine"] == "structured":
+                column = machine(found["runs"][record["run"]]), DESIGNS[record["designs"]]
+                rate, worlds = record["grasps_per_s"], record["worlds"]
+                text = f"{_rounded(rate)} ({_rounded(worlds / rate)} s)"
+                cells.setdefault(column, {})[worlds] = text
+    columns = sorted(cells, key=lambda c: list(DESIGNS.values()).index(c[1]))
+    columns.sort(key=lambda c: [machine(f["runs"][0]) for f in files].index(c[0]))
+    sizes = sorted({n for column in cells.values() for n in column})
+    rows = [
+        [
+            "grasps a second (time of a batch)",
+            *(f"{where}, {designs}" for where, designs in columns),
+        ]
+    ]
+    for n in sizes:
+        rows.append([f"{n:,} grasps{BATCHES.get(n, '')}", *(cells[c].get(n, "–") for c in columns)])
+    return output.markdown(rows)
+
+
+def machines(files: list[dict[str, Any]]) -> str:
+    """What measured the default scene's rates, in a line; the files have the commits."""
+    made: dict[str, None] = {}
+    for found in files:
+        for record in found["records"]:
+            run = found["runs"][record["run"]]
+            if record["scene"] == "paper":
+                made[f"{machine(run)}, JAX {run['jax']}, {run['date'][:10]}"] = None
+    return f"Measured on {'; on '.join(made)} (`docs/data/rates_*.json`)."
+
+
+def peers(files: list[dict[str, Any]]) -> str:
+    """This engine beside each peer: the same grasps on the same machine, in Markdown."""
+    head = "scene, machine, peer, peer's grasps a second, this engine's, times as many"
+    rows = [[*head.split(", "), "same verdicts"]]
+    for found in files:
+        for theirs in found["records"]:
+            if theirs["engine"] == "structured":
+                continue
+            ours = _beside(found["records"], theirs)
+            where = machine(found["runs"][theirs["run"]])
+            where += f", {theirs['worlds']:,} grasps" if theirs["worlds"] else ""
+            numbers = [theirs["grasps_per_s"], ours["grasps_per_s"]]
+            shown = [_rounded(n) for n in numbers]
+            ratio = f"{numbers[1] / numbers[0]:.0f}"
+            same = _same(ours.get("verdicts", ""), theirs.get("verdicts", ""))
+            rows.append([theirs["scene"], where, theirs["engine"], *shown, ratio, same])
+    return output.markdown(rows)
+
+
+def _beside(records: Iterable[dict[str, Any]], theirs: dict[str, Any]) -> dict[str, Any]:
+    alike = [theirs[k] for k in ("scene", "designs", "worlds")]
+    [ours] = [
+        r
+        for r in records
+        if [r[k] for k in ("scene", "designs", "worlds")] == alike and r["engine"] == "structured"
+    ]
+    return ours
+
+
+def _same(a: str, b: str) -> str:
+    pairs = list(zip(a, b, strict=False))
+    return f"{sum(x == y for x, y in pairs)} of {len(pairs)}" if pairs else "–"
+
+
+def _rounded(number: float) -> str:
+    return f"{float(f'{number:.2g}'):,.0f}" if number >= 10 else f"{number:#.2g}"
+
+
+TABLES = {"rates": rates, "measured": machines, "peers": peers}
+
+
+def fill_pages() -> None:
+    files = read()
+    for page, marks in PAGES.items():
+        for mark in marks:
+            output.fill(ROOT / page, TABLES[mark](files), mark)
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
 def arguments() -> argparse.Namespace:
-    """Command line."""
     parser = provenance.parser(__doc__)
     parser.add_argument("--json", type=Path, default=Path("runs/rates.json"))
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE")
@@ -159,7 +271,7 @@ def main() -> None:
     """Measures the cases and writes the file after each, or fills in the tables."""
     args = arguments()
     if args.page:
-        return report.fill_pages()
+        return fill_pages()
     # Warp allocates beside JAX, which otherwise takes most of the device's memory.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     found = json.loads(args.json.read_text()) if args.json.exists() else {"runs": [], "records": []}
@@ -181,7 +293,7 @@ def main() -> None:
                     new = {"scene": name, "designs": designs, "engine": named(engine)}
                     new |= {"worlds": count, "run": len(found["runs"]) - 1}
                     new |= measured(chosen, designs, engine, count, args.calls)
-                    found["records"] = report.replaced(found["records"], new)
+                    found["records"] = replaced(found["records"], new)
                     output.write_json(args.json, found)
                     words = f"{new['grasps_per_s']} grasps/s, kept {new['kept']:.0%}"
                     took = time.perf_counter() - begin

@@ -1,4 +1,4 @@
-"""MuJoCo Warp on the same fields and controls: a captured graph of one step, launched repeatedly.
+"""MuJoCo Warp on the same fields and controls: a GPU's graph of one step, launched repeatedly.
 
 Importing this module needs the package `warp`; MJX brings MuJoCo Warp itself along.
 """
@@ -103,11 +103,9 @@ class WarpProgram:
         self.out = wp.zeros((self.steps, self.worlds, 3), dtype=float)
         self._reset()
         self._step()  # compiles the kernels
-        self.graph = None
-        if wp.get_device().is_cuda:
-            with wp.ScopedCapture() as capture:
-                self._step()
-            self.graph = capture.graph
+        with wp.ScopedCapture() as capture:
+            self._step()
+        self.graph = capture.graph
         wp.synchronize()
         self.compile_s = time.perf_counter() - begin
 
@@ -137,10 +135,7 @@ class WarpProgram:
         wp.synchronize()
         begin = time.perf_counter()
         for _ in range(self.steps):
-            if self.graph is None:
-                self._step()
-            else:
-                wp.capture_launch(self.graph)
+            wp.capture_launch(self.graph)
         wp.synchronize()
         seconds = time.perf_counter() - begin
         out = np.array(np.moveaxis(self.out.numpy(), 0, 1))

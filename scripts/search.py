@@ -1,0 +1,469 @@
+"""Which optimiser finds a good hand in the fewest grasps: many seeds of each, in lock step.
+
+python -m scripts.search --out runs/search                      # again to go on where it stopped
+timeout -s INT 500 python -m scripts.search --out runs/search   # stop after a time
+python -m scripts.search --report docs/data/search              # table and figure of the note
+
+At every mark the optimiser's best particles meet fresh trials, and the one that costs least in
+these is what it recommends there: 25 particles in 12 trials each, or the final test of an optimiser
+that says how many finalists it has.  These trials count as the search's; those by which the
+recommended design is judged do not.  An H200 simulates about 1,900 grasps a second of the default
+scene: 100 seeds of the default optimiser are 209,000 grasps and each mark 69,000, so that
+`--marks 3` takes four minutes there.  evosax is needed for all but the particle filter.
+"""
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib import ticker
+
+from codesign_jax import codesign, optimize, rollout, runs, use_compilation_cache
+from codesign_jax import scene as scenes
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.cost import particle_cost
+from codesign_jax.engines import Engine, make_engine
+from codesign_jax.optimize import NAMES, Optimizer, State
+from codesign_jax.report.statistics import wilson
+from codesign_jax.report.verdicts import RELIABLE
+from codesign_jax.runs.progress import duration
+from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.types import Outcome, Trial, failed
+from scripts.shared import output, provenance
+
+CANDIDATES, ROUNDS = 25, 12
+"""Most particles that are tested at a mark, and trials of each, but for whole turns of the objects;
+an optimiser with `finalists` has its runs' final test."""
+STREAM_JUDGE = 0x6A756467
+"""Stream of the trials that judge a recommended design ("judg")."""
+PAGE, FIGURE = Path("docs/notes/search.md"), Path("docs/figures/search.png")
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """An optimiser with its sizes, by a name such as `screened-es:sigma=0.2,particles=12,tests=0`.
+
+    Attributes:
+      name: The name.
+      optimizer: The optimiser.
+      particles: Its particles.
+      trials: Trials of each in an episode.
+      tests: Trials of each finalist that choose at a mark; 0 recommends the state's first particle.
+      finalists: Particles that these choose from.
+    """
+
+    name: str
+    optimizer: Optimizer
+    particles: int
+    trials: int
+    tests: int = ROUNDS
+    finalists: int = CANDIDATES
+
+    @property
+    def worlds(self) -> int:
+        return self.particles * self.trials
+
+
+def make_case(name: str, space: DesignSpace, preset: str, objects: int = 3) -> Case:
+    """A case by its name; what the name does not change has the command's defaults."""
+    kind, _, changes = name.partition(":")
+    given = dict(pair.split("=") for pair in changes.split(",") if pair)
+    sizes = {n: int(given.pop(n)) for n in ("particles", "trials") if n in given}
+    how = preset, "concurrent", "morphology", "structured", 0
+    usual = runs.make_settings(*how, optimizer=kind, objects=objects, **sizes)
+    made: Any = codesign.make_optimizer(kind, space)
+    own_test = getattr(made, "finalists", None)
+    tests = int(given.pop("tests", usual.test_trials if own_test else ROUNDS))
+    finalists = min(own_test or CANDIDATES, usual.particles)
+    if tests == 0 and not made.keeps_best:
+        raise ValueError(f"{name}: tests=0 is for optimisers whose first particle is the best")
+    own = {n: _as(type(getattr(made, n)), v) for n, v in given.items()}
+    optimizer = dataclasses.replace(made, **own)
+    return Case(name, optimizer, usual.particles, usual.trials, tests, finalists)
+
+
+def _as(kind: type, text: str) -> Any:
+    """A field's value from its text; "4.0" is a whole number too."""
+    return text if kind is str else kind(float(text))
+
+
+class Study:
+    """The episodes of one case over many seeds, from a file and back to it."""
+
+    def __init__(
+        self,
+        case: Case,
+        scene: Scene,
+        engine: Engine,
+        space: DesignSpace,
+        *,
+        seeds: int,
+        budget: int,
+        tests: int,
+        marks: int = 9,
+        at: Sequence[int] = (),
+        first_seed: int = 0,
+        chunk: int,
+        path: Path,
+    ):
+        self.case, self.scene, self.engine, self.space = case, scene, engine, space
+        self.tests, self.chunk, self.path = tests, chunk, path
+        self.keys = jax.vmap(jax.random.key)(first_seed + jnp.arange(seeds))
+        self.mask = jnp.ones(space.num_parameters, bool)
+        objects = len(scene.objects.object)
+        self.rounds = -(-case.tests // objects) * objects
+        self.batch = min(chunk, seeds * case.worlds)
+        self.simulate = jax.jit(self._simulate)
+        self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
+        self.tell = jax.jit(
+            jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
+        )
+        episodes = self._episodes(budget)
+        first = getattr(case.optimizer, "screening", 0) + getattr(case.optimizer, "retests", 0) + 1
+        self.marks = sorted(
+            {*map(self._episodes, at)}
+            # Backwards, so that a single mark is the last one.
+            or {*np.geomspace(episodes, min(first, episodes), marks).round().astype(int)}
+        )
+        self.kept: dict[int, np.ndarray] = {}
+        self.designs: dict[int, np.ndarray] = {}
+        self.state, self.last = self._restore() if path.exists() else (self._start(), None)
+
+    def _episodes(self, grasps: int) -> int:
+        """Episodes of a seed after which no more than so many grasps have been simulated."""
+        return max(1, int((grasps - self.before - self.tested) / self.case.worlds))
+
+    @property
+    def before(self) -> int:
+        """Grasps that find a poor seed particle."""
+        return 0 if getattr(self.case.optimizer, "screens", False) else self.case.worlds
+
+    @property
+    def tested(self) -> int:
+        """Grasps by which a mark chooses."""
+        return self.case.finalists * self.rounds
+
+    @property
+    def done(self) -> int:
+        return int(self.state.episode[0])
+
+    @property
+    def finished(self) -> bool:
+        return len(self.kept) == len(self.marks)
+
+    def step(self) -> int:
+        """Simulates an episode, or judges the designs of a mark; returns its grasps."""
+        if self.done in self.marks and self.done not in self.kept:
+            return self._mark()
+        population = self.ask(self.state)
+        outcome = self._all(
+            population, self._noise(codesign.STREAM_TRIAL, self.done), self.case.trials
+        )
+        cost = self._costs(outcome)
+        self.last = population, cost
+        self.state = self.tell(self.state, population, cost)
+        return cost.size * self.case.trials
+
+    def save(self) -> None:
+        arrays = {f"state{i}": leaf for i, leaf in enumerate(self._leaves())}
+        for name, values in (("kept", self.kept), ("designs", self.designs)):
+            arrays |= {f"{name}{mark}": value for mark, value in values.items()}
+        if self.last is not None:
+            arrays |= {"population": self.last[0], "cost": self.last[1]}
+        output.write_arrays(self.path, {n: np.asarray(v) for n, v in arrays.items()})
+
+    def row(self) -> dict[str, Any]:
+        """Grasps of a seed at each mark, all counted, and the share that its design keeps."""
+        found = sorted(self.kept)
+        return {
+            "optimizer": self.case.name,
+            "particles": self.case.particles,
+            "trials": self.case.trials,
+            "grasps": [int(self.before + e * self.case.worlds + self.tested) for e in found],
+            "kept": [np.round(self.kept[e], 4).tolist() for e in found],
+        }
+
+    def _start(self) -> State:
+        space, first = self.case.optimizer.space, np.arange(self.case.particles)
+        drawn = jax.jit(jax.vmap(lambda key: optimize.candidates(key, space, first)))(self.keys)
+        rows = jnp.zeros(len(self.keys), int)
+        if self.before:
+            noise = self._noise(codesign.STREAM_SCREEN, 0)
+            poor = self._costs(self._all(drawn, noise, self.case.trials)) > codesign.SEED_COST
+            if not np.asarray(poor.any(1)).all():
+                raise RuntimeError("a seed has no poor particle among its first candidates")
+            rows = poor.argmax(1)
+        init = jax.vmap(lambda k, x: self.case.optimizer.init(k, x, self.case.particles))
+        return jax.jit(init)(self.keys, drawn[jnp.arange(len(rows)), rows])
+
+    def _mark(self) -> int:
+        """Chooses from particles by fresh trials, and judges the chosen one by others."""
+        assert self.last is not None
+        particles, mark = self.state.particles, self.done
+        if not self.case.optimizer.keeps_best:
+            order = jnp.argsort(jnp.asarray(self.last[1]), axis=1)[..., None]
+            particles = jnp.take_along_axis(jnp.asarray(self.last[0]), order, 1)
+        chosen = particles[:, : self.case.finalists]
+        best, grasps = jnp.zeros(len(chosen), int), 0
+        if self.rounds:
+            noise = self._noise(codesign.STREAM_TEST, mark)
+            tested = self._costs(self._all(chosen, noise, self.rounds))
+            best, grasps = tested.argmin(1), tested.size * self.rounds
+        design = chosen[jnp.arange(len(chosen)), best][:, None]
+        outcome = self._all(design, self._noise(STREAM_JUDGE, 0), self.tests)
+        kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
+        self.kept[mark] = kept[:, 0].mean(-1)
+        self.designs[mark] = np.asarray(design[:, 0])
+        return grasps + kept.size
+
+    def _noise(self, stream: int, index: int) -> jax.Array:
+        return jax.vmap(lambda key: codesign.stream_key(key, stream, index))(self.keys)
+
+    def _costs(self, outcome: Outcome) -> jax.Array:
+        return jax.jit(lambda found: particle_cost(self.scene, found))(outcome)
+
+    def _all(self, populations: jax.Array, keys: jax.Array, count: int) -> Outcome:
+        """Outcomes of shape (seed, particle, trial) in the trials of these keys, by one program."""
+        draw = lambda key: rollout.sample_trials(self.scene, key, count)  # noqa: E731
+        trials = jax.tree.map(np.asarray, jax.vmap(draw)(keys))
+        shape = (*populations.shape[:2], count)
+        seed, particle, trial = np.indices(shape).reshape(3, -1)
+        designs, parts = np.asarray(populations), []
+        for start in range(0, len(seed), self.batch):
+            rows = np.minimum(np.arange(start, start + self.batch), len(seed) - 1)
+            own = jax.tree.map(lambda v, at=(seed[rows], trial[rows]): v[at], trials)
+            parts.append(self.simulate(designs[seed[rows], particle[rows]], own))
+        found = jax.tree.map(lambda *v: np.concatenate(v)[: len(seed)], *parts)
+        return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), found)
+
+    def _simulate(self, designs: jax.Array, trials: Trial) -> Outcome:
+        hands = jax.vmap(self.space.params)(designs)
+        return rollout.simulate(self.scene, self.engine, hands, trials)[0]
+
+    def _leaves(self) -> list[jax.Array]:
+        state = self.state._replace(key=jax.vmap(jax.random.key_data)(self.state.key))
+        return jax.tree.leaves(state)
+
+    def _restore(self) -> tuple[State, Any]:
+        """What a file holds of the study; the arrays' order is that of a state."""
+        n, zeros = self.case.particles, jnp.zeros(self.mask.shape)
+        like = jax.eval_shape(jax.vmap(lambda k: self.case.optimizer.init(k, zeros, n)), self.keys)
+        with np.load(self.path) as stored:
+            shapes = jax.tree.leaves(like._replace(key=np.zeros(0)))
+            leaves = [jnp.asarray(stored[f"state{i}"]) for i in range(len(shapes))]
+            for name in stored:
+                for word, values in (("kept", self.kept), ("designs", self.designs)):
+                    if name.startswith(word):
+                        values[int(name.removeprefix(word))] = stored[name]
+            last = [jnp.asarray(stored[n]) for n in ("population", "cost") if n in stored]
+        state = jax.tree.unflatten(jax.tree.structure(like), leaves)
+        if state.particles.shape != like.particles.shape:
+            raise ValueError(f"{self.path} is of other seeds or sizes: choose another folder")
+        return state._replace(key=jax.vmap(jax.random.wrap_key_data)(state.key)), (*last,) or None
+
+
+# --- table and figure -----------------------------------------------------------------------------
+
+
+def reached(row: dict[str, Any], share: float) -> str:
+    """Grasps after which this share of the seeds keeps `RELIABLE`, and stays there."""
+    good = np.array([np.mean(np.array(kept) >= RELIABLE) for kept in row["kept"]])
+    below = np.flatnonzero(good < share)
+    first = 0 if below.size == 0 else int(below[-1]) + 1
+    return f"{row['grasps'][first]:,}" if first < len(good) else "not reached"
+
+
+def order(row: dict[str, Any]) -> tuple:
+    """Where a row stands: 23D first, the paper's objects first, the default's order of names."""
+    name = row["optimizer"].split(":")[0]
+    place = NAMES.index(name) if name in NAMES else len(NAMES)
+    return row["preset"] != "23d", row.get("objects") or "", place, row["optimizer"]
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """A row for each optimiser: what its recommended designs keep at its last mark."""
+    head = [
+        "optimiser",
+        "preset",
+        "objects",
+        "seeds",
+        "grasps of a seed",
+        "median kept",
+        "5 % of the seeds below",
+    ]
+    head += ["share of seeds that keep 95 % (95 % interval)", "grasps until 90 % of the seeds do"]
+    head += ["commit"]
+    found = [head]
+    for row in sorted((r for r in rows if not variant(r["optimizer"])), key=order):
+        kept = np.array(row["kept"][-1])
+        found.append(
+            [
+                f"`{row['optimizer']}`",
+                row["preset"],
+                row.get("objects") or "three",
+                str(kept.size),
+                f"{row['grasps'][-1]:,}",
+                f"{np.median(kept):.3f}",
+                f"{np.quantile(kept, 0.05):.3f}",
+                share_of(kept),
+                reached(row, 0.9),
+                str(row.get("provenance", {}).get("commit", ""))[:7],
+            ]
+        )
+    return output.markdown(found)
+
+
+def share_of(kept: np.ndarray) -> str:
+    """Share of the seeds that keep `RELIABLE`, with its interval."""
+    good = int((kept >= RELIABLE).sum())
+    share = wilson(good, kept.size)
+    return f"{good / kept.size:.2f} ({share.low:.2f} to {share.high:.2f})"
+
+
+def variant(name: str) -> bool:
+    """Whether a case's name changes more than an optimiser's sizes."""
+    changes = {pair.split("=")[0] for pair in name.partition(":")[2].split(",") if pair}
+    return not changes <= {"particles", "trials"}
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> Path:
+    """What recommended designs keep, and how many seeds' designs keep `RELIABLE`, over grasps.
+
+    Variants of an optimiser, but for its sizes, are in the table alone, as are questions that one
+    optimiser was asked, or at one number of grasps.  Marks of optimisers at the same number of
+    grasps stand a little beside one another.
+    """
+    rows = sorted((row for row in rows if not variant(row["optimizer"])), key=order)
+    kinds: dict[tuple[str, str], list[dict[str, Any]]] = {}  # in the table's order
+    for row in rows:
+        kinds.setdefault((row["preset"], row.get("objects") or "three objects"), []).append(row)
+    shown = {k: v for k, v in kinds.items() if len(v) > 1 and max(len(r["grasps"]) for r in v) > 1}
+    shown = shown or kinds
+    figure = output.new_figure(9.2, 3.8 * len(shown))
+    for place, (kind, own) in enumerate(shown.items()):
+        kept, share = (figure.add_subplot(len(shown), 2, 2 * place + i) for i in (1, 2))
+        for number, row in enumerate(own):
+            name, beside = row["optimizer"].split(":")[0], 1.02 ** (number - len(own) // 2)
+            at, found = beside * np.array(row["grasps"]), [np.array(k) for k in row["kept"]]
+            color = f"C{NAMES.index(name)}" if name in NAMES else None
+            style: dict[str, Any] = {"fmt": "o-", "ms": 4, "lw": 1.4, "elinewidth": 1, "capsize": 3}
+            low, middle, high = np.array([np.quantile(k, [0.25, 0.5, 0.75]) for k in found]).T
+            seeds = " to ".join(str(n) for n in sorted({k.size for k in found}))
+            style |= {"color": color, "label": f"{name}, {seeds} seeds"}
+            kept.errorbar(at, middle, [middle - low, high - middle], **style)
+            counts = [(int((k >= RELIABLE).sum()), k.size) for k in found]
+            good, ends = np.array([g / n for g, n in counts]), [wilson(*c) for c in counts]
+            away = [good - [e.low for e in ends], [e.high for e in ends] - good]
+            share.errorbar(at, good, np.maximum(away, 0), **style)
+        kept.axhline(RELIABLE, color="0.6", lw=0.8)
+        # Shares near 1 are what differs: even steps are equal ratios of what is lost.
+        kept.set_yscale("function", functions=(_stretched, _unstretched))
+        kept.yaxis.set_major_locator(ticker.FixedLocator([0, 0.5, 0.8, 0.9, 0.95, 0.98, 1]))
+        kept.yaxis.set_minor_locator(ticker.NullLocator())
+        kept.yaxis.set_major_formatter(ticker.PercentFormatter(1))
+        share.yaxis.set_major_formatter(ticker.PercentFormatter(1))
+        title = f"{kind[0].removesuffix('d')} parameters, {kind[1]}"
+        kept.set(title=f"{title}: fresh grasps kept,\nmedian and middle half of the seeds")
+        share.set(title=f"seeds whose design keeps {100 * RELIABLE:.0f} %,\nwith 95 % intervals")
+        ticks = sorted({g for row in own for g in row["grasps"]})
+        for axes in (kept, share):
+            axes.set(xscale="log", xlabel="grasps of a seed, all counted", ylim=(0, 1.002))
+            axes.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
+            axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:,.0f}")
+            axes.xaxis.set_minor_formatter(ticker.NullFormatter())
+            axes.grid(axis="y", lw=0.3)
+        kept.legend(fontsize=7, loc="lower right")
+    return output.save_figure(figure, path)
+
+
+def _stretched(share: np.ndarray) -> np.ndarray:
+    return -np.log(1.01 - np.minimum(share, 1.005))
+
+
+def _unstretched(height: np.ndarray) -> np.ndarray:
+    return 1.01 - np.exp(-height)
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = provenance.parser(__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs/search"), help="folder")
+    parser.add_argument("--preset", default="23d")
+    parser.add_argument("--scene", default="paper")
+    parser.add_argument("--objects", help="object set instead of the scene's")
+    parser.add_argument(
+        "--optimizers",
+        nargs="+",
+        default=[optimize.DEFAULT],
+        help="names, each with changes if wanted: screened-es:sigma=0.2,particles=13,trials=6",
+    )
+    parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--budget", type=int, default=2400, help="grasps of a seed, all counted")
+    parser.add_argument("--tests", type=int, default=400, help="trials of a recommended design")
+    parser.add_argument("--marks", type=int, default=9, help="times at which one is recommended")
+    parser.add_argument("--at", type=int, nargs="+", default=[], help="grasps instead of --marks")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--chunk", type=int, help="most grasps of a call")
+    parser.add_argument("--report", type=Path, help="fill page and figure from a folder, and stop")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--figure", type=Path, default=FIGURE)
+    return parser.parse_args(arguments)
+
+
+def search(args: argparse.Namespace, name: str) -> None:
+    """Runs an optimiser's study to its end and writes what its designs keep."""
+    scene = scenes.load(args.scene, object_set=args.objects)
+    engine, space = make_engine("structured", scene), design_space(scene.hand, args.preset)
+    case = make_case(name, space, args.preset, len(scene.objects.object))
+    stem = f"{args.preset}-{name.replace(':', '-').replace('=', '')}"
+    how = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at", "first_seed")}
+    how["chunk"] = args.chunk or (512 if jax.default_backend() == "cpu" else 16_384)
+    study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")
+    grasps, start = 0, time.monotonic()
+    while not study.finished:
+        grasps += study.step()
+        study.save()  # the next command goes on here, whatever ends this one
+        rate = grasps / (time.monotonic() - start)
+        print(f"{name}: episode {study.done}/{study.marks[-1]}, {rate:.0f} grasps/s", flush=True)
+    row = study.row() | {"preset": args.preset, "scene": args.scene, "objects": args.objects}
+    row |= {"first_seed": args.first_seed, "tests": args.tests}
+    row["provenance"] = provenance.results(args.commit)
+    output.write_json(args.out / f"{stem}.json", row)
+    shares = [sum(k >= RELIABLE for k in kept) / len(kept) for kept in row["kept"]]
+    took = duration(time.monotonic() - start)
+    print(f"{name}: {dict(zip(row['grasps'], shares, strict=True))} in {took}", flush=True)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    args = parse(arguments)
+    if args.report:
+        rows = [json.loads(path.read_text()) for path in sorted(args.report.glob("*.json"))]
+        if not rows:
+            sys.exit(f"error: {args.report} has no results of scripts.search")
+        output.fill(args.page, table(rows), "search")
+        print(args.page, draw(rows, args.figure))
+        return 0
+    use_compilation_cache()
+    try:
+        for name in args.optimizers:
+            search(args, name)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -323,6 +323,13 @@ def test_figures_and_page_are_made_from_files_alone(finished, tmp_path):
     assert json.loads((tmp_path / "2d.json").read_text())["grasps"] == PLAN.grasps
 
 
+def test_the_page_has_the_tables_of_its_data():
+    data = ROOT / "docs" / "data" / "experiments"
+    studies = {name: report.load_study(data, name) for name in ("2d", "23d")}
+    text = report.tables(studies, report.load(data, "landscape"))
+    assert text in (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")
+
+
 def test_what_was_not_run_is_said(tmp_path):
     text = report.make(tmp_path, tmp_path / "figures")
     assert text.count("not run") == 3

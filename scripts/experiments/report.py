@@ -249,9 +249,11 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     Returns:
       The table in Markdown.
     """
-    studies = {name: load_study(data, name) for name in ("2d", "23d")}
-    grid = load(data, "landscape")
-    text = "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
+    studies, grid = (
+        {name: load_study(data, name) for name in ("2d", "23d")},
+        load(data, "landscape"),
+    )
+    text = tables(studies, grid)
     for study in studies.values():
         if study and len(study.strategies) > 1:
             _draw(study, pictures)
@@ -270,6 +272,11 @@ def _draw(study: Study, pictures: Path) -> None:
     if study.tested:
         draw_success(study, pictures / f"fig{number}a_success.png")
     draw_convergence(study, pictures / f"fig{number}b_convergence.png")
+
+
+def tables(studies: dict[str, Study | None], grid) -> str:
+    """All tables of the page, in Markdown."""
+    return "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
 
 
 def comparison(studies: dict[str, Study | None], grid) -> str:

@@ -17,6 +17,9 @@ from codesign_jax.compiler.layout import Array, Layout
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
 BACKENDS = ["cpu", pytest.param("gpu", marks=pytest.mark.gpu)]
+# The oracles of steps compute in float64: these say what is wrong if those fail.
+FLOATS = [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)]
+INTEGERS = [np.int32, pytest.param(np.int64, marks=pytest.mark.slow)]
 BLOCKS = 26
 """Enough for all pairs of the special numbers below on eight lanes."""
 
@@ -168,7 +171,7 @@ def control_operations():
     return {f.__name__: (f, 1e-5) for f in names}
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_operations_on_floats(backend, dtype):
     """Of all kinds of numbers, also infinite ones and what is no number."""
@@ -176,7 +179,7 @@ def test_operations_on_floats(backend, dtype):
         compare(float_operations(np.finfo(dtype).eps), floats(backend, dtype), backend, dtype)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_angles_and_control(backend, dtype):
     """Sine and cosine to some units in the last place, and every kind of control flow."""
@@ -231,7 +234,7 @@ def test_what_lanes_sum_after_an_exchange_has_the_same_bits_on_all(backend):
         assert f"{sign[1:]}.rn.f32" in ptx and "fma" not in ptx
 
 
-@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+@pytest.mark.parametrize("dtype", INTEGERS)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_operations_on_integers(backend, dtype):
     """Of all kinds of numbers, also those at which processors trap; sums wrap around."""

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import control, model, rollout, scene
+from codesign_jax import model, rollout, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import spec
 from tests.helpers.grasps import (
@@ -163,19 +163,6 @@ def test_no_part_reads_the_unread_constants(worlds):
     np.testing.assert_array_equal(np.flatnonzero(compiled.body_simple), [0, compiled.nbody - 1])
 
 
-def test_vmap_is_one_at_a_time(worlds):
-    the_scene, fields, _, inputs = worlds
-
-    def fields_of(p, t, c):
-        return model.model_fields(the_scene.with_constants(c), p, t)
-
-    with jax.enable_x64(True):
-        one = jax.jit(fields_of)(*nth(inputs, 4))
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(nth(fields, 4)), strict=True):
-        # The batch may fuse otherwise; sine and cosine of a full turn are right to 1e-16.
-        np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-17)
-
-
 def test_the_template_is_its_own_field_set(worlds):
     """The template's parameters and numbers give back the template."""
     the_scene = worlds[0].structure
@@ -186,61 +173,6 @@ def test_the_template_is_its_own_field_set(worlds):
     rebuilt = arrays(world_model(the_scene, fields))
     for name, value in arrays(template).items():
         np.testing.assert_allclose(rebuilt[name], value, rtol=1e-14, atol=1e-18, err_msg=name)
-
-
-@pytest.fixture(scope="module")
-def grasp():
-    """A scene with five links and, for each object, params, trial, fields and controls."""
-    the_scene = scene.load("paper_spheres", overrides={"discretization": {"links": 5}})
-    with jax.enable_x64(True):
-        params, trials = random_worlds(the_scene, seed=3, count=3)
-        # Random sections and spreads, straight above the object, fingers fully inflated.
-        length, pressure = 0 * params.length + 0.1, np.minimum(120e3, 39e6 * params.wall)
-        params = params._replace(length=length, arm=0 * params.arm, pressure=pressure)
-        both = jax.jit(
-            jax.vmap(
-                lambda p, t: (
-                    model.model_fields(the_scene, p, t),
-                    control.commands(the_scene, p, t),
-                )
-            )
-        )
-        return the_scene, nth((params, trials, *both(params, trials)), slice(None))
-
-
-@pytest.mark.parametrize(
-    "shape, resting",
-    [
-        (0, 4),
-        pytest.param(1, 4, marks=pytest.mark.slow),
-        pytest.param(2, 1, marks=pytest.mark.slow),
-    ],
-)
-def test_contact_rich_steps_as_a_fresh_compile(grasp, shape, resting):
-    """Approach, inflation and lift: every step from the same state, with both models."""
-    the_scene, worlds = grasp
-    params, trial, fields, ctrl = nth(worlds, shape)
-    fresh = model.compile_model(the_scene, params, trial)
-    mine = world_model(the_scene, fields)
-    # The mean inertia only scales the tolerance at which the solver stops; a batch has one for all.
-    fresh.stat.meaninertia = mine.stat.meaninertia
-    fresh.opt.tolerance = mine.opt.tolerance = 1e-12
-    one, other = mujoco.MjData(fresh), mujoco.MjData(mine)
-    one.qpos[:] = fields.start
-    contacts, error = [], []
-    for u in ctrl[:450]:
-        one.ctrl[:] = u
-        for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
-            getattr(other, name)[:] = getattr(one, name)
-        mujoco.mj_step(fresh, one)
-        mujoco.mj_step(mine, other)
-        contacts.append(one.ncon)
-        # At rest accelerations are the rounding of forces that balance: not below 1 rad/s^2.
-        error.append(np.abs(one.qacc - other.qacc).max() / max(1.0, np.abs(one.qacc).max()))
-    assert np.sum(np.array(contacts) >= resting + 2) > 100  # a second of finger contacts
-    # The same problem to rounding (measured 6e-12): 1e-16 times a condition number of about 1e5
-    # between links and palm; twenty times that leaves room for another processor.
-    assert max(error) < 1e-10
 
 
 # --- implicit springs ----------------------------------------------------------------------------
@@ -330,20 +262,6 @@ def test_implicit_springs_are_stable(damping):
         fields, _ = world_inputs(the_scene, params, trial)
     np.testing.assert_allclose(fields.dof_damping, ours.dof_damping, rtol=1e-12)
     np.testing.assert_allclose(fields.dof_armature, ours.dof_armature, rtol=1e-12)
-
-
-def test_explicit_springs_are_not_stable(tmp_path, monkeypatch):
-    """What the implicit ones are for."""
-    the_scene = free_scene()
-    params, trial = hand_world(the_scene, **STIFF)
-    ctrl = np.array([0, 0, 0.3, 0.3, 0, 0.3, 150e3, 150e3])
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs the instability where it runs
-    explicit = model.compile_model(the_scene, params, trial)
-    with jax.enable_x64(True):
-        _, damping = nth(model.joint_springs(the_scene, params), slice(None))
-    explicit.dof_damping[:], explicit.dof_armature[:] = damping, 0.0
-    speeds, _ = wobble(explicit, 900, ctrl)
-    assert not np.abs(speeds[-100:, :-6]).max() < 1e3  # measured: not a number
 
 
 def test_every_kind_of_pair_has_its_own_numbers():

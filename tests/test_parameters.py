@@ -183,25 +183,6 @@ def test_gradients_reach_every_free_parameter():
         np.testing.assert_allclose(weights, tied)
 
 
-def test_fixed_entries_do_not_take_part():
-    base = PLANAR.expand(jnp.asarray([0.1, 0.0]))
-    moved = PLANAR.expand(jnp.asarray([0.2, 0.1]))
-    fixed = np.array(PLANAR.source) < 0
-    np.testing.assert_array_equal(base[fixed], moved[fixed])
-
-
-def test_default_lies_inside_the_bounds():
-    for name in ("full", "2d"):
-        space = parameters.design_space(HAND, name)
-        default = space.default()
-        assert (default >= space.low).all() and (default <= space.high).all()
-
-
-def test_unknown_preset_names_the_nearest():
-    with pytest.raises(schema.InputError, match="did you mean '2d'"):
-        parameters.design_space(HAND, "2D")
-
-
 designs = st.lists(st.floats(0, 1, width=32, allow_subnormal=False), min_size=23, max_size=23).map(
     lambda u: np.array(FULL.low) + np.array(u) * (np.array(FULL.high) - np.array(FULL.low))
 )

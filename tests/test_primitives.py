@@ -6,9 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import model
 from codesign_jax.engines.structured.laws import shapes
-from codesign_jax.report import sketch
 from codesign_jax.scene import primitives
 from tests.helpers import grasps
 
@@ -78,17 +76,6 @@ def test_outline_and_triangles_lie_on_the_surface(kind):
         sizes = jnp.asarray(size)[:, None, None]
         distance, _ = shapes.SHAPES[kind].distance(sizes, jnp.asarray(points.T[:, None]))
     assert np.abs(distance).max() < 1e-9  # trimesh rounds corners that it merges to 1e-8
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_sketch_draws_the_shape_of_the_trial(kind):
-    the_scene = grasps.pinch(kind, links=1)
-    compiled = model.compile_model(the_scene, *grasps.hand_world(the_scene))
-    got = sketch._outline(the_scene, compiled, 0)
-    want = primitives.PRIMITIVES[kind].outline(the_scene.objects.object[0].half_sizes)
-    assert len(got) == len(want)
-    for line, other in zip(got, want, strict=True):
-        np.testing.assert_allclose(line, other, atol=1e-12)
 
 
 @pytest.mark.parametrize("names", [KINDS[1:], [*KINDS, "cone"]])

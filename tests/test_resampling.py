@@ -126,17 +126,6 @@ def test_huge_and_tiny_weights_need_no_normalisation():
         np.testing.assert_array_equal(sample(0.2, weights * scale), sample(0.2, weights))
 
 
-@pytest.mark.slow
-def test_same_bits_under_eager_jit_and_vmap():
-    rng = np.random.default_rng(1)
-    weights = rng.exponential(size=(5, 4)).astype(np.float32)
-    u = rng.uniform(size=5).astype(np.float32)
-    batched = jax.jit(jax.vmap(stochastic_universal))(u, weights)
-    for i in range(5):
-        np.testing.assert_array_equal(batched[i], stochastic_universal(u[i], weights[i]))
-        np.testing.assert_array_equal(batched[i], sample(u[i], weights[i]))
-
-
 @pytest.mark.parametrize("shape", [(), (0,), (2, 3), (MAX_PARTICLES + 1,)])
 def test_wrong_shapes_are_errors(shape):
     with pytest.raises(ValueError, match="shape"):

@@ -53,6 +53,7 @@ def test_household_shapes(household):
         assert shape.mass == 0.1
 
 
+@pytest.mark.slow  # quick: the shapes of the files that are there
 def test_household_is_what_its_script_makes(tmp_path, household):
     script = [sys.executable, str(ROOT / "scripts" / "make_objects.py"), "--out", str(tmp_path)]
     subprocess.run(script, check=True, capture_output=True)
@@ -224,14 +225,17 @@ def unbalanced(the_scene, result, stride):
     return oracles.unbalanced(the_scene, fields, ctrl[:, 1:], found, stride)
 
 
-@pytest.fixture(scope="module")
-def grasps(tmp_path_factory, household):
+SHAPES = [("mug",), pytest.param(tuple(HOUSEHOLD), marks=pytest.mark.slow)]
+
+
+@pytest.fixture(scope="module", params=SHAPES, ids=["mug", "household"])
+def grasps(request, tmp_path_factory, household):
     """Two fingers grasp primitives, their meshed twins and the household's shapes, in one batch."""
     folder = tmp_path_factory.mktemp("objects")
     box(60, 60, 60).export(folder / "box.stl")
     trimesh.creation.icosphere(4, 30).export(folder / "ball.stl")
     files = {"mesh box": folder / "box.stl", "mesh ball": folder / "ball.stl"}
-    files |= {shape.name: shape.mesh.path for shape in household}
+    files |= {s.name: s.mesh.path for s in household if s.name in request.param}
     common = "mass = 0.1; friction = 0.8"
     path = object_file(
         folder,

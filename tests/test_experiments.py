@@ -4,10 +4,8 @@ import dataclasses
 import json
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from rich.console import Console
@@ -15,7 +13,6 @@ from rich.console import Console
 from codesign_jax import codesign, runs
 from codesign_jax import scene as scenes
 from codesign_jax.batch import Batch
-from codesign_jax.optimize import schedule
 from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import InputError
 from codesign_jax.scene.parameters import design_space
@@ -24,7 +21,6 @@ from scripts.experiments import __main__ as experiments
 from scripts.experiments import report, simulate
 from scripts.experiments.simulate import PAPER, TOTAL_GRASPS, Landscape, Strategies
 from scripts.shared import statistics
-from tests.helpers import episodes
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
 PLAN = Strategies("2d", "2d", ("single", "switch-2", "concurrent"), 2, 6, 5, 3, 6)
@@ -63,15 +59,6 @@ def points(part, seed=SEED):
     return simulate.landscape(GRID, scenes.load(TINY), "structured", part, **how)
 
 
-@pytest.fixture(scope="module")
-def single():
-    """What a single run is made of: scene, space, filter and episode."""
-    scene, space, engine = tiny()
-    optimizer = codesign.make_filter(space)
-    episode = partial(codesign.Task(scene, space, PLAN.trials, engine).episode, optimizer)
-    return scene, space, optimizer, episode
-
-
 def test_counts_are_the_papers():
     assert {name: p.grasps for name, p in PAPER.items()} == simulate.PAPER_GRASPS
     assert simulate.PAPER_GRASPS == {"2d": 1_008_000, "23d": 4_536_000, "landscape": 129_600}
@@ -98,38 +85,6 @@ def test_masks_open_one_domain_and_start_equally_often_in_either(name, monkeypat
         expected = 0 if strategy == "single" else int(strategy.removeprefix("switch-"))
         np.testing.assert_array_equal(switches.sum(-1), expected)
     assert names[-1] == "concurrent" and masks[-1].all()
-
-
-@pytest.mark.parametrize(("strategy", "run"), [(0, 1), (1, 0), (2, 1)])
-def test_a_run_of_the_batch_is_the_single_run(finished, single, strategy, run):
-    """As `codesign optimize --seed` does it: seed, episodes, final test."""
-    _, got = finished
-    (scene, space, optimizer, episode), key = single, jax.random.key(SEED + run)
-    evaluate = episodes.evaluate_by(episode, optimizer)
-    search = codesign.seed_search(scene, optimizer, key, batch=PLAN.particles)
-    seed, cost, drawn = episodes.answered(search, evaluate)
-    mask = schedule(
-        PLAN.strategies[strategy],
-        np.array(space.is_morphology),
-        PLAN.episodes,
-        PLAN.first()[run],
-    )
-    state, costs, info = optimizer.init(key, seed, PLAN.particles), [], None
-    for e in range(PLAN.episodes):
-        state, info = episode(state, mask[e])
-        costs.append(info.selection.cost)
-    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.outcomes)
-    how = {"num_trials": PLAN.test_trials, "previous": kept}
-    test = episodes.answered(codesign.testing(scene, state.particles, key, **how), evaluate)
-    # The same arithmetic in other programs, where the compiler fuses it: the last bit may differ.
-    close = {"rtol": 1e-5, "atol": 1e-6}
-    np.testing.assert_allclose(got["seeds"][run], seed, **close)
-    np.testing.assert_allclose(got["seed_cost"][run], cost, **close)
-    assert got["seed_candidates"][run] == drawn
-    np.testing.assert_allclose(got["cost"][strategy, run], costs, **close)
-    np.testing.assert_allclose(got["particles"][strategy, run], state.particles, **close)
-    np.testing.assert_allclose(got["test_cost"][strategy, run], test.outcomes.cost, **close)
-    np.testing.assert_array_equal(got["test_status"][strategy, run], test.outcomes.status)
 
 
 def test_one_program_serves_seeds_episodes_and_tests(toy, finished):

@@ -116,13 +116,3 @@ def test_a_failing_launch_is_an_exception(monkeypatch):
     monkeypatch.undo()
     got = jax.jit(run)(x, table)
     np.testing.assert_allclose(got, kernels.expected(x, table), atol=TOLERANCE)
-
-
-def test_arrays_of_another_kind_are_refused():
-    """By the handler, before anything is launched."""
-    x, table = batch(3)
-    words = jax.jit(run).lower(x, table).as_text().replace("@", " ").replace("(", " ").split()
-    name = next(w for w in words if "kernel_" in w)
-    outputs = [jax.ShapeDtypeStruct((3, rows, thread.LANES), np.float32) for rows in (1, 3)]
-    with pytest.raises(Exception, match="needs array 0 to be input float32.blocks, 2, 32."):
-        jax.block_until_ready(jax.jit(lambda *a: jax.ffi.ffi_call(name, outputs)(*a))(table, table))

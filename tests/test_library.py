@@ -77,16 +77,6 @@ def test_the_derivative_on_the_front_page(monkeypatch, only_heights):
     np.testing.assert_allclose(names["slope"], [0.0, 1.0], rtol=1e-6)
 
 
-@pytest.mark.slow  # three kernels of the whole scene; the test above has the idea
-def test_the_derivative_on_the_front_page_by_differences():
-    """Over 2 mm, which lose 1e-7 m to rounding, 1e-4 of a slope of one."""
-    names, second = front_page("state =")
-    exec(second, names)
-    run = jax.jit(jax.vmap(names["distance"]))
-    sides = [np.asarray(run(names["poor"] + sign * 1e-3 * jnp.eye(2))) for sign in (1, -1)]
-    np.testing.assert_allclose(names["slope"], (sides[0] - sides[1]) / 2e-3, rtol=0.01)
-
-
 def test_steps_of_a_grasp_are_checked(short):
     the_scene = scene.load("paper")
     space = parameters.design_space(the_scene.hand, "2d")

@@ -263,27 +263,6 @@ def test_concurrent_optimisation_converges():
     assert np.all((final.particles >= LOW) & (final.particles <= HIGH))
 
 
-def test_runs_in_one_batch_equal_runs_alone():
-    """One episode: ancestors bitwise, moves up to the rounding of another loop layout."""
-    keys = jax.random.split(jax.random.key(7), 6)
-    seeds = draw(jax.random.key(8), FILTER.space, np.arange(6))
-    names = ["concurrent", "morphology", "control", "switch-1", "switch-2", "single"]
-    masks = np.stack([schedule(name, IS_MORPHOLOGY, 4)[0] for name in names])
-    states = jax.vmap(FILTER.init, in_axes=(0, 0, None))(keys, seeds, 4)
-    populations = jax.jit(jax.vmap(FILTER.ask))(states, masks)
-    costs = quadratic(populations)
-    finals, infos = jax.jit(jax.vmap(FILTER.tell))(states, populations, costs)
-    for i in range(6):
-        state = FILTER.init(keys[i], seeds[i], 4)
-        np.testing.assert_allclose(
-            (ask(state, masks[i]) - populations[i]) / (HIGH - LOW), 0, atol=1e-6
-        )
-        final, info = tell(state, populations[i], costs[i])
-        assert_same_bits(final, jax.tree.map(lambda x, i=i: x[i], finals))
-        np.testing.assert_array_equal(info.ancestors, infos.ancestors[i])
-        np.testing.assert_allclose(info.weight, infos.weight[i], rtol=1e-6)
-
-
 def test_other_bounds_masks_and_seeds_do_not_recompile():
     traces = []
 

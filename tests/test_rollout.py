@@ -9,7 +9,7 @@ import pytest
 from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
-from tests.helpers.grasps import hand_world, nth, pinch, random_designs, stack
+from tests.helpers.grasps import hand_world, nth, pinch, random_designs
 
 PAPER = scene.load("paper_spheres")
 KEY = jax.random.key(5)
@@ -194,21 +194,6 @@ def test_outcomes_do_not_depend_on_the_number_of_particles_and_trials(batch):
     whole = evaluate(designs, trials)
     few = evaluate(designs[:3], nth(trials, slice(0, 2)))
     assert_same(few, (v[:3, :2] for v in whole))
-
-
-@pytest.mark.slow  # quick: numbers of particles and trials, above
-def test_jit_and_single_worlds_agree(batch):
-    """A world by itself, with its trace, costs what it costs in the batch."""
-    evaluate, _, designs, trials, (the_scene, engine, space) = batch
-    whole = evaluate(designs, trials)
-    params = space.params(designs[3])
-    world = jax.tree.map(lambda v: v[None], (params, nth(trials, 1)))
-    outcome, trace = jax.jit(
-        lambda p, t: rollout.simulate(the_scene, engine, p, t, record_qpos=True)
-    )(*stack(nth(world, 0)))
-    assert_same(nth(outcome, 0), (v[3, 1] for v in whole))
-    assert trace.qpos.shape == (1, the_scene.num_steps, engine.template.nq)
-    assert trace.distance.dtype == jnp.float32
 
 
 def test_noise_reaches_the_outcome(batch):

@@ -1,8 +1,6 @@
 """The default engine under JAX's transformations, and what a trace means on every engine."""
 
 import functools
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -15,9 +13,8 @@ import pytest
 from codesign_jax import codesign, control, model, rollout
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.optimize import schedule
 from codesign_jax.scene import parameters
-from codesign_jax.types import WARNINGS, Status
+from codesign_jax.types import Status
 from tests.helpers import grasps, toy_engine
 
 ROOT = Path(__file__).parents[1]
@@ -168,32 +165,6 @@ def test_pieces_of_a_rollout_make_the_same_trace(decided, name):
 
 
 # --- a whole optimisation as one program ---------------------------------------------------------
-
-
-@pytest.mark.slow  # quick: by the toy engine (test_codesign)
-def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes():
-    """By the kernel: each seed of a batch with its own schedule, as a loop over single episodes."""
-    scene = grasps.pinch("sphere", **SHORT)
-    space = parameters.design_space(scene.hand, "2d")
-    optimizer, engine = codesign.make_filter(space), StructuredEngine(scene)
-    run = partial(codesign.Task(scene, space, 2, engine).run, optimizer)
-    seeds = [(0, (0.1, 0.05), "concurrent"), (7, (0.09, 0.03), "control")]
-    starts = [optimizer.init(jax.random.key(k), np.array(d), 3) for k, d, _ in seeds]
-    masks = np.stack([schedule(n, np.array(space.is_morphology), 2) for *_, n in seeds])
-    batch = jax.tree.map(lambda *v: jnp.stack(v), *starts)
-    ends, infos = jax.jit(jax.vmap(run), compiler_options=QUICK)(batch, masks)
-    episode = partial(codesign.Task(scene, space, 2, engine).episode, optimizer)
-    episode = jax.jit(episode, compiler_options=QUICK)
-    # XLA rounds the model fields of these programs differently in their last bit, which moves the
-    # states at the end by 1e-5, but no loss by a step, which would be 4e-2 of cost.
-    close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
-    for k, state in enumerate(starts):
-        for e in range(2):
-            state, want = episode(state, masks[k, e])
-            for a, b in zip(jax.tree.leaves(infos), jax.tree.leaves(want), strict=True):
-                close(a[k, e], b)
-        close(ends.particles[k], state.particles)
-    assert np.ptp(infos.outcomes.cost) > 0.1 and (infos.outcomes.status & ~int(WARNINGS) == 0).any()
 
 
 @pytest.mark.slow
@@ -422,39 +393,6 @@ def test_gradients_through_the_air_supply():
     assert (np.abs(slope) > 1e-3).all()
     # As above; where the rate ceases to limit, a step later, there is a kink.
     np.testing.assert_allclose(slope, (sides[:3] - sides[3:]) / 2e-5, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_checkpoints_and_devices_do_not_change_a_gradient():
-    """`jax.checkpoint`, and `jax.shard_map` over two CPU devices; in a process that has two."""
-    program = """
-import jax, jax.numpy as jnp, numpy as np
-jax.config.update("jax_num_cpu_devices", 2)
-from jax.sharding import Mesh, PartitionSpec
-from codesign_jax.engines.structured import StructuredEngine
-from tests import test_compose
-from tests.helpers import grasps
-scene = grasps.pinch("sphere", **test_compose.FREE)
-engine, world = StructuredEngine(scene), grasps.hand_world(scene, pressure=50e3)
-broken = jnp.array([False, True, False, False])
-x = jnp.asarray(np.random.default_rng(0).uniform(0.9, 1.1, (4, 3)), jnp.float32)
-def value(x, broken):
-    return test_compose.bent(scene, engine, world, x, broken).sum()
-plain = jax.grad(value)
-kept = jax.grad(jax.checkpoint(value))
-part = PartitionSpec("device")
-mesh = Mesh(np.array(jax.devices()), ("device",))
-shared = jax.shard_map(plain, mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
-want = np.asarray(jax.jit(plain)(x, broken))
-assert len(jax.devices()) == 2 and (np.abs(want) > 1e-3).all()
-for name, other in {"checkpoint": kept, "shard_map": shared}.items():
-    found = jax.jit(other)(x, broken)
-    # XLA rounds the fields of other programs differently in their last bit: 1e-6 was seen.
-    np.testing.assert_allclose(found, want, atol=1e-5 * np.abs(want).max(), err_msg=name)
-assert len(found.sharding.device_set) == 2
-"""
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_what_has_no_derivative_says_so():

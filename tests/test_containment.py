@@ -1,4 +1,4 @@
-"""Status bits, frozen worlds and their neighbours, saved failures and their replay."""
+"""Status bits, saved failures and their replay; neighbours of failing worlds: test_kernel."""
 
 import re
 from functools import partial
@@ -21,9 +21,7 @@ from tests.helpers.grasps import (
     hand_world,
     nth,
     outcome,
-    outcomes,
     pinch,
-    random_worlds,
     stack,
     still,
     world_inputs,
@@ -37,7 +35,6 @@ HURRIED = {
     "phases__disturb": 0.9,
     "phases__ungrasp": 1.5,
 }
-GOOD, SUDDEN, NEIGHBOUR = range(3)
 
 
 def both(the_scene, params, trials):
@@ -45,49 +42,7 @@ def both(the_scene, params, trials):
     return batch_inputs(the_scene, params, trials)
 
 
-@pytest.fixture(scope="module")
-def batches():
-    """Three worlds, and the same with a finger of the middle one blown up from step 20 on."""
-    the_scene = pinch("box", **HURRIED)
-    fields, ctrl = both(the_scene, *random_worlds(the_scene, 3, 3))
-    return the_scene, (fields, ctrl), (fields, ctrl.at[SUDDEN, 20:, 6].set(1e12))
-
-
-@pytest.fixture(scope="module")
-def traces(batches):
-    """Of both batches by the structured engine, with trajectories."""
-    the_scene, *both = batches
-    engine = StructuredEngine(the_scene)
-    run = jax.jit(lambda f, c: engine.rollout(f, c, trajectory=True))
-    return [jax.tree.map(np.asarray, run(*batch)) for batch in both]
-
-
 # --- structured engine -----------------------------------------------------------------------
-
-
-@pytest.mark.slow  # quick: without the path, in test_kernel
-def test_neighbours_of_a_failing_world_are_bitwise_unaffected(traces):
-    good, bad = traces
-    for index in (GOOD, NEIGHBOUR):
-        for a, b in zip(good, bad, strict=True):
-            np.testing.assert_array_equal(a[index], b[index])
-    assert not np.array_equal(good.speed[SUDDEN], bad.speed[SUDDEN])
-
-
-@pytest.mark.slow  # quick: in test_kernel, and against MuJoCo C in test_compose
-def test_a_failed_world_returns_its_last_good_state(batches, traces):
-    """First bad step, frozen from then on, and the state before it, at most one step old."""
-    the_scene, *_ = batches
-    bad = traces[1]
-    result = outcomes(the_scene, bad)
-    assert not failed(np.asarray(result.status))[[GOOD, NEIGHBOUR]].any()
-    assert int(result.status[SUDDEN]) & (Status.SPEED | Status.NONFINITE)
-    step = int(result.bad_step[SUDDEN])
-    assert 20 < step < 25
-    last = model.split(the_scene, bad.last[SUDDEN])
-    assert np.isfinite(last.qpos).all() and np.abs(last.qvel).max() <= the_scene.limits.speed
-    np.testing.assert_array_equal(last.qpos, bad.qpos[SUDDEN, step])
-    np.testing.assert_array_equal(last.qpos, bad.qpos[SUDDEN, -1])
 
 
 def test_the_cap_is_flagged_step_by_step():

@@ -6,8 +6,8 @@ import shutil
 
 import pytest
 
-from codesign_jax import runs, scene
-from codesign_jax.runs import belongings, manifest, scene_files
+from codesign_jax import files, runs, scene
+from codesign_jax.runs import directory, manifest, scene_files
 from codesign_jax.runs.directory import open_run
 from codesign_jax.scene.schema import InputError
 from tests.helpers.command_runs import command, own_workplace, snapshot, without  # noqa: F401
@@ -70,7 +70,7 @@ def test_a_users_own_seeds_table_is_not_replaced(tmp_path, capsys):
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize("left", [None, ["landscape.npz", "report.html"], ["scene.toml"]])
 def test_what_is_no_run_is_not_cleared(left, fresh, run, capsys):
-    """A run that lost provenance.json, results alone, and a start by a version without marker."""
+    """A run that lost provenance.json, results alone, and a scene."""
     for path in run.iterdir():
         if path.name == "provenance.json" or (left and path.name not in left):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -84,9 +84,9 @@ def test_what_is_no_run_is_not_cleared(left, fresh, run, capsys):
     assert snapshot(run) == before
 
 
-@pytest.mark.parametrize("moment", range(6))
-def test_a_start_that_was_cut_short_begins_anew(moment, tmp_path, monkeypatch):
-    """At any file that it writes: the marker, three of the scene, provenance.json, and after it."""
+@pytest.mark.parametrize("moment", range(4))
+def test_a_start_that_was_cut_short_goes_on(moment, tmp_path, monkeypatch):
+    """At any file that it writes: provenance.json and three of the scene."""
     folder, replace, count = tmp_path / "run", os.replace, [0]
 
     def killed(source, target):
@@ -98,47 +98,34 @@ def test_a_start_that_was_cut_short_begins_anew(moment, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", killed)
-        patch.setattr(belongings, "tidy", lambda path: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             start(folder)
-    assert (folder / ".start.json").exists() == (moment > 0)
-    assert (folder / "provenance.json").exists() == (moment == 5)
-    left = sorted(os.listdir(folder))
-    if 0 < moment < 5:  # and a file that somebody put there stays
-        (folder / "meshes").mkdir()
-        (folder / "meshes" / "object_0.stl").write_text("solid")
-        with pytest.raises(InputError, match="meshes/object_0.stl and no provenance"):
+    assert (folder / "provenance.json").exists() == (moment > 0)
+    if moment == 3:  # and what somebody has changed since then stays
+        text = (folder / "hand.toml").read_text()
+        (folder / "hand.toml").write_text("# my own\n")
+        before = snapshot(folder)
+        with pytest.raises(InputError, match=r"hand.toml.* since the run was made"):
             start(folder)
-        shutil.rmtree(folder / "meshes")
-        assert sorted(os.listdir(folder)) == left
+        assert snapshot(folder) == before
+        (folder / "hand.toml").write_text(text)
     start(folder)
     names = [".lock", "events.log", "hand.toml", "objects.toml", "provenance.json", "scene.toml"]
     assert sorted(os.listdir(folder)) == names
     assert scene.load(folder / "scene.toml") == tiny()[0]
 
 
-def test_a_file_changed_after_a_start_was_cut_short_is_kept(tmp_path, monkeypatch):
+def test_a_start_that_was_cut_short_is_of_its_own_scene(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(manifest, "write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
+        patch.setattr(scene_files, "write_scene", lambda *_: (_ for _ in ()).throw(OSError))
+        with pytest.raises(OSError):
             start(folder)
-    (folder / "hand.toml").write_text("# my own\n")
-    before = snapshot(folder)
-    with pytest.raises(InputError, match="holds hand.toml and no provenance.json"):
-        start(folder)
-    assert snapshot(folder) == before
-
-
-@pytest.mark.parametrize("marker", ["[" * 100_000, '{"files": {"../x": "0"}}', "[1]", "\xff"])
-def test_a_marker_names_no_other_files(marker, tmp_path):
-    (tmp_path / "run").mkdir()
-    for path in (tmp_path / "x", tmp_path / "run" / "scene.toml"):
-        path.write_text("mine")
-    (tmp_path / "run" / ".start.json").write_text(marker)
-    with pytest.raises(InputError, match="holds scene.toml and no provenance"):
-        start(tmp_path / "run")
-    assert (tmp_path / "x").exists() and (tmp_path / "run" / "scene.toml").exists()
+    with pytest.raises(InputError, match="is missing since the run was made"):
+        other = tiny(**{"discretization.timestep": 0.01})[0]
+        with open_run(folder, other, SETTINGS, ["codesign"]):
+            pass
+    assert start(folder, fresh=True) == []
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link", "dangling", "lock"])
@@ -174,9 +161,9 @@ def test_fresh_does_not_delete_the_scene_that_it_reads(run, capsys):
 
 
 def test_fresh_that_was_cut_short_can_be_given_again(run, monkeypatch):
-    files = len(belongings._all(run))
-    remove = belongings.remove
-    for moment in (0, 1, files // 2):
+    number = len(directory._all(run))
+    remove = files.remove
+    for moment in (0, 1, number // 2):
         count = [0]
 
         def killed(path, count=count, moment=moment):
@@ -186,7 +173,7 @@ def test_fresh_that_was_cut_short_can_be_given_again(run, monkeypatch):
             remove(path)
 
         with monkeypatch.context() as patch:
-            patch.setattr(belongings, "remove", killed)
+            patch.setattr(files, "remove", killed)
             with pytest.raises(KeyboardInterrupt):
                 start(run, fresh=True)
         assert (run / "provenance.json").exists(), "the last file to go: it is still a run"
@@ -205,8 +192,8 @@ def test_another_hand_is_said_in_a_line(run, capsys):
 def test_a_run_has_no_files_but_its_own(run):
     """What `--fresh` deletes is all that a run makes."""
     assert command("report", run, "--no-replay") == 0
-    belongings.refuse_to_delete(run)
-    belongings.delete_run(run)
+    directory._refuse_to_delete(run, ())
+    directory._delete_run(run)
     assert os.listdir(run) == [".lock"]
 
 

@@ -9,7 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from codesign_jax import runs
+from codesign_jax import files, runs
 from codesign_jax.batch import Batch
 from codesign_jax.commands import status
 from codesign_jax.runs import checkpoint, choice, directory, manifest, tables
@@ -166,7 +166,7 @@ def test_a_step_under_another_name_is_refused(careful, run, capsys):
 
 def relabelled(run, identity):
     """Saves the newest step of a run as one of a run with this identity, or with none."""
-    own = manifest.read_provenance(run).get("id")
+    own = manifest.read_provenance(run)["id"]
     with Checkpoints(run / "checkpoints", run=own, read_only=True) as store:
         arrays = store.restore().arrays
     shutil.rmtree(run / "checkpoints")
@@ -185,33 +185,13 @@ def test_checkpoints_of_another_run_are_refused(identity, run, capsys):
     assert snapshot(run / "checkpoints") == before
 
 
-def as_before_versions(run):
-    """Makes a run one from before runs had an identity."""
-    relabelled(run, None)
+@pytest.mark.parametrize("change", [{"particles": 5}, {"trials": 2}, {"episodes": 2}])
+def test_settings_that_are_not_those_of_the_checkpoints_are_refused(change, run):
+    """Such as those of an older copy of provenance.json."""
     content = manifest.read_provenance(run)
-    for key in ("schema", "id", "files"):
-        del content[key]
+    content["settings"] |= change
     manifest.write(run, content)
-    return content
-
-
-def test_a_run_from_before_versions_is_read_and_goes_on(run, whole, capsys):
-    content = as_before_versions(run)
-    assert stored(run) == stored(whole)
-    assert command(*RUN, "--out", run) == 0
-    assert "all 3 episodes are done" in capsys.readouterr().out
-    content["settings"]["seed"] = 4  # whose checkpoints they are, its key tells
-    manifest.write(run, content)
-    with pytest.raises(InputError, match="not this run's: they are of another seed"):
-        runs.load_record(run)
-    content["settings"] |= {"seed": 3, "particles": 5}
-    manifest.write(run, content)
-    with pytest.raises(InputError, match="they are not of 5 particles"):
-        runs.load_record(run)
-    content["settings"]["particles"] = 4
-    manifest.write(run, content)
-    renumbered(run, NEWEST, 7)
-    with pytest.raises(InputError, match="checkpoint 7 holds episode 3"):
+    with pytest.raises(InputError, match="its checkpoints have 3 episodes of 4 particles and 3"):
         runs.load_record(run)
 
 
@@ -260,7 +240,7 @@ def test_a_damaged_step_that_cannot_be_deleted_is_said(run, monkeypatch, capsys)
     def refused(path):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
-    monkeypatch.setattr(checkpoint, "remove", refused)
+    monkeypatch.setattr(files, "remove", refused)
     assert command(*RUN, "--out", run) == 1
     error = capsys.readouterr().err
     assert "cannot be deleted (Permission denied): delete" in error and "by hand" in error

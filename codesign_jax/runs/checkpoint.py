@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codesign_jax import files
-from codesign_jax.runs.belongings import remove
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.manifest import SCHEMA
 
@@ -73,8 +72,8 @@ class Checkpoints:
 
         Args:
           folder: Folder of the steps.
-          run: Identity of the run, 32 hexadecimal digits, which every step carries; None for one
-            from before runs had any.
+          run: Identity of the run, 32 hexadecimal digits, which every step carries; None for steps
+            of no run.
           keep: Newest steps to keep.
           tell: Called when the folder is closed, with a message, if a step could not be deleted;
             from then on orbax deletes none.
@@ -95,7 +94,7 @@ class Checkpoints:
         if not read_only:
             # Not by orbax, which begins a thread for it and does not wait for that when it closes.
             for left in self.folder.glob(f"*{_TEMPORARY}*"):
-                remove(left)
+                files.remove(left)
         self._args, self._tell, self._run = ocp.args, tell, run
         _silence()
         self._manager = ocp.CheckpointManager(self.folder, options=options)
@@ -166,7 +165,7 @@ class Checkpoints:
             places = self.folder / str(step), self._digests(step)
             try:
                 for place in places:
-                    remove(place)
+                    files.remove(place)
             except OSError as error:
                 raise RunError(
                     f"checkpoint {step} is damaged, and cannot be deleted ({error.strerror}): "

@@ -1,6 +1,8 @@
 """The run folder: one run, one process at a time, and nothing in it that is not the run's.
 
-`columns` has its files and what is in them.
+A start writes provenance.json first, with digests of the files that it is about to make: the same
+command writes what a start that was cut short has not.  `--fresh` deletes the files that a run has
+by their names, provenance.json last.  Nothing else is ever deleted.
 """
 
 import contextlib
@@ -9,16 +11,18 @@ import datetime
 import difflib
 import fcntl
 import os
+import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from codesign_jax import files, own
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment
-from codesign_jax.runs import belongings, manifest, reading, scene_files
+from codesign_jax.runs import manifest, reading, scene_files
 from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
@@ -30,18 +34,28 @@ _MOST_LINES = 16
 """Lines of a file's differences that an error shows."""
 
 
+_LOCK = ".lock"
+_INSIDE = {
+    own.FOLDER: re.compile(r"[A-Za-z_][\w.]*\.py"),
+    "checkpoints": re.compile(r"[0-9]+(\.sha256|\.orbax-checkpoint-tmp.*)?"),
+    "failures": re.compile(r"episode-[0-9]+-particle-[0-9]+-trial-[0-9]+\.npz"),
+    "figures": re.compile(r"(cost_evolution|landscape)\.png"),
+    scene_files.MESHES: re.compile(r"object_[0-9]+\.[a-z0-9.]+"),
+}
+"""Names in the folders of a run; folders of steps are the run's with all that is in them."""
+
+
 class RunDirectory:
     """An open run folder; see `open_run`."""
 
-    def __init__(self, path: Path, identity: str | None):
-        """Refers to a folder that `open_run` has prepared, of the run with this identity."""
-        self.path, self.identity = path, identity
-        self.checkpoints = path / "checkpoints"
-        self.figures = path / "figures"
+    def __init__(self, path: Path):
+        """Refers to a folder that `open_run` has prepared."""
+        self.path = path
 
     def store(self, *, tell: Callable[[str], None]) -> Checkpoints:
         """Opens the run's checkpoints, see there."""
-        return Checkpoints(self.checkpoints, run=self.identity, tell=tell)
+        identity = manifest.read_provenance(self.path)["id"]
+        return Checkpoints(self.path / "checkpoints", run=identity, tell=tell)
 
     def log(self, message: str) -> None:
         """Appends a line with the time to events.log."""
@@ -61,32 +75,28 @@ def open_run(
     fresh: bool = False,
     sources: Iterable[Path] = (),
 ) -> Iterator[tuple[RunDirectory, list[str]]]:
-    """Opens a run folder: makes it, or checks that it is this very run; locks it meanwhile.
-
-    Nothing is deleted in it but what `belongings` tells to be a run's or an unfinished start's.
-    """
+    """Opens a run folder: makes it, or checks that it is this very run; locks it meanwhile."""
     sources = tuple(sources)
     check_folder(path, scene, settings, fresh=fresh, sources=sources)
-    made = not path.exists()
     path.mkdir(parents=True, exist_ok=True)
     with _locked(path):
         # Again: another process may have been here.
         check_folder(path, scene, settings, fresh=fresh, sources=sources)
-        if fresh and (path / PROVENANCE).exists():
-            contents = _contents(scene, settings)
-            belongings.delete_run(path)
+        contents, run, notes = _contents(scene, settings), RunDirectory(path), []
+        if fresh:
+            _delete_run(path)
+        created = not (path / PROVENANCE).exists()
+        if created:
+            manifest.write(path, manifest.new(settings, contents, command))
         else:
-            contents = None
-        notes = []
-        if (path / PROVENANCE).exists():
-            belongings.tidy(path)
             notes = _resume(path, settings, command)
-        else:
-            _create(path, scene, settings, command, contents)
-        run = RunDirectory(path, manifest.read_provenance(path).get("id"))
-        run.log("created" if made or fresh else "opened")
-        for note in notes:
-            run.log(note)
+        if any(not (path / name).exists() for name in contents):
+            scene_files.write_scene(scene, path, contents)
+        for name in _all(path):  # temporaries that killed processes left
+            if _named(name) != name and _is_of_a_run(path, name):
+                (path / name).unlink()
+        for message in ["created" if created else "opened", *notes]:
+            run.log(message)
         yield run, notes
 
 
@@ -110,14 +120,13 @@ def check_folder(
     Raises:
       InputError: See `open_run`.
     """
-    belongings.refuse_foreign(path)
-    belongings.refuse_unmarked(path)
+    _refuse_foreign(path)
     if not (path / PROVENANCE).exists():
         return
     stored = manifest.read_provenance(path)
     if fresh:
         meshes = (shape.mesh.path for shape in scene.objects.object if shape.mesh)
-        belongings.refuse_to_delete(path, (*sources, *meshes))
+        _refuse_to_delete(path, (*sources, *meshes))
     else:
         _refuse_other(path, scene, settings, stored)
         if reading.lost_all(path):
@@ -149,7 +158,7 @@ def setting_of(paths: Iterable[Path], name: str) -> Any:
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Holds the folder's lock; the kernel releases it with the process, however it ends."""
-    place = os.open(path / belongings.LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    place = os.open(path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     with os.fdopen(place, "r+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -180,21 +189,6 @@ def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
     return notes
 
 
-def _create(
-    path: Path,
-    scene: Scene,
-    settings: Settings,
-    command: list[str],
-    contents: Mapping[str, bytes] | None,
-) -> None:
-    """Makes a run: its marker first and provenance.json last, which makes the folder a run."""
-    contents = _contents(scene, settings) if contents is None else contents
-    belongings.begin(path, contents)
-    scene_files.write_scene(scene, path, contents)
-    manifest.write(path, manifest.new(settings, contents, command))
-    belongings.tidy(path)
-
-
 def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
     """Files that a run is made from: the scene's, and the user's own code."""
     return scene_files.contents(scene) | own.contents((settings.optimizer, settings.cost))
@@ -204,12 +198,14 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
     """Refuses to resume another run, and says what differs."""
     problems, extension = [], []
     for name, value in dataclasses.asdict(settings).items():
-        stood = stored["settings"].get(name)
+        stood = stored["settings"][name]
         if name == "episodes":
             extension = _extension_problems(scene, settings, stood)
         elif stood != value:
             flag = name.replace("_", "-")
             problems.append(f"--{flag}: the run has {stood}, asked for is {value}")
+    if not problems and _is_cut_short(path, scene, settings, stored):
+        return
     manifest.refuse_changed(path, stored)
     before = scenes.load(path / "scene.toml")
     if before != scene:
@@ -240,11 +236,19 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
         raise InputError([f"--out {path}: {problem}; {hint}" for problem in extension])
 
 
+def _is_cut_short(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> bool:
+    """Whether the run's start was cut short, of this very scene: what is there is as it was."""
+    noted = manifest.digests(_contents(scene, settings))
+    changed = manifest.changed_files(path, stored)
+    missing = not any((path / name).exists() for name in changed)
+    return bool(changed) and missing and not _top(path / "checkpoints") and noted == stored["files"]
+
+
 def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[str]:
     """How the user's own optimiser and cost differ from those that the run was made with."""
     found = []
     for name, content in own.contents((settings.optimizer, settings.cost)).items():
-        if manifest.digests({name: content})[name] != stored.get("files", {}).get(name):
+        if manifest.digests({name: content})[name] != stored["files"].get(name):
             old, new = (path / name).read_text("utf-8"), content.decode()
             ends = f"run/{name}", f"now/{name}"
             diff = difflib.unified_diff(old.splitlines(), new.splitlines(), *ends, n=0)
@@ -254,8 +258,7 @@ def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[
 
 def _own_command(stored: dict[str, Any]) -> list[str]:
     """By which command a run goes on, in words; nothing if it was begun from Python."""
-    last = [stored.get("started", {}), *stored.get("resumed", [])][-1]
-    program, *arguments = last.get("command", [""])
+    program, *arguments = [stored["started"], *stored.get("resumed", [])][-1]["command"] or [""]
     if Path(program).name not in ("codesign", "cli.py"):
         return []
     return [f"the run in it goes on by its own command: {shlex.join(['codesign', *arguments])}"]
@@ -293,3 +296,114 @@ def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
     if not changed:
         return []
     return [f"not bitwise comparable with an uninterrupted run: {', '.join(changed)}"]
+
+
+def _refuse_foreign(path: Path) -> None:
+    """Refuses a folder with files of other names than a run's, or that is no run."""
+    if path.is_symlink() and not path.exists():
+        raise InputError([f"--out {path} is a symbolic link to nothing"])
+    if path.exists() and not path.is_dir():
+        raise InputError([f"--out {path} is a file"])
+    ours = {*FILES, *TABLES, _LOCK}
+    others = [name for name in _top(path) if _named(name) not in ours]
+    if _LOCK in _top(path) and not _is_lock(path / _LOCK):
+        others.append(_LOCK)
+    if others:
+        raise InputError(
+            [f"--out {path} holds other files ({_some(others)}); choose another folder"]
+        )
+    others = [name for name in _all(path) if name != _LOCK and _named(name) != PROVENANCE]
+    if others and not (path / PROVENANCE).exists():
+        hint = "they may be yours"
+        if (path / "checkpoints").exists():
+            hint = (
+                f"if it is a run that lost {PROVENANCE}, put that back from a copy and it goes on"
+            )
+        raise InputError(
+            [
+                f"--out {path} holds {_some(others)} and no {PROVENANCE}: {hint}. Nothing was "
+                "changed. Choose another folder, or delete these files yourself, if nobody needs "
+                "them"
+            ]
+        )
+
+
+def _refuse_to_delete(path: Path, sources: tuple[Path, ...]) -> None:
+    """Refuses `--fresh` where more than a run's own files would go."""
+    place = path.resolve()
+    if read := [str(file) for file in sources if place in file.resolve().parents]:
+        raise InputError(
+            [
+                f"--fresh would delete {_some(read)}, which this command reads: copy the files of "
+                "the scene to another folder, or choose another --out"
+            ]
+        )
+    if links := [name for name in _all(path) if (path / name).is_symlink()]:
+        raise InputError(
+            [f"--fresh deletes no symbolic links ({_some(links)} in {path}): delete them yourself"]
+        )
+    if others := [name for name in _all(path) if not _is_of_a_run(path, name)]:
+        raise InputError(
+            [
+                f"--fresh would delete {_some(others)} in {path}, which are no files of a run: "
+                "move them elsewhere first, or choose another folder"
+            ]
+        )
+
+
+def _delete_run(path: Path) -> None:
+    """Deletes a run's files, those that make it one last; see `_refuse_to_delete`."""
+    for name in _all(path):
+        if name not in (_LOCK, PROVENANCE) and _is_of_a_run(path, name):
+            files.remove(path / name)
+    for name in _INSIDE:
+        with contextlib.suppress(FileNotFoundError):
+            (path / name).rmdir()
+    (path / PROVENANCE).unlink(missing_ok=True)
+
+
+def _top(path: Path) -> list[str]:
+    return sorted(os.listdir(path)) if path.is_dir() else []
+
+
+def _all(path: Path) -> list[str]:
+    """Names of the files in a folder, and in the folders that a run has there."""
+    found = []
+    for name in _top(path):
+        inside = path / name
+        if name in _INSIDE and inside.is_dir() and not inside.is_symlink():
+            found += [f"{name}/{other}" for other in _top(inside)]
+        else:
+            found.append(name)
+    return found
+
+
+def _named(name: str) -> str:
+    """The file that a temporary was to replace, as `files.atomically` names it; others as they are.
+
+    A killed process leaves its temporaries.
+    """
+    found = re.fullmatch(r"(.*?\.(?:toml|json|csv|log|npz|html|sha256|png))\.[^/]*tmp", name)
+    return found[1] if found else name
+
+
+def _is_lock(path: Path) -> bool:
+    """Whether a file is the lock of a run, which holds a process's number."""
+    try:
+        with path.open("rb") as file:
+            return not path.is_symlink() and re.fullmatch(rb"[0-9]*\s*", file.read(64)) is not None
+    except OSError:
+        return False
+
+
+def _is_of_a_run(path: Path, name: str) -> bool:
+    """Whether a run makes files of this name."""
+    folder, _, inside = name.rpartition("/")
+    if folder:
+        return _INSIDE[folder].fullmatch(_named(inside)) is not None
+    return _named(name) in {*FILES, *TABLES, _LOCK} - {*_INSIDE} and not (path / name).is_dir()
+
+
+def _some(names: list[str]) -> str:
+    """The first of some names, and how many more there are."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

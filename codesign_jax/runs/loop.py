@@ -229,7 +229,7 @@ class Loop:
             return None
         record, self._saved = records.from_arrays(found.arrays), found.step
         plan = self.plan
-        records.refuse_other(record, plan.settings, found.step, plan.space.num_parameters)
+        records.refuse_other(record, plan.settings)
         for step, reason in found.damaged:
             self._say(f"checkpoint {step} is lost: {reason}; using an older one")
         self.store.discard([step for step, _ in found.damaged])

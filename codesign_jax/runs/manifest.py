@@ -6,6 +6,7 @@ It may be a stranger's, or damaged: all that others read from it is checked here
 import dataclasses
 import datetime
 import json
+import re
 import uuid
 from collections.abc import Mapping
 from hashlib import sha256
@@ -22,12 +23,22 @@ from codesign_jax.scene.schema import InputError
 PROVENANCE = "provenance.json"
 """File that makes a folder a run."""
 SCHEMA = 1
-"""Version of what a run folder holds; runs from before there were versions have none and are read.
-
-It grows when a folder can no longer be read by the code before.
-"""
+"""Version of what a run folder holds: it grows when the code before can no longer read a folder."""
 _MOST_BYTES = 20_000_000
-_OF_ENVIRONMENT = ("python", "platform", "machine", "device")
+_START = {"time": str, "command": [str]}
+_TYPES = {
+    "schema": int,
+    "id": str,
+    "settings": {field.name: field.type for field in dataclasses.fields(Settings)},
+    "started": _START,
+    "resumed": [_START],
+    "extended": [_START],
+    "environment": dict.fromkeys(("python", "platform", "machine", "device"), str)
+    | {"versions": {...: str | None}},
+    "git": {"commit": str | None},
+    "files": {...: str},
+}
+"""Types of the entries; [T] is a list of T, and {...: T} a table of them by any name."""
 
 
 def new(settings: Settings, contents: Mapping[str, bytes], command: list[str]) -> dict[str, Any]:
@@ -61,7 +72,7 @@ def write(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
-    """Reads provenance.json of a run folder; settings that it lacks have their defaults."""
+    """Reads provenance.json of a run folder."""
     file = path / PROVENANCE
     try:
         size = file.stat().st_size
@@ -82,7 +93,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
         raise _damaged(file, "it is no valid JSON") from error
     if problem := _problem(stored):
         raise _damaged(file, problem)
-    if stored.get("schema", 0) > SCHEMA:
+    if stored["schema"] > SCHEMA:
         raise InputError(
             [
                 f"{path} was made by a newer version of codesign-jax (its folders have schema "
@@ -92,20 +103,16 @@ def read_provenance(path: Path) -> dict[str, Any]:
     settings = Settings(**stored["settings"])
     if problems := check(settings, None):
         raise _damaged(file, f"its settings are not valid: {problems[0]}")
-    stored["settings"] = dataclasses.asdict(settings)
     return stored
 
 
 def changed_files(path: Path, stored: Mapping[str, Any]) -> list[str]:
     """Names of the scene files that differ from those the run was made with.
 
-    Other comments or another layout of a TOML file are no difference. Runs from before digests were
-    noted have none to compare with.
+    Other comments or another layout of a TOML file are no difference.
     """
-    noted = stored.get("files", {})
-    found = []
-    for name, digest in noted.items():
-        found += [] if _digest(path / name) == digest else [name]
+    noted = stored["files"]
+    found = [name for name, digest in noted.items() if _digest(path / name) != digest]
     if not found or not set(found) <= set(scene_files.NAMES):
         return found
     try:
@@ -171,57 +178,28 @@ def _problem(stored: Any) -> str:
     """What is wrong with the types of a provenance; nothing if they are right."""
     if not isinstance(stored, dict):
         return "it is no table"
-    types = {"settings": dict, "environment": dict, "started": dict, "git": dict, "files": dict}
-    types |= {"resumed": list, "extended": list, "schema": int, "id": str}
-    for name, kind in types.items():
-        if name not in stored and name not in ("settings", "environment", "started"):
-            continue
-        if not isinstance(stored.get(name), kind) or isinstance(stored.get(name), bool):
-            return f'"{name}" is missing' if name not in stored else f'"{name}" is not valid'
-    if not _is_id(stored.get("id", "0" * 32)):
-        return '"id" is not valid'
-    steps = [stored["started"], *stored.get("resumed", []), *stored.get("extended", [])]
-    checks = {
-        "settings": _are_settings(stored["settings"]),
-        "environment": _is_environment(stored["environment"]),
-        "started, resumed or extended": all(map(_is_start, steps)),
-        "git": isinstance(stored.get("git", {}).get("commit"), str | None),
-        "files": all(
-            isinstance(v, str) and _is_inside(k) for k, v in stored.get("files", {}).items()
-        ),
-    }
-    wrong = [name for name, right in checks.items() if not right]
-    return f'"{wrong[0]}" is not valid' if wrong else ""
+    stored = {"resumed": [], "extended": []} | stored
+    wrong = [name for name, types in _TYPES.items() if not _fits(stored.get(name), types)]
+    if not wrong:
+        folders = ([scene_files.MESHES], [own.FOLDER])
+        ours = (n in scene_files.NAMES or n.split("/")[:-1] in folders for n in stored["files"])
+        right = {
+            "settings": stored["settings"].keys() == _TYPES["settings"].keys(),  # type: ignore[attr-defined]
+            "id": re.fullmatch("[0-9a-f]{32}", stored["id"]) is not None,
+            "files": all(ours),
+        }
+        wrong = [name for name, holds in right.items() if not holds]
+    return f'"{wrong[0]}" is missing, or not valid' if wrong else ""
 
 
-def _is_id(text: str) -> bool:
-    return len(text) == 32 and not set(text) - set("0123456789abcdef")
-
-
-def _is_inside(name: str) -> bool:
-    """Whether a name is of a file that a run has, and nowhere else."""
-    folders = ([scene_files.MESHES], [own.FOLDER])
-    return name in scene_files.NAMES or name.split("/")[:-1] in folders
-
-
-def _are_settings(given: dict[str, Any]) -> bool:
-    fields = {field.name: field for field in dataclasses.fields(Settings)}
-    needed = {n for n, field in fields.items() if field.default is dataclasses.MISSING}
-    right = all(type(v) is fields[n].type for n, v in given.items() if n in fields)
-    return right and needed <= set(given) <= set(fields)
-
-
-def _is_environment(given: dict[str, Any]) -> bool:
-    versions = given.get("versions")
-    return (
-        all(isinstance(given.get(name), str) for name in _OF_ENVIRONMENT)
-        and isinstance(versions, dict)
-        and all(isinstance(v, str | None) for v in versions.values())
-    )
-
-
-def _is_start(given: Any) -> bool:
-    if not isinstance(given, dict) or not isinstance(given.get("time"), str):
-        return False
-    command = given.get("command")
-    return isinstance(command, list) and all(isinstance(word, str) for word in command)
+def _fits(value: Any, types: Any) -> bool:
+    """Whether a value of JSON has types, see `_TYPES`."""
+    if isinstance(types, list):
+        return isinstance(value, list) and all(_fits(v, types[0]) for v in value)
+    if isinstance(types, dict):
+        if not isinstance(value, dict):
+            return False
+        if ... in types:
+            return all(_fits(v, types[...]) for v in value.values())
+        return all(_fits(value.get(name), kind) for name, kind in types.items())
+    return isinstance(value, types) and not isinstance(value, bool)

@@ -67,12 +67,12 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
     stored = manifest.read_provenance(folder)
     settings = Settings(**stored["settings"])
     try:
-        with Checkpoints(folder / "checkpoints", run=stored.get("id"), read_only=True) as store:
+        with Checkpoints(folder / "checkpoints", run=stored["id"], read_only=True) as store:
             found = store.restore()
         if found.step is None:
             return _none(folder, found)
         record = records.from_arrays(found.arrays)
-        records.refuse_other(record, settings, found.step)
+        records.refuse_other(record, settings)
     except (RunError, OSError) as error:
         raise InputError([f"run {folder}: {error}"]) from error
     if found.damaged:

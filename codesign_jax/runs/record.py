@@ -93,8 +93,7 @@ class Record:
       state: State of the optimiser.
       history: Reports of the episodes.
       test: Outcomes of the final test, shape (particle, trial), or None before it.
-      start: What the run started from; None if an older version of codesign-jax began it,
-        or if its optimiser looks for its start by itself.
+      start: What the run started from; None if its optimiser looks for its start by itself.
     """
 
     state: State
@@ -150,9 +149,9 @@ def from_arrays(arrays: dict) -> Record:
         key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
         memory = jax.tree.map(jnp.asarray, s.get("memory"))
         state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
-        test = _outcomes(jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
+        test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
         start = Start(**arrays["start"]) if "start" in arrays else None
-        history = History(outcomes=_outcomes(h.pop("trials")), **h)
+        history = History(outcomes=Outcome(**h.pop("trials")), **h)
         return Record(state, history, test, start)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RunError(
@@ -161,46 +160,18 @@ def from_arrays(arrays: dict) -> Record:
         ) from error
 
 
-def _outcomes(arrays: dict) -> Outcome:
-    """Outcomes; checkpoints of an older version do not tell how the solver ended."""
-    untold = np.full_like(arrays["cost"], np.nan)
-    return Outcome(**({"capped": untold, "residual": untold} | arrays))
-
-
-def refuse_other(
-    record: Record, settings: Settings, step: int, num_parameters: int | None = None
-) -> None:
-    """Refuses a record that is not of a run of these settings, or of another step.
-
-    Args:
-      record: What was read.
-      settings: Settings of the run.
-      step: Number of the checkpoint that it was read from.
-      num_parameters: Parameters of the design space; None to leave them out.
+def refuse_other(record: Record, settings: Settings) -> None:
+    """Refuses a record that is not of a run of these settings.
 
     Raises:
       RunError: With what differs.
     """
-    e, n, t = (settings.episodes, settings.particles, settings.trials)
-    particles, history = np.shape(record.state.particles), record.history
-    d = particles[-1] if num_parameters is None else num_parameters
-    seed = np.asarray(jax.random.key_data(jax.random.key(settings.seed)))
-    own = record.done + (record.test is not None)
-    room = len(history.cost)
-    problems = {
-        "they are of another seed": not np.array_equal(jax.random.key_data(record.state.key), seed),
-        f"they are not of {n} particles of {d} parameters": particles != (n, d)
-        or history.population.shape != (room, n, d),
-        f"they are not of {t} trials": any(
-            np.shape(v) != (room, n, t)  # type: ignore[call-overload]  # one may be None
-            for v in history.outcomes
-        ),
-        f"checkpoint {step} holds episode {record.done}": own != step,
-        f"they have {record.done} episodes of {e}": not 0 <= record.done <= min(room, e),
-    }
-    found = [words for words, wrong in problems.items() if wrong]
-    if found:
+    (_, n, t), done = record.history.outcomes.cost.shape, record.done
+    asked = settings.particles, settings.trials, settings.episodes
+    if asked[:2] != (n, t) or done > asked[2]:
         raise RunError(
-            f"its checkpoints are not this run's: {'; '.join(found)}. Nothing was changed. Put its "
-            "own back, or choose another folder"
+            f"its checkpoints have {done} episodes of {n} particles and {t} trials, and "
+            "provenance.json {2} of {0} and {1}: put back the one that belongs to them".format(
+                *asked
+            )
         )

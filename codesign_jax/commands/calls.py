@@ -68,15 +68,7 @@ def equal(designs: int, most: int) -> int:
 def in_turn(
     task: Task, key: jax.Array, designs: np.ndarray, size: int, *, devices: int | None = 1
 ) -> Iterator[Outcome]:
-    """Outcomes of designs, some at a time in their order, of shape (design, trial).
-
-    Args:
-      task: What they are simulated in.
-      key: Key of the trials, which all of them meet.
-      designs: Designs [SI units], shape (design, parameter).
-      size: Designs of a call; the last call is filled up.
-      devices: Devices that take turns; None for all.
-    """
+    """Outcomes of designs, some at a time in their order, of shape (design, trial)."""
     places, running = batch.take(devices), deque()
 
     def arrived() -> Outcome:

@@ -142,7 +142,6 @@ def _head(case: Case, load: float) -> list[str]:
 
 
 def _settings(options: "Check", case: Case) -> Settings:
-    """Of the run, or of a search with the default optimiser."""
     if options.run_folder:
         return runs.read_run(options.run_folder)[1]
     objects = len(case.scene.objects.object)
@@ -169,7 +168,6 @@ def _draw(case: Case, stream: int, first: int, count: int) -> sampling.Drawn:
 
 
 def _timed(run: Run, designs: jax.Array, trials: Trial) -> tuple[Outcome, float]:
-    """Outcomes on the host, and seconds."""
     begin = time.perf_counter()
     found = jax.tree.map(np.asarray, interruptible(run, designs, trials))
     return found, time.perf_counter() - begin

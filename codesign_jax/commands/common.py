@@ -144,11 +144,7 @@ def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
 
 
 def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[str]:
-    """What is wrong with numbers of a command line.
-
-    Args:
-      *numbers: Flag, value, smallest and largest one; None is a flag that was not given.
-    """
+    """What is wrong with numbers of a command line."""
     given = [(flag, v, "", low, high) for flag, v, low, high in numbers if v is not None]
     return [problem for number in given if (problem := schema.range_problem(*number))]
 
@@ -174,12 +170,7 @@ def check_engine(name: str) -> None:
 
 
 def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[str]:
-    """An engine that there is not, or values of the [solver] table for one that does not read them.
-
-    Args:
-      name: The engine's name.
-      overrides: Values as KEY=VALUE, as of --set.
-    """
+    """An engine that there is not, or values of [solver] for one that does not read them."""
     if name not in engines.NAMES:
         return [f"--engine = {name!r} is not valid; {schema.nearest(name, engines.NAMES)}"]
     given = keypaths.parse(chain.from_iterable(overrides)) if name == "structured" else {}
@@ -211,13 +202,7 @@ def mesh_notes(scene: Scene) -> list[str]:
 def preflight_warnings(
     scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]
 ) -> list[str]:
-    """Warnings about designs that are about to be simulated.
-
-    Args:
-      scene: The scene.
-      space: The design space.
-      designs: Designs [SI units], each of shape (parameter,), by what to call them.
-    """
+    """Warnings about designs that are about to be simulated."""
     stacked = np.array([*designs.values()], np.float32)
     params = params_of(space, stacked)
     report = preflight.check(scene, params, [*designs])

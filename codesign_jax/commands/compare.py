@@ -34,14 +34,7 @@ _WORDS = {"schedule": "strategy"}
 
 
 class Compared(NamedTuple):
-    """A run that is compared with others.
-
-    Attributes:
-      scene: Its scene.
-      settings: Its settings.
-      result: How it ended; None if it could not finish.
-      fresh: Fresh trials of its design; None without any.
-    """
+    """A run that is compared with others."""
 
     scene: Scene
     settings: Settings
@@ -124,7 +117,6 @@ def with_fresh(
 
 
 def _pair(options: "Compare", folders: list[Path]) -> list[Case]:
-    """The designs of two runs, with the same objects."""
     replaced = {n: getattr(options, n) for n in ("accuracy", "objects", "overrides", "robust")}
     given = [
         flags.Subject(run_folder=folder, engine=options.engine, **replaced) for folder in folders
@@ -136,7 +128,6 @@ def _pair(options: "Compare", folders: list[Path]) -> list[Case]:
 
 
 def _compare_pair(pair: list[Case], names: list[str], options: "Compare", console: Console) -> None:
-    """Simulates both designs in the same trials and says how they differ."""
     kept, count = [], options.trials or 0
     for case, name in zip(pair, names, strict=True):
         with Busy(console, f"simulating {common.counted(count, 'grasp')}"):
@@ -252,7 +243,6 @@ def write_table(every: Mapping[Path, Compared], path: Path) -> None:
 
 
 def _values(run: Compared) -> dict[str, object]:
-    """How a run converged and how its final test ended, by column."""
     found: dict[str, object] = {"converged_episode": run.converged}
     if run.result is None or run.result.record is None or run.result.test is None:
         return found
@@ -283,7 +273,6 @@ def _fresh_values(judged: Judged | None) -> dict[str, object]:
 
 
 def _row(run: Compared) -> tuple[str, ...]:
-    """Convergence of a run, and how its design did."""
     if run.result is None or run.result.record is None:
         return ("failed", *[""] * 6)
     converged = f"episode {run.converged}" if run.converged else "no"

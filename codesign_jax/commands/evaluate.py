@@ -57,7 +57,6 @@ def main(options: "Evaluate") -> int:
 
 
 def _of_particle(case: Case, options: "Evaluate") -> Case:
-    """The case of the final particle that was asked for, if one was."""
     if options.particle is None:
         return case
     if options.run_folder is None:
@@ -106,7 +105,6 @@ def simulate(case: Case, options: "Evaluate", console: Console) -> types.Outcome
 
 
 def _untried(case: Case, options: "Evaluate") -> list[str]:
-    """Says which objects fewer trials than objects leave out."""
     names = [shape.name for shape in case.scene.objects.object]
     left = names[options.trials :]
     if not left:

@@ -92,7 +92,6 @@ def _check(options: "Export", case: Case) -> None:
 
 
 def _missing(options: "Export") -> list[str]:
-    """What is to be installed for the parts."""
     names = () if options.no_parts else ("manifold3d", "networkx", "lxml")
     absent = [name for name in names if importlib.util.find_spec(name) is None]
     if not absent:
@@ -125,7 +124,6 @@ def write_files(
 
 
 def _tell(case: Case, options: "Export", console: Console) -> None:
-    """Says where everything is."""
     from codesign_jax.export import sheet
 
     console.print(f"exported: {options.out}", markup=False)

@@ -23,12 +23,7 @@ MOST = 10
 
 
 def main(path: Path, engine: str | None) -> int:
-    """Replays a failed world; returns the exit status.
-
-    Args:
-      path: A file of a run folder's failures/.
-      engine: Engine that simulates; None for the run's.
-    """
+    """Replays a failed world; returns the exit status."""
     failure = failures.load(path)
     scene, settings = runs.read_run(path.resolve().parent.parent)
     name = engine or settings.engine
@@ -70,7 +65,6 @@ def _world(scene: Scene, space: DesignSpace, failure: Failure):
 
 
 def _again(scene: Scene, space: DesignSpace, failure: Failure, name: str) -> None:
-    """Simulates the grasp from its start."""
     engine = make_engine(name, scene)
     worlds = jax.tree.map(lambda v: v[None], _world(scene, space, failure))
     run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t))
@@ -89,7 +83,6 @@ def _again(scene: Scene, space: DesignSpace, failure: Failure, name: str) -> Non
 
 
 def _where(trace: Trace, k: int) -> str:
-    """Where the object is at an entry of a trace."""
     return (
         f"object {trace.height[k]:.4f} m above the table, {trace.distance[k]:.4f} m from the hand"
     )

@@ -147,7 +147,6 @@ def _errors(table: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> str:
 
 
 def _of_fit(fit: Fit, table: dict[str, np.ndarray]) -> list[str]:
-    """What was fitted, and what to set."""
     modulus, gain = fingers.fitted(table)
     lines = []
     if modulus:

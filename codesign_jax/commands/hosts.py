@@ -34,11 +34,7 @@ class Hosts(NamedTuple):
 
 
 def check(text: str) -> tuple[str, int, int] | None:
-    """Reads "ADDRESS:PORT,PROCESSES,INDEX"; None for "auto".
-
-    Raises:
-      InputError: If the text is neither.
-    """
+    """Reads "ADDRESS:PORT,PROCESSES,INDEX"; None for "auto"."""
     if text == "auto":
         return None
     match = re.fullmatch(r"([^,\s]+:[0-9]{1,5}),([0-9]{1,5}),([0-9]{1,5})", text)

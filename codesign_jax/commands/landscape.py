@@ -86,7 +86,6 @@ def _folder(options: "Options", case: Case) -> Path:
 
 
 def _refuse_other_scene(folder: Path, case: Case) -> None:
-    """Refuses to replace scene files that are not those of the landscape."""
     others = [
         str(folder / name)
         for name, content in contents(case.scene).items()
@@ -110,7 +109,6 @@ def _check(options: "Options", case: Case) -> None:
 
 
 def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
-    """Indices of the two parameters."""
     known = case.space.names
     chosen = names or (known if len(known) == 2 else ())
     unknown = [name for name in chosen if name not in known]

@@ -79,7 +79,6 @@ def main(options: "Optimize") -> int:
 
 
 def _tell_error(name: str, error: Exception) -> None:
-    """Says how a run failed, with the traceback of what nobody expected."""
     if not isinstance(error, runs.FAILURES):
         traceback.print_exception(error)
         name += f"{type(error).__name__}: "
@@ -103,7 +102,6 @@ def _distributed(options: "Optimize") -> int:
 
 
 def _compare_all(options: "Optimize") -> int:
-    """Compares the runs of all hosts; returns the exit status."""
     scene, settings = resolve(options)
     every = runs_of(options, scene, settings)
     found = compare.read_all({folder: (scene, own) for folder, own in every.items()})
@@ -112,7 +110,6 @@ def _compare_all(options: "Optimize") -> int:
 
 
 def _compare(options: "Optimize", every: dict[Path, Compared], console: Console) -> None:
-    """Compares runs on the console and in seeds.csv."""
     compare.compare(every, console)
     table = table_folder(options) / columns.SEEDS
     compare.write_table(every, table)
@@ -186,7 +183,6 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
 
 
 def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
-    """Prints whether the run converged, and the final particle that did best."""
     assert result.record is not None
     history, particles = result.record.history, np.asarray(result.record.state.particles)
     converged = codesign.convergence_episode(history.cost.mean(1))
@@ -233,7 +229,6 @@ def _judge(
 
 
 def _say_places(result: RunResult, folder: Path, console: Console) -> None:
-    """Draws the figure, and says where everything is."""
     _figures(result, folder, console)
     console.print(f"results: {folder}", markup=False)
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}", markup=False)
@@ -258,10 +253,10 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     except InputError as error:
         problems += error.problems
     schedules = options.schedule.split(",")
-    optimizer = options.optimizer or optimize.DEFAULT
-    if scene is not None and options.optimizer is None and not options.fresh:
+    optimizer, episodes = options.optimizer, options.episodes
+    if scene is not None and not options.fresh:
         try:
-            optimizer = _of_the_runs(options, scene) or optimizer
+            optimizer, episodes = _of_the_runs(options, scene)
         except InputError as error:
             problems += error.problems
     settings = runs.make_settings(
@@ -272,17 +267,12 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         options.seed,
         particles=options.particles,
         trials=options.trials,
-        episodes=options.episodes,
+        episodes=episodes,
         test_trials=options.test_trials,
-        optimizer=optimizer,
+        optimizer=optimizer or optimize.DEFAULT,
         cost=options.cost or runs.SCENE_COST,
         objects=len(scene.objects.object) if scene else 1,
     )
-    if scene is not None and options.episodes is None and not options.fresh:
-        try:
-            settings = _as_the_runs(options, scene, settings)
-        except InputError as error:
-            problems += error.problems
     problems += _flag_problems(options)
     for name in schedules:
         own = dataclasses.replace(settings, schedule=name)
@@ -294,7 +284,6 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
 
 
 def _flag_problems(options: "Optimize") -> list[str]:
-    """What is wrong with flags that are no settings of a run."""
     problems = []
     if options.seeds is not None and options.seed != 0:
         problems.append("--seed and --seeds exclude each other")
@@ -310,23 +299,21 @@ def _flag_problems(options: "Optimize") -> list[str]:
     )
 
 
-def _of_the_runs(options: "Optimize", scene: Scene) -> str | None:
-    """The optimiser of the runs that are there: a run goes on with its own.
+def _of_the_runs(options: "Optimize", scene: Scene) -> tuple[str | None, int | None]:
+    """Optimiser and episodes: where none are given, those of the runs that are there.
 
-    One of somebody's own is not among them: only a command line has code imported.
+    An optimiser of somebody's own is not among them: only a command line has code imported.
     """
-    cost = options.cost or runs.SCENE_COST
-    usual = runs.make_settings(options.preset, "", "", "", 0, optimizer=optimize.DEFAULT, cost=cost)
+    optimizer, cost = options.optimizer, options.cost or runs.SCENE_COST
+    usual = runs.make_settings(
+        options.preset, "", "", "", 0, optimizer=optimizer or optimize.DEFAULT, cost=cost
+    )
     folders = runs_of(options, scene, usual)
-    found = runs.setting_of(folders, "optimizer")
-    return None if found is None or is_own(found) else found
-
-
-def _as_the_runs(options: "Optimize", scene: Scene, settings: Settings) -> Settings:
-    """Settings with the episodes of the runs that are there: these may have been extended."""
-    folders = runs_of(options, scene, settings)
-    episodes = runs.setting_of(folders, "episodes") or settings.episodes
-    return dataclasses.replace(settings, episodes=episodes)
+    if optimizer is None:
+        found = runs.setting_of(folders, "optimizer")
+        optimizer = None if found is None or is_own(found) else found
+    episodes = options.episodes
+    return optimizer, runs.setting_of(folders, "episodes") if episodes is None else episodes
 
 
 def several(options: "Optimize") -> bool:

@@ -34,13 +34,7 @@ class Findings(NamedTuple):
 
 
 def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Findings:
-    """Checks designs against the scene's limits; simulates nothing.
-
-    Args:
-      scene: The scene.
-      designs: Parameters with leading axis (design,).
-      names: What to call the designs; by default "design 0" and so on.
-    """
+    """Checks designs against the scene's limits; simulates nothing."""
     designs = Params._make(np.asarray(v, float) for v in designs)
     count = designs.length.shape[0]
     names = names or [f"design {i}" for i in range(count)]

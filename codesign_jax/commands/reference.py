@@ -31,12 +31,7 @@ STREAM_REFERENCE = 0x72656665
 
 
 def number_of_trials(asked: int | None, settings: Settings) -> int:
-    """Fresh trials of a run: what was asked for, or `TRIALS` with the engine that is fast enough.
-
-    Args:
-      asked: Number on the command line; None for none.
-      settings: The run's settings; a run without a final test has no reference test either.
-    """
+    """Fresh trials of a run: those asked for, or `TRIALS` with the engine that is fast."""
     if asked is not None:
         return asked
     return TRIALS if settings.engine == engines.DEFAULT and settings.test_trials else 0
@@ -46,9 +41,6 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
     """Simulates the best particle of a run in fresh trials at `reference`.
 
     Its outcomes are kept in the run folder: a finished run does not simulate them again.
-
-    Returns:
-      Outcomes of the trials, shape (trial,).
     """
     case, key = _case(folder, settings, trials)
     found, why = outcomes.load(folder / FILE, key)
@@ -87,11 +79,7 @@ def steps_and_links(scene: Scene) -> float:
 
 
 def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
-    """Outcomes that `test` kept in a run folder, shape (trial,), if they are of its design today.
-
-    Returns:
-      The outcomes or None, and why there are none; see `runs.outcomes.load`.
-    """
+    """Outcomes that `test` kept of the run's design, or why there are none; see `outcomes.load`."""
     trials = outcomes.count(folder / FILE)
     return outcomes.load(folder / FILE, _case(folder, settings, trials)[1])
 
@@ -104,5 +92,4 @@ def _case(folder: Path, settings: Settings, trials: int) -> tuple[Case, str]:
 
 
 def _noise(settings: Settings) -> jax.Array:
-    """Key of the trials' noise."""
     return codesign.stream_key(jax.random.key(settings.seed), STREAM_REFERENCE)

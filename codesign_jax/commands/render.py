@@ -74,7 +74,6 @@ def _camera(words: Sequence[str]) -> "Camera":
 
 
 def _number(name: str, text: str) -> tuple[str | None, float]:
-    """What is wrong with a number of a camera, and the number."""
     unit, most = _LIMITS[name]
     try:
         value = float(text)

@@ -40,7 +40,6 @@ def main(options: "Replay") -> int:
 
 
 def _default(folder: Path | None) -> Path:
-    """Where the page goes if the flags do not say."""
     return Path("replay.html") if folder is None else folder / "replay.html"
 
 

@@ -2,13 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 from rich.console import Console
 
 from codesign_jax import runs
-from codesign_jax.commands import common, reference, stress
-from codesign_jax.engines import make_engine
+from codesign_jax.commands import common, grasp, reference, stress
+from codesign_jax.commands.case import Case
 from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.manifest import read_provenance
 from codesign_jax.runs.progress import Busy
@@ -71,11 +69,7 @@ def best_grasp(
     scene: Scene, settings: Settings, record: Record, engine: str, console: Console
 ) -> "tuple[choice.Grasp, animation.Replay]":
     """The best grasp of the chosen design, simulated again to see how it moves."""
-    from codesign_jax.report import animation
-
-    grasp = choice.find_grasp(scene, record)
+    planned = choice.find_grasp(scene, record)
+    case = Case(scene, design_space(scene.hand, settings.preset), planned.design, engine)
     with Busy(console, "simulating the best grasp again"):
-        params = design_space(scene.hand, settings.preset).params(jnp.asarray(grasp.design))
-        trials = jax.tree.map(lambda v: v[None], grasp.trial)
-        [replay] = animation.replay(scene, make_engine(engine, scene), params, trials)
-    return grasp, replay
+        return planned, grasp.simulate(grasp.Asked(case, planned.trial, "", None))

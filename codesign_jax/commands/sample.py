@@ -71,7 +71,6 @@ def main(options: "Sample") -> int:
 
 
 def _check(options: "Sample") -> None:
-    """Refuses numbers out of range, and a place that cannot be written."""
     problems = common.number_problems(
         ("--designs", options.designs, 1, MOST),
         ("--trials", options.trials, 1, 100_000),
@@ -102,7 +101,6 @@ def _question(options: "Sample", scene: Scene) -> Question:
 
 
 def _amount(options: "Sample") -> str:
-    """Designs and grasps in words."""
     sizes = (options.designs, "design"), (options.trials, "trial")
     each = " x ".join(common.counted(*size) for size in sizes)
     return f"{each}: {common.counted(_grasps(options), 'grasp')}"
@@ -113,7 +111,6 @@ def _grasps(options: "Sample") -> int:
 
 
 def _finished(options: "Sample", question: Question) -> bool:
-    """Whether the file is there and has what is asked."""
     done = dataset.finished(options.out)
     if done is None:
         return False
@@ -153,11 +150,7 @@ def _simulate(
     interrupts: Interrupts,
     console: Console,
 ) -> _Tally:
-    """Simulates the shards that are missing.
-
-    Raises:
-      Stopped: If a signal came; what was simulated is saved.
-    """
+    """Simulates the shards that are missing."""
     simulate = sampling.make_simulate(question.scene, engine, question.space)
     tally = _Tally(np.zeros(len(VERDICTS), int))
     total = question.shards(designs)

@@ -29,7 +29,6 @@ def main(options: "Scenes") -> int:
 
 
 def _table(scene: scenes.Scene, engines: tuple[str, ...]) -> Table:
-    """Effects of a scene, a row each, with a column for each engine."""
     # A narrow console breaks between words, never inside a name that a scene file may have.
     states = [Column(engine, min_width=len("unsupported")) for engine in engines]
     table = Table(Column("effect", no_wrap=True), *states, "meaning", box=box.SIMPLE)

@@ -62,13 +62,7 @@ HELD = 10
 
 
 def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
-    """Simulates the design under every condition, in the same trials.
-
-    Args:
-      case: The design and its scene.
-      trials: Grasps of each condition.
-      key: Key of the trials' noise.
-    """
+    """Simulates the design under every condition, in the same trials."""
     scene, conditions, kept = case.scene, [], []
     run = _program(scene, case.engine, case.space, trials)
     design = jnp.asarray(case.design, jnp.float32)

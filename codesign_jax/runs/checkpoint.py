@@ -129,7 +129,6 @@ class Checkpoints:
         self._forget_old_digests()
 
     def _write_digests(self, step: int, arrays: Arrays) -> None:
-        """Writes the digests of a step, which make it whole."""
         lines = [f"# arrays {digest(arrays)}"]
         for path in sorted((self.folder / str(step)).rglob("*")):
             if path.is_file():
@@ -155,11 +154,7 @@ class Checkpoints:
         return Restored(None, {}, tuple(damaged))
 
     def discard(self, steps: Iterable[int]) -> None:
-        """Deletes damaged steps, so that their numbers can be saved again.
-
-        Raises:
-          RunError: If one cannot be deleted.
-        """
+        """Deletes damaged steps, so that their numbers can be saved again."""
         for step in steps:
             # Not the manager's delete: it fails on a step whose files are missing.
             places = self.folder / str(step), self._digests(step)
@@ -175,11 +170,7 @@ class Checkpoints:
         self._manager.reload()
 
     def _read(self, step: int) -> tuple[Arrays, str]:
-        """Returns a step's arrays, or why they cannot be trusted.
-
-        Raises:
-          RunError: If it cannot be read now, though it may be whole.
-        """
+        """Returns a step's arrays, or why they cannot be trusted."""
         try:
             expected, reason = self._compare(step)
             if reason:
@@ -201,12 +192,7 @@ class Checkpoints:
         return (arrays, "") if digest(arrays) == expected else ({}, "its arrays' digest differs")
 
     def _compare(self, step: int) -> tuple[str, str]:
-        """Compares a step's files with their digests; returns the arrays' one and what is wrong.
-
-        Raises:
-          OSError: If a file cannot be read.
-          RunError: If the digests are another step's.
-        """
+        """Compares a step's files with their digests; returns the arrays' one and what is wrong."""
         path = self._digests(step)
         if path.exists() and not path.is_file():
             return "", f"{path.name} is no file"
@@ -230,7 +216,6 @@ class Checkpoints:
         return expected, ""
 
     def _check_label(self, step: int, label: Arrays | None) -> None:
-        """Refuses a step of another run, and one that has another step's number."""
         if label is None and self._run is None:
             return
         try:
@@ -287,7 +272,6 @@ def file_digest(path: Path) -> str:
 
 
 def _label(run: str, step: int) -> Arrays:
-    """Arrays that say whose a step is."""
     return {
         "id": np.frombuffer(bytes.fromhex(run), np.uint8),
         "step": np.array(step, np.int32),

@@ -55,12 +55,7 @@ class Chosen(NamedTuple):
 
 
 def read_record(folder: Path, *, tell: Tell | None = None) -> Record:
-    """Reads a run's newest whole checkpoint.
-
-    Args:
-      folder: The run folder.
-      tell: Called with what is amiss, see `runs.load_record`; None to warn.
-    """
+    """Reads a run's newest whole checkpoint."""
     record = load_record(folder, tell=tell)
     if record is None or record.done == 0:
         raise InputError([f"run {folder} has no finished episode yet"])

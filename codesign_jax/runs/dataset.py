@@ -39,16 +39,7 @@ _WORDS = {"chunk": "designs of a call (by --chunk)"}
 
 @dataclasses.dataclass(frozen=True)
 class Question:
-    """What grasps a file has, but for their number.
-
-    Attributes:
-      scene: The scene.
-      engine: Name of the engine.
-      preset: Name of the design space.
-      trials: Trials of each design.
-      seed: Root of designs and trials.
-      chunk: Designs that one call simulates, a shard.
-    """
+    """What grasps a file has, but for their number."""
 
     scene: Scene
     engine: str

@@ -108,18 +108,7 @@ def check_folder(
     fresh: bool = False,
     sources: Iterable[Path] = (),
 ) -> None:
-    """Checks that a run could start or go on in a folder; changes nothing.
-
-    Args:
-      path: The folder.
-      scene: The scene of the run.
-      settings: Its settings.
-      fresh: Whether an earlier run's files will be deleted.
-      sources: Files that the scene was read from.
-
-    Raises:
-      InputError: See `open_run`.
-    """
+    """Checks that a run could start or go on in a folder; changes nothing."""
     _refuse_foreign(path)
     if not (path / PROVENANCE).exists():
         return
@@ -129,20 +118,12 @@ def check_folder(
         _refuse_to_delete(path, (*sources, *meshes))
     else:
         _refuse_other(path, scene, settings, stored)
-        if reading.lost_all(path):
-            raise InputError([reading.lost_all(path)])
+        if problem := reading.lost(path):
+            raise InputError([problem])
 
 
 def setting_of(paths: Iterable[Path], name: str) -> Any:
-    """A setting of the runs in folders, such as their episodes; None if no folder has a run.
-
-    Args:
-      paths: The folders.
-      name: Name of the setting.
-
-    Raises:
-      InputError: If the runs differ in it, or one cannot be read.
-    """
+    """A setting of the runs in folders, such as their episodes; None if no folder has a run."""
     found = [path for path in paths if (path / PROVENANCE).exists()]
     values = {path: manifest.read_provenance(path)["settings"][name] for path in found}
     if len(set(values.values())) > 1:
@@ -175,7 +156,6 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
-    """Notes a resumption or extension; returns what the user should know about it."""
     stored = manifest.read_provenance(path)
     notes = _differences(stored["environment"], environment())
     stored["resumed"] = [*stored.get("resumed", []), manifest.start_note(command)]
@@ -195,7 +175,6 @@ def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
-    """Refuses to resume another run, and says what differs."""
     problems, extension = [], []
     for name, value in dataclasses.asdict(settings).items():
         stood = stored["settings"][name]
@@ -265,7 +244,6 @@ def _own_command(stored: dict[str, Any]) -> list[str]:
 
 
 def _beginning(lines: list[str]) -> list[str]:
-    """The first lines of many, and how many more there are."""
     rest = len(lines) - _MOST_LINES
     return lines if rest <= 0 else [*lines[:_MOST_LINES], f"and {rest} lines more"]
 
@@ -367,7 +345,6 @@ def _top(path: Path) -> list[str]:
 
 
 def _all(path: Path) -> list[str]:
-    """Names of the files in a folder, and in the folders that a run has there."""
     found = []
     for name in _top(path):
         inside = path / name
@@ -397,7 +374,6 @@ def _is_lock(path: Path) -> bool:
 
 
 def _is_of_a_run(path: Path, name: str) -> bool:
-    """Whether a run makes files of this name."""
     folder, _, inside = name.rpartition("/")
     if folder:
         return _INSIDE[folder].fullmatch(_named(inside)) is not None
@@ -405,5 +381,4 @@ def _is_of_a_run(path: Path, name: str) -> bool:
 
 
 def _some(names: list[str]) -> str:
-    """The first of some names, and how many more there are."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -18,9 +18,6 @@ def interruptible(function: Callable[..., T], *arguments: Any) -> T:
 
     The function goes on in a thread of its own until the process ends: what may be interrupted must
     have nothing to save.
-
-    Raises:
-      KeyboardInterrupt: If SIGINT came.
     """
     future: concurrent.futures.Future[T] = concurrent.futures.Future()
 
@@ -38,11 +35,7 @@ def interruptible(function: Callable[..., T], *arguments: Any) -> T:
 
 
 class Stopped(Exception):
-    """The user asked to stop, and nothing is left to save.
-
-    Attributes:
-      signum: Number of the signal that came.
-    """
+    """The user asked to stop, and nothing is left to save."""
 
     def __init__(self, signum: int):
         """Takes the signal's number."""
@@ -55,9 +48,6 @@ class Interrupts:
 
     Simulations run in a worker thread: a signal's handler runs between two byte codes of the main
     thread, which a simulation may otherwise hold for minutes.
-
-    Attributes:
-      signum: Number of the signal that came, or 0.
     """
 
     def __init__(self, notify: Callable[[str], None]):
@@ -81,19 +71,11 @@ class Interrupts:
         self._worker.shutdown()
 
     def call(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Runs a function and waits until its arrays are there.
-
-        Raises:
-          Stopped: If a signal came before.
-        """
+        """Runs a function and waits until its arrays are there."""
         return self.begin(lambda: lambda: function(*arguments))()
 
     def begin(self, function: Callable[..., Callable[[], T]], *arguments: Any) -> Callable[[], T]:
-        """Runs a function, and goes on with the one that it returns; returns what waits for that.
-
-        Raises:
-          Stopped: If a signal came before.
-        """
+        """Runs a function, then the one that it returns; returns what waits for that."""
         if self.signum:
             raise Stopped(self.signum)
         begun = threading.Event()

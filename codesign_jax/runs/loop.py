@@ -22,7 +22,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.optimize import NoSeed, Optimizer, State, translated
 from codesign_jax.runs import failures, reading, tables
 from codesign_jax.runs import record as records
-from codesign_jax.runs.checkpoint import Checkpoints, Restored
+from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.directory import RunDirectory
 from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.interrupts import Stopped
@@ -210,10 +210,6 @@ class Loop:
         those since the last checkpoint. The run does so by itself before its next episode is over;
         whoever drives it may ask for it while that episode is simulated. It asks nothing of the
         devices, which are busy then.
-
-        Raises:
-          AllFailed: If every trial of the episode failed.
-          OSError: If the episode cannot be saved; earlier ones stay intact.
         """
         unsaved, self._unsaved = self._unsaved, None
         if unsaved is not None:
@@ -225,7 +221,11 @@ class Loop:
     def _restore(self) -> Record | None:
         found = self.store.restore()
         if found.step is None:
-            self._begin_anew(found)
+            if problem := reading.lost(self.run_directory.path, found):
+                raise RunError(problem)
+            for step, reason in found.damaged:
+                self._say(f"checkpoint {step} is lost: {reason}; the run begins anew")
+            self.store.discard([step for step, _ in found.damaged])
             return None
         record, self._saved = records.from_arrays(found.arrays), found.step
         plan = self.plan
@@ -247,19 +247,7 @@ class Loop:
             self._say(f"all {total} episodes are done in {self.run_directory.path}")
         return record
 
-    def _begin_anew(self, found: Restored) -> None:
-        """Refuses to begin anew where results would be overwritten."""
-        reasons = "; ".join(f"{step}: {reason}" for step, reason in found.damaged)
-        folder = self.run_directory.path
-        if episodes := tables.episodes_in(folder):
-            which = f"no checkpoint that is whole ({reasons})" if reasons else "no checkpoint"
-            raise RunError(f"{folder} has {which}, {reading.lost(episodes)}")
-        for step, reason in found.damaged:
-            self._say(f"checkpoint {step} is lost: {reason}; the run begins anew")
-        self.store.discard([step for step, _ in found.damaged])
-
     def _seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Record]:
-        """Finds the seed particle and saves it as step 0."""
         plan, settings = self.plan, self.plan.settings
         if needs_poor_seed(plan):
             start = yield from self._poor_seed()
@@ -273,7 +261,6 @@ class Loop:
         return record
 
     def _poor_seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Start]:
-        """Looks for a design that loses most of its objects."""
         plan, batch = self.plan, self.plan.settings.particles
         search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, batch=batch)
         with self.progress.busy("looking for a poor seed") as watch:
@@ -314,11 +301,7 @@ class Loop:
             self._unsaved = partial(self._close, record, e, fetched, watch.seconds)
 
     def _close(self, record: Record, e: int, info: EpisodeInfo, seconds: float) -> None:
-        """Saves an episode and reports it.
-
-        Raises:
-          AllFailed: If every trial failed; the episode is saved.
-        """
+        """Saves an episode and reports it."""
         records.add_report(record.history, e, info)
         self._save_failures(e, info)
         last = e + 1 == self.plan.settings.episodes or record.failed_status() is not None
@@ -335,14 +318,12 @@ class Loop:
             _all_failed(status, self.run_directory.path)
 
     def _save_failures(self, e: int, info: EpisodeInfo) -> None:
-        """Saves failed worlds with their last good states, for `codesign replay`."""
         if not types.failed(np.asarray(info.outcomes.status)).any():
             return
         for path in failures.save(self.run_directory.path, e + 1, info):
             self.run_directory.log(f"failed world: codesign replay {path}")
 
     def _test(self, record: Record) -> Asking:
-        """Tests the final particles once and saves the outcomes as one more step."""
         plan, settings = self.plan, self.plan.settings
         if self._tested(record):
             return
@@ -391,7 +372,6 @@ class Loop:
             tables.write_tests(folder, plan.space, np.asarray(record.state.particles), test)
 
     def _mend_tables(self, record: Record) -> None:
-        """Writes the tables that differ from what the run has so far, and says which."""
         plan, folder = self.plan, self.run_directory.path
         mended = tables.mend(folder, plan.scene, plan.space, record, _final_test(plan, record))
         if mended and record.done:

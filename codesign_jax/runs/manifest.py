@@ -175,7 +175,6 @@ def _runs_inside(path: Path) -> str:
 
 
 def _problem(stored: Any) -> str:
-    """What is wrong with the types of a provenance; nothing if they are right."""
     if not isinstance(stored, dict):
         return "it is no table"
     stored = {"resumed": [], "extended": []} | stored

@@ -12,15 +12,7 @@ from codesign_jax.types import Outcome
 
 
 def key(scene: Scene, engine: str, designs: np.ndarray, trials: int, seed: int) -> str:
-    """Digest of what determines outcomes, beside code, versions and device.
-
-    Args:
-      scene: The scene.
-      engine: Name of the engine.
-      designs: Designs [SI units], shape (design, parameter).
-      trials: Trials of each design.
-      seed: Root of the trials' noise.
-    """
+    """Digest of what determines outcomes, beside code, versions and device."""
     texts = {name: np.array(text) for name, text in scene_texts(scene).items()}
     how = {"engine": np.array(engine), "trials": np.array(trials), "seed": np.array(seed)}
     return digest({"scene": texts, "designs": np.asarray(designs)} | how)

@@ -34,12 +34,7 @@ class Column(NamedTuple):
 
 
 class Names(NamedTuple):
-    """Values of a column of the kind "name".
-
-    Attributes:
-      index: Which of the texts, integers of any shape.
-      texts: The texts.
-    """
+    """Values of a column of the kind "name"."""
 
     index: np.ndarray
     texts: list[str]

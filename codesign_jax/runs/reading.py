@@ -60,7 +60,7 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
       InputError: If the folder is no run, no checkpoint of it can be read, or they are another's.
     """
     tell = tell or (lambda text: warnings.warn(text, stacklevel=3))
-    if problem := lost_all(folder):
+    if problem := lost(folder):
         raise InputError([problem])
     if not (folder / "checkpoints").is_dir():
         return None
@@ -69,12 +69,15 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
     try:
         with Checkpoints(folder / "checkpoints", run=stored["id"], read_only=True) as store:
             found = store.restore()
-        if found.step is None:
-            return _none(folder, found)
-        record = records.from_arrays(found.arrays)
-        records.refuse_other(record, settings)
+        record = records.from_arrays(found.arrays) if found.arrays else None
+        if record is not None:
+            records.refuse_other(record, settings)
     except (RunError, OSError) as error:
         raise InputError([f"run {folder}: {error}"]) from error
+    if record is None:
+        if problem := lost(folder, found):
+            raise InputError([problem])
+        return None
     if found.damaged:
         steps = "; ".join(f"{step}: {reason}" for step, reason in found.damaged)
         test = "with" if record.test is not None else "without"
@@ -87,25 +90,16 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
     return record
 
 
-def lost_all(folder: Path) -> str:
-    """Says that a run has lost its checkpoints' folder; nothing if it has not, or had none yet."""
-    episodes = 0 if (folder / "checkpoints").is_dir() else tables.episodes_in(folder)
-    return f"run {folder} has lost its checkpoints, {lost(episodes)}" if episodes else ""
-
-
-def lost(episodes: int) -> str:
-    """What to do about a run whose checkpoints are all lost, in words."""
-    return (
-        f"while its tables have {episodes} episode{'s' * (episodes != 1)}. Put checkpoints/ back "
-        "from a copy; or copy the tables, if they are wanted, and begin anew with codesign "
-        "optimize --fresh"
-    )
-
-
-def _none(folder: Path, found: Restored) -> None:
-    """Refuses a run that has lost all checkpoints; one that has none yet is no error."""
-    steps = "; ".join(f"{step}: {reason}" for step, reason in found.damaged)
+def lost(folder: Path, found: Restored | None = None) -> str:
+    """Says that a run has no whole checkpoint while its tables have episodes; else nothing."""
     episodes = tables.episodes_in(folder)
-    if found.damaged or episodes:
-        damaged = f"no checkpoint that is whole ({steps})" if steps else "no checkpoint"
-        raise InputError([f"run {folder} has {damaged}, {lost(episodes)}"])
+    if not episodes or (found is None and (folder / "checkpoints").is_dir()):
+        return ""
+    damaged = found.damaged if found else ()
+    steps = "; ".join(f"{step}: {reason}" for step, reason in damaged)
+    what = f"no checkpoint that is whole ({steps})" if steps else "lost its checkpoints"
+    return (
+        f"run {folder} has {what}, while its tables have {episodes} "
+        f"episode{'s' * (episodes != 1)}. Put checkpoints/ back from a copy; or copy the tables, "
+        "if they are wanted, and begin anew with codesign optimize --fresh"
+    )

@@ -161,11 +161,7 @@ def from_arrays(arrays: dict) -> Record:
 
 
 def refuse_other(record: Record, settings: Settings) -> None:
-    """Refuses a record that is not of a run of these settings.
-
-    Raises:
-      RunError: With what differs.
-    """
+    """Refuses a record that is not of a run of these settings."""
     (_, n, t), done = record.history.outcomes.cost.shape, record.done
     asked = settings.particles, settings.trials, settings.episodes
     if asked[:2] != (n, t) or done > asked[2]:

@@ -129,7 +129,6 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
 
 
 def _schedule_problems(settings: Settings, space: DesignSpace | None) -> list[str]:
-    """Checks the schedule, on both domains where the design space is not known."""
     domains = (True, False) if space is None else space.is_morphology
     try:
         schedule(settings.schedule, list(domains), settings.episodes, settings.first)  # type: ignore[arg-type]

@@ -47,14 +47,7 @@ def write_episodes(
 
 
 def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: FinalTest) -> None:
-    """Writes the final particles and their test.
-
-    Args:
-      folder: The run folder.
-      space: The design space.
-      particles: Final particles [SI units], shape (particle, parameter).
-      test: Their test.
-    """
+    """Writes the final particles and their test."""
     _replace(folder / TESTS, _text(TESTS, space, _of_test(space, particles, test)))
 
 
@@ -65,13 +58,6 @@ def mend(
 
     A process that was killed between a checkpoint and its rows leaves files without these; others
     were damaged or changed by somebody.
-
-    Args:
-      folder: The run folder.
-      scene: The scene.
-      space: The design space.
-      record: The run.
-      test: Its final test, or None if it has none yet; its file is deleted then.
     """
     wanted = _of_episodes(scene, space, record.history, range(record.done))
     if test is not None:
@@ -111,14 +97,7 @@ def noise_values(trials: Trial) -> dict[str, Any]:
 
 
 def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> None:
-    """Writes a design's trials with their noise and how they ended, a row each.
-
-    Args:
-      path: The file; its folder is made.
-      scene: The scene that was simulated.
-      trials: The trials, arrays with leading axis (trial,).
-      outcomes: Their outcomes, arrays of shape (trial,).
-    """
+    """Writes a design's trials with their noise and how they ended, a row each."""
     names, noise = [s.name for s in scene.objects.object], noise_values(trials)
 
     def row(t: int) -> Row:
@@ -240,7 +219,6 @@ def _ending(outcome: Outcome) -> Row:
 
 
 def _designs(table: str, space: DesignSpace, population: np.ndarray) -> list[Row]:
-    """The columns of designs in a table."""
     names = TABLES[table].head(design_columns(space))[-len(space.names) :]
     values = space.in_units(population)
     return [dict(zip(names, map(_number, design), strict=True)) for design in values]
@@ -253,7 +231,6 @@ def _number(value: Any) -> str:
 def _of_episodes(
     scene: Scene, space: DesignSpace, history: History, span: range
 ) -> dict[str, Iterable[Row]]:
-    """Rows of the tables of episodes, by the files' names."""
     return {
         "episodes.csv": _episodes(history, space, span),
         "particles.csv": _particles(history, space, span),
@@ -262,7 +239,6 @@ def _of_episodes(
 
 
 def _of_test(space: DesignSpace, particles: np.ndarray, test: FinalTest) -> Iterator[Row]:
-    """Rows of the table of the final test."""
     failed = types.failed(np.asarray(test.outcomes.status))
     for i, design in enumerate(_designs(TESTS, space, particles)):
         yield {
@@ -281,11 +257,7 @@ def _text(table: str, space: DesignSpace, rows: Iterable[Row], *, named: bool = 
 
 
 def written(head: list[str], rows: Iterable[Row], *, named: bool = True) -> str:
-    """Text of a table.
-
-    Raises:
-      ValueError: If a row has other columns.
-    """
+    """Text of a table."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, head, lineterminator="\n")
     if named:
@@ -303,5 +275,4 @@ def _replace(path: Path, text: str) -> None:
 
 
 def _content(path: Path) -> bytes | None:
-    """A file's bytes; None if there is none."""
     return path.read_bytes() if path.is_file() else None

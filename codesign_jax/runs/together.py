@@ -30,30 +30,10 @@ Any other error is unexpected: its traceback is kept.
 """
 
 
-class Timing(NamedTuple):
-    """What the runs took.
-
-    Attributes:
-      compile_seconds: Compiling the episode; 0 if there was nothing to simulate.
-      seconds: Simulations with the saving in between.
-      grasps: Grasps of these.
-    """
-
-    compile_seconds: float = 0.0
-    seconds: float = 0.0
-    grasps: int = 0
-
-
 class Results(NamedTuple):
-    """How runs ended.
-
-    Attributes:
-      runs: Result of each run by its folder, or why it failed.
-      timing: What they took; with more than `MOST` runs that of the first ones.
-    """
+    """Result of each run by its folder, or why it failed."""
 
     runs: dict[Path, RunResult | Exception]
-    timing: Timing
 
     @property
     def signum(self) -> int:
@@ -91,7 +71,7 @@ def optimize(
       ValueError: If the plans are not variants of one.
     """
     found: dict[Path, RunResult | Exception] = {}
-    timing, folders = None, list(plans)
+    folders = list(plans)
     begun = {"fresh": fresh, "sources": tuple(sources)}
     for plan in plans.values():
         variant(plans[folders[0]], plan.settings)
@@ -99,10 +79,9 @@ def optimize(
         group = {folder: plans[folder] for folder in folders[start : start + MOST]}
         results = _group(group, command, begun, devices, chunk, every, after)
         found |= results.runs
-        timing = timing or results.timing
         if results.signum:
             break
-    return Results(found, timing or Timing())
+    return Results(found)
 
 
 def run_names(every: Mapping[Path, Settings]) -> dict[Path, str]:
@@ -157,7 +136,7 @@ class _Together:
         batch: Batch,
     ):
         self.plan, self.loops, self.progress = plan, loops, progress
-        self.interrupts, self.timing, self.seconds = interrupts, Timing(), 0.0
+        self.interrupts, self.seconds = interrupts, 0.0
         self.batch = batch
         self.waiting: dict[Path, tuple[Generator, Request]] = {}
         self.found: dict[Path, RunResult | Exception] = {}
@@ -183,7 +162,7 @@ class _Together:
             for folder in self.loops
             if (r := self.found.get(folder)) is not None
         }
-        return Results(ended, self.timing)
+        return Results(ended)
 
     def _go_on(self, folder: Path, asking: Generator, reply: Any) -> None:
         """Lets a run go on until it wants another episode or ends."""
@@ -208,7 +187,6 @@ class _Together:
         self.progress.compiled()
         for folder in self.waiting:
             self.loops[folder].run_directory.log(message)
-        self.timing = Timing(watch.seconds)
 
     def _test(self, request: Request) -> Request | None:
         """What the final test will ask for, if that is another program than an episode's."""
@@ -231,11 +209,6 @@ class _Together:
             if folder in self.waiting:
                 self._go_on(folder, self.waiting.pop(folder)[0], reply)
         self.seconds = time.perf_counter() - start
-        trials = self.plan.settings.trials
-        grasps = sum(len(request.state.particles) * trials for request in asked.values())
-        self.timing = self.timing._replace(
-            seconds=self.timing.seconds + self.seconds, grasps=self.timing.grasps + grasps
-        )
 
     def _save(self) -> None:
         """Saves the last episode of each run; those that cannot be saved end."""

@@ -198,19 +198,6 @@ def test_record_survives_its_arrays_bitwise(run):
     assert again.done == 3 and jnp.issubdtype(again.state.key.dtype, jax.dtypes.prng_key)
 
 
-def test_a_record_of_an_older_version_tells_nothing_of_the_solver(run):
-    """Its arrays lack how the solver ended; all else is read, and the tables have empty cells."""
-    the_scene, _, record, _ = run
-    arrays = records.to_arrays(record)
-    for outcomes in (arrays["history"]["trials"], arrays["test"]):
-        del outcomes["capped"], outcomes["residual"]
-    again = records.from_arrays(arrays)
-    assert again.test is not None and np.isnan(again.test.capped).all()
-    np.testing.assert_array_equal(again.history.outcomes.cost, record.history.outcomes.cost)
-    for row in tables._trials(again.history, the_scene, range(1)):
-        assert row["steps_at_limit"] == row["residual"] == ""
-
-
 def test_history_of_a_restored_record_can_be_written(run):
     _, _, record, _ = run
     arrays = jax.tree.map(lambda v: np.asarray(jnp.asarray(v)), records.to_arrays(record))

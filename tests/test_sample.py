@@ -231,7 +231,7 @@ def test_fewer_designs_of_what_was_begun_are_enough(place, monkeypatch):
     assert run(out="whole.parquet") == 0
     killed_after(2, monkeypatch)
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(dataset.parquet, "table", lambda *_: (_ for _ in ()).throw(Killed))
+        patch.setattr(dataset, "_table", lambda *_: (_ for _ in ()).throw(Killed))
         run(designs=7, chunk=None)
     assert not (place / "a.parquet").exists()
     assert run(designs=7, chunk=None) == 0

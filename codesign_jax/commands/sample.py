@@ -13,7 +13,7 @@ from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.commands import calls, common
 from codesign_jax.commands.calls import Meter
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.runs import dataset, parquet
+from codesign_jax.runs import dataset
 from codesign_jax.runs.dataset import Question
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.scene import Scene
@@ -83,7 +83,7 @@ def _check(options: "Sample") -> None:
     if problems:
         raise InputError(problems)
     if not options.outcomes:
-        parquet.pyarrow_module("codesign sample")
+        dataset.pyarrow_module("codesign sample")
     common.check_place("--out", options.out)
 
 

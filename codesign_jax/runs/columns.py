@@ -36,7 +36,6 @@ TABLES = {
     ),
 }
 
-DESIGNS = "the design"
 GRASPS = {
     "design": ("int32", "", "index of the design, from 0"),
     "trial": ("int32", "", "index of the design's trial, from 0"),

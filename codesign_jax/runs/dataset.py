@@ -1,4 +1,4 @@
-"""Grasps of random designs in one Parquet file, in steps that survive a kill.
+"""Grasps of random designs in one Parquet file (extra `parquet`), in steps that survive a kill.
 
 A row follows from the question (scene, design space, seed, ...) and the indices of design and
 trial, but for its outcome.  So a file beside the unfinished one holds outcomes alone, a shard for
@@ -11,7 +11,8 @@ import hashlib
 import json
 import uuid
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,9 +20,7 @@ import numpy as np
 from codesign_jax import files, reuse, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.provenance import environment
-from codesign_jax.runs import parquet
-from codesign_jax.runs.columns import DESIGNS, GRASPS, MAY_BE_EMPTY
-from codesign_jax.runs.parquet import Column, Names
+from codesign_jax.runs.columns import GRASPS, MAY_BE_EMPTY
 from codesign_jax.runs.scene_files import contents, scene_texts
 from codesign_jax.runs.tables import design_columns, noise_values, status_names
 from codesign_jax.sampling import Drawn
@@ -29,7 +28,7 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
 from codesign_jax.store import Store
-from codesign_jax.types import Outcome
+from codesign_jax.types import Outcome, Status
 
 ROWS = 1 << 16
 """About as many rows are written at once: a row group of the file."""
@@ -119,7 +118,7 @@ def finished(path: Path) -> tuple[dict[str, Any], int] | None:
     """Question, as `Question.described`, and number of designs of a file; None if there is none."""
     if not path.exists():
         return None
-    pa = parquet.pyarrow_module("--out")
+    pa = pyarrow_module("--out")
     try:
         metadata = pa.parquet.read_schema(path).metadata or {}
         return json.loads(metadata[b"question"]), json.loads(metadata[b"designs"])
@@ -128,16 +127,51 @@ def finished(path: Path) -> tuple[dict[str, Any], int] | None:
         raise InputError([f"{problem}; choose another"]) from error
 
 
-def columns(space: DesignSpace) -> dict[str, Column]:
-    """The columns of a file, by name."""
-    found = {
-        name: Column(kind, text, {"unit": unit} if unit else {}, nullable=name in MAY_BE_EMPTY)
-        for name, (kind, unit, text) in GRASPS.items()
-    }
-    names = zip(design_columns(space), space.names, space.units, strict=True)
-    for column, name, unit in names:
-        found[column] = Column("float32", DESIGNS, {"unit": unit, "parameter": name})
-    return found
+class Names(NamedTuple):
+    """Values of a column of few texts: which of them, integers of any shape, and the texts."""
+
+    index: np.ndarray
+    texts: list[str]
+
+
+def pyarrow_module(what: str) -> ModuleType:
+    """Returns pyarrow."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ModuleNotFoundError as error:
+        message = f"{what} needs {error.name}: pip install '.[parquet]' in the checkout"
+        raise InputError([message]) from error
+    return pyarrow
+
+
+def _schema(pa: ModuleType, space: DesignSpace, notes: dict[str, Any]) -> Any:
+    fields = []
+    for name, (kind, unit, text) in GRASPS.items():
+        named = pa.dictionary(pa.int16(), pa.string())
+        about = {"description": text} | ({"unit": unit} if unit else {})
+        own, empty = named if kind == "name" else getattr(pa, kind)(), name in MAY_BE_EMPTY
+        fields.append(pa.field(name, own, nullable=empty, metadata=about))
+    for column, name, unit in zip(design_columns(space), space.names, space.units, strict=True):
+        about = {"description": "the design", "unit": unit, "parameter": name}
+        fields.append(pa.field(column, pa.float32(), nullable=False, metadata=about))
+    return pa.schema(fields, {name: json.dumps(note) for name, note in notes.items()})
+
+
+def _table(pa: ModuleType, schema: Any, columns: dict[str, Any], shape: tuple[int, int]) -> Any:
+    """A row for each entry of arrays that broadcast to a shape; masked entries are missing."""
+    arrays = []
+    for field in schema:
+        value = columns[field.name]
+        if isinstance(value, Names):
+            index = np.broadcast_to(value.index, shape).ravel().astype(np.int16)
+            arrays.append(pa.DictionaryArray.from_arrays(pa.array(index), value.texts))
+            continue
+        mask = np.ma.getmask(value)
+        flat = np.broadcast_to(np.ma.getdata(value), shape).ravel()
+        masked = None if mask is np.ma.nomask else np.broadcast_to(mask, shape).ravel()
+        arrays.append(pa.array(flat.astype(field.type.to_pandas_dtype()), mask=masked))
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[str, Any]:
@@ -165,15 +199,18 @@ def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[s
 
 def write(path: Path, question: Question, designs: int, outcomes: Store) -> None:
     """Writes the file from its outcomes, as a whole or not at all."""
-    pa = parquet.pyarrow_module("--out")
+    pa = pyarrow_module("--out")
     notes = {"question": question.described, "designs": designs, "environment": environment()}
-    notes |= {"status_bits": parquet.STATUS_BITS}
-    schema = parquet.arrow_schema(pa, columns(question.space), notes)
+    notes |= {"status_bits": {str(int(bit)): bit.name for bit in Status if bit}}
+    schema = _schema(pa, question.space, notes)
     shape, left, group = (question.chunk, question.trials), designs * question.trials, []
-    with files.naming(path), parquet.writing(pa, path, schema) as writer:
+    with (
+        files.atomically(path) as temporary,
+        pa.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,
+    ):
         for shard, arrays in zip(range(question.shards(designs)), outcomes, strict=False):
             values = rows(question, shard, question.drawn(shard), Outcome(**arrays))
-            group.append(parquet.table(pa, schema, values, shape).slice(0, left))
+            group.append(_table(pa, schema, values, shape).slice(0, left))
             left -= group[-1].num_rows
             if not left or sum(table.num_rows for table in group) >= ROWS:
                 # Groups are written as they are, whatever the writer's own size is.
@@ -184,5 +221,6 @@ def write(path: Path, question: Question, designs: int, outcomes: Store) -> None
 
 def most_bytes(question: Question, designs: int) -> int:
     """About how many bytes a file has at most: numbers compress by a few per cent."""
-    kinds = [column.kind for column in columns(question.space).values()]
-    return designs * question.trials * sum(1 if kind == "name" else 4 for kind in kinds)
+    names = sum(kind == "name" for kind, _, _ in GRASPS.values())
+    numbers = len(GRASPS) - names + question.space.num_parameters
+    return designs * question.trials * (names + 4 * numbers)

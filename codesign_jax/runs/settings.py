@@ -43,7 +43,7 @@ class Settings:
     episodes: int
     seed: int
     test_trials: int
-    optimizer: str = optimize.PAPER  # of runs from before there were others
+    optimizer: str = optimize.PAPER
     cost: str = SCENE_COST
 
     @property

@@ -12,7 +12,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import jax
 
@@ -24,13 +24,6 @@ if TYPE_CHECKING:
 
 WAIT = 7 * 24 * 3600
 """Longest time that a process waits for the others' runs [s]."""
-
-
-class Hosts(NamedTuple):
-    """Which of how many processes this one is."""
-
-    index: int = 0
-    count: int = 1
 
 
 def check(text: str) -> tuple[str, int, int] | None:
@@ -48,8 +41,8 @@ def check(text: str) -> tuple[str, int, int] | None:
     return match[1], int(match[2]), int(match[3])
 
 
-def join(text: str) -> Hosts:
-    """Meets the other processes; before anything of JAX is used."""
+def join(text: str) -> tuple[int, int]:
+    """Meets the others, before anything of JAX is used: which of how many processes this is."""
     given = check(text)
     address, count, index = given or (None, None, None)
     jax.config.update("jax_platforms", "cpu")  # this process leaves the GPUs to the one that runs
@@ -57,21 +50,21 @@ def join(text: str) -> Hosts:
         jax.distributed.initialize(address, count, index, shutdown_timeout_seconds=WAIT)
     except (RuntimeError, ValueError) as error:
         raise InputError([f"--distributed {text}: {error}"]) from error
-    return Hosts(jax.process_index(), jax.process_count())
+    return jax.process_index(), jax.process_count()
 
 
-def run(options: "Optimize") -> tuple[int, Hosts]:
-    """Runs this host's seeds, and waits until the runs of all hosts have ended."""
+def run(options: "Optimize") -> tuple[int, int]:
+    """Runs this host's seeds and waits for all hosts'; the exit status and this host's index."""
     chosen = common.parse_seeds(options.seeds or "")
-    here = join(options.distributed or "")
-    mine = ",".join(map(str, chosen[here.index :: here.count]))
+    index, count = join(options.distributed or "")
+    mine = ",".join(map(str, chosen[index::count]))
     code = 0
     if mine:
         own = dataclasses.replace(options, distributed=None, seeds=mine)
         code = in_a_process(own.run)
     if code < 128:  # not stopped by a signal
         jax.distributed.shutdown()
-    return code, here
+    return code, index
 
 
 def in_a_process(function: Callable[[], int]) -> int:

@@ -95,8 +95,8 @@ def _distributed(options: "Optimize") -> int:
         problems.append("--dry-run knows one host: leave out --distributed")
     if problems:
         raise InputError(problems)
-    code, here = hosts.run(options)
-    if here.index or code == 2 or code >= 128:
+    code, index = hosts.run(options)
+    if index or code == 2 or code >= 128:
         return code
     return hosts.in_a_process(functools.partial(_compare_all, options)) or code
 

@@ -81,7 +81,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
         text = file.read_text(encoding="utf-8")
     except OSError as error:
         if isinstance(error, FileNotFoundError | NotADirectoryError):
-            why = f"it has no {PROVENANCE}" if _exists(path) else "there is no such folder"
+            why = f"it has no {PROVENANCE}" if path.exists() else "there is no such folder"
         else:
             why = f"{PROVENANCE} cannot be read: {error.strerror}"
         raise InputError([f"{path} is not a run folder: {why}{_runs_inside(path)}"]) from error
@@ -152,13 +152,6 @@ def _digest(path: Path) -> str:
         return sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
     except OSError:
         return ""
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # such as a name that is too long
-        return False
 
 
 def _runs_inside(path: Path) -> str:

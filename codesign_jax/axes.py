@@ -28,8 +28,9 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
       InputError: With every array of another shape.
     """
     fingers = (scene.num_fingers,)
-    one = Params._make([fingers, fingers, fingers, (), (6,), fingers])
-    problems = _problems("params", params, one, axes[0])
+    one = Params(*[fingers, fingers, fingers, (), (6,), fingers])  # type: ignore[list-item]
+    problems = _problems("params", params._replace(control=None), one, axes[0])
+    problems += _control_problems(scene, params)
     problems += _problems("trials", trials, _TRIAL, axes[1])
     if not problems and axes[0] == axes[1]:
         counts = len(params.length), len(trials.yaw)
@@ -37,6 +38,24 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
             problems = [f"params have {counts[0]} {axes[0]}s and trials {counts[1]}"]
     if problems:
         raise InputError(problems)
+
+
+def _control_problems(scene: Scene, params: Params) -> list[str]:
+    """What is wrong with the parameters of the scene's control."""
+    one = {p.name: (scene.num_fingers,) * (p.per == "finger") for p in scene.control.parameter}
+    given = {k: np.shape(v) for k, v in (params.control or {}).items()}
+    if given.keys() != one.keys():
+        names = [", ".join(v) or "none" for v in (given, one)]
+        return [
+            f"params.control has {names[0]}; the scene's control {scene.control.name!r} needs "
+            f"{names[1]}"
+        ]
+    leading = np.shape(params.length)[:-1]
+    return [
+        f"params.control[{k!r}] has shape {given[k]}, not {(*leading, *shape)}"
+        for k, shape in one.items()
+        if given[k] != (*leading, *shape)
+    ]
 
 
 def refuse_other(scene: Any, engine: Any) -> None:

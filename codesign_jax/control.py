@@ -1,4 +1,4 @@
-"""Open-loop key frames: pressures and the pose of the arm frame X_D over a grasp (paper Fig. 3).
+"""Commands over a grasp: key frames, the disturbance that any of them gets, and the air supply.
 
 >>> import jax
 >>> from codesign_jax import control, parameters, rollout, scene
@@ -10,13 +10,11 @@
 ((900, 10), 120000)
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, key_frames
 from codesign_jax.types import Params, Trial
 
 
@@ -33,29 +31,39 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
       trial: Its trial; the arm frame carries the trial's roll and pitch noise.
     """
     time = np.arange(scene.num_steps) * scene.discretization.timestep
-    arm, p = params.arm, scene.phases
-    start, grasp = scene.arm.start_height, scene.arm.zero_height + arm[2]
-    # The approach is vertical: lateral position and orientation are the grasp's from the start
-    # [ours].
-    frames = jnp.stack([jnp.asarray(start, arm.dtype), grasp, grasp, jnp.asarray(start, arm.dtype)])
-    height = jnp.interp(time, _stack([0.0, p.approach, p.inflate, p.lift]), frames)
-    roll, pitch = _shake(scene, time)
-    ones = jnp.ones_like(height)
+    place = _place(scene, params, time)
+    x, y, z, roll, pitch, yaw = _between(place, key_frames.poses(scene, params)).T
+    shaken_roll, shaken_pitch = _shake(scene, time)
     # Positive pitch points the fingers towards +x, so that Table I's x = -20 mm with 15 degrees
     # aims the hand at the object [ours]; the wrist's hinge turns about +y, which points them
     # towards -x.
-    pose = [
-        arm[0] * ones,
-        arm[1] * ones,
-        height,
-        arm[3] + trial.arm_tilt[0] + roll,
-        arm[5] * ones,
-        pitch - arm[4] + trial.arm_tilt[1],
-    ]
-    pressure = params.pressure[:, None] * _inflation(scene, time)
+    roll = roll + trial.arm_tilt[0] + shaken_roll
+    pitch = shaken_pitch - pitch + trial.arm_tilt[1]
+    pressure = jnp.zeros((len(time), scene.num_fingers), params.pressure.dtype)
+    for value, factors in key_frames.pressures(scene, params):
+        pressure = pressure + value * _between(place, factors)
+    pressure = pressure.T
     if scene.effects.pressure_dynamics:
         pressure = supplied(scene, pressure)
-    return jnp.concatenate([jnp.stack(pose), pressure]).T
+    return jnp.concatenate([jnp.stack([x, y, z, roll, yaw, pitch]), pressure]).T
+
+
+def _place(scene: Scene, params: Params, time: np.ndarray) -> tuple[jax.Array, ...]:
+    """Between which key frames times are, and the share of the way, each of shape (time,)."""
+    at = key_frames.times(scene, params)
+    now = jnp.asarray(time, at.dtype)
+    reached = (at <= now[:, None]).sum(1)
+    before, after = jnp.maximum(reached - 1, 0), jnp.minimum(reached, len(at) - 1)
+    span = at[after] - at[before]
+    share = (now - at[before]) / jnp.where(span > 0, span, 1.0)
+    held = np.array([frame.interpolation == "held" for frame in scene.control.frame])
+    return before, after, jnp.where(jnp.asarray(held)[before], 0.0, share) if held.any() else share
+
+
+def _between(place: tuple[jax.Array, ...], knots: jax.Array) -> jax.Array:
+    """Interpolates values at the key frames, shape (frame, n), to (time, n)."""
+    before, after, share = place
+    return knots[before] + share[:, None] * (knots[after] - knots[before])
 
 
 def supplied(scene: Scene, wanted: jax.Array) -> jax.Array:
@@ -78,20 +86,6 @@ def supplied(scene: Scene, wanted: jax.Array) -> jax.Array:
         return now + jnp.clip(gain * (goal - now), -p.rate * h, p.rate * h), now
 
     return jax.lax.scan(step, target[:, 0], target.T)[1].T
-
-
-def _stack(keys: list[Any]) -> jax.Array:
-    return jnp.stack([jnp.asarray(k, float) for k in keys])
-
-
-def _inflation(scene: Scene, time: np.ndarray) -> jax.Array:
-    """Fraction of the nominal pressure, shape (time,)."""
-    p = scene.phases
-    keys, values = [p.approach, p.inflate], [0.0, 1.0]
-    if scene.effects.ungrasp:
-        end = scene.window[1]
-        keys, values = [*keys, end, end + p.deflate_time], [*values, 1.0, 0.0]
-    return jnp.interp(time, _stack(keys), _stack(values))
 
 
 def _shake(scene: Scene, time: np.ndarray) -> tuple[jax.Array, jax.Array]:

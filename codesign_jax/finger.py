@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from scipy import optimize
 
@@ -113,7 +114,7 @@ def of_design(scene: Scene, params: Params, index: int) -> Finger:
       index: Which finger.
     """
     hand, links = scene.hand, scene.discretization.links
-    params = Params._make(np.asarray(v, float) for v in params)
+    params = jax.tree.map(lambda v: np.asarray(v, float), params)
     beams = morphology.finger_beams(hand, params)
     springs, _ = morphology.joint_springs(hand, params, beams, links, ("bend",))
     return Finger(

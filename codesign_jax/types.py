@@ -86,6 +86,7 @@ class Params(NamedTuple):
       spread: Spread gamma between the finger pairs [rad], shape ().
       arm: Arm pose X_D after the approach: x, y, z [m], roll, pitch, yaw [rad], shape (6,).
       pressure: Chamber gauge pressure while grasping p_i [Pa], shape (finger,).
+      control: Parameters of the scene's control by name [SI], shape () or (finger,); None without.
 
     A design space makes them of the numbers that are free, given in the units of the hand file:
 
@@ -102,6 +103,7 @@ class Params(NamedTuple):
     spread: jax.Array
     arm: jax.Array
     pressure: jax.Array
+    control: dict[str, jax.Array] | None = None
 
 
 class Trial(NamedTuple):

@@ -25,6 +25,7 @@ from codesign_jax.scene import (
     description,
     effects,
     hand,
+    key_frames,
     objects,
     primitives,
 )
@@ -42,6 +43,12 @@ FILES = (
         "objects/",
         "`--objects`, or the key `objects` of a scene file",
     ),
+    (
+        "Control files",
+        key_frames.ControlFile,
+        "codesign_jax/controls/",
+        "`--set control=NAME`, or the key `control` of a scene file",
+    ),
     ("Presets of accuracy", Accuracy, "codesign_jax/scenes/accuracy/", "`--accuracy`"),
 )
 
@@ -54,12 +61,14 @@ The columns of a run's tables are in [files.md](files.md).
 
 ## Keys
 
-Scene, hand and object files are TOML. Everything is checked on reading: unknown and missing keys,
-types, ranges, and what does not go together, all at once and before anything is simulated.
+Scene, hand, object and control files are TOML. Everything is checked on reading: unknown and
+missing keys, types, ranges, and what does not go together, all at once and before anything is
+simulated.
 
-* A key's *path* leads from the scene's root, through `hand` and `objects` into the files that the
-  scene names; an entry of an array is named by its `name` or its index: `cost.failure`,
-  `hand.material.shear_modulus`, `hand.finger[0].tilt`, `objects.object.sphere.mass`.
+* A key's *path* leads from the scene's root, through `hand`, `objects` and `control` into the
+  files that the scene names; an entry of an array is named by its `name` or its index:
+  `cost.failure`, `hand.material.shear_modulus`, `hand.finger[0].tilt`,
+  `objects.object.sphere.mass`.
   `--set PATH=VALUE` and `scene.load(overrides=...)` replace any of them.
 * A range includes its ends. A key whose default is *required* must be given, one whose default is
   *not given* may be left out.
@@ -103,9 +112,9 @@ def _fields(schema: Any) -> list[dataclasses.Field]:
 
 def _inner(schema: type, field: dataclasses.Field) -> type | None:
     """The dataclass of a table or of an array of tables, None of a value."""
-    hint = typing.get_type_hints(schema)[field.name]
+    hint = field.metadata.get("table", typing.get_type_hints(schema)[field.name])
     for kind in (hint, *typing.get_args(hint)):
-        if dataclasses.is_dataclass(kind):
+        if dataclasses.is_dataclass(kind) and not _number_of(kind):
             return typing.cast(type, kind)
     return None
 
@@ -149,6 +158,7 @@ def _text(described: Any) -> str:
 def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
     """Unit, range and default of a field."""
     hint, limits = typing.get_type_hints(schema)[field.name], field.metadata
+    limits = _number_of(hint) or limits
     if "low" in limits:
         mark = f"{_SPACE}◆" if limits["structure"] else ""
         span = _range(limits["low"], limits["high"]) + mark
@@ -159,6 +169,13 @@ def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
         if any(typing.get_origin(kind) is tuple for kind in typing.get_args(hint)):
             span += ", or one for each finger"
     return limits.get("unit", ""), span, _default(field)
+
+
+def _number_of(hint: Any) -> Any:
+    """Unit and range of the number in a sum of a control file; None of other values."""
+    if isinstance(hint, type) and issubclass(hint, key_frames.Sum):
+        return next(f.metadata for f in dataclasses.fields(hint) if f.name == "number")
+    return next(filter(None, map(_number_of, typing.get_args(hint))), None)
 
 
 def _base(hint: Any) -> Any:

@@ -10,7 +10,6 @@ import pytest
 from codesign_jax import model, scene
 from codesign_jax.commands import preflight
 from codesign_jax.scene import constants, hand, schema
-from codesign_jax.types import Params
 from tests.helpers.grasps import DATA, hand_world
 
 SPREADS = np.deg2rad([0.0, 30.0, 60.0, 90.0, 110.0])
@@ -69,7 +68,7 @@ def test_contact_between_fingers_finds_none_at_rest():
     the_scene = coarse("paper")
     corners = itertools.product(CORNERS, SPREADS[[0, -1]])
     worlds = [hand_world(the_scene, length=n, height=h, spread=s)[0] for (n, h), s in corners]
-    designs = Params(*(np.stack(v) for v in zip(*worlds, strict=True)))
+    designs = jax.tree.map(lambda *v: np.stack(v), *worlds)
     assert not preflight.check(the_scene, designs._replace(wall=0 * designs.wall + 0.005)).refusals
 
 

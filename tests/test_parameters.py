@@ -176,7 +176,7 @@ def test_the_subset_agrees_with_the_full_table():
 def test_gradients_reach_every_free_parameter():
     """No entry of a design is lost on its way into Params."""
     for space in (FULL, PLANAR):
-        weights = jax.grad(lambda d, s=space: sum(v.sum() for v in s.params(d)))(
+        weights = jax.grad(lambda d, s=space: sum(v.sum() for v in jax.tree.leaves(s.params(d))))(
             jnp.asarray(space.default(), jnp.float32)
         )
         tied = [space.source.count(j) for j in range(space.num_parameters)]

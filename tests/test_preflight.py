@@ -20,7 +20,7 @@ from tests.helpers.grasps import hand_world, pinch, random_worlds, still
 def hands(scene, count):
     """Random hands of the whole table, NumPy arrays in float64 with leading axis (world,)."""
     params, _ = random_worlds(scene, 0, count)
-    return Params(*(np.asarray(v, float) for v in params))
+    return jax.tree.map(lambda v: np.asarray(v, float), params)
 
 
 def deepest(compiled, data, geoms, others):
@@ -74,7 +74,7 @@ def test_starts_inside_table_or_object_are_refused():
     """Straight fingers of 180 mm, 75 degrees down from 150 mm: as deep as MuJoCo C finds."""
     the_scene = pinch(arm__start_height=0.15)
     worlds = [hand_world(the_scene, length=length)[0] for length in (0.08, 0.18)]
-    designs = Params(*(np.stack(v) for v in zip(*worlds, strict=True)))
+    designs = jax.tree.map(lambda *v: np.stack(v), *worlds)
     [refusal] = preflight.check(the_scene, designs).refusals
     assert refusal.startswith("design 1: starts 17 mm inside the table or object 'box'")
     assert refusal.endswith("raise arm.start_height = 0.15 m")
@@ -103,7 +103,7 @@ def test_fingers_inside_one_another_are_refused(surface):
     effects = {"surface": surface, "finger_finger": True}
     the_scene = scene.load("paper_spheres", overrides={"effects": effects})
     both = [hand_world(the_scene, spread=np.deg2rad(x))[0] for x in (0.0, 60.0)]
-    designs = Params(*(np.stack(v) for v in zip(*both, strict=True)))
+    designs = jax.tree.map(lambda *v: np.stack(v), *both)
     refusals = preflight.check(the_scene, designs, ["together", "apart"]).refusals
     assert len(refusals) == 1 and refusals[0].startswith(
         "together: fingers start 20 mm inside one another (limits.penetration = 10 mm)"

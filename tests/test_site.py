@@ -20,6 +20,7 @@ BUILT_IN = {
     "Scene files": ROOT / "codesign_jax" / "scenes",
     "Hand files": ROOT / "hands",
     "Object files": ROOT / "objects",
+    "Control files": ROOT / "codesign_jax" / "controls",
     "Presets of accuracy": ROOT / "codesign_jax" / "scenes" / "accuracy",
 }
 
@@ -27,6 +28,9 @@ BUILT_IN = {
 def test_the_committed_reference_is_what_the_code_says():
     again = "python -m scripts.reference_page"
     assert reference_page.PAGE.read_text(encoding="utf-8") == reference_page.page(), again
+
+
+FREE = "fixed", "group", "pressure"  # tables whose keys are names
 
 
 def documented(page):
@@ -46,7 +50,7 @@ def used(heading, table, values):
     """Keys of a TOML file as `documented` has them, without those of tables of free keys."""
     for key, value in values.items():
         rows = value if isinstance(value, list) else [value]
-        if not isinstance(rows[0], dict) or key == "fixed" or heading.startswith("Presets"):
+        if not isinstance(rows[0], dict) or key in FREE or heading.startswith("Presets"):
             yield heading, table, key
             continue
         for row in rows:

@@ -54,7 +54,9 @@ def source_files(options: SceneFlags) -> tuple[Path, ...]:
     scene = library.find("scenes", options.scene or SCENE)
     table = library.read(scene)
     beside = {"hands": table.get("hand"), "objects": table.get("objects")}
+    beside["controls"] = table.get("control")
     given = {"hands": options.hand, "objects": options.objects, "accuracy": options.accuracy}
+    given["controls"] = changes(options).get(("control",))
     found = [library.find(kind, name) for kind, name in given.items() if name is not None]
     found += [scene.parent / n for n in beside.values() if isinstance(n, str) and n[-5:] == ".toml"]
     return scene, *found

@@ -5,6 +5,7 @@ The scene's own checks look at one number at a time; these look at what a design
 
 import functools
 import math
+import operator
 from typing import NamedTuple
 
 import jax
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model, rollout, start
-from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene import Constants, Scene, key_frames
 from codesign_jax.types import Params
 
 SHAKE_STEPS = 20
@@ -35,13 +36,13 @@ class Findings(NamedTuple):
 
 def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Findings:
     """Checks designs against the scene's limits; simulates nothing."""
-    designs = Params._make(np.asarray(v, float) for v in designs)
+    designs = jax.tree.map(lambda v: np.asarray(v, float), designs)
     count = designs.length.shape[0]
     names = names or [f"design {i}" for i in range(count)]
     report = Findings([], _scene_warnings(scene))
     sound = []
     for i, name in enumerate(names):
-        one = Params(*(v[i] for v in designs))
+        one = jax.tree.map(operator.itemgetter(i), designs)
         problems = _sections(scene, one, name)
         report.refusals.extend(problems)
         sound.append(not problems)
@@ -49,7 +50,7 @@ def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Find
             report.warnings.extend(_reach(scene, one, name))
     if any(sound):
         keep = np.array(sound)
-        kept = Params(*(v[keep] for v in designs))
+        kept = jax.tree.map(operator.itemgetter(keep), designs)
         report.refusals.extend(
             _overlaps(scene, kept, [n for n, s in zip(names, sound, strict=True) if s])
         )
@@ -89,7 +90,7 @@ def _scene_warnings(scene: Scene) -> list[str]:
 
 def _sections(scene: Scene, one: Params, name: str) -> list[str]:
     """Why a design's numbers are no hand."""
-    if not all(np.isfinite(v).all() for v in one):
+    if not all(np.isfinite(v).all() for v in jax.tree.leaves(one)):
         return [f"{name}: a parameter is not a finite number"]
     found = []
     for f in range(scene.num_fingers):
@@ -115,7 +116,7 @@ def _reach(scene: Scene, one: Params, name: str) -> list[str]:
     """Warns if no finger can come down to the object's top, even straight."""
     if not scene.effects.finger_object:
         return []
-    palm = scene.arm.zero_height + float(one.arm[2])
+    palm = float(key_frames.poses(scene, one)[:, 2].min())
     tilt = np.deg2rad([f.tilt for f in scene.hand.finger])
     lowest = float((palm - one.length * np.sin(tilt)).min())
     # An arm that is turned may bring a finger lower, by no more than its whole length.
@@ -132,7 +133,7 @@ def _reach(scene: Scene, one: Params, name: str) -> list[str]:
 def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     """Refuses designs that start deep inside the table, an object or themselves, without noise."""
     numbers = jax.tree.map(np.float32, scene.constants())
-    singles = Params(*(v.astype(np.float32) for v in designs))
+    singles = jax.tree.map(np.float32, designs)
     with_objects, fingers, palm = map(np.asarray, _depths(scene.structure, numbers, singles))
     limit = scene.limits.penetration
     found = []

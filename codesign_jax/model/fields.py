@@ -21,7 +21,7 @@ from codesign_jax.model.layout import (
     wrist_springs,
 )
 from codesign_jax.model.spec import compile_template, palm_inertia
-from codesign_jax.scene import Constants, Scene, by_structure
+from codesign_jax.scene import Constants, Scene, by_structure, key_frames
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.types import Params, Trial
 
@@ -318,9 +318,9 @@ def _geom_fields(
 
 def _start(scene: Scene, params: Params, trial: Trial, rest: jax.Array) -> jax.Array:
     """Start state: palm at the arm's first pose, straight fingers, object at rest."""
-    arm, tilt, dtype = params.arm, trial.arm_tilt, params.arm.dtype
-    height = jnp.asarray(scene.arm.start_height, dtype)
-    wrist = jnp.stack([arm[0], arm[1], height, arm[3] + tilt[0], arm[5], tilt[1] - arm[4]])
+    tilt, dtype = trial.arm_tilt, params.arm.dtype
+    x, y, z, roll, pitch, yaw = key_frames.poses(scene, params, 1)[0]
+    wrist = jnp.stack([x, y, z, roll + tilt[0], yaw, tilt[1] - pitch])
     fingers = jnp.zeros(layout(scene).dofs.size, dtype)
     parts = [wrist, fingers, trial.position, rest[None], object_quat(scene.objects, trial)]
     return jnp.concatenate(parts).astype(dtype)

@@ -50,7 +50,7 @@ def finger_beams(hand: Hand, params: Params) -> Beam:
 
 def free_bends(hand: Hand, params: Params) -> np.ndarray:
     """Angles by which free fingers bend at their pressures [rad], by the linear law, (finger,)."""
-    beams = finger_beams(hand, Params(*(np.asarray(v, float) for v in params)))
+    beams = finger_beams(hand, jax.tree.map(lambda v: np.asarray(v, float), params))
     curvature = np.asarray(params.pressure) * beams.moment_per_pressure / beams.bending
     return np.asarray(curvature * np.asarray(params.length))
 

@@ -10,27 +10,33 @@ import tomli_w
 
 from codesign_jax import files
 from codesign_jax import scene as scenes
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.objects import Shape
 
-NAMES = ("scene.toml", "hand.toml", "objects.toml")
+NAMES = ("scene.toml", "hand.toml", "objects.toml", "control.toml")
 MESHES = "meshes"  # folder of the objects' meshes
 
 
 def scene_texts(scene: Scene) -> dict[str, str]:
-    """Returns the three files of a resolved scene by name; the scene refers to the others."""
+    """Returns the files of a resolved scene by name; the scene refers to the others."""
     top = _plain(scene) | {"hand": "hand.toml", "objects": "objects.toml"}
+    top |= {"control": "control.toml"}
     shapes = tuple(
         dataclasses.replace(shape, file=_mesh_name(shape, i) if shape.mesh else None)
         for i, shape in enumerate(scene.objects.object)
     )
     objects = dataclasses.replace(scene.objects, object=shapes)
+    hand = key_frames.without_parameters(scene.hand)
     return {
         "scene.toml": _document(
-            top, _units(scene) | {"gravity": "m/s^2", "hand": "", "objects": ""}
+            top,
+            _units(scene)
+            | {"gravity": "m/s^2"}
+            | dict.fromkeys(("hand", "objects", "control"), ""),
         ),
-        "hand.toml": _document(_plain(scene.hand), _units(scene.hand)),
+        "hand.toml": _document(_plain(hand), _units(hand)),
         "objects.toml": _document(_plain(objects), _units(objects)),
+        "control.toml": _document(scene.control.as_file(), {}),
     }
 
 

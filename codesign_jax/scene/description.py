@@ -1,4 +1,4 @@
-"""The scene: hand, objects, effects, phases, contact and discretization, frozen and hashable.
+"""The scene: hand, objects, control, effects, phases, contact, time step; hashable.
 
 A scene has two parts.  Its `structure` (effects, counts, kinds of shapes, time step and number of
 steps) is what programs are compiled for; its `Constants` are all other numbers of the scene, hand
@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
-from codesign_jax.scene import hand, objects, schema
+from codesign_jax.scene import hand, key_frames, objects, schema
 from codesign_jax.scene.schema import quantity
 from codesign_jax.scene.tables import (
     Arm,
@@ -51,6 +51,7 @@ class Constants(NamedTuple):
     contact: Any
     limits: Any
     pneumatics: Any
+    control: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +64,8 @@ class SceneFile:
       hand: Name of a built-in hand, or the path of a hand file, relative to the scene file.
       objects: Name of a built-in object set, or the path of an object file, relative to the scene
         file.
+      control: Name of a built-in control, or the path of a control file, relative to the scene
+        file; docs/control.md.
       gravity: Acceleration of gravity, only with `effects.gravity`.
     """
 
@@ -80,6 +83,7 @@ class SceneFile:
     limits: Limits
     pneumatics: Pneumatics = Pneumatics()
     newton: Newton = Newton()
+    control: str = "paper"
     gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
 
 
@@ -89,6 +93,7 @@ class Scene(SceneFile):
 
     hand: hand.Hand
     objects: objects.ObjectSet
+    control: key_frames.Control  # type: ignore[assignment]
 
     def constants(self) -> Constants:
         """The numbers of the scene's files that are not structure."""
@@ -139,6 +144,7 @@ class Scene(SceneFile):
             phases=Phases(*ends, deflate_time=step),
             hand=hand.structure(fixed.hand),
             objects=objects.structure(fixed.objects),
+            control=key_frames.structure(fixed.control),
         )
 
     @property

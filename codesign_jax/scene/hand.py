@@ -226,10 +226,8 @@ def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: lis
 
 def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
     """Every section that the table or a preset allows needs an air chamber and a legal pressure."""
-    everything = Preset("full", tuple(Free(p.name) for p in hand.parameter))
-    for preset in (everything, *hand.preset):
-        path = where if preset is everything else f"{where}.preset {preset.name}"
-        bounds = {p.name: _bounds(p, preset, hand) for p in hand.parameter}
+    places = [where, *(f"{where}.preset {preset.name}" for preset in hand.preset)]
+    for path, bounds in zip(places, all_bounds(hand), strict=True):
         lowest, walls = {name: low for name, (low, _) in bounds.items()}, bounds["wall"][1]
         fingers = zip(lowest["height"], walls, lowest["wall"], lowest["pressure"], strict=True)
         # Equal fingers have the same problems, which are told once.
@@ -246,6 +244,13 @@ def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
                     f"{path}: a pressure of {pressure:g} Pa is not below the limit of "
                     f"{limit:g} Pa for walls of {thinnest:g} m"
                 )
+
+
+def all_bounds(hand: Hand) -> Iterator[dict[str, tuple[tuple[float, ...], tuple[float, ...]]]]:
+    """Lowest and highest values [SI] of every parameter, of the whole table and of each preset."""
+    everything = Preset("full", tuple(Free(p.name) for p in hand.parameter))
+    for preset in (everything, *hand.preset):
+        yield {p.name: _bounds(p, preset, hand) for p in hand.parameter}
 
 
 def _bounds(

@@ -15,6 +15,7 @@ _FOLDERS = {
     "hands": (_PACKAGE / "hands", _PACKAGE.parent / "hands"),
     "objects": (_PACKAGE / "objects", _PACKAGE.parent / "objects"),
     "scenes": (_PACKAGE / "scenes",),
+    "controls": (_PACKAGE / "controls",),
     "accuracy": (_PACKAGE / "scenes" / "accuracy",),
 }
 MOST_BYTES = 1 << 18
@@ -26,7 +27,7 @@ DEEPEST = 12
 
 
 def available(kind: str) -> dict[str, Path]:
-    """Returns the built-in files of a kind ("hands", "objects", "scenes", "accuracy") by name."""
+    """Returns the built-in files of a kind of `_FOLDERS` by name."""
     found: dict[str, Path] = {}
     for folder in _FOLDERS[kind]:
         if folder.is_dir():

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax.scene import hand, keypaths, library, objects, reach, schema
+from codesign_jax.scene import hand, key_frames, keypaths, library, objects, reach, schema
 from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.tables import Accuracy
 
@@ -31,6 +31,7 @@ def load(
         "standard", "fine", "reference", or a path ending in .toml; see `load_accuracy`.
       overrides: Values by key path that replace the files' and the preset's, nested or dotted,
         e.g. {"discretization": {"links": 5}, "hand.material.shear_modulus": 60e3}; see `keypaths`.
+        That of "control" names another control: a built-in one, or a path ending in .toml.
 
     Raises:
       InputError: with every problem of the scene, the hand and the objects.
@@ -39,7 +40,7 @@ def load(
     table = library.read(path)
     problems: list[str] = []
     changes = keypaths.flatten(_preset(accuracy, problems)) | keypaths.flatten(overrides or {})
-    inside = {key: keypaths.below(changes, key) for key in ("hand", "objects")}
+    inside = {key: keypaths.below(changes, key) for key in ("hand", "objects", "control")}
     own = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
     places = keypaths.apply(table, own, path.name, problems)
     parsed = schema.parse(SceneFile, table, path.name, problems)
@@ -59,13 +60,25 @@ def load(
             parts[key] = loader(source, overrides=inside[key])
         except schema.InputError as error:
             problems += error.problems
+    if parsed is not None and "hand" in parts:
+        # A path that the caller gives is not beside the scene's file.
+        given = ("control",) in own
+        source = parsed.control if given else _beside(path, parsed.control)
+        try:
+            parts["control"] = key_frames.load(source, parts["hand"], overrides=inside["control"])
+        except schema.InputError as error:
+            problems += error.problems
     if problems or parsed is None:
         raise schema.InputError(problems)
     parts["objects"] = reach.fit(parts["objects"], parts["hand"])
     law = parsed.effects.neo_hookean
     parts["hand"] = hand.with_strain(parts["hand"], parsed.limits.strain, neo_hookean=law)
+    parts["hand"] = key_frames.with_parameters(parts["hand"], parts["control"])
     names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
-    return Scene(**parts, **{n: getattr(parsed, n) for n in names})
+    scene = Scene(**parts, **{n: getattr(parsed, n) for n in names})
+    if problems := key_frames.check(scene, "control"):
+        raise schema.InputError(problems)
+    return scene
 
 
 def load_accuracy(name: str | Path) -> Accuracy:
@@ -165,6 +178,8 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
             f"{where}.effects.lateral_threshold = true resists sideways bending, which "
             "effects.lateral_bending = false leaves out"
         )
+    if isinstance(scene, Scene):
+        problems += key_frames.check(scene, f"{where}.control")
     if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:
         problems.append(
             f"{where}.phases ends after {scene.end_time:g} s: the number of steps is structure, "

@@ -30,7 +30,7 @@ import numpy as np
 
 from codesign_jax.scene import schema, unit_slips
 from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, structure
-from codesign_jax.scene.hand_tables import per_finger
+from codesign_jax.scene.hand_tables import PARAMETERS, per_finger
 from codesign_jax.types import Params
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
@@ -359,11 +359,12 @@ def unflatten(hand: Hand, full: jax.Array) -> Params:
         spread=take("spread"),
         arm=jnp.stack(arm),
         pressure=take("pressure"),
+        control={p.name: take(p.name) for p in hand.parameter if p.name not in PARAMETERS} or None,
     )
 
 
 def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
-    """Builds the design space of a preset.
+    """Builds the design space of a preset; parameters of the scene's control are free as well.
 
     Args:
       hand: The hand.
@@ -373,7 +374,7 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
     Raises:
       InputError: if the hand has no such preset.
     """
-    total = sum(hand.width(p) for p in hand.parameter)
+    total = sum(hand.width(p) for p in hand.parameter if p.name in PARAMETERS)
     if preset in ("full", f"{total}d"):
         chosen = Preset(preset, ())
     else:
@@ -403,8 +404,8 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
     free = {f.name: f for f in preset.free}
     columns: list[tuple[str, str, float, float, float, bool]] = []
     for row in hand.parameter:
-        if not everything and row.name not in free:
-            continue
+        if not everything and row.name not in free and row.name in PARAMETERS:
+            continue  # those of the control are free in every preset
         spec = free.get(row.name, Free(row.name))
         factor, width = UNITS[row.unit][1], hand.width(row)
         low, high = spec.bounds(row, width)

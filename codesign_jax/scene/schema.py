@@ -211,7 +211,7 @@ def numbers(table: Any) -> Any:
     """The numbers of a dataclass that are not structure, as nested named tuples.
 
     Field names are those of the file; arrays of tables and of numbers are tuples. A table without
-    such numbers is left out.
+    such numbers is left out, and None in an array of tables.
 
     Args:
       table: A dataclass whose numeric fields are made by `quantity`.
@@ -237,7 +237,8 @@ def with_numbers(table: T, values: Any) -> T:
         if dataclasses.is_dataclass(old):
             new = with_numbers(old, new)
         elif isinstance(old, tuple) and dataclasses.is_dataclass(old[0]):
-            new = tuple(with_numbers(o, n) for o, n in zip(old, new, strict=True))
+            pairs = zip(old, new, strict=True)
+            new = tuple(o if n is None else with_numbers(o, n) for o, n in pairs)
         changes[name] = new
     return dataclasses.replace(table, **changes)  # type: ignore[type-var]
 
@@ -265,7 +266,7 @@ def _collect(table: Any, leaf: typing.Callable[[dataclasses.Field, Any], Any]) -
             found[field.name] = _collect(value, leaf)
         elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
             rows = tuple(_collect(v, leaf) for v in value)
-            found[field.name] = None if None in rows else rows
+            found[field.name] = rows if any(row is not None for row in rows) else None
     found = {name: value for name, value in found.items() if value is not None}
     return _named(type(table).__name__, tuple(found))(**found) if found else None
 

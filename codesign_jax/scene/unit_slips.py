@@ -22,10 +22,11 @@ def refuse(params: Params) -> None:
     Raises:
       InputError: With every such number and its suggested value.
     """
-    if any(isinstance(v, jax.core.Tracer) for v in params):
+    if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(params)):
         return
     arm = [f"arm_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
-    values = {name: getattr(params, name) for name in Params._fields if name != "arm"}
+    own = [name for name in Params._fields if name not in ("arm", "control")]
+    values = {name: getattr(params, name) for name in own}
     values |= {name: np.asarray(params.arm)[..., i] for i, name in enumerate(arm)}
     found = [slip for name, v in values.items() for slip in slips(name, name, np.asarray(v))]
     if found:
@@ -61,6 +62,8 @@ def outside(name: str, unit: str, low: float, high: float, values: np.ndarray) -
 
 def slips(name: str, row: str, values: np.ndarray) -> list[str]:
     """What is wrong with the first value, if any, that looks like one of another unit."""
+    if row not in PARAMETERS:  # of the control: only its bounds say what makes sense
+        return []
     kind = PARAMETERS[row]
     slack = 1e-6 * abs(kind.high)  # a float32 of a bound
     outside = values[(values < kind.low - slack) | (values > kind.high + slack)]

@@ -6,6 +6,7 @@ worlds are decided.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -123,7 +124,9 @@ class Program(Packing):
         if self.backend == "interpreter":
             return call(*inputs)
         of_code(reuse.code_digest())
-        origin = repr((self.scene.structure, self.limits, trajectory, states))
+        # Controls come as arrays: key frames are no part of the kernel.
+        structure = replace(self.scene.structure, control=None)  # type: ignore[arg-type]
+        origin = repr((structure, self.limits, trajectory, states))
         shared = (len(inputs) - 1,) if self.meshes else ()
         kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
         if self.team > 1:

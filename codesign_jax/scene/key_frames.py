@@ -1,0 +1,559 @@
+"""Key frames: pose of the arm frame and pressures over time, as a file that a scene names.
+
+A value is a number, the name of a number that the design or the scene has, or a sum of such terms,
+each with a factor if need be: `"zero_height + arm_z - 0.01"`, `"0.5 * pressure"`. docs/control.md
+has the names. A sum stays a sum: its numbers are data, as those of the other files.
+
+>>> from codesign_jax.scene import key_frames
+>>> key_frames.read_sum("zero_height + 0.5 * arm_z", key_frames.Metres)
+Metres(number=None, term=(Term(name='zero_height', factor=None), Term(name='arm_z', factor=0.5)))
+"""
+
+import dataclasses
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.scene import hand as hands
+from codesign_jax.scene import keypaths, library, schema
+from codesign_jax.scene.hand_tables import PARAMETERS, UNITS, Hand, Parameter
+from codesign_jax.scene.schema import choice, quantity
+from codesign_jax.types import Params
+
+POSE = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Channels of the pose, in the order of `Params.arm`."""
+_OF_SCENE = {
+    "s": ("approach", "inflate", "lift", "disturb", "ungrasp", "release", "deflate_time"),
+    "m": ("start_height", "zero_height", "arm_x", "arm_y", "arm_z"),
+    "rad": ("arm_roll", "arm_pitch", "arm_yaw"),
+    "Pa": ("pressure",),
+}
+"""Names that every scene has, by the SI unit of what may use them."""
+_NAME = re.compile(r"[a-z]\w*", re.ASCII)
+_TERM = re.compile(
+    r"\s*([+-]?)\s*(?:(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+)\s*(\*)?)?\s*([A-Za-z]\w*)?\s*", re.ASCII
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """A named number times a factor.
+
+    Attributes:
+      name: A parameter of the design, or a number of the scene.
+      factor: What it is multiplied by; None for 1.
+    """
+
+    name: str
+    factor: float | None = quantity("", -100, 100, default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sum:
+    """A number and named terms; the subclasses have the number's unit and range."""
+
+    number: float | None = None
+    term: tuple[Term, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Seconds(Sum):
+    """A time."""
+
+    number: float | None = quantity("s", -60, 60, default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Metres(Sum):
+    """A coordinate."""
+
+    number: float | None = quantity("m", -2, 2, default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Degrees(Sum):
+    """An angle; its names stand for radians, its number for degrees."""
+
+    number: float | None = quantity("deg", -360, 360, default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pascals(Sum):
+    """A gauge pressure."""
+
+    number: float | None = quantity("Pa", -1e6, 1e6, default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """A key frame; what it leaves out is as in the frame before.
+
+    What the first frame leaves out is the design's: the pose `arm_x` to `arm_yaw`, at the height
+    `start_height`, with empty chambers.
+
+    Attributes:
+      time: When the frame is reached; 0 for the first one.
+      x: Position of the arm frame.
+      y: Position of the arm frame.
+      z: Height of the arm frame above the table.
+      roll: Orientation of the arm frame.
+      pitch: Orientation of the arm frame; positive points the fingers towards +x.
+      yaw: Orientation of the arm frame.
+      pressure: Pressure of each finger. A file gives one value for all, an array with one for each,
+        or a table by names of groups, whose other fingers stay as they were.
+      interpolation: How the next frame is reached: linearly, or by a jump when its time has come.
+    """
+
+    time: Seconds
+    x: Metres | None = None
+    y: Metres | None = None
+    z: Metres | None = None
+    roll: Degrees | None = None
+    pitch: Degrees | None = None
+    yaw: Degrees | None = None
+    pressure: tuple[Pascals, ...] | None = None
+    interpolation: str = choice("linear", "held", default="linear")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ControlParameter:
+    """A parameter that key frames name, which is free in every preset of the hand.
+
+    Attributes:
+      name: Its name in key frames and designs.
+      unit: Unit of the numbers here, and in presets, commands and tables.
+      low: Lower bound.
+      high: Upper bound.
+      default: Value where nothing else is given.
+      per: Whether each finger has a value of its own, which only pressures may, or the hand has
+        one.
+    """
+
+    name: str
+    unit: str = choice(*UNITS)
+    low: float
+    high: float
+    default: float
+    per: str = choice("finger", "hand", default="hand")
+
+    @property
+    def row(self) -> Parameter:
+        """The parameter as a row of the hand's table."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return Parameter(domain="control", **values)
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlFile:
+    """A control file; docs/control.md shows how to write one.
+
+    Attributes:
+      name: Name of the control, as in results.
+      description: What the control is, in a line.
+      group: Fingers by the name of a group, counted from 0, for pressures.
+    """
+
+    name: str
+    description: str
+    frame: tuple[dict, ...] = dataclasses.field(metadata={"table": Frame})
+    parameter: tuple[ControlParameter, ...] = ()
+    group: dict = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Control:
+    """A control file: key frames, and the parameters that they add to the hand's table.
+
+    Attributes:
+      name: Name of the control, as in results.
+      description: What the control is, in a line.
+      frame: The key frames, in the order of their times.
+      parameter: Parameters of the control's own.
+    """
+
+    name: str
+    description: str
+    frame: tuple[Frame, ...]
+    parameter: tuple[ControlParameter, ...] = ()
+
+    def as_file(self) -> dict[str, Any]:
+        """The content of a file that reads as this control."""
+        table: dict[str, Any] = {"name": self.name, "description": self.description}
+        if self.parameter:
+            table["parameter"] = [dataclasses.asdict(p) for p in self.parameter]
+        return table | {"frame": [_frame_table(frame) for frame in self.frame]}
+
+
+def structure(control: Control) -> Control:
+    """The control without what no program depends on; numbers are left to `schema.typical`."""
+    rows = (dataclasses.replace(p, low=0.0, high=0.0, default=0.0) for p in control.parameter)
+    return dataclasses.replace(control, name="", description="", parameter=tuple(rows))
+
+
+def load(name: str | Path, hand: Hand, *, overrides: Mapping[Any, Any] | None = None) -> Control:
+    """Reads a control and checks what does not depend on the scene's numbers; `check` does.
+
+    Args:
+      name: Name of a built-in control, or a path ending in .toml.
+      hand: The hand that it drives.
+      overrides: Values by key path that replace the file's; see `keypaths`.
+
+    Raises:
+      InputError: With every problem of the file.
+    """
+    path = library.find("controls", name)
+    problems: list[str] = []
+    table = library.read(path)
+    changes = keypaths.flatten(overrides or {})
+    places = keypaths.apply(table, changes, path.name, problems, root="control")
+    control = _Reader(table, path.name, len(hand.finger), problems).control()
+    if problems or control is None:
+        raise schema.InputError(keypaths.as_given(problems, places))
+    return control
+
+
+def with_parameters(hand: Hand, control: Control) -> Hand:
+    """The hand with the control's parameters in its table."""
+    return dataclasses.replace(
+        hand, parameter=(*hand.parameter, *(p.row for p in control.parameter))
+    )
+
+
+def without_parameters(hand: Hand) -> Hand:
+    """The hand as its file has it."""
+    own = tuple(p for p in hand.parameter if p.name in PARAMETERS)
+    return dataclasses.replace(hand, parameter=own)
+
+
+# --- values over a design ------------------------------------------------------------------------
+
+
+def times(scene: Any, params: Params) -> jax.Array:
+    """Times of the key frames [s], shape (frame,)."""
+    names = _names(scene, params)
+    found = [_value(frame.time, names) for frame in scene.control.frame]
+    return jnp.stack([jnp.asarray(t, float) for t in found])
+
+
+def poses(scene: Any, params: Params, count: int | None = None) -> jax.Array:
+    """Poses of the arm frame at the first `count` key frames [m, rad], shape (frame, 6)."""
+    names, dtype = _names(scene, params), params.arm.dtype
+    pose: dict[str, Any] = {axis: params.arm[i] for i, axis in enumerate(POSE)}
+    pose["z"], rows = scene.arm.start_height, []
+    for frame in scene.control.frame[:count]:
+        given = {axis: getattr(frame, axis) for axis in POSE}
+        pose |= {axis: _value(v, names) for axis, v in given.items() if v is not None}
+        rows.append(jnp.stack([jnp.asarray(v, dtype) for v in pose.values()]))
+    return jnp.stack(rows)
+
+
+def pressures(scene: Any, params: Params) -> list[tuple[Any, jax.Array]]:
+    """Pressures at the key frames as terms, whose products are to be added.
+
+    Factors are interpolated and not products: chambers that are held keep their exact pressure, and
+    emptied ones have none.
+
+    Returns:
+      Named numbers [Pa], of shape (finger,) or (), and their factors, shape (frame, finger); the
+      number is 1 where the factors are the numbers of the file.
+    """
+    names, dtype = _names(scene, params), params.pressure.dtype
+    rows, now = [], [{}] * scene.num_fingers
+    for frame in scene.control.frame:
+        if frame.pressure is not None:
+            now = [_factors(v) for v in frame.pressure]
+        rows.append(now)
+    used = sorted({name for row in rows for value in row for name in value})
+    return [
+        (
+            names[name] if name else 1.0,
+            jnp.array([[value.get(name, 0.0) for value in row] for row in rows], dtype),
+        )
+        for name in used
+    ]
+
+
+def _names(scene: Any, params: Params) -> dict[str, Any]:
+    """What the names of a sum stand for, in SI units."""
+    found = _scene_times(scene)
+    found |= {key: getattr(scene.arm, key) for key in ("start_height", "zero_height")}
+    found |= {f"arm_{axis}": params.arm[i] for i, axis in enumerate(POSE)}
+    return found | {"pressure": params.pressure} | (params.control or {})
+
+
+def _scene_times(scene: Any) -> dict[str, Any]:
+    return {**vars(scene.phases), "release": scene.window[1]}
+
+
+def _value(total: Sum, names: Mapping[str, Any]) -> Any:
+    own = ((1.0 if t.factor is None else t.factor, names[t.name]) for t in total.term)
+    parts = [factor * value for factor, value in own]
+    if total.number is not None:
+        factor = UNITS["deg"][1] if isinstance(total, Degrees) else 1.0
+        parts.insert(0, total.number * factor)
+    value = parts[0] if parts else 0.0
+    for part in parts[1:]:
+        value = value + part
+    return value
+
+
+def _factors(total: Sum) -> dict[str, Any]:
+    """Factors by name; that of no name is the number."""
+    found = {t.name: 1.0 if t.factor is None else t.factor for t in total.term}
+    return found if total.number is None else found | {"": total.number}
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+def read_sum(value: Any, kind: type[Sum]) -> Sum | str:
+    """A value of a file as a sum, or what is wrong with it.
+
+    Args:
+      value: A number, or text such as "zero_height + 0.5 * arm_z - 0.01".
+      kind: The subclass, by the unit.
+    """
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return kind(float(value))
+    if not isinstance(value, str) or not value.strip():
+        return 'must be a number, or a sum of numbers and names such as "zero_height + arm_z"'
+    number, terms, place = None, {}, 0
+    while place < len(value):
+        found = _TERM.match(value, place)
+        if found is None or found.end() == place or not (found[2] or found[4]):
+            return "is no sum of numbers and names, each with a factor if need be"
+        sign, digits, times, name = found.groups()
+        if (place and not sign) or (times and not name):
+            return "is no sum of numbers and names, each with a factor if need be"
+        factor = (-1.0 if sign == "-" else 1.0) * float(digits or 1.0)
+        if name in terms:
+            return f"has {name!r} twice"
+        if name:
+            terms[name] = factor
+        else:
+            number = factor + (number or 0.0)
+        place = found.end()
+    return kind(number, tuple(Term(n, None if f == 1.0 else f) for n, f in terms.items()))
+
+
+def _text(total: Sum) -> str | float:
+    """What `read_sum` reads as this sum."""
+    if not total.term:
+        return float(total.number or 0.0)
+    parts = [t.name if t.factor is None else f"{float(t.factor)!r} * {t.name}" for t in total.term]
+    parts += [] if total.number is None else [repr(float(total.number))]
+    return " + ".join(parts).replace("+ -", "- ")
+
+
+def _frame_table(frame: Frame) -> dict[str, Any]:
+    given = {f.name: getattr(frame, f.name) for f in dataclasses.fields(frame)}
+    found = {k: _text(v) if isinstance(v, Sum) else v for k, v in given.items() if v is not None}
+    if frame.pressure is not None:
+        found["pressure"] = [_text(v) for v in frame.pressure]
+    return found
+
+
+_KINDS = {"time": Seconds, "x": Metres, "y": Metres, "z": Metres, "pressure": Pascals}
+_KINDS |= dict.fromkeys(("roll", "pitch", "yaw"), Degrees)
+
+
+class _Reader:
+    """Reads one file; problems are collected."""
+
+    def __init__(self, table: Any, where: str, fingers: int, problems: list[str]):
+        self.table, self.where, self.fingers, self.problems = table, where, fingers, problems
+        self.groups: dict[str, list[int]] = {}
+        self.units = {name: unit for unit, names in _OF_SCENE.items() for name in names}
+
+    def control(self) -> Control | None:
+        """The control, or None where the file is not of its schema."""
+        file = schema.parse(ControlFile, self.table, self.where, self.problems)
+        if file is None:
+            return None
+        for i, row in enumerate(file.parameter):
+            self._parameter(row, f"{self.where}.parameter[{i}]")
+        for name, fingers in file.group.items():
+            self._group(name, fingers)
+        frames, now = [], (Pascals(0.0),) * self.fingers
+        for i, entry in enumerate(file.frame):
+            frame = self._frame(entry, f"{self.where}.frame[{i}]", now)
+            frames.append(frame)
+            now = frame.pressure or now
+        if not frames or frames[0].time != Seconds(0.0):
+            self.problems.append(f"{self.where}.frame[0].time must be 0: a grasp begins with it")
+        return Control(file.name, file.description, tuple(frames), file.parameter)
+
+    def _parameter(self, row: ControlParameter, path: str) -> None:
+        if not _NAME.fullmatch(row.name) or row.name in self.units or row.name in PARAMETERS:
+            self.problems.append(
+                f"{path}.name = {schema.shown(row.name)} must be a lower-case word not taken"
+            )
+        if not row.low < row.high:
+            self.problems.append(f"{path}: low {row.low:g} must be below high {row.high:g}")
+        elif not row.low <= row.default <= row.high:
+            key = f"{path}.default"
+            why = schema.range_problem(key, row.default, row.unit, row.low, row.high)
+            self.problems.append(str(why))
+        if row.per == "finger" and UNITS[row.unit][0] != "Pa":
+            self.problems.append(f"{path}.per = 'finger' is for pressures, not for {row.unit}")
+        self.units[row.name] = UNITS[row.unit][0]
+
+    def _group(self, name: str, fingers: Any) -> None:
+        whole = isinstance(fingers, list) and all(type(f) is int for f in fingers)
+        if not whole or not all(0 <= f < self.fingers for f in fingers):
+            self.problems.append(
+                f"{self.where}.group.{name} = {schema.shown(fingers)} must be an array of fingers, "
+                f"0 to {self.fingers - 1}"
+            )
+            fingers = []
+        self.groups[name] = fingers
+
+    def _frame(self, entry: dict, path: str, now: tuple[Pascals, ...]) -> Frame:
+        known = [f.name for f in dataclasses.fields(Frame)]
+        values: dict[str, Any] = {"time": Seconds(0.0)}
+        for key, value in entry.items():
+            if key not in known:
+                why = schema.nearest(key, known)
+                self.problems.append(f"{path}.{schema.shown(key)[1:-1]} is not a known key; {why}")
+            elif key == "interpolation":
+                if value not in ("linear", "held"):
+                    self.problems.append(f"{path}.{key} must be 'linear' or 'held'")
+                values[key] = value
+            elif key == "pressure":
+                values[key] = self._pressure(value, f"{path}.{key}", now)
+            else:
+                values[key] = self._sum(value, f"{path}.{key}", _KINDS[key])
+        if "time" not in entry:
+            self.problems.append(f"{path}.time is missing (unit s)")
+        return Frame(**values)
+
+    def _pressure(self, value: Any, path: str, now: tuple[Pascals, ...]) -> tuple[Sum, ...]:
+        if isinstance(value, dict):
+            found: list[Sum] = list(now)
+            for name, entry in value.items():
+                if name not in self.groups:
+                    why = schema.nearest(name, self.groups)
+                    self.problems.append(f"{path}.{name} is not a group; {why}")
+                    continue
+                given = self._sum(entry, f"{path}.{name}", Pascals)
+                for finger in self.groups[name]:
+                    found[finger] = given
+        elif isinstance(value, list):
+            if len(value) != self.fingers:
+                self.problems.append(
+                    f"{path} has {len(value)} entries, the hand {self.fingers} fingers"
+                )
+            found = [self._sum(v, f"{path}[{i}]", Pascals) for i, v in enumerate(value)]
+        else:
+            found = [self._sum(value, path, Pascals)] * self.fingers
+        return tuple(found)
+
+    def _sum(self, value: Any, path: str, kind: type[Sum]) -> Any:
+        total = read_sum(value, kind)
+        if isinstance(total, str):
+            self.problems.append(f"{path} = {schema.shown(value)} {total}")
+            return kind(0.0)
+        limits = next(f for f in dataclasses.fields(kind) if f.name == "number").metadata
+        unit = limits["unit"]
+        if total.number is not None:
+            why = schema.range_problem(path, total.number, unit, limits["low"], limits["high"])
+            self.problems += [why] if why else []
+        wanted = UNITS[unit][0]
+        fitting = [name for name, u in self.units.items() if u == wanted]
+        for term in total.term:
+            if term.name not in self.units:
+                why = schema.nearest(term.name, fitting)
+                self.problems.append(f"{path} names an unknown parameter {term.name!r}; {why}")
+            elif self.units[term.name] != wanted:
+                self.problems.append(
+                    f"{path}: {term.name!r} has the unit {self.units[term.name]}, not {wanted}; "
+                    f"valid: {', '.join(fitting)}"
+                )
+        return total
+
+
+# --- checks over all designs ---------------------------------------------------------------------
+
+
+def check(scene: Any, where: str) -> list[str]:
+    """What is wrong with key frames in some design of the hand's presets.
+
+    Args:
+      scene: The scene, its numbers not traced.
+      where: Key path of the control.
+    """
+    own = {row.name: _ends(row.row) for row in scene.control.parameter}
+    fixed = {name: (value, value) for name, value in _scene_times(scene).items()}
+    problems = [*_falling(scene.control.frame, fixed | own, where)]
+    for low, high, limits in _walls(scene.hand):
+        problems += _too_high(scene.control.frame, own, low, high, limits, where)
+    return list(dict.fromkeys(problems))
+
+
+def _ends(row: Parameter) -> tuple[float, float]:
+    factor = UNITS[row.unit][1]
+    return row.low * factor, row.high * factor  # type: ignore[operator]
+
+
+def _range(factors: Mapping[str, float], ends: Mapping[str, tuple[float, float]]) -> tuple:
+    """Smallest and largest value of a sum over a box."""
+    both = [sorted((f * ends[n][0], f * ends[n][1])) for n, f in factors.items() if n]
+    return tuple(factors.get("", 0.0) + sum(pair[side] for pair in both) for side in (0, 1))
+
+
+def _falling(frames: tuple[Frame, ...], ends: Mapping, where: str) -> Iterator[str]:
+    """Times that do not grow; a frame that repeats the one before may have its time."""
+    for i, (a, b) in enumerate(zip(frames, frames[1:], strict=False), 1):
+        first, second = _factors(a.time), _factors(b.time)
+        step = {n: second.get(n, 0.0) - first.get(n, 0.0) for n in {**first, **second}}
+        least = _range(step, ends)[0]
+        changes = any(
+            v is not None and v != getattr(a, f.name)
+            for f in dataclasses.fields(b)[1:-1]
+            for v in [getattr(b, f.name)]
+        )
+        if least < -1e-9 or (changes and least < 1e-9):
+            earlier = f"{-least:g} s before it" if least < -1e-9 else "at that time"
+            yield (
+                f"{where}.frame[{i}].time = {schema.shown(_text(b.time))} must come after that of "
+                f"frame[{i - 1}], {schema.shown(_text(a.time))}, and is {earlier} in some design"
+            )
+
+
+def _walls(hand: Hand) -> Iterator[tuple]:
+    """Lowest and highest pressures, and lowest and highest limits of the walls, by finger."""
+    for bounds in hands.all_bounds(hand):
+        walls = [[hand.pressure_limit.per_wall * w for w in side] for side in bounds["wall"]]
+        yield *bounds["pressure"], list(zip(*walls, strict=True))
+
+
+def _too_high(
+    frames: tuple[Frame, ...], own: Mapping, low: Any, high: Any, limits: Any, where: str
+) -> Iterator[str]:
+    """Pressures above the limit of the wall, or below zero, in some design."""
+    for i, frame in enumerate(frames):
+        for finger, value in enumerate(frame.pressure or ()):
+            factors = _factors(value)
+            # A search keeps `pressure` below the limit of its wall, so that the worst design is at
+            # an end of the limits, or where the limit begins to hold.
+            places = sorted(
+                {*limits[finger], min(max(high[finger], limits[finger][0]), limits[finger][1])}
+            )
+            for limit in places:
+                ends = {**own, "pressure": (min(low[finger], limit), min(high[finger], limit))}
+                least, most = _range(factors, ends)
+                key = f"{where}.frame[{i}].pressure"
+                text = schema.shown(_text(value))
+                if most > limit * (1 + 1e-9):
+                    yield (
+                        f"{key} = {text} of finger {finger} may be {most:.6g} Pa, above the limit "
+                        f"of {limit:.6g} Pa of its wall"
+                    )
+                    break
+                if least < 0:
+                    yield f"{key} = {text} of finger {finger} may be {least:.6g} Pa, below zero"
+                    break

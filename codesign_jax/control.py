@@ -39,7 +39,7 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     # towards -x.
     roll = roll + trial.arm_tilt[0] + shaken_roll
     pitch = shaken_pitch - pitch + trial.arm_tilt[1]
-    pressure = jnp.zeros((len(time), scene.num_fingers), params.pressure.dtype)
+    pressure = jnp.zeros((len(time), scene.num_fingers), jnp.result_type(params.pressure))
     for value, factors in key_frames.pressures(scene, params):
         pressure = pressure + value * _between(place, factors)
     pressure = pressure.T

@@ -44,7 +44,7 @@ COMMAND = (
     *("--set", "discretization.links=3"),
 )
 WHOLE = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
-SOURCES = ("scene.toml", "hand.toml", "objects.toml")
+SOURCES = ("scene.toml", "hand.toml", "objects.toml", "control.toml")
 
 
 def run(*arguments: str | Path) -> tuple[int, str]:
@@ -247,8 +247,11 @@ def damaged_bytes(draw: Any, data: bytes) -> bytes:
     return data[:at] + new + data[end:]
 
 
+KINDS = "scenes", "hands", "objects", "accuracy", "controls"
+
+
 @st.composite
-def toml_files(draw: Any, kinds: tuple[str, ...] = ("scenes", "hands", "objects", "accuracy")):
+def toml_files(draw: Any, kinds: tuple[str, ...] = KINDS):
     """A kind of file and its bytes: a built-in one with one to three hostile changes."""
     kind = draw(st.sampled_from(kinds))
     # Sets with meshes take seconds to read.
@@ -331,6 +334,8 @@ def try_toml(kind: str, data: bytes, folder: Path) -> bool:
     path.write_bytes(data)
     names = {"scenes": "scene", "hands": "hand_name", "objects": "object_set"}
     how: dict[str, Any] = {names.get(kind, kind): str(path)}
+    if kind == "controls":
+        how = {"overrides": {"control": str(path)}}
     loaded: list[scenes.Scene] = []
     if refused(lambda: loaded.append(scenes.load(how.pop("scene", "paper"), **how))):
         return True

@@ -13,7 +13,6 @@ from codesign_jax import model, scene, start
 from codesign_jax.commands import preflight
 from codesign_jax.model.layout import first_on_palm
 from codesign_jax.scene import parameters
-from codesign_jax.types import Params
 from tests.helpers.grasps import hand_world, pinch, random_worlds, still
 
 
@@ -48,8 +47,9 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
 
     with jax.enable_x64(True):
         places, between, palm, invalid = map(np.asarray, of_engines(designs))
-    for i, one in enumerate(zip(*designs, strict=True)):
-        compiled = model.compile_model(the_scene, Params(*one), still())
+    for i in range(len(places)):
+        one = jax.tree.map(lambda v, i=i: v[i], designs)
+        compiled = model.compile_model(the_scene, one, still())
         data = mujoco.MjData(compiled)
         data.qpos[:] = places[i]
         mujoco.mj_kinematics(compiled, data)

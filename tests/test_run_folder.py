@@ -46,7 +46,7 @@ def test_a_users_own_scene_stays_where_it_is(more, mine, capsys):
     own = ["optimize", "--scene", mine / "scene.toml", "--engine", "mujoco", "--out", mine]
     assert command(*own, *more) == 2
     error = capsys.readouterr().err
-    assert f"{mine} holds hand.toml, meshes/capsule.stl, objects.toml and 1 more" in error
+    assert f"{mine} holds control.toml, hand.toml, meshes/capsule.stl and 2 more" in error
     assert "Choose another folder" in error
     assert snapshot(mine) == before and not (mine / ".lock").exists()
 
@@ -84,9 +84,9 @@ def test_what_is_no_run_is_not_cleared(left, fresh, run, capsys):
     assert snapshot(run) == before
 
 
-@pytest.mark.parametrize("moment", range(4))
+@pytest.mark.parametrize("moment", range(5))
 def test_a_start_that_was_cut_short_goes_on(moment, tmp_path, monkeypatch):
-    """At any file that it writes: provenance.json and three of the scene."""
+    """At any file that it writes: provenance.json and four of the scene."""
     folder, replace, count = tmp_path / "run", os.replace, [0]
 
     def killed(source, target):
@@ -110,7 +110,8 @@ def test_a_start_that_was_cut_short_goes_on(moment, tmp_path, monkeypatch):
         assert snapshot(folder) == before
         (folder / "hand.toml").write_text(text)
     start(folder)
-    names = [".lock", "events.log", "hand.toml", "objects.toml", "provenance.json", "scene.toml"]
+    names = [".lock", "control.toml", "events.log", "hand.toml", "objects.toml"]
+    names += ["provenance.json", "scene.toml"]
     assert sorted(os.listdir(folder)) == names
     assert scene.load(folder / "scene.toml") == tiny()[0]
 
@@ -203,4 +204,4 @@ def test_a_new_run_has_an_identity_of_its_own(tmp_path):
     first, second = (json.loads((tmp_path / n / "provenance.json").read_text()) for n in "ab")
     assert first["schema"] == second["schema"] == manifest.SCHEMA
     assert first["id"] != second["id"] and first["files"] == second["files"]
-    assert [*first["files"]] == ["scene.toml", "hand.toml", "objects.toml"]
+    assert [*first["files"]] == ["scene.toml", "hand.toml", "objects.toml", "control.toml"]

@@ -166,7 +166,7 @@ def test_units_and_the_question_are_in_the_schema(place):
     assert all(field.metadata[b"description"] for field in schema)
     question = json.loads(schema.metadata[b"question"])
     assert (question["seed"], question["trials"], question["preset"]) == (3, 1, "full")
-    assert {"scene.toml", "hand.toml", "objects.toml"} == set(question["scene"])
+    assert {"scene.toml", "hand.toml", "objects.toml", "control.toml"} == set(question["scene"])
 
 
 def test_row_groups_end_where_memory_would_grow(place, monkeypatch):

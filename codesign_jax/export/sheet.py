@@ -13,7 +13,7 @@ from codesign_jax.model.layout import mounts
 from codesign_jax.report import stress
 from codesign_jax.report.statistics import Interval
 from codesign_jax.report.stress import Stress
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, key_frames
 from codesign_jax.types import Params
 
 NAME = "build_sheet"
@@ -168,24 +168,22 @@ def _material(scene: Scene) -> SheetSection:
 
 
 def _control(scene: Scene, params: Params) -> SheetSection:
-    x, y, z, roll, pitch, yaw = np.asarray(params.arm, float)
-    palm = scene.arm.zero_height + z
-    top = f"{1e3 * scene.arm.start_height:.0f}"
-    heights = {"approach": f"{top} to {1e3 * palm:.1f}", "inflate": f"{1e3 * palm:.1f}"}
-    heights |= {"lift": f"{1e3 * palm:.1f} to {top}", "disturb": top, "ungrasp": top}
-    shares = {"approach": "0", "inflate": "0 to 1", "lift": "1", "disturb": "1"}
-    shares |= {"ungrasp": f"1 to 0 in {scene.phases.deflate_time:g} s"}
-    begin, rows = 0.0, []
-    for name, end in scene.phase_ends.items():
-        rows.append((name, f"{begin:g} to {end:g}", heights[name], shares[name]))
-        begin = end
+    times, poses = (np.asarray(f(scene, params)) for f in (key_frames.times, key_frames.poses))
+    terms = key_frames.pressures(scene, params)
+    pressures = sum(np.asarray(v) * np.asarray(f) for v, f in terms) + np.zeros((len(times), 1))
+    rows = []
+    for time, pose, row in zip(times, poses, 1e-3 * pressures, strict=True):
+        same = [f"{row[0]:.1f}"] if np.ptp(row) == 0 else [f"{p:.1f}" for p in row]
+        place = [f"{v:.1f}" for v in (*(1e3 * pose[:3]), *np.degrees(pose[3:]))]
+        rows.append((f"{time:g}", *place, " ".join(same)))
+    head = ("time s", "x mm", "y mm", "z mm", "roll °", "pitch °", "yaw °", "pressure kPa")
+    held = [i for i, f in enumerate(scene.control.frame) if f.interpolation == "held"]
     notes = [
-        f"Arm frame while grasping: x {1e3 * x:.1f} mm, y {1e3 * y:.1f} mm, height "
-        f"{1e3 * palm:.1f} mm above the table; roll {np.degrees(roll):.1f}°, pitch "
-        f"{np.degrees(pitch):.1f}°, yaw {np.degrees(yaw):.1f}° (Table I). Every time step: "
-        "commands.csv."
+        f"Key frames of the control {scene.control.name!r}: arm frame, z above the table, and "
+        "pressures of the fingers; between them linear"
+        + (f", but held after row {', '.join(str(i + 1) for i in held)}" if held else "")
+        + ". Every time step, with the shaking: commands.csv."
     ]
-    head = ("phase", "time s", "palm above the table mm", "share of the pressures")
     return SheetSection("Grasp", head, rows, notes)
 
 

@@ -83,8 +83,16 @@ MORE = {
 """Tables that are not of a run alone."""
 
 FILES = {
-    *("scene.toml", "hand.toml", "objects.toml", "meshes", "code", "provenance.json"),
-    *("checkpoints", "events.log", "failures", "figures", "landscape.npz", LANDSCAPE),
+    *("scene.toml", "hand.toml", "objects.toml", "control.toml", "meshes", "code"),
+    *(
+        "provenance.json",
+        "checkpoints",
+        "events.log",
+        "failures",
+        "figures",
+        "landscape.npz",
+        LANDSCAPE,
+    ),
     *("landscape.part", "reference.npz", REFERENCE, "stress.npz", "replay.html", "report.html"),
 }
 """Names at the top of a run folder, beside those of `TABLES`."""

@@ -241,7 +241,7 @@ def times(scene: Any, params: Params) -> jax.Array:
 
 def poses(scene: Any, params: Params, count: int | None = None) -> jax.Array:
     """Poses of the arm frame at the first `count` key frames [m, rad], shape (frame, 6)."""
-    names, dtype = _names(scene, params), params.arm.dtype
+    names, dtype = _names(scene, params), jnp.result_type(params.arm)
     pose: dict[str, Any] = {axis: params.arm[i] for i, axis in enumerate(POSE)}
     pose["z"], rows = scene.arm.start_height, []
     for frame in scene.control.frame[:count]:
@@ -261,7 +261,7 @@ def pressures(scene: Any, params: Params) -> list[tuple[Any, jax.Array]]:
       Named numbers [Pa], of shape (finger,) or (), and their factors, shape (frame, finger); the
       number is 1 where the factors are the numbers of the file.
     """
-    names, dtype = _names(scene, params), params.pressure.dtype
+    names, dtype = _names(scene, params), jnp.result_type(params.pressure)
     rows, now = [], [{}] * scene.num_fingers
     for frame in scene.control.frame:
         if frame.pressure is not None:
@@ -353,7 +353,8 @@ def _frame_table(frame: Frame) -> dict[str, Any]:
     given = {f.name: getattr(frame, f.name) for f in dataclasses.fields(frame)}
     found = {k: _text(v) if isinstance(v, Sum) else v for k, v in given.items() if v is not None}
     if frame.pressure is not None:
-        found["pressure"] = [_text(v) for v in frame.pressure]
+        values = [_text(v) for v in frame.pressure]
+        found["pressure"] = values if len(set(frame.pressure)) > 1 else values[0]
     return found
 
 

@@ -94,7 +94,9 @@ def test_supply_against_an_integrator():
         contact__time_constant=0.02,
     )
     time = np.arange(count) * h
-    wanted = 130e3 * control._inflation(scene, time)[None]
+    p, end = scene.phases, scene.window[1]
+    keys = [p.approach, p.inflate, end, end + p.deflate_time]
+    wanted = 130e3 * np.interp(time, keys, [0.0, 1.0, 1.0, 0.0])[None]
     with jax.enable_x64(True):
         reached = np.asarray(control.supplied(scene, jnp.asarray(wanted)))[0]
 

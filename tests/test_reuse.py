@@ -280,12 +280,19 @@ def test_many_structures_stay_below_a_limit(monkeypatch):
 def place(tmp_path, monkeypatch):
     """The folder of all caches; JAX's is not chosen yet."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    previous = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_compilation_cache
+    names = [
+        "jax_compilation_cache_dir",
+        "jax_compilation_cache_max_size",
+        "jax_enable_compilation_cache",
+        "jax_persistent_cache_min_compile_time_secs",
+    ]
+    previous = [getattr(jax.config, name) for name in names]
     jax.config.update("jax_compilation_cache_dir", None)
     compilation_cache.reset_cache()
     yield tmp_path / "codesign-jax"
-    jax.config.update("jax_compilation_cache_dir", previous[0])
-    jax.config.update("jax_enable_compilation_cache", previous[1])
+    # The limit too: with one JAX asks for the age of every program that other tests share.
+    for name, value in zip(names, previous, strict=True):
+        jax.config.update(name, value)
     compilation_cache.reset_cache()
 
 

@@ -173,7 +173,7 @@ def test_kept_code_runs_in_another_process_on_several_devices(folder):
         patch.setattr(host, "known", lambda name: False)  # another test may have compiled it
         patch.setattr(host, "register", lambda *_: None)
         jax.jit(kernels.run).lower(x, table)
-    assert list(folder.rglob("*.kernel"))
+    assert list(folder.rglob("*.kept"))
     here = {**os.environ, "PYTHONPATH": os.pathsep.join([".", *sys.path])}
     done = subprocess.run(
         [sys.executable, "-c", DEVICES, str(folder)],
@@ -193,7 +193,7 @@ def test_code_that_is_not_optimized_is_other_code_with_the_same_result(folder, m
     for level in ("2", "0"):
         monkeypatch.setenv(host.OPTIMIZATION, level)
         found.append(jax.jit(partial(kernels.run, rounds=8))(x, table))
-        assert len(list(folder.rglob("*.kernel"))) == len(found)
+        assert len(list(folder.rglob("*.kept"))) == len(found)
     # The chaotic map multiplies a difference by up to 3.9 in each of eight rounds.
     np.testing.assert_allclose(*found, atol=3.9**8 * 6e-8)
     monkeypatch.setenv(host.OPTIMIZATION, "3")

@@ -74,7 +74,9 @@ def weights_of(start, seed=0):
     """Random ones."""
     random, nq, steps = np.random.default_rng(seed), len(start.fields.start), len(start.ctrl)
     shapes = (2 * nq - 1,), (steps, 3), (steps, nq)
-    return Weights(*(random.normal(size=shape) for shape in shapes))
+    weights = Weights(*(random.normal(size=shape) for shape in shapes))
+    weights.entries[0, 2] = 0.0  # the first speed is a number of the state, as it is given
+    return weights
 
 
 class Case:

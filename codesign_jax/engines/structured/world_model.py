@@ -1,7 +1,7 @@
 """Constants of a rollout in lane layout, taken from the same model fields as every engine uses."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -136,8 +136,12 @@ def world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
 
     A rollout asks for them at its start and in the engine, and traces them once.
     """
-    # Apart from what is around it, XLA rounds it alike in every program.
-    apart = jax.lax.optimization_barrier
+
+    # Apart from what is around it, XLA rounds it alike in every program. Each array by itself: one
+    # that the scene's effects do not ask for leaves the program.
+    def apart(tree: Any) -> Any:
+        return jax.tree.map(jax.lax.optimization_barrier, tree)
+
     return apart(_world_constants(scene.structure, apart(fields)))
 
 

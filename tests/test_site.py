@@ -157,7 +157,7 @@ def test_the_site_is_read_and_searched_without_a_network(site, browser):
     page.goto((site / "index.html").as_uri())
     shown = "e => e.complete && e.naturalWidth > 0"
     assert all(picture.evaluate(shown) for picture in page.locator("article img").all())
-    assert page.locator("article img[src$='.gif']").count() >= 1
+    assert page.locator("article img").count() >= 1
     # Key by key: the search listens to keys. What is filled in once its index is there goes unseen.
     page.locator("input.md-search__input").press_sequentially("shear modulus")
     page.wait_for_selector(".md-search-result__item a[href*='reference.html']", timeout=20_000)

@@ -1,6 +1,7 @@
 """Scene files: read with hand, objects and a preset of accuracy, and checked as a whole."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ from codesign_jax.scene import hand, keypaths, library, objects, reach, schema
 from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.tables import Accuracy
 
+GONE = ("effects.soft_touch", "effects.speculative_palm", "contact.touch_depth")
+GONE += ("contact.time_constant", "contact.impedance")
+"""Keys of earlier scene files, which have no effect any more; see docs/hull.md."""
 _OF_ACCURACY = ("discretization", "solver", "newton")
 """Tables of a scene that a preset of accuracy replaces values of."""
 
@@ -39,6 +43,7 @@ def load(
     table = library.read(path)
     problems: list[str] = []
     changes = keypaths.flatten(_preset(accuracy, problems)) | keypaths.flatten(overrides or {})
+    _leave_out(table, changes, path.name)
     inside = {key: keypaths.below(changes, key) for key in ("hand", "objects")}
     own = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
     places = keypaths.apply(table, own, path.name, problems)
@@ -66,6 +71,20 @@ def load(
     parts["hand"] = hand.with_strain(parts["hand"], parsed.limits.strain, neo_hookean=law)
     names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
     return Scene(**parts, **{n: getattr(parsed, n) for n in names})
+
+
+def _leave_out(table: dict, changes: dict[tuple, Any], where: str) -> None:
+    """Takes the keys of `GONE` out of a scene's table and its changes, with a warning."""
+    found = []
+    for key in (tuple(name.split(".")) for name in GONE):
+        inside = table.get(key[0])
+        if isinstance(inside, dict) and inside.pop(key[1], None) is not None:
+            found.append(".".join(key))
+        if changes.pop(key, None) is not None:
+            found.append(".".join(key))
+    if found:
+        text = f"{where}: {', '.join(found)} no longer has a meaning and is left out; docs/hull.md"
+        warnings.warn(text, stacklevel=3)
 
 
 def load_accuracy(name: str | Path) -> Accuracy:
@@ -153,12 +172,6 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
         problems.append(
             f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
             f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
-        )
-    if scene.contact.time_constant < 2 * h:
-        problems.append(
-            f"{where}.contact.time_constant = {scene.contact.time_constant:g} s "
-            f"must be at least two time steps ({2 * h:g} s): "
-            "a stiffer contact is unstable (MuJoCo's refsafe)"
         )
     if scene.effects.lateral_threshold and not scene.effects.lateral_bending:
         problems.append(

@@ -243,9 +243,13 @@ def test_deflation_must_end_before_the_grasp_does():
     assert "deflate_time" in problem
 
 
-def test_contact_stiffer_than_the_time_step_allows():
-    (problem,) = scene_problems(discretization={"timestep": 0.02})
-    assert "time_constant" in problem and "0.04" in problem
+def test_keys_of_earlier_scene_files_are_read_with_a_warning():
+    gone = {"contact.time_constant": 0.04, "effects.soft_touch": True}
+    with pytest.warns(UserWarning, match="effects.soft_touch, contact.time_constant no longer"):
+        found = scene.load("paper", overrides=gone)
+    assert found == scene.load("paper")
+    with pytest.raises(schema.InputError, match="contact.impedence"):
+        scene.load("paper", overrides={"contact.impedence": 0.9})
 
 
 def test_all_problems_of_all_files_at_once(tmp_path):

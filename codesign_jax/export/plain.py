@@ -22,7 +22,7 @@ import numpy as np
 
 from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
-from codesign_jax.model.layout import pairings_held, palm_ahead
+from codesign_jax.model.layout import pairings_held
 from codesign_jax.model.pairs import SOLIMP
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trial
@@ -48,7 +48,7 @@ class Inexpressible(ValueError):
 def differences(scene: Scene) -> list[str]:
     """What of a scene the model lacks or has in another form, a sentence each."""
     acts = {name: getattr(scene.effects, name) for name in _LEFT_OUT}
-    acts |= {"friction_memory": pairings_held(scene) > 0, "speculative_palm": palm_ahead(scene)}
+    acts |= {"friction_memory": pairings_held(scene) > 0}
     found = [
         f"the model is without effects.{name}: {how}"
         for name, how in _LEFT_OUT.items()
@@ -56,7 +56,7 @@ def differences(scene: Scene) -> list[str]:
     ]
     if scene.effects.surface == "hull":
         found.append(
-            'the model has effects.surface = "hull" as points on the links that its vertices follow'
+            'the model has effects.surface = "hull" as spheres at its rings, and capsules between fingers'
         )
     return found + [
         f"the model has the mesh {shape.name!r} as its convex hull"

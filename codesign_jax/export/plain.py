@@ -56,7 +56,7 @@ def differences(scene: Scene) -> list[str]:
     ]
     if scene.effects.surface == "hull":
         found.append(
-            'the model has effects.surface = "hull" as spheres at its rings, and capsules between fingers'
+            'the model has effects.surface = "hull" as spheres at its rings and capsules of fingers'
         )
     return found + [
         f"the model has the mesh {shape.name!r} as its convex hull"

@@ -98,7 +98,7 @@ def test_penetrations_equal_mujoco(kind):
     """The depth of a sphere that overlaps the object."""
     position, quat, centre = poses(kind, 8)
     want, _ = reference(kind, position, quat, centre)
-    gap = np.asarray(engine_contacts(kind, position, quat, centre).distance)[0]
+    gap = np.asarray(engine_contacts(kind, position, quat, centre).gap)[0]
     inside = gap < -1e-6
     assert inside.sum() > 100
     np.testing.assert_allclose(gap[inside], want[inside], rtol=0, atol=1e-14)

@@ -226,7 +226,7 @@ def test_a_sphere_is_as_stiff_as_its_share_of_the_finger(skinned):
         expected = share * alone.contact.normal_stiffness * 2 / bodies
         assert stiffness[contact.efc_address] == pytest.approx(expected, rel=1e-9)
         touching += share < 1
-    assert touching > 10
+    assert touching > 2
 
 
 def test_a_grasp_of_the_skin_is_its_file_s(skinned):

@@ -6,7 +6,7 @@ below, which count from the last of `frictions`.
 
 from typing import Any
 
-from codesign_jax.model.layout import IMPEDANCE, palm_impedance
+from codesign_jax.model.layout import IMPEDANCE, dissipation, palm_impedance
 from codesign_jax.scene import Scene
 
 OBJECT_TABLE, HAND_TABLE, FINGERS, PALM = -4, -3, -2, -1
@@ -37,6 +37,6 @@ def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, li
     c = scene.contact
     turning = [c.torsional_friction, c.rolling_friction, c.rolling_friction]
     h = scene.discretization.timestep
-    spring, damper = 1.0 / (h * (h + c.dissipation_time)), 1.0 / h
+    spring, damper = 1.0 / (h * (h + dissipation(scene))), 1.0 / h
     reference = [-impedance * spring, -impedance * damper]
     return [friction, friction, *turning], reference, [impedance] * 2 + [*SOLIMP]

@@ -354,7 +354,7 @@ class Rings:
 def reach(half, direction):
     """Support of |x/e|^4 + |y/a|^4 + |z/b|^4 = 1 in a direction, and where it is reached."""
     along = half * direction
-    largest = np.sqrt(along @ along + 1e-12)
+    largest = np.linalg.norm(along)
     unit = along / largest
     size = largest * ((unit**2 + FLOOR) ** (2 / 3)).sum() ** 0.75
     return size, along / size
@@ -411,7 +411,7 @@ def between(ring, other, low, high):
     i, t = other.nearest(ring.centre, low, high)
     a, b = other.points[i : i + 2]
     away, section = ring.centre - a - t * (b - a), other.section(i, t)
-    apart = np.sqrt(away @ away + FLOOR**2)
+    apart = np.linalg.norm(away)
     line, normal = away / apart, 0.0
     half = np.array([other.rings[-1].half[0] if i == other.links else 0.0, *ring.half[1:]])
     half[1:] = other.rings[-1].half[1:]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
-from codesign_jax.engines.structured.kernel.memory import either, full, loop, upper
+from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
 from codesign_jax.engines.structured.lanes import contract, dot, total
@@ -40,35 +40,38 @@ class Elimination:
         if problem.pairs:
             self.between_fingers(problem.pairs, alpha)
 
-        def eliminate(node, pushes, pair, body, motion, smooth, tau, axes, armature, acc):
+        def load(node, body, motion, smooth, pair):
             link = make_body(*body)
-            push, tau = smooth - link.times(motion), tau - armature * acc
+            push = smooth - link.times(motion)
             push = push if pair is None else push + pair
-            node = el.add_link(node, el.link_terms(link.matrix(), push, pushes))
+            return node._replace(p=node.p + link.matrix(), r=node.r + push)
+
+        def eliminate(node, axes, armature, tau, acc):
+            tau = tau - armature * acc
             y = contract(axes, node.r[None], 1) + tau
             node, kept = el.eliminate(node, axes, armature, tau)
             return node, kept, dot(y, kept.factors.z)
 
-        def free(node, pushes, *forces):
+        def free(node, *forces):
             """`eliminate` where the subtree does not touch the object: c, q and r_object are 0."""
-            pushes = {name: push for name, push in pushes.items() if name != "finger_object"}
-            new, kept, more = eliminate(node._replace(c=None), pushes, *forces)
+            new, kept, more = eliminate(node._replace(c=None), *forces)
             factors = kept.factors._replace(g=jnp.zeros_like(kept.factors.w))
             return new._replace(c=node.c), kept._replace(factors=factors), more
 
         def step(i: Any, carry: tuple) -> tuple:
             node, work = carry
             acc, motion = self.accelerations(i, alpha)
-            pushes = {c.set.name: self.push(c, i, alpha) for c in problem.fingers}
             smooth, tau = self.smooth(i)
             axes, armature = problem.read("axes", "armature", item=i)
-            node = node._replace(p=full(node.p), q=full(node.q))
             pair = problem.pairs.pushed(i + 1) if problem.pairs else None
-            forces = (motion, smooth, tau, axes, armature, acc)
-            forces = (problem.body_of(i), *forces)
+            node = node._replace(p=full(node.p), q=full(node.q))
+            node = lanewise(load, node, problem.body_of(i), motion, smooth, pair)
+            for contacts in problem.fingers:
+                node = self.touch(node, contacts, i, alpha)
+            forces = axes, armature, tau, acc
 
             def eliminated(how: Callable) -> tuple[el.Quadratic, Lanes]:
-                new, kept, more = lanewise(how, node, pushes, pair, *forces)
+                new, kept, more = lanewise(how, node, *forces)
                 for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
                     problem.write(name, value, i)
                 if problem.slotted:
@@ -76,10 +79,8 @@ class Elimination:
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 
             ways = (partial(eliminated, eliminate), partial(eliminated, free))
-            node, more = either(i <= held, *ways, self.block.size)
-            if problem.pairs:
-                work = lanewise(jnp.add, work, more)
-            return node, work
+            node, more = ways[1]() if held is None else either(i <= held, *ways, self.block.size)
+            return node, lanewise(jnp.add, work, more) if problem.pairs else work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         start, held = (el.Quadratic(*empty), zeros((), self.like)), self.last_on_object()
@@ -107,15 +108,22 @@ class Elimination:
         """Prepares contacts between fingers, see `BoundPairs.update_constraints`."""
         pairs.update_constraints(alpha)
 
-    def last_on_object(self) -> jax.Array:
-        """Last link with contacts with the object, a scalar; -1 if there is none."""
+    def touch(self, node: el.Quadratic, contacts: BoundContacts, i: Any, alpha: Lanes) -> Any:
+        """Adds a link's contacts with object or table, if there are any."""
+
+        def add() -> el.Quadratic:
+            return lanewise(_add, node, *self.push(contacts, i, alpha), contacts.set.on_object)
+
+        return choose(contacts.touching(i), add, node, self.block.size)
+
+    def last_on_object(self) -> jax.Array | None:
+        """Last link with contacts with the object, -1 for none; None if the scene has none."""
         held = [c for c in self.problem.fingers if c.set.on_object]
 
         def later(i: Any, last: jax.Array) -> jax.Array:
             return jnp.where(held[0].touching(i), jnp.asarray(i, jnp.int32), last)
 
-        none = jnp.int32(-1)
-        return jax.lax.fori_loop(0, self.links, later, none) if held else none
+        return jax.lax.fori_loop(0, self.links, later, jnp.int32(-1)) if held else None
 
     def slot_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
         """Contact inertia and wrench of the palm's and the object's contacts; see `backward`."""
@@ -177,3 +185,11 @@ def with_palm(
     )
     matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
     return el.add_palm(node, matrices, force, pushes), force
+
+
+def _add(node: el.Quadratic, matrix, wrench, held: bool) -> el.Quadratic:
+    p, c, q, r, ro = node
+    p, r = p + matrix, r + wrench
+    if held:
+        c, q, ro = c + matrix, q + matrix, ro - wrench
+    return el.Quadratic(p, c, q, r, ro)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.laws.contact import Cone
-from codesign_jax.model.layout import contact_mass, friction_ratio
+from codesign_jax.model.layout import contact_mass, dissipation, friction_ratio
 from codesign_jax.scene import Scene
 
 
@@ -49,11 +49,12 @@ def make_cone(
       stiffer: Stiffness over `contact.normal_stiffness`.
     """
     c, h = scene.contact, scene.discretization.timestep
-    normal = 2.0 / bodies * stiffer * contact_mass(scene)
-    reference = 1.0 / (h * (h + c.dissipation_time)), 1.0 / h + 0.0 * normal
+    how = {"ahead": scene.effects.surface == "hull"}
+    normal = 2.0 / bodies * stiffer * contact_mass(scene, **how)
+    reference = 1.0 / (h * (h + dissipation(scene, **how))), 1.0 / h + 0.0 * normal
     if scene.effects.friction == "none":
         return Cone(normal, None, None, None, *reference)  # type: ignore[arg-type]
-    impratio = friction_ratio(scene, c.friction_ratio if ratio is None else ratio)
+    impratio = friction_ratio(scene, c.friction_ratio if ratio is None else ratio, **how)
     cone = Cone(normal, impratio * normal, friction, friction / jnp.sqrt(impratio), *reference)
     if scene.effects.friction != "full":
         return cone

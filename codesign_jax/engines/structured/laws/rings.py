@@ -23,6 +23,8 @@ NOMINAL = 0.5e-3
 """Least depth of which a contact has the stiffness, also before it touches [m]."""
 FADE = 1e-3
 """Distance of two centre lines at which their contact has lost 3 parts in 10 of its force [m]."""
+SMALL = 1e-18
+"""Of squared lengths [m^2], likewise."""
 FLOOR = 1e-6
 """Of squares of numbers up to one, where the slope of a root would have none."""
 
@@ -95,7 +97,7 @@ def support(half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array
       direction: Unit vector in the ring's frame, shape (3, ...).
     """
     along = half * direction
-    largest = jnp.sqrt(dot(along, along) + 1e-12)
+    largest = jnp.sqrt(dot(along, along) + SMALL)
     unit = along / largest
     squares = [u * u + FLOOR for u in jnp.unstack(unit)]
     root = jnp.sqrt(total([s / cube_root(s) for s in squares]))  # of the sum of |u|^(4/3)
@@ -153,7 +155,7 @@ def section_normal(half: jax.Array, local: jax.Array) -> jax.Array:
     y, z = local[1] / half[1], local[2] / half[2]
     largest = jnp.maximum(jnp.maximum(jnp.abs(y), jnp.abs(z)), 1e-6)
     y, z = (y / largest) ** 3 / half[1], (z / largest) ** 3 / half[2]
-    size = jnp.sqrt(y * y + z * z + 1e-12)
+    size = jnp.sqrt(y * y + z * z + SMALL)
     return jnp.stack([jnp.zeros_like(y), y / size, z / size])
 
 
@@ -174,7 +176,7 @@ def aim(ring: Ring, frame: jax.Array, distance: jax.Array, gradient: jax.Array) 
     """
     local = apply_rows(frame, -jnp.maximum(distance, 0.0) * gradient)
     normal = section_normal(ring.half, local)
-    length = jnp.sqrt(local[1] ** 2 + local[2] ** 2 + 1e-12)
+    length = jnp.sqrt(local[1] ** 2 + local[2] ** 2 + SMALL)
     away = jnp.stack([0.0 * length, local[1] - length * normal[1], local[2] - length * normal[2]])
     moves = (distance > 0) & (ring.tip < 0.5)
     return apply_columns(frame, jnp.where(moves, away, 0.0))
@@ -261,13 +263,13 @@ def between(
     """
     other = section_frame(segment, t)
     away = centre - on_line(segment, t)
-    apart = jnp.sqrt(dot(away, away) + 1e-12)
+    apart = jnp.sqrt(dot(away, away) + SMALL)
     line, normal = away / apart, jnp.zeros_like(away)
     for axes, half, side in ((frame, ring.half, -1.0), (other, segment.half, 1.0)):
         own = apply_columns(axes, side * section_normal(half, side * apply_rows(axes, away)))
         along = dot(line, axes[0]) ** 2
         normal = normal + own + along * (line - own)
-    normal = normal / jnp.sqrt(dot(normal, normal) + 1e-12)
+    normal = normal / jnp.sqrt(dot(normal, normal) + SMALL)
     toward, back = -apply_rows(frame, normal), apply_rows(other, normal)
     beyond = jnp.where((t >= 1.0) & (back[0] > 0), segment.half[0], 0.0)
     theirs, _ = support(jnp.stack([beyond, segment.half[1], segment.half[2]]), back)

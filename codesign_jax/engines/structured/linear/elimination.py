@@ -183,37 +183,6 @@ def solve_object(q: jax.Array, r: jax.Array) -> jax.Array:
     return jnp.concatenate([contract(top, left[None], 1), second])
 
 
-class Own(NamedTuple):
-    """A link's own inertia, forces and contacts.
-
-    Attributes:
-      matrix: Inertia with that of all contacts, shape (6, 6, link, finger, world).
-      push: Force with that of all contacts, shape (6, link, finger, world).
-      object: The contacts with the object alone, alike, if the scene has them.
-    """
-
-    matrix: jax.Array
-    push: jax.Array
-    object: tuple[jax.Array, jax.Array] | None
-
-
-def link_terms(matrix: jax.Array, push: jax.Array, terms: dict) -> Own:
-    """Sums inertia, forces and contacts of the links."""
-    for inertia, wrench in terms.values():
-        matrix, push = matrix + inertia, push + wrench
-    return Own(matrix, push, terms.get("finger_object"))
-
-
-def add_link(node: Quadratic, own: Own) -> Quadratic:
-    """Adds a link's own inertia, forces and contacts to what its children left."""
-    p, c, q, r, ro = node
-    p, r = p + own.matrix, r + own.push
-    if own.object is not None:
-        coupling, wrench = own.object
-        c, q, ro = c + coupling, q + coupling, ro - wrench
-    return Quadratic(p, c, q, r, ro)
-
-
 def add_palm(node: Quadratic, matrix: Matrices, force: Forces, pushes: dict) -> Quadratic:
     """Sums the fingers and adds the palm, the object and their contacts."""
     sums: Any = [None if v is None else sum_fingers(v) for v in node]

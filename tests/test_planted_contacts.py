@@ -39,7 +39,7 @@ FIELD, AIM, BETWEEN, BALLS = "rings_on_field", "aimed", "between", "balls"
 BEGUN, HELD, HOLD, KEEP = "begun", "_with_held", "sums.<locals>.add", "quotient"
 RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
 LOAD = "BoundPairs.load.<locals>.wrench"
-ELIMINATE = "Elimination.backward.<locals>.eliminate"
+LINK, ADD = "Elimination.backward.<locals>.load", "_add"
 NEXT = "next acceleration"
 """A check of the second step, of a fault in what the first one leaves."""
 TIMES, AGAIN, PALM_AGAIN = "_times", "_again", "Coupling._palm.<locals>.solve"
@@ -85,22 +85,18 @@ def half_gap(right, margin, where, *rest):
     return right(margin, where._replace(gap=gap), *rest)
 
 
-def eliminated(change):
-    """Another result of the elimination of a link's joint, or of its arguments."""
-    return Fault({ELIMINATE: change})
+def without_pairs(right, node, body, motion, smooth, pair):
+    """Links do not feel contacts between fingers."""
+    return right(node, body, motion, smooth, 0 * pair)
 
 
-def without_pairs(right, node, pushes, pair, *rest):
-    return right(node, pushes, 0 * pair, *rest)
+def added(*fields):
+    """Contacts with object or table add nothing to these fields of the elimination."""
 
+    def stage(right, node, *rest):
+        return right(node, *rest)._replace(**{f: getattr(node, f) for f in fields})
 
-def object_at_rest(right, node, pushes, *rest):
-    new, *others = right(node, pushes, *rest)
-    return new._replace(r_object=new.r_object + pushes["finger_object"][1]), *others
-
-
-def apart(right, node, pushes, *rest):
-    return right(node._replace(c=node.c - pushes["finger_object"][0]), pushes, *rest)
+    return Fault({ADD: stage})
 
 
 def first_only(right, mine, self, row, which, fields, lane):
@@ -162,7 +158,7 @@ PAIRS = {
     "the other finger does not feel the contact": Fault(
         {LOAD: lambda f, *a: jnp.zeros_like(f(*a))}, finger=1
     ),
-    "links do not feel contacts between fingers": eliminated(without_pairs),
+    "links do not feel contacts between fingers": Fault({LINK: without_pairs}),
     "relative motion of one side": Fault({}, methods={(BoundPairs, "relative"): own_half}),
     "half the Hessian between fingers": Fault({TIMES: lambda f, *a: 0.5 * f(*a)}),
     "conjugate gradients without forces on the object": Fault({PALM_AGAIN: without_last}),
@@ -170,8 +166,10 @@ PAIRS = {
     # of all contacts
     "no reference acceleration": Fault({BEGUN: unwanted}),
     "contacts without velocity": Fault({BEGUN: at_rest}),
-    "the object does not feel fingers": eliminated(object_at_rest),
-    "link and object apart": eliminated(apart),
+    "the object does not feel fingers": added("r_object"),
+    "link and object apart": added("c"),
+    "the object's matrix has no contacts": added("q"),
+    "links do not feel the object": added("r"),
     "fingers rub each other as the object": cone_of("finger_finger", "finger_object"),
 }
 HULL = {

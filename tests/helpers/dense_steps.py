@@ -248,18 +248,12 @@ class DensePairs(Dense):
 
     def _on_itself(self, f, ring):
         c, finger, before = self.scene.contact, self.fingers[f], len(self.rows)
-        away = max(3.0, 1.8 * finger.height / finger.segment)
-        for low, high in ((0.5, ring.along - away), (ring.along + away, finger.links)):
-            if low > high:
-                continue
-            place = between(ring, finger, low, high)
-            point, normal, gap, share, body = place
-            ends, sign = (ring.body, body), 1.0
-            if body > ring.body:  # the first side is the one nearer to the tip
-                ends, normal = ends[::-1], -normal
+        end = ring.along - max(3.0, 1.8 * finger.height / finger.segment)
+        if end >= 0.5:
+            point, normal, gap, share, body = between(ring, finger, 0.5, end)
             grip = None if self.own is None else self.own[f]
-            rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, grip, sign, f
-            self._add(point, normal, gap, share, ends, *rest)
+            rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, grip, 1.0, f
+            self._add(point, normal, gap, 2 * share, (ring.body, body), *rest)
         self._count("itself", before)
 
     def _on_finger(self, f, g, ring):

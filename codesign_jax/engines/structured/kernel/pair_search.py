@@ -1,8 +1,8 @@
 """Finds where fingers touch each other, themselves and the palm: rings or spheres.
 
-A ring meets the nearest place of another finger's centre line, or of its own before and behind it
-that is `arc` away along the finger.  Both fingers' rings look, each with half of the stiffness, see
-`rings.between`.  The lanes of a team, see `teams`, look with a ring each.
+A ring meets the nearest place of another finger's centre line, or of its own on the way back to the
+palm that is `arc` away along the finger.  Both fingers' rings look, each with half of the
+stiffness, see `rings.between`.  The lanes of a team, see `teams`, look with a ring each.
 """
 
 from collections.abc import Callable
@@ -236,37 +236,25 @@ class Search:
 
     def _on_itself(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
-        cone, held = self.pairs.of_row(1), grip.of_row(self.step, self.pairs, 0)
-        for side in (-1, 1):
-            ends = self._away(item, side)
-            square, other, t = self._nearest("line", centre, ends)
-            near = self._near(square, numbers, numbers, self.read("fastest"))
+        square, other, t = self._nearest("line", centre, item)
+        near = mine & self._near(square, numbers, numbers, self.read("fastest"))
 
-            def enter(other: Any = other, t: Any = t, side: int = side) -> None:
-                place = self._between(numbers, frame, centre, other, t, None)
-                if side > 0:  # a contact's first side is the one nearer to the tip
-                    place, rows = lanewise(turned, place), (other, row + jnp.zeros_like(other))
-                else:
-                    rows = row + jnp.zeros_like(other), other
-                self._alone(place, cone, rows, held, item, mine)
+        def enter() -> None:
+            place = lanewise(whole, self._between(numbers, frame, centre, other, t, None))
+            cone, held = self.pairs.of_row(1), grip.of_row(self.step, self.pairs, 0)
+            self._alone(place, cone, (row + jnp.zeros_like(other), other), held, item, near)
 
-            any_of(mine & near, enter)
+        any_of(near, enter)
 
-    def _away(self, item: Any, side: int) -> tuple[jax.Array, jax.Array]:
-        """Between which places along it [links] a finger is touched by one of its own rings."""
-        at, least = self._along(item), lanewise(arc, self.ring(self.count - 1)).lane
-        none = jnp.zeros_like(at)
-        return (none, at - least) if side < 0 else (at + least, none + 1e6)
+    def _end(self, item: Any) -> jax.Array:
+        """The last place along a finger [links] that one of its rings touches."""
+        return self._along(item) - lanewise(arc, self.ring(self.count - 1)).lane
 
-    def windows(self, item: Any, row: Any) -> list[tuple[jax.Array, jax.Array]]:
-        """Limits of where along segments rings touch their own finger, before and behind them."""
-        return [self._window(self._away(item, side), row) for side in (-1, 1)]
-
-    def _window(self, ends: tuple, row: Any) -> tuple[jax.Array, jax.Array]:
+    def last_of(self, item: Any, row: Any) -> jax.Array:
+        """The last place on a segment, 0 to 1, that rings of the same finger touch."""
         start = self.like + jnp.asarray(row).astype(self.like.dtype) - 0.5
         length = jnp.where(jnp.equal(row, self.p.links), self.like + TIP, 1.0)
-        low, high = ((end - start) / length for end in ends)
-        return jnp.maximum(low, 0.0), jnp.minimum(high, 1.0)
+        return jnp.minimum((self._end(item) - start) / length, 1.0)
 
     def _along(self, item: Any) -> jax.Array:
         """Place of a ring along the finger, in links from its base."""
@@ -283,7 +271,7 @@ class Search:
         self, row: Any, pairing: Pairing, there: Any, first: Any, item: Any, mine: Any
     ) -> None:
         link, numbers, frame, centre = self.body(item)
-        square, other, t = self._nearest("other", centre, None)
+        square, other, t = self._nearest("other", centre)
         speed = lanewise(jnp.add, *(self.read("fastest", 0, at) for at in (None, pairing.lane)))
         theirs = self.ring(self.count - 1, pairing.lane)
         near = there & mine & self._near(square, numbers, theirs, speed)
@@ -315,36 +303,35 @@ class Search:
 
         any_of(which, lambda: each(2, way))
 
-    def _nearest(self, name: str, centre: Lanes, ends: tuple | None) -> tuple:
+    def _nearest(self, name: str, centre: Lanes, itself: Any = None) -> tuple:
         """The nearest place of a centre line: squared distance, segment, and where along it.
 
         Args:
           name: "line" or "other".
           centre: Places, lanes.
-          ends: Of the finger itself: between which places along it [links]; lanes.
+          itself: Of the finger's own line: the ring whose place it is.
         """
         last = self.p.links
 
-        def compare(segment, centre, best, number, window):
+        def compare(segment, centre, best, number, end):
             start, along = segment[:3], segment[3:6]
             away = centre - start
             t = dot(away, along) * segment[6]
-            t = jnp.minimum(jnp.maximum(t, window[0]), window[1])
+            t = jnp.minimum(jnp.maximum(t, 0.0), end)
             left = away - t * along
-            square = jnp.where(window[0] <= window[1], dot(left, left), 1.0)
+            square = jnp.where(end >= 0, dot(left, left), 1.0)
             better = square < SURELY * best[0]
             new = jnp.stack([square, number + 0.0 * square, t])
             return jnp.where(better, new, best)
 
         def one(row: Any, best: Lanes) -> Lanes:
-            zero, number = self.like, self.like + jnp.asarray(row).astype(self.like.dtype)
-            low, high = (zero, zero + 1.0) if ends is None else self._window(ends, row)
-            window = lanes([low, high], (2,), wide=True)
-            place = lanes([number], (), wide=True)
-            return lanewise(compare, self.read(name, row), centre, best, place, window)
+            number = self.like + jnp.asarray(row).astype(self.like.dtype)
+            end = self.like + 1.0 if itself is None else self.last_of(itself, row)
+            place, end = (lanes([v], (), wide=True) for v in (number, end))
+            return lanewise(compare, self.read(name, row), centre, best, place, end)
 
         best = lanes([self.like + 1.0, self.like, self.like], (3,), wide=True)
-        first = 0 if ends is None else 1  # a finger's half link at the palm is the palm's
+        first = int(itself is not None)  # a finger's half link at the palm is the palm's
         best = loop(last + 1 - first, lambda k, b: one(k + first, b), best, self.block.size)
         square, number, t = (best[k].lane for k in range(3))
         return square, number.astype(jnp.int32), t
@@ -447,9 +434,9 @@ def balls(numbers, centre, theirs, their_centre):
     return rings.ball_on_ball(numbers[3] * numbers[6], centre, theirs[3] * theirs[6], their_centre)
 
 
-def turned(place: Place) -> Place:
-    """A contact from its other side."""
-    return place._replace(normal=-place.normal)
+def whole(place: Place) -> Place:
+    """A contact that no ring of the other side looks for."""
+    return place._replace(share=2.0 * place.share)
 
 
 def above(origin, before, frame, numbers):
@@ -457,9 +444,9 @@ def above(origin, before, frame, numbers):
     return origin + 0.5 * numbers[5] * (before[2] + frame[2])
 
 
-def where_on(ends, point, low, high):
+def where_on(ends, point, last):
     """Where between its ends a segment is nearest to a point, see `rings.nearest`."""
-    return rings.nearest(point, Segment(ends, None, None), low, high)  # type: ignore[arg-type]
+    return rings.nearest(point, Segment(ends, None, None), last)  # type: ignore[arg-type]
 
 
 def _line(start, end):

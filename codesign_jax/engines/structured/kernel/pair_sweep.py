@@ -114,21 +114,16 @@ class PairSweep:
         """Adds the cotangents of a ring and of another finger's segment."""
         row = self.pairs.read("row", item)
         other = pairing.swap(row).lane.astype(jnp.int32)
-        still = {"low": self._float(0), "high": self._float(1), "side": self._float(1)}
+        still = {"end": self._float(1), "part": self._float(1)}
         theirs = self._rings(item, pairing, live, other, pairing.lane, still)
         line, where = pairing.swap((theirs, self._float(other)))
         self._leave_line(line, where.lane.astype(jnp.int32))
 
     def _on_itself(self, item: Any, pairing: Pairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of its own finger's segment."""
-        number, own, _ = self._ring(item)
-        rows = [self.pairs.read(n, item).lane.astype(jnp.int32) for n in ("row", "other")]
-        first = rows[0] == own
-        other = jnp.where(first, rows[1], rows[0])
-        ends = self.sweep.step.search.windows(number, other)
-        low, high = (jnp.where(first, *pair) for pair in zip(*ends, strict=True))
-        still = {"low": self._float(low), "high": self._float(high)}
-        still["side"] = self._float(jnp.where(first, self.like + 1.0, self.like - 1.0))
+        other = self.pairs.read("other", item).lane.astype(jnp.int32)
+        end = self.sweep.step.search.last_of(self._ring(item)[0], other)
+        still = {"end": self._float(end), "part": self._float(2)}
         line = self._rings(item, pairing, live, other, self.lane, still)
         self._leave_line(line, other)
 

@@ -238,8 +238,8 @@ def between_rings(
       numbers: Numbers of the cone.
       held: What the fingers hold, see `holding.held`, and cotangents of the sums of
         `holding.hold`; nothing where they have no such state.
-      still: Whether the segment is the last one, "last", the limits of where it is touched, "low"
-        and "high", and the side of the ring, "side", see `pair_search`.
+      still: Whether the segment is the last one, "last", where it may be touched at the most,
+        "end", and the contact's part of the force of two sides, "part".
     """
     place, ring = mine
     link, before, after = theirs.place, *theirs.frames
@@ -248,11 +248,11 @@ def between_rings(
     tip = pair_search.ring_centre(link.origin, link.frame, theirs.tip)
     ends = start, jnp.where(still["last"] > 0, tip, behind)
     centre = pair_search.ring_centre(*place[:2], ring)
-    t = pair_search.where_on(ends, centre, still["low"], still["high"])
+    t = pair_search.where_on(ends, centre, still["end"])
     other = ends, (before, link.frame, after), theirs.tip, still["last"]
     found = pair_search.between(ring, place.frame, centre, other, t)
-    # The sides change places where the ring is not the contact's first one.
-    return _between(scene, found, place[2:], link[2:], numbers, held, still["side"])
+    found = found._replace(share=still["part"] * found.share)
+    return _between(scene, found, place[2:], link[2:], numbers, held)
 
 
 def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:
@@ -261,13 +261,10 @@ def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.A
 
 
 def _between(
-    scene: Scene, found: Any, mine: Any, theirs: Any, numbers: Any, held: tuple = (), side: Any = 1
+    scene: Scene, found: Any, mine: Any, theirs: Any, numbers: Any, held: tuple = ()
 ) -> jax.Array:
-    place, cone = pair_search.with_axis(found), cone_of(scene, numbers)
-    one = ContactSet.contacts(place._replace(normal=side * place.normal), cone)
-    vel, motion, along = (
-        one.relative(side * (a - b)[:, None]) for a, b in zip(mine, theirs, strict=True)
-    )
+    one = ContactSet.contacts(pair_search.with_axis(found), cone_of(scene, numbers))
+    vel, motion, along = (one.relative((a - b)[:, None]) for a, b in zip(mine, theirs, strict=True))
     jar = motion - one.reference(vel)
     if not held:
         force = contact.constraint_update(one, jar).force

@@ -219,13 +219,11 @@ def ball_on_field(
 # Against centre lines
 
 
-def nearest(
-    point: jax.Array, segment: Segment, low: jax.Array | float = 0.0, high: jax.Array | float = 1.0
-) -> jax.Array:
-    """Where between its ends, 0 to 1, a segment is nearest to a point, shape (...)."""
+def nearest(point: jax.Array, segment: Segment, last: jax.Array | float = 1.0) -> jax.Array:
+    """Where between its ends, 0 to 1 or `last`, a segment is nearest to a point, shape (...)."""
     start, end = segment.ends
     along = end - start
-    return jnp.minimum(jnp.maximum(dot(point - start, along) / dot(along, along), low), high)
+    return jnp.minimum(jnp.maximum(dot(point - start, along) / dot(along, along), 0.0), last)
 
 
 def on_line(segment: Segment, t: jax.Array) -> jax.Array:

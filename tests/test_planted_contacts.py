@@ -31,7 +31,7 @@ BOUND = 1e-8
 ITERATIONS = {"hull": 12, "spheres": 9}
 """Of Newton's method.  With many to spare a wrong matrix of the conjugate gradients would cost
 iterations and change no result."""
-SLOTS = 24
+SLOTS = 18
 """Between two fingers, and of a finger with itself and the palm."""
 
 # Stages of the kernel: functions that it evaluates lane by lane.
@@ -210,7 +210,7 @@ SPHERES = {
 }
 SURFACES = {"hull": HULL, "spheres": SPHERES}
 STATES = {
-    "hull": {"main": (5, 0.9, 0.06), "overflow": (1, 1.3, 0.045)},
+    "hull": {"main": (5, 0.9, 0.06), "overflow": (1, 1.5, 0.045)},
     "spheres": {"main": (1, 1.2, 0.06)},
 }
 """Arguments of `curled`: seed, bend and height [m]. Contacts of every kind, with rings more than
@@ -262,8 +262,8 @@ def simulated(surface):
         if surface == "hull":  # as on a GPU; spheres, and the slow tests' hulls, as on this CPU
             patch.setattr(tables, "GATHERING", ("cpu", "gpu"))
         states = {name: curled(scene, *state) for name, state in STATES[surface].items()}
-        kinds = [f.check if f.check in states else "main" for f in faults.values()]
-        each = [states[kind] for kind in [*kinds, *states]]
+        checks = [f.check if f.check in states else "main" for f in faults.values()]
+        each = [states[check] for check in [*checks, *states]]
         fields, qpos, qvel, ctrl = curled_hands.batched(each)
         with planted(faults):
             run = jax.jit(partial(simulate, scene, iterations=ITERATIONS[surface]))

@@ -23,7 +23,7 @@ from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from codesign_jax.engines.structured.laws.rings import Place
 from tests.helpers import curled_hands, dense_steps, grasps
-from tests.helpers.curled_hands import curled
+from tests.helpers.curled_hands import curled, kinds
 from tests.helpers.planted_faults import Fault, chosen, cone_of, planted, simulate
 
 BOUND = 1e-8

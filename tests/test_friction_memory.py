@@ -77,13 +77,15 @@ def test_bodies_that_part_hold_by_their_elastic_force():
 def test_bodies_apart_hold_nothing():
     with jax.enable_x64(True):
         contacts = touching(np.array([[0, 0, 1.0]] * 3), np.array([-1e-3, -1e-6, 0.0]))
-        grip, force = next_grip(contacts, jnp.full((3, 3), -5.0), np.array([0.5, 0.0, 0.0]))
+        grip, force = next_grip(
+            contacts, jnp.diag(jnp.array([0, 0, 5.0])) @ jnp.ones((3, 3)), np.zeros(3) + 0.5
+        )
     assert not grip.any() and not np.asarray(force).any()
 
 
 def test_spheres_keep_nothing():
     """Their contact is that of MuJoCo, which has no state, so that every engine simulates it."""
-    for surface, held in ("hull", 3), ("spheres", 0):
+    for surface, held in ("hull", 4), ("spheres", 0):
         chosen = scene.load("paper", overrides={"effects.surface": surface})
         assert chosen.effects.friction_memory and pairings_held(chosen) == held
     make_engine("mujoco", chosen)

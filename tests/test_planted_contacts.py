@@ -28,7 +28,7 @@ from tests.helpers.planted_faults import Fault, chosen, cone_of, planted, simula
 
 BOUND = 1e-8
 """As in test_kernel_pairs.py."""
-ITERATIONS = {"hull": 12, "spheres": 9}
+ITERATIONS = {"hull": 12, "spheres": 11}
 """Of Newton's method.  With many to spare a wrong matrix of the conjugate gradients would cost
 iterations and change no result."""
 SLOTS = 18

@@ -149,7 +149,8 @@ class FieldContacts:
         none = jnp.zeros((self.p.size,), self.step.finger_state.dtype)
         dealt = []
         for field in range(len(Place._fields)):
-            values, parts = [s[field] for s in slots], []
+            values: list[Any] = [s[field] for s in slots]
+            parts = []
             for c in range(values[0].parts.shape[0]):
                 lane = none
                 for k, value in enumerate(values):

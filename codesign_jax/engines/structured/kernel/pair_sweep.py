@@ -122,7 +122,9 @@ class PairSweep:
     def _on_itself(self, item: Any, pairing: Pairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of its own finger's segment."""
         other = self.pairs.read("other", item).lane.astype(jnp.int32)
-        end = self.sweep.step.search.last_of(self._ring(item)[0], other)
+        search = self.sweep.step.search
+        assert search is not None
+        end = search.last_of(self._ring(item)[0], other)
         still = {"end": self._float(end), "part": self._float(2)}
         line = self._rings(item, pairing, live, other, self.lane, still)
         self._leave_line(line, other)

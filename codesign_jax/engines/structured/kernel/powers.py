@@ -205,8 +205,8 @@ def on_palm(scene: Scene, mine: tuple[Place, Any], palm: Place, size, numbers) -
 
 def between_spheres(scene: Scene, mine: tuple, theirs: tuple, numbers: Any) -> jax.Array:
     """Power of two fingers' spheres on one another: links, and the spheres' numbers."""
-    ends = [(ring, pair_search.ring_centre(*place[:2], ring)) for place, ring in (mine, theirs)]
-    found = pair_search.balls(*ends[0], *ends[1])
+    one, other = (pair_search.ring_centre(*place[:2], ring) for place, ring in (mine, theirs))
+    found = pair_search.balls(mine[1], one, theirs[1], other)
     return _between(scene, found, mine[0][2:], theirs[0][2:], numbers)
 
 

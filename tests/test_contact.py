@@ -2,11 +2,15 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import scipy.optimize
 
 from codesign_jax import model
+from codesign_jax.engines.structured.laws import cones, contact
 from tests.helpers.grasps import SHAPES, hand_world, pinch
 from tests.helpers.tables import GRAVITY, MASS, MU, Table
 
@@ -46,6 +50,53 @@ def test_stiffness_is_a_material_number(dissipation_time, timestep):
     position, _ = table.run(3.0)
     sunk = table.model.qpos0[-5] - position[-1, 2]
     assert sunk == pytest.approx(MASS * GRAVITY / 4000.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("dissipation", [0.0, 0.006, 0.03])
+@pytest.mark.parametrize("timestep", [0.01, 0.001])
+def test_a_step_ends_with_the_force_at_its_end(dissipation, timestep):
+    """A ball falls on the table and bounces: f = -k (g + (h + tau) v) of each step's end, no pull.
+
+    MuJoCo C with our numbers, at any time step; g is the gap at the beginning of the step.  What
+    does not act ahead of touch dissipates over one and a half steps at least.
+    """
+    table = Table(
+        "sphere", contact__dissipation_time=dissipation, discretization__timestep=timestep
+    )
+    tau = max(dissipation, 1.5 * timestep)
+    touch = table.data.qpos[-5]
+    table.data.qpos[-5] += 0.02
+    position, velocity = table.run(0.3)
+    k, h, ends = 2 * table.scene.contact.normal_stiffness, timestep, velocity[:, 2]
+    gaps = position[:, 2] - h * ends - touch  # at the beginning of each step
+    force = np.where(gaps < 0, np.maximum(-k * (gaps + (h + tau) * ends), 0), 0)
+    before = np.append(0, ends[:-1])
+    assert (force > 0).sum() > 3
+    np.testing.assert_allclose(ends, before + h * (force / MASS - GRAVITY), atol=1e-6)
+
+
+@pytest.mark.parametrize("gap", [-2e-3, -1e-5, 1e-5, 2e-3])
+@pytest.mark.parametrize("speed", [-2.0, -0.1, 0.3])
+def test_a_contact_is_the_least_of_a_convex_problem(gap, speed):
+    """A free mass under our cone against the law in closed form, in touch and ahead of it.
+
+    Ahead of touch the gap closes within the step at the earliest: f = -k (h + tau) (v + g / h).
+    """
+    scene = pinch("sphere", links=1)
+    h = scene.discretization.timestep
+    tau = max(scene.contact.dissipation_time, 1.5 * h)
+    with jax.enable_x64(True):
+        cone = cones.make_cone(scene, MU, bodies=2)
+        up = jnp.array([0.0, 0.0, 1.0])
+        one = contact.Contacts(0.0 * up, up, jnp.float64(gap), cone)
+        wanted = one.reference(speed * up)
+        pushed = jax.jit(lambda a: contact.constraint_update(one, a * up - wanted).force[2])
+        found = scipy.optimize.brentq(lambda a: MASS * (a + GRAVITY) - float(pushed(a)), -1e4, 1e4)
+    k = scene.contact.normal_stiffness
+    coming = gap / h if gap > 0 else gap / (h + tau)
+    after = (MASS * (speed / h - GRAVITY) - k * (h + tau) * coming) / (MASS / h + k * (h + tau))
+    after = after if -k * (h + tau) * (after + coming) > 0 else speed - h * GRAVITY
+    assert speed + h * found == pytest.approx(after, abs=1e-9)
 
 
 def creep(table, shape, angle):

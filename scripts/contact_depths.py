@@ -12,9 +12,11 @@ another is that of its deepest point from the other's surface, in every step fro
 
 import argparse
 import json
+import multiprocessing
+import os
 import shlex
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -238,22 +240,28 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
     size, start = min(args.batch, total), int(scene.last_step("approach"))
     run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t, record_qpos=True))
     rows: list[dict[str, Any]] = []
-    with ThreadPoolExecutor(args.workers) as pool:
+    os.environ["JAX_PLATFORMS"] = "cpu"  # of the processes that measure
+    with ProcessPoolExecutor(args.workers, multiprocessing.get_context("spawn")) as pool:
         for first in range(0, total, size):
             world = np.minimum(first + np.arange(size), total - 1)
             p = jax.tree.map(lambda v, w=world: v[w // args.trials], hands)
             t = jax.tree.map(lambda v, w=world: v[w % args.trials], trials)
             outcome, trace = jax.tree.map(np.asarray, run(p, t))
-            bad = types.failed(outcome.status)
+            bad, found = types.failed(outcome.status), []
             kept = ~bad & (outcome.cost < SUCCESS_COST)
-
-            def row(i: int, p=p, t=t, trace=trace, kept=kept, bad=bad, world=world):
-                p, t = jax.tree.map(lambda v: v[i], (p, t))
-                found = {"design": int(world[i]) // args.trials, "kept": bool(kept[i])}
-                found |= {"object": scene.objects.object[int(t.shape)].name, "failed": bool(bad[i])}
-                return found | (measured(scene, p, t, trace.qpos[i, start:]) if kept[i] else {})
-
-            rows += pool.map(row, range(min(size, total - first)))
+            for i in range(min(size, total - first)):
+                own, trial = jax.tree.map(lambda v, i=i: v[i], (p, t))
+                row = {"design": int(world[i]) // args.trials, "kept": bool(kept[i])}
+                row |= {
+                    "object": scene.objects.object[int(trial.shape)].name,
+                    "failed": bool(bad[i]),
+                }
+                rows.append(row)
+                if kept[i]:
+                    states = trace.qpos[i, start:]
+                    found.append((row, pool.submit(measured, scene, own, trial, states)))
+            for row, depths in found:
+                row |= depths.result()
             print(f"{len(rows):,} of {total:,}", flush=True)
     return rows
 
@@ -263,7 +271,7 @@ def designs_of(path: Path) -> list[np.ndarray]:
     if path.is_dir():
         from codesign_jax.runs import choice, read_run
 
-        folders = sorted(p.parent for p in path.rglob("manifest.json"))
+        folders = sorted(p.parent for p in path.rglob("provenance.json"))
         return [choice.choose(read_run(p)[0], choice.read_record(p)).design for p in folders]
     if path.suffix == ".json":
         return [np.array(d["vector"]) for d in json.loads(path.read_text())["designs"]]
@@ -280,7 +288,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="designs of each file; all without")
     parser.add_argument("--trials", type=int, default=3, help="of a design, objects in turn")
     parser.add_argument("--batch", type=int, default=96, help="worlds of a call")
-    parser.add_argument("--workers", type=int, help="threads that measure")
+    parser.add_argument("--workers", type=int, help="processes that measure")
     parser.add_argument("--preset", default="23d", help="the designs' parameters")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")

@@ -1,5 +1,7 @@
 """Depths that `scripts.contact_depths` tells, of poses whose depth is known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -55,3 +57,10 @@ def test_an_edge_of_an_object_is_in_a_finger(kind):
     np.testing.assert_allclose(found, depth, atol=0.1e-3)
     away = one.rings.reshape(1, -1, 3) - [0.055, 0, HEIGHT - depth + size[2]]
     np.testing.assert_allclose(contact_depths.in_object(kind, size, away), depth, atol=1e-6)
+
+
+def test_designs_are_read_from_data_of_experiments_and_of_its_own():
+    data = Path(__file__).parents[1] / "docs/data"
+    for name, count in (("experiments/23d.npz", 30), ("picture_winners.json", 12)):
+        found = contact_depths.designs_of(data / name)
+        assert len(found) == count and all(v.shape == (23,) for v in found)

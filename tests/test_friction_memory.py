@@ -104,7 +104,7 @@ def crossed():
         hand = space.params(space.from_units(np.array([150.0, 120.0])))
         worlds = jax.tree.map(lambda v: jnp.asarray(v)[None], (hand, trial))
         fields, ctrl, _ = rollout.prepare(chosen, *worlds, chosen.constants())
-        start = jax.jit(engine.rollout)(fields, ctrl[:, :340]).last
+        start = jax.jit(engine.rollout)(fields, ctrl[:, :344]).last
     assert np.abs(model.split(chosen, start).held).max() > 0.1
 
     def one(start, ctrl):
@@ -117,7 +117,7 @@ def crossed():
         shown, end = jnp.stack(shown).reshape(3, -1), model.split(chosen, last)
         return shown.sum() + end.qpos.sum() + end.held.sum(), (last, shown)
 
-    return start, ctrl[:, 340:360], pieces
+    return start, ctrl[:, 344:364], pieces
 
 
 def test_a_rollout_in_pieces_is_that_of_one_piece(crossed):

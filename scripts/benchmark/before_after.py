@@ -66,7 +66,8 @@ def start(folder: Path, args: argparse.Namespace) -> subprocess.Popen:
     command += ["--designs", str(args.designs.resolve())]
     if folder.resolve() == Path().resolve():
         command += [part for value in args.set for part in ("--set", value)]
-    settings = {"PYTHONPATH": str(folder.resolve()), "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    path = os.pathsep.join([str(folder.resolve()), os.environ.get("PYTHONPATH", "")])
+    settings = {"PYTHONPATH": path, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     pipe = subprocess.PIPE
     return subprocess.Popen(
         command, cwd=folder, env=os.environ | settings, stdin=pipe, stdout=pipe, text=True

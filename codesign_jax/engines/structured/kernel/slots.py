@@ -119,16 +119,19 @@ class BoundSlots(BoundContacts):
         found = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
         self._counts = Counts.of_rows([jnp.minimum(n, most) for n in found], most)
         if self.set.gathers:
-            self._write_empty()
+            self.write_empty(self.set.fields(), self.set.count - 1)
 
-    def _write_empty(self) -> None:
-        """Stores what lanes read in slots that are not theirs: a contact that does not touch."""
+    def write_empty(self, fields: dict[str, tuple[int, tuple[int, ...]]], item: int) -> None:
+        """Stores what lanes read in slots that are not theirs: a contact that does not touch.
+
+        All fields of it, as a number that is none, times no share, is none.
+        """
         none = jnp.zeros((self.set.size,), self.ref.dtype)
         one, prefix = jnp.ones_like(none), f"{self.set.name}."
         sound = {"gap": [one], "normal": [none, none, one]}
-        for name, (_, shape) in self.set.fields().items():
+        for name, (_, shape) in fields.items():
             values = sound.get(name.removeprefix(prefix), [none] * math.prod(shape))
-            self.table.write(self.ref, name, lanes(values, shape, wide=True), self.set.count - 1)
+            self.table.write(self.ref, name, lanes(values, shape, wide=True), item)
 
     def used(self, row: Any) -> jax.Array:
         """Number of slots that any lane has filled, a scalar; within `only` any of its lanes."""

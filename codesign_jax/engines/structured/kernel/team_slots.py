@@ -58,8 +58,7 @@ class TeamFields(BoundSlots):
 
     def begin_step(self) -> None:
         """Stores what lanes without an item read: no contact."""
-        none = lanes([jnp.zeros((self.set.size,), self.ref.dtype)], (1, 1), wide=True)
-        self.write("share", none, self.set.rings)
+        self.write_empty(self.set.groups(), self.set.rings)
 
     def every(self, body: Callable, start: Any) -> Any:
         """Folds body(item, rings, tree of lanes) over all items, a lane each."""

@@ -1,6 +1,7 @@
 """`codesign evaluate`: rows and verdict of a design, of its own or of a run."""
 
 import csv
+import tomllib
 from pathlib import Path
 
 import jax
@@ -9,9 +10,11 @@ import pytest
 from scipy import stats
 
 from codesign_jax import codesign, cost, rollout, runs, scene
+from codesign_jax.commands import common
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import columns
+from codesign_jax.scene import parameters
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -46,6 +49,29 @@ def test_what_is_not_given_is_said_to_be_a_default(capsys):
     twice = ["--preset", "23d", "--design", "length=95", "length[1]=90"]
     assert command("evaluate", "--dry-run", *twice) == 2
     assert "'length[1]' is given more than once: 95, 90" in capsys.readouterr().err
+
+
+def test_a_design_is_opened_from_its_file(workplace, capsys):
+    """As it was written, in its own design space, and with what the command line changes."""
+    space = parameters.design_space(scene.load("paper").hand, "23d")
+    design = np.asarray(space.sample(jax.random.key(3), 1)[0])
+    text = common.design_text(space, "23d", design)
+    (workplace / "mine.toml").write_text(text)
+    assert tomllib.loads(text)["preset"] == "23d"
+    opened = common.find_design(space, ["mine.toml"])
+    np.testing.assert_allclose(opened, design, rtol=1e-8)  # nine digits
+    assert command("evaluate", "--dry-run", "--design", "mine.toml", "length[1]=90") == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    lengths = [f"{v:.4g}" for v in 1e3 * design[:4]]
+    assert ["1", "90"] == rows[4][:2] and [row[1] for row in rows[5:7]] == lengths[2:]
+    assert not any("defaults:" in row for row in rows)
+    (workplace / "wrong.toml").write_text(
+        "design.lenght = 95\ndesign.arm_z = [1, 2]\npreset = '2d'"
+    )
+    assert command("evaluate", "--dry-run", "--design", "wrong.toml") == 2
+    told = capsys.readouterr().err
+    assert "wrong.toml 'lenght' is not a parameter; did you mean 'length'?" in told
+    assert "wrong.toml 'arm_z[0]' is not a parameter" in told
 
 
 def test_evaluate_takes_the_best_of_a_run(finished, capsys):
@@ -264,6 +290,7 @@ def test_evaluate_says_which_objects_it_leaves_out(capsys):
         (["--design", "length=nan"], "must be a number in mm"),
         (["--design", "length"], "must be a number in mm"),
         (["--design", "length=90", "arm_z=5", "length=95"], "more than once: 90, 95"),
+        (["--design", "nowhere.toml"], "nowhere.toml: No such file or directory"),
         (["--trials", "0"], "--trials = 0 is outside"),
         (["--engine", "c"], "--engine"),
         (["--set", "solver.iterations=50"], "set newton.iterations, which limits the solver"),

@@ -273,9 +273,9 @@ def test_what_is_imported_is_there():
 # As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
-    "codesign_jax": 39_500,
+    "codesign_jax": 40_000,
     "codesign_jax/codesign": 600,
-    "codesign_jax/commands": 3_800,
+    "codesign_jax/commands": 4_300,
     "codesign_jax/compiler": 3_100,
     "codesign_jax/engines": 12_800,
     "codesign_jax/export": 1_800,
@@ -285,7 +285,7 @@ MOST_LINES = {
     "codesign_jax/runs": 3_450,
     "codesign_jax/scene": 5_100,
     "scripts": 5_200,
-    "tests": 25_900,
+    "tests": 26_050,
 }
 
 

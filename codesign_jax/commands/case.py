@@ -55,8 +55,9 @@ def find_case(options: Subject, *, tell: Tell = common.warn) -> Case:
 
 def _from_flags(options: Subject) -> Case:
     scene = common.load_scene(options)
-    space = design_space(scene.hand, options.preset or PRESET)
-    design = common.parse_design(space, [*chain.from_iterable(options.design)])
+    words = [*chain.from_iterable(options.design)]
+    space = design_space(scene.hand, options.preset or common.open_designs(words)[1] or PRESET)
+    design = common.find_design(space, words)
     return Case(scene, space, design, options.engine or engines.DEFAULT)
 
 

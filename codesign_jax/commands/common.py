@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 from rich.console import Console
 from rich.table import Table
 
@@ -21,6 +22,7 @@ from codesign_jax import scene as scenes
 from codesign_jax.commands import preflight
 from codesign_jax.commands.flags import SceneFlags, TrialFlags
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
+from codesign_jax.runs import tables
 from codesign_jax.scene import Scene, keypaths, library, objects, schema
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import InputError
@@ -67,13 +69,83 @@ def warn(text: str) -> None:
     print(f"warning: {text}", file=sys.stderr)
 
 
-def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
-    """Reads a design given as NAME=VALUE in the hand file's units.
+@dataclasses.dataclass(frozen=True)
+class DesignFile:
+    """A design as a .toml file, see `design_text`.
+
+    Attributes:
+      preset: Design space that the names belong to.
+      design: Numbers by name in the hand file's units, or arrays with one for each finger.
+    """
+
+    preset: str
+    design: dict
+
+
+def design_text(space: DesignSpace, preset: str, design: np.ndarray) -> str:
+    """A design [SI units] as the .toml text that --design opens again."""
+    own, others = tables.by_finger(space)
+    places = {space.names[k]: k for k in others} | own
+    values = [f"{value:.9g}" for value in space.in_units(design)]
+    lines = ["# A design in the hand file's units, for --design."]
+    lines += [tomli_w.dumps({"preset": preset}), "[design]"]
+    for name, k in places.items():
+        several = isinstance(k, list)
+        text = f"[{', '.join(values[i] for i in k)}]" if several else values[k]
+        lines.append(f"{name} = {text}  # {space.units[k[0] if several else k]}")
+    return "\n".join([*lines, ""])
+
+
+def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], str | None]:
+    """Splits the words of --design into NAME=VALUE pairs, by the file that has them.
+
+    Returns:
+      Pairs by file in the order given, those of the command line last under "--design", and the
+      last file's preset; None without a file.
+    """
+    found: dict[str, list[str]] = {}
+    preset, direct = None, []
+    for word in words:
+        if "=" in word or not word.endswith(".toml"):
+            direct.append(word)
+            continue
+        problems: list[str] = []
+        path = Path(word)
+        file = schema.parse(DesignFile, library.read(path), path.name, problems)
+        if file is None:
+            raise InputError(problems)
+        preset, pairs = file.preset, found.setdefault(path.name, [])
+        for name, value in file.design.items():
+            if isinstance(value, list):
+                pairs += [f"{name}[{k}]={v}" for k, v in enumerate(value)]
+            else:
+                pairs.append(f"{name}={value}")
+    return found | {"--design": direct}, preset
+
+
+def find_design(space: DesignSpace, words: Sequence[str]) -> np.ndarray:
+    """The design that --design names: files and NAME=VALUE, later words hold; SI, (parameter,)."""
+    design = space.default()
+    for where, pairs in open_designs(words)[0].items():
+        design = parse_design(space, pairs, design, where)
+    return design
+
+
+def parse_design(
+    space: DesignSpace, pairs: Sequence[str], base: np.ndarray, where: str = "--design"
+) -> np.ndarray:
+    """Reads changes of a design given as NAME=VALUE in the hand file's units.
+
+    Args:
+      space: The design space.
+      pairs: The changes.
+      base: What is changed [SI units], shape (parameter,).
+      where: Where the pairs stand, for messages.
 
     Returns:
       The design [SI units], shape (parameter,).
     """
-    values = dict(zip(space.names, space.in_units(space.default()), strict=True))
+    values = dict(zip(space.names, space.in_units(base), strict=True))
     lows = dict(zip(space.names, space.in_units(np.array(space.low)), strict=True))
     highs = dict(zip(space.names, space.in_units(np.array(space.high)), strict=True))
     units = dict(zip(space.names, space.units, strict=True))
@@ -81,20 +153,20 @@ def parse_design(space: DesignSpace, pairs: Sequence[str]) -> np.ndarray:
     # A name without an index is all fingers' parameter: one value for each of them.
     given = [(each, v) for name, _, v in given for each in _members(name, space)]
     problems = [
-        f"--design {name!r} is given more than once: {', '.join(v for n, v in given if n == name)}"
+        f"{where} {name!r} is given more than once: {', '.join(v for n, v in given if n == name)}"
         for name, count in Counter(name for name, _ in given).items()
         if count > 1
     ]
     for name, text in given:
         if name not in values:
-            problems.append(f"--design {name!r} is not a parameter; {schema.nearest(name, values)}")
+            problems.append(f"{where} {name!r} is not a parameter; {schema.nearest(name, values)}")
             continue
         value = _number(text)
         # Bounds went to SI and back; the last bit of that is no reason to refuse one.
         low, high = (round(float(b[name]), 9) for b in (lows, highs))
         if value is None:
-            problems.append(f"--design {name} = {text!r} must be a number in {units[name]}")
-        elif problem := schema.range_problem(f"--design {name}", value, units[name], low, high):
+            problems.append(f"{where} {name} = {text!r} must be a number in {units[name]}")
+        elif problem := schema.range_problem(f"{where} {name}", value, units[name], low, high):
             problems.append(problem)
         else:
             values[name] = value
@@ -109,8 +181,9 @@ def _members(name: str, space: DesignSpace) -> list[str]:
     return each if name not in space.names and each else [name]
 
 
-def by_default(space: DesignSpace, pairs: Sequence[str]) -> str:
+def by_default(space: DesignSpace, words: Sequence[str]) -> str:
     """Says which parameters of a design are the hand file's defaults; empty if none is."""
+    pairs = chain.from_iterable(open_designs(words)[0].values())
     given = {each for pair in pairs for each in _members(pair.partition("=")[0], space)}
     left = [name for name in space.names if name not in given]
     if not left:

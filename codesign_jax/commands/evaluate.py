@@ -37,8 +37,8 @@ def main(options: "Evaluate") -> int:
         console.print(f"{which} of {options.run_folder}", markup=False)
     console.print(runs.describe(case.space, case.design), markup=False)
     if not options.run_folder:
-        pairs = [*chain.from_iterable(options.design)]
-        if note := common.by_default(case.space, pairs):
+        words = [*chain.from_iterable(options.design)]
+        if note := common.by_default(case.space, words):
             console.print(note, markup=False)
     for note in [*_untried(case, options), *notes, *common.mesh_notes(case.scene)]:
         console.print(note, markup=False)

@@ -97,16 +97,17 @@ class Subject(SceneFlags):
     design: Annotated[
         tuple[tuple[str, ...], ...],
         tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint=""),
+        tyro.conf.arg(metavar="FILE NAME=VALUE ...", help_behavior_hint=""),
     ] = ()
-    """The design in the hand file's units, e.g. length=148 arm_z=-59; the rest is the default."""
+    """The design: a .toml file that `codesign studio` saved, or numbers in the hand file's units,
+    e.g. length=148 arm_z=-59, which replace the file's; the rest is the default."""
     run_folder: Annotated[
         Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
     ] = None
     """Take scene, design space and best particle from this run folder; --accuracy, --objects, --set
     and --engine then replace the run's."""
     preset: Text = None
-    """Design space that the names belong to; default: the run's, or 2d."""
+    """Design space that the names belong to; default: the run's, the design file's, or 2d."""
     engine: Engine = None
 
 

@@ -301,8 +301,7 @@ class Replay(Command, Shown):
     """Show one grasp in 3D in a browser, or say how a failed world of a run failed.
 
     A page of its own that works offline: the best grasp of a run, any row of its trials.csv, or a
-    design. A failed world (a file of the run folder's failures/) is simulated again, and its last
-    good state goes on in MuJoCo C.
+    design. A failed world (a file of the run folder's failures/) is simulated again.
     """
 
     path: Annotated[
@@ -367,21 +366,20 @@ def main(arguments: list[str] | None = None) -> int:
     def run() -> int:
         if given == ["--version"]:
             return _version()
-        refuse(flags.text_problems(given))
+        " ".join(
+            given
+        ).encode()  # `status.of` says that bytes are no text, which no file could hold
         command = tyro.cli(
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,
             prog="codesign",
             description="Co-design of soft hand morphology and control; --version says which.",
         )
-        refuse(reuse.problems() + flags.path_problems(command))
-        return command.run()
-
-    def refuse(problems: list[str]) -> None:
-        if problems:
+        if problems := reuse.problems():
             from codesign_jax.scene.schema import InputError
 
             raise InputError(problems)
+        return command.run()
 
     code = status.of(run)
     if arguments is None and code == status.INTERRUPTED:

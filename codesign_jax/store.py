@@ -24,7 +24,7 @@ MOST = 2**30
 """Most bytes of arrays that a file may unpack to."""
 SCHEMA = 2
 """Layout of results, in which their arrays have names and shapes."""
-_DIGEST, _NUMBER = "digest", "number of the part"
+_DIGEST, _NUMBER, _HEADS = "digest", "number of the part", ("about", "code", "schema")
 _HEAD = 8  # bytes of a part's length
 
 Arrays = Mapping[str, Any]
@@ -101,18 +101,41 @@ def head(about: Any) -> dict[str, np.ndarray]:
     # Results of code that is not known are nobody's: nothing is equal to this.
     code = reuse.code_digest() or f"unknown {uuid.uuid4()}"
     text = json.dumps(about, sort_keys=True)
-    return {"about": np.array(text), "code": np.array(code), "schema": np.array(SCHEMA)}
+    return dict(zip(_HEADS, map(np.array, (text, code, SCHEMA)), strict=True))
 
 
 def refusal(arrays: Arrays, about: Any) -> str:
     """Why results are not taken for those of `about`, with the file as subject; else nothing."""
-    own = head(about)
-    found = {name: str(arrays.get(name)) for name in own}
-    if found["schema"] == str(SCHEMA) and found["about"] != str(own["about"]):
-        return "is of another design or other settings"
-    return (
-        "" if found == {n: str(v) for n, v in own.items()} else "is of another version of the code"
-    )
+    different = [name for name, own in head(about).items() if str(arrays.get(name)) != str(own)]
+    if not different:
+        return ""
+    what = "design or other settings" if different == ["about"] else "version of the code"
+    return f"is of another {what}"
+
+
+def keep(path: Path, about: Any, results: Arrays) -> None:
+    """Writes results that `found` finds again, see `head`."""
+    save(path, {**head(about), **results})
+
+
+def found(path: Path, about: Any) -> tuple[dict[str, Any] | None, str]:
+    """Results of `about` that are in a file.
+
+    Returns:
+      The results, or None; and why there are none, with the file as subject: they are of something
+      else, of other code, or damaged. Empty if there is no such file.
+    """
+    try:
+        arrays = load(path)
+    except FileNotFoundError:
+        return None, ""
+    except OSError as error:
+        return None, f"cannot be read ({error.strerror})"
+    except StoreError:
+        return None, "is damaged, or of another version of the code"
+    if why := refusal(arrays, about):
+        return None, why
+    return {name: value for name, value in arrays.items() if name not in _HEADS}, ""
 
 
 class Store:

@@ -1,6 +1,5 @@
 """Checkpoints: what is saved comes back bit for bit, and damage never passes for data."""
 
-import asyncio
 import re
 import resource
 import shutil
@@ -10,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from codesign_jax.runs import checkpoint
 from codesign_jax.runs.checkpoint import Checkpoints, digest
 
 PACKAGE = Path(__file__).parent.parent / "codesign_jax"
@@ -178,20 +176,3 @@ def test_only_one_module_imports_orbax():
 def test_nothing_uses_pickle():
     pattern = re.compile(r"import (c?pickle|dill|joblib|shelve)|allow_pickle=True")
     assert [p.name for p in PACKAGE.rglob("*.py") if pattern.search(p.read_text())] == []
-
-
-def test_a_closed_loop_of_orbax_may_be_called():
-    """Threads of tensorstore call it after a failed write; an open loop works as ever."""
-    before = asyncio.get_event_loop_policy()
-    with checkpoint._patient_loops():
-        loop = asyncio.new_event_loop()
-    assert asyncio.get_event_loop_policy() is before
-    called = []
-    loop.call_soon_threadsafe(called.append, 1)
-    loop.call_soon_threadsafe(loop.stop)
-    loop.run_forever()
-    loop.close()
-    loop.call_soon_threadsafe(called.append, 2)
-    assert called == [1]
-    with pytest.raises(RuntimeError, match="closed"):
-        loop.call_soon(called.append, 3)

@@ -9,12 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import cli, cost, model, rollout, runs, scene, start
-from codesign_jax.commands import failure
+from codesign_jax import cli, cost, model, rollout, runs, start
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.export import grasps
-from codesign_jax.scene import parameters
 from codesign_jax.types import Status, Trace, failed
 from tests.helpers.grasps import (
     batch_inputs,
@@ -276,35 +273,11 @@ def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
     text = capsys.readouterr().out
     recorded, again = (line for line in text.splitlines() if "first bad step" in line)
     assert recorded.split(": ")[1] == again.split(": ")[1]
-    # From the last good state MuJoCo C itself takes the step beyond the limit.
-    speed = float(text.rsplit("to a speed of ", 1)[1])
-    assert speed > scene.limits.speed
+    steps = re.findall(r"step \d+: speed (\S+), object", text)
+    assert float(steps[-1]) > scene.limits.speed >= float(steps[-2])
     assert cli.main(["replay", str(folder), "--engine", "mujoco"]) == 0
     assert files[0].name in capsys.readouterr().out
     assert (folder / "replay.html").exists()
-
-
-def test_the_end_of_a_stuck_world_has_its_hull_and_its_controls_in_mujoco():
-    """The hull is in MuJoCo C as points, and no step of a world that is STUCK was bad."""
-    from tests.helpers.toy_engine import TINY
-
-    hull = scene.load(TINY, overrides={"effects.surface": "hull"})
-    space = parameters.design_space(hull.hand, "2d")
-    trial = jax.tree.map(np.asarray, rollout.nominal_trial(hull, 0))
-    design = space.default().astype(np.float32)
-    params = jax.tree.map(np.asarray, space.params(design))
-    data = mujoco.MjData(grasps.world(hull, params, trial))
-    mujoco.mj_kinematics(data.model, data)
-    data.qpos[-7:-4] = data.xpos[model.layout(hull).bodies[0, 1]]  # the object in a finger's place
-    state = np.concatenate([data.qpos, data.qvel])
-    world = runs.failures.Failure(design, trial, state, int(Status.STUCK), -1, (1, 0, 0))
-    controls = grasps.timed_controls(hull, params, trial)[:, 1:]
-    data = failure._last_state(hull, space, world)
-    np.testing.assert_array_equal(data.ctrl, controls[-1])
-    assert re.match(r"contacts: \d+ of hand and object, ", failure._contacts(data))
-    assert (controls[4] != controls[-1]).any()
-    early = failure._last_state(hull, space, world._replace(bad_step=5))
-    np.testing.assert_array_equal(early.ctrl, controls[4])
 
 
 def test_what_is_no_failed_world_is_refused(failing_run, tmp_path, capsys):

@@ -101,7 +101,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
     elif arguments[0] == "render":
         monkeypatch.setattr(render, "draw", lambda *rest: reached.append(rest))
     elif arguments[0] == "replay" and "failures" in example:
-        monkeypatch.setattr(replay.failure, "main", lambda *rest: reached.append(rest) or 0)
+        monkeypatch.setattr(replay, "explain", lambda *rest: reached.append(rest) or 0)
     elif arguments[0] == "replay":
         monkeypatch.setattr(replay, "write_page", lambda *rest: reached.append(rest))
     assert cli.main(arguments) == 0

@@ -10,12 +10,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rich.console import Console
 
 from codesign_jax import cli, codesign, files, scene
-from codesign_jax.commands import calls, export
-from codesign_jax.commands.calls import Meter
+from codesign_jax.commands import export
 from codesign_jax.export import drawing, process, sheet, tolerance
 from codesign_jax.export.process import Process
 from codesign_jax.model import morphology
 from codesign_jax.optimize import answer
+from codesign_jax.runs import progress
+from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import parameters
 from codesign_jax.types import Outcome, Status
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
@@ -271,7 +272,7 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, by_toy, monkeypatch):
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys):
     now = [0.0]
-    monkeypatch.setattr(calls.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with Meter("tolerance", 100, Console(highlight=False, soft_wrap=True)) as meter:
         for now[0], total in ((20.0, 100), (25.0, 100), (35.0, 80)):  # at last a side ended
             meter.total = total

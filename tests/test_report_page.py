@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from codesign_jax import cli, runs
+from codesign_jax import cli, runs, store
 from codesign_jax.commands import reference
 from codesign_jax.report import landscape
-from codesign_jax.runs import choice, outcomes
+from codesign_jax.runs import choice
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Status, failed
 from tests.helpers.tiny_run import small_run  # noqa: F401
@@ -111,9 +111,9 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
     lost = np.where(cost == 2.0, 5.0, np.inf)
     found = Outcome(cost, status, lost, np.full(trials, -1))
     for design, words in (("own", True), ("other", False)):
-        case, key = reference._case(copy, settings, trials)
-        other = outcomes.key(case.scene, case.engine, case.design[None] + 1, trials, settings.seed)
-        outcomes.save(copy / reference.FILE, found, key if design == "own" else other)
+        case = choice.case_of_run(copy, accuracy="reference")
+        tested = case if design == "own" else case._replace(design=case.design + 1)
+        store.keep(copy / reference.FILE, tested.digest(settings.seed), found._asdict())
         page = tmp_path / f"{design}.html"
         assert cli.main(["report", str(copy), "--no-replay", "--out", str(page)]) == 0
         low, high = stats.binomtest(3, 5).proportion_ci(0.95, method="wilson")

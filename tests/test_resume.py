@@ -15,9 +15,9 @@ import pytest
 
 from codesign_jax import reuse, runs
 from codesign_jax.commands import reference
-from codesign_jax.commands.case import Case
 from codesign_jax.runs import choice, columns, manifest
 from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.runs.choice import Case
 from tests.helpers.command_runs import (  # noqa: F401
     EPISODES,
     RESULTS,

@@ -23,7 +23,7 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.runs.progress import Busy, Progress, Ticker, Voice, duration
+from codesign_jax.runs.progress import Busy, Live, Progress, Report, Voice, duration
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import effects, library, parameters
@@ -314,8 +314,7 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
 
 def test_progress_line(capsys):
     with Progress(64) as progress:
-        found = {"mean": 1.5, "best": 0.25, "failed": 1, "grasps": 60, "causes": "STUCK 1"}
-        line = Voice(progress).episode(16, **found)
+        line = Voice(progress).episode(Report(16, 1.5, 0.25, 1, 60, "STUCK 1"))
         progress.round(10.0)
     assert line == "episode 16/64  mean 1.500  best 0.250  failed 1/60 (STUCK 1)"
     told = f"{line}  6.0 grasps/s  ETA 8:00"  # 48 episodes of 10 s
@@ -326,7 +325,7 @@ def test_time_left_includes_the_tests(capsys):
     """At 6 grasps/s: 48 episodes of 60 grasps, 600 of the final test, and what comes afterwards."""
     with Progress(64, test=600, after=120) as progress:
         for done in (16, 64):
-            Voice(progress).episode(done, mean=1.5, best=0.25, failed=1, grasps=60)
+            Voice(progress).episode(Report(done, 1.5, 0.25, 1, 60))
             progress.round(10.0)
         for _ in range(2):
             progress.tested(300)
@@ -341,7 +340,7 @@ def test_time_left_of_many_runs(capsys):
     """Two runs, at 2 x 60 grasps in 10 s: two episodes are left, and 60 of the test for each."""
     with Progress(3, 2, test=60) as progress:
         for k in (0, 1):
-            Voice(progress, f"seed {k}").episode(1, mean=1.0, best=k, failed=0, grasps=60)
+            Voice(progress, f"seed {k}").episode(Report(1, 1.0, k, 0, 60))
         progress.round(10.0)
         for _ in range(2):
             progress.tested(60)
@@ -352,28 +351,19 @@ def test_time_left_of_many_runs(capsys):
     assert lines[1] == "final test 120/120 grasps  12.0 grasps/s  ETA 0:00"
 
 
-def test_compiling_is_no_time_of_an_episode(monkeypatch):
-    """A resumed run begins its first episode before its program is compiled."""
-    now = iter([0.0, 100.0, 103.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(now))
-    with Progress(2) as progress, progress.busy("simulating") as watch:
-        progress.compiled()
-    assert watch.seconds == 3.0
-
-
 def test_silence_is_broken_where_there_is_no_terminal(monkeypatch, capsys):
     """Every five seconds, counted from what was printed last."""
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(
         "codesign_jax.runs.progress.time", SimpleNamespace(monotonic=lambda: clock.now)
     )
-    ticker, said = Ticker(), {}
-    ticker.begin("simulating")
+    live, said = Live(Console(file=io.StringIO())), {}
+    live.begin("simulating")
     for second in range(1, 30):
         clock.now = 100.0 + second
         if second == 18:
-            ticker.spoke()
-        ticker.tick()
+            live.message("said")
+        live.tick()
         said[second] = capsys.readouterr().err
     told = {second: text for second, text in said.items() if text}
     assert list(told) == [5, 10, 15, 23, 28]
@@ -382,8 +372,8 @@ def test_silence_is_broken_where_there_is_no_terminal(monkeypatch, capsys):
 
 def test_what_is_busy_says_so_where_there_is_no_terminal(monkeypatch, capsys):
     told = threading.Event()
-    monkeypatch.setattr(Ticker, "SILENCE", 0.0)
-    monkeypatch.setattr(Ticker, "tick", lambda self, tick=Ticker.tick: (tick(self), told.set()))
+    monkeypatch.setattr("codesign_jax.runs.progress.SILENCE", 0.0)
+    monkeypatch.setattr(Live, "tick", lambda self, tick=Live.tick: (tick(self), told.set()))
     with Busy(Console(file=io.StringIO()), "simulating"):
         assert told.wait(60)
     assert "simulating: 0:00" in capsys.readouterr().err

@@ -13,12 +13,12 @@ import pytest
 from PIL import Image
 
 from codesign_jax import cli, codesign, reuse, runs, scene
-from codesign_jax.commands import calls, failure, replay, status
+from codesign_jax.commands import calls, replay, status
 from codesign_jax.commands import landscape as command
-from codesign_jax.commands.case import Case
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, landscape
 from codesign_jax.runs import choice
+from codesign_jax.runs.choice import Case
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome, Status, failed
 from tests.helpers.tiny_run import small_run  # noqa: F401
@@ -92,7 +92,7 @@ def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys)
 
 def test_failed_worlds_are_listed_where_no_grasp_was_asked_for(run, tmp_path, monkeypatch):
     listed = []
-    monkeypatch.setattr(failure, "show_list", listed.append)
+    monkeypatch.setattr(replay, "show_failures", listed.append)
     monkeypatch.setattr(replay, "write_page", lambda *arguments: None)
     own = ["replay", str(run), "--out", str(tmp_path / "r.html")]
     for more in (["--trial", "0"], ["--episode", "1"], ["--object", "sphere"]):

@@ -10,7 +10,7 @@ from rich.console import Console
 from scipy import integrate, optimize
 
 from codesign_jax import codesign, constants, model, runs, scene
-from codesign_jax.commands import stress as commands_stress
+from codesign_jax.commands import reference
 from codesign_jax.model import morphology, overlap
 from codesign_jax.report import stress
 from codesign_jax.scene import beams, parameters
@@ -24,21 +24,21 @@ HAND = jax.tree.map(np.asarray, SPACE.params(SPACE.default()))
 
 def test_conditions_are_numbers_within_the_files_ranges():
     """Masses are four and ten times as large, at most 500 g; what is not named stays."""
-    found = [*commands_stress.variants(PAPER)]
+    found = [*stress.variants(PAPER)]
     names = [name for name, _ in found]
     assert names[:3] == ["objects of 200 g", "objects of 500 g", "friction 0.4 on the hand"]
-    assert len(names) == 3 + commands_stress.DRAWS and len({*names[3:]}) == 1
+    assert len(names) == 3 + stress.DRAWS and len({*names[3:]}) == 1
     usual = PAPER.constants()
     for _, numbers in found:
         constants.check(PAPER, numbers)
         assert numbers.phases == usual.phases and numbers.hand.palm == usual.hand.palm
     assert [o.mass for o in found[1][1].objects.object] == [0.5] * 3
     ratio = [c.contact.normal_stiffness / usual.contact.normal_stiffness for _, c in found[3:]]
-    low, high = commands_stress.FACTORS["contact", "normal_stiffness"]
+    low, high = stress.FACTORS["contact", "normal_stiffness"]
     assert len({*ratio}) == len(ratio) and low <= min(ratio) and max(ratio) <= high
     masses = {f"objects.object.{o.name}.mass": 0.18 for o in PAPER.objects.object}
     heavy = scene.load("paper", overrides=masses | {"objects.object.sphere.mass": 0.7})
-    [(name, numbers), (after, _), *_] = commands_stress.variants(heavy)
+    [(name, numbers), (after, _), *_] = stress.variants(heavy)
     assert (name, after) == ("objects of 500 to 700 g", "friction 0.4 on the hand")
     assert [o.mass for o in numbers.objects.object] == [0.5, 0.5, 0.7]
 
@@ -168,10 +168,10 @@ def test_warnings_of_a_design():
 def test_stress_is_told_kept_and_reported(finished, capsys):
     """Kept grasps of each condition are those of `codesign evaluate` with its numbers."""
     settings = runs.read_run(finished)[1]
-    assert commands_stress.stored(finished, settings) is None
+    assert reference.stored_stress(finished, settings) is None
     text = io.StringIO()
-    commands_stress.of_run(finished, settings, Console(file=text, width=100))
-    found = commands_stress.stored(finished, settings)
+    reference.stress_run(finished, settings, Console(file=text, width=100))
+    found = reference.stored_stress(finished, settings)
     assert [*dict.fromkeys(found.conditions)][-1] == "neo-Hookean bending law"
     assert "under other conditions, 12 grasps each" in text.getvalue()
     for line in found.lines():
@@ -181,7 +181,7 @@ def test_stress_is_told_kept_and_reported(finished, capsys):
     page = (finished / "report.html").read_text(encoding="utf-8")
     assert "Under other conditions, 12 grasps each" in page and "neo-Hookean bending law" in page
     other = settings.__class__(**{**vars(settings), "seed": settings.seed + 1})
-    assert commands_stress.stored(finished, other) is None
+    assert reference.stored_stress(finished, other) is None
 
 
 def test_evaluate_stresses_a_design(capsys):
@@ -189,7 +189,7 @@ def test_evaluate_stresses_a_design(capsys):
     design = ["--scene", TINY, "--engine", "mujoco", "--design", "length=100", "--trials", "3"]
     assert command("evaluate", *design, "--stress") == 0
     tiny = scene.load(TINY)
-    name, numbers = next(commands_stress.variants(tiny))
+    name, numbers = next(stress.variants(tiny))
     kept = re.search(rf"{name} +(\d+ %) of 3 ", capsys.readouterr().out)
     assert kept and name.startswith("objects of ")
     pairs = zip(tiny.objects.object, numbers.objects.object, strict=True)

@@ -1,7 +1,6 @@
 """Many designs in the same trials, some at a time: progress, and a file from which to go on."""
 
 import itertools
-import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,14 +9,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress, TimeRemainingColumn
 
 from codesign_jax import batch, codesign
 from codesign_jax.codesign import Task
 from codesign_jax.engines import Engine
-from codesign_jax.runs import outcomes
-from codesign_jax.runs.progress import Live, duration
+from codesign_jax.runs import scene_files
+from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.store import Store
@@ -25,8 +22,6 @@ from codesign_jax.types import Outcome
 
 WORLDS = {"cpu": 512}
 """Most worlds of one call by platform: few enough to see progress, enough to fill the cores."""
-SECONDS = 10.0
-"""Shortest time between lines of progress where there is no terminal for a bar."""
 
 
 class Trials(NamedTuple):
@@ -86,49 +81,6 @@ def in_turn(
         yield arrived()
 
 
-class Meter(Live):
-    """Grasps that were simulated: a live bar on a terminal, elsewhere a line now and then.
-
-    Attributes:
-      total: Grasps to simulate, which may become fewer.
-      done: Grasps that were simulated.
-    """
-
-    def __init__(self, text: str, total: int, console: Console):
-        """Takes what is simulated, the number of grasps, and where to tell."""
-        self.total, self._text, self._console = total, text, console
-        columns = (*Progress.get_default_columns()[:-1], TimeRemainingColumn())
-        super().__init__(console, *columns)
-        self._task = self._bar.add_task(text, total=total)
-        self._ticker.begin(f"{text}: compiling, then {total} grasps")
-        self.done, self._since, self._told = 0, None, time.monotonic()
-
-    def found(self, grasps: int) -> None:
-        """Counts grasps that an earlier process simulated."""
-        self.done += grasps
-        self._bar.update(self._task, completed=self.done, total=self.total)
-
-    def advance(self, grasps: int) -> None:
-        """Counts grasps that were just simulated."""
-        self.done += grasps
-        self._bar.update(self._task, completed=self.done, total=self.total)
-        now = time.monotonic()
-        self._ticker.rename(f"{self._text}: {self.done} of {self.total} grasps")
-        if self._since and not self._console.is_terminal and now - self._told >= SECONDS:
-            start, before = self._since
-            self._told, rate = now, (self.done - before) / max(now - start, 1e-9)
-            left = duration(max(self.total - self.done, 0) / rate)
-            self._console.print(
-                f"{self._text}: {self.done} of {self.total} grasps, {rate:.1f} grasps/s, "
-                f"about {left} left"
-            )
-            self._ticker.spoke()
-
-    def compiled(self) -> None:
-        """Leaves the call before, which compiled, out of the rate."""
-        self._since = time.monotonic(), self.done
-
-
 class Calls:
     """Simulates designs in calls of one size, and keeps the outcomes in a file.
 
@@ -162,9 +114,9 @@ class Calls:
             and `size` determine the outcomes: calls of another size round differently.
           devices: Devices that calls are dealt to; None for all.
         """
-        how = trials.scene, trials.engine, designs, trials.count, trials.seed
-        key = " ".join(map(str, (outcomes.key(*how), size, *trials.stream)))
-        self._trials, self._size, self._part = trials, size, Store(part, key)
+        numbers = trials.count, trials.seed, size, *trials.stream
+        about = scene_files.digest(trials.scene, trials.engine, designs, *numbers)
+        self._trials, self._size, self._part = trials, size, Store(part, about)
         self.refused = self._part.refused
         kept = [Outcome(**arrays) for arrays in self._part]  # a part has no fields that are None
         self._kept = joined(kept) if kept else None

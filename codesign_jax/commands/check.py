@@ -13,14 +13,14 @@ from rich.console import Console
 
 from codesign_jax import codesign, optimize, runs, sampling
 from codesign_jax.commands import common, reference
-from codesign_jax.commands.case import PRESET, Case, find_case
+from codesign_jax.commands.common import PRESET, find_case
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.report.statistics import wilson
 from codesign_jax.runs import Settings, choice
+from codesign_jax.runs.choice import Case
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, with_accuracy
-from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Trial, failed
 
 if TYPE_CHECKING:
@@ -118,8 +118,7 @@ def _refuse(options: "Check", case: Case, finer: Scene) -> None:
             f"accuracy {reference.ACCURACY} is what others are compared with: choose another by "
             "--accuracy"
         )
-    if problems:
-        raise InputError(problems)
+    common.refuse(problems)
 
 
 def _head(case: Case, load: float) -> list[str]:

@@ -20,17 +20,19 @@ from rich.table import Table
 from codesign_jax import engines
 from codesign_jax import scene as scenes
 from codesign_jax.commands import preflight
-from codesign_jax.commands.flags import SceneFlags, TrialFlags
+from codesign_jax.commands.flags import SceneFlags, Subject, TrialFlags
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
-from codesign_jax.runs import tables
+from codesign_jax.runs import choice, tables
+from codesign_jax.runs.choice import Case
+from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene, keypaths, library, objects, schema
-from codesign_jax.scene.parameters import DesignSpace, params_of
+from codesign_jax.scene.parameters import DesignSpace, design_space, params_of
 from codesign_jax.scene.schema import InputError
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
-SCENE = "paper"
-"""Scene where none is named."""
+SCENE, PRESET = "paper", "2d"
+"""Scene and design space where none is named."""
 
 
 def changes(options: TrialFlags) -> dict[keypaths.Path, Any]:
@@ -51,22 +53,26 @@ def load_scene(options: SceneFlags) -> Scene:
     )
 
 
-def source_files(options: SceneFlags) -> tuple[Path, ...]:
-    """The .toml files that a command's flags name, and those that its scene names."""
-    scene = library.find("scenes", options.scene or SCENE)
-    table = library.read(scene)
-    beside = {"hands": table.get("hand"), "objects": table.get("objects")}
-    beside["controls"] = table.get("control")
-    given = {"hands": options.hand, "objects": options.objects, "accuracy": options.accuracy}
-    given["controls"] = changes(options).get(("control",))
-    found = [library.find(kind, name) for kind, name in given.items() if name is not None]
-    found += [scene.parent / n for n in beside.values() if isinstance(n, str) and n[-5:] == ".toml"]
-    return scene, *found
-
-
 def warn(text: str) -> None:
     """Prints a warning that concerns the result, apart from the result."""
     print(f"warning: {text}", file=sys.stderr)
+
+
+def find_case(options: Subject, *, tell: Tell = warn) -> Case:
+    """The design that the flags name: the best of a run, or one given by its parameters."""
+    if options.run_folder is None:
+        scene, words = load_scene(options), [*chain.from_iterable(options.design)]
+        space = design_space(scene.hand, options.preset or open_designs(words)[1] or PRESET)
+        design = find_design(space, words)
+        return Case(scene, space, design, options.engine or engines.DEFAULT)
+    own = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
+    given = ["--design"] * bool(options.design) + [f for f, v in own.items() if v is not None]
+    if given:
+        raise InputError(
+            [f"--run brings design, hand and scene of its own; leave out {' and '.join(given)}"]
+        )
+    how = {"objects": options.objects, "accuracy": options.accuracy, "engine": options.engine}
+    return choice.case_of_run(options.run_folder, overrides=changes(options), tell=tell, **how)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,28 +200,32 @@ def by_default(space: DesignSpace, words: Sequence[str]) -> str:
     return f"not given, so the hand file's defaults: {', '.join(groups)}"
 
 
-def check_place(flag: str, path: Path, *, folder: bool = False) -> None:
-    """Checks that something can be written to a path, before anything is simulated for it.
+def refuse(problems: list[str]) -> None:
+    """Ends the command if anything is wrong with its input."""
+    if problems:
+        raise InputError(problems)
+
+
+def place_problems(flag: str, path: Path | None, *suffixes: str, folder: bool = False) -> list[str]:
+    """Why nothing could be written to a path, before anything is simulated for it.
 
     A temporary file is made and removed in the path's folder, or in the nearest folder above it
     that exists; missing folders are not made.
     """
+    if path is None:
+        return []
+    if suffixes and path.suffix not in suffixes:
+        return [f"{flag} {path} must end in {' or '.join(suffixes)}"]
     place = path.absolute() if folder else path.absolute().parent
     try:
-        str(path.absolute()).encode()
-    except UnicodeEncodeError as error:
-        shown = ascii(str(path))
-        raise InputError([f"{flag} {shown}: the name is no text in UTF-8"]) from error
-    try:
         if not folder and path.is_dir():
-            raise InputError([f"{flag} {path} cannot be written: it is a folder"])
+            return [f"{flag} {path} cannot be written: it is a folder"]
         while not place.exists():
             place = place.parent
         with tempfile.TemporaryFile(dir=place):
-            pass
+            return []
     except OSError as error:
-        problem = f"{flag} {path} cannot be written: {error.strerror} ({place})"
-        raise InputError([problem]) from error
+        return [f"{flag} {path} cannot be written: {error.strerror} ({place})"]
 
 
 def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[str]:
@@ -229,19 +239,12 @@ def print_table(console: Console, table: Table) -> None:
     Console(file=console.file, width=1000).print(table)
 
 
-def picture_problems(flag: str, path: Path) -> list[str]:
+def picture_problems(flag: str, path: Path | None) -> list[str]:
     """What is wrong with the path of a picture."""
-    if path.suffix not in (".gif", ".mp4", ".png"):
-        return [f"{flag} {path} must end in .gif, .mp4 or .png"]
-    if path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
-        return [f"{flag} {path}: .mp4 needs PyAV: pip install '.[report]' in the checkout"]
-    return []
-
-
-def check_engine(name: str) -> None:
-    """Refuses an engine that there is not."""
-    if problems := engine_problems(name):
-        raise InputError(problems)
+    problems = place_problems(flag, path, ".gif", ".mp4", ".png")
+    if path and path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
+        problems.append(f"{flag} {path}: .mp4 needs PyAV: pip install '.[report]' in the checkout")
+    return problems
 
 
 def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[str]:

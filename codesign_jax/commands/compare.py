@@ -17,10 +17,11 @@ from rich.table import Table
 
 from codesign_jax import codesign, cost, files, runs
 from codesign_jax.commands import common, flags, reference
-from codesign_jax.commands.case import Case, find_case
+from codesign_jax.commands.common import find_case
 from codesign_jax.report import statistics, verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns
+from codesign_jax.runs.choice import Case
 from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
@@ -74,14 +75,8 @@ def main(options: "Compare") -> int:
         problems.append("compare needs at least one run folder")
     if options.trials is not None and len(folders) != 2:
         problems.append(f"--trials compares two designs; the folders have {len(folders)} runs")
-    if options.out is not None and options.out.suffix != ".csv":
-        problems.append(f"--out {options.out} must end in .csv")
-    if problems:
-        raise InputError(problems)
+    common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     pair = [] if options.trials is None else _pair(options, folders)
-    if options.out is not None:
-        common.check_place("--out", options.out)
-        check_table(options.out)
     every = read_all({folder: runs.read_run(folder) for folder in folders})
     console = Console(highlight=False, soft_wrap=True)
     compare(every, console, named=True)
@@ -215,18 +210,6 @@ def _summary(own: list[Compared]) -> tuple[str, ...]:
     share = statistics.wilson(good, len(found))
     interval = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
     return converged, grasps, f"{good} of {len(found)}", interval
-
-
-def check_table(path: Path) -> None:
-    """Refuses to replace a file that is no table of runs."""
-    if not path.exists():
-        return
-    with path.open("rb") as file:
-        head = file.readline(1000)
-    if not (head.startswith(b"seed,") and b",best_test_cost," in head):
-        raise InputError(
-            [f"{path} is no table of runs, and would be replaced: choose another --out"]
-        )
 
 
 def write_table(every: Mapping[Path, Compared], path: Path) -> None:

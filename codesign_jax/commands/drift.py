@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from codesign_jax.commands import calls, common
-from codesign_jax.commands.calls import Calls, Meter, Trials
-from codesign_jax.commands.case import Case
+from codesign_jax.commands.calls import Calls, Trials
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import answer
 from codesign_jax.report.statistics import Interval
+from codesign_jax.runs.choice import Case
+from codesign_jax.runs.progress import Meter
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Export

@@ -10,13 +10,13 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import engines, rollout, runs, types
-from codesign_jax.commands import common, stress
-from codesign_jax.commands.case import Case, find_case
+from codesign_jax.commands import common, reference
+from codesign_jax.commands.common import find_case
 from codesign_jax.engines import make_engine
-from codesign_jax.report import verdicts
+from codesign_jax.report import stress, verdicts
 from codesign_jax.runs import choice, tables
+from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
-from codesign_jax.scene import schema
 from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def main(options: "Evaluate") -> int:
     if options.stress:
         with Busy(console, "simulating other conditions"):
             found = stress.simulate(case, options.trials, jax.random.key(options.seed))
-        stress.tell(case, found, console)
+        reference.tell_stress(case, found, console)
     if options.render:
         draw(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
@@ -63,9 +63,7 @@ def _of_particle(case: Case, options: "Evaluate") -> Case:
         raise InputError(["--particle is one of a run: give its folder, or leave it out"])
     record = choice.read_record(options.run_folder)
     particles = np.asarray(record.state.particles)
-    problem = schema.range_problem("--particle", options.particle, "", 0, len(particles) - 1)
-    if problem:
-        raise InputError([problem])
+    common.refuse(common.number_problems(("--particle", options.particle, 0, len(particles) - 1)))
     return case._replace(design=particles[options.particle])
 
 
@@ -73,16 +71,9 @@ def _check(options: "Evaluate", engine: str) -> None:
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
-    if options.render:
-        problems += common.picture_problems("--render", options.render)
-    if options.out and options.out.suffix != ".csv":
-        problems.append(f"--out {options.out} must end in .csv")
-    problems += common.engine_problems(engine, options.overrides)
-    if problems:
-        raise InputError(problems)
-    for flag, path in (("--render", options.render), ("--out", options.out)):
-        if path:
-            common.check_place(flag, path)
+    problems += common.picture_problems("--render", options.render)
+    problems += common.place_problems("--out", options.out, ".csv")
+    common.refuse(problems + common.engine_problems(engine, options.overrides))
 
 
 def simulate(case: Case, options: "Evaluate", console: Console) -> types.Outcome:

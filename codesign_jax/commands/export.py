@@ -12,11 +12,12 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import engines, files, provenance, rollout, runs
-from codesign_jax.commands import common, drift, reference, stress
-from codesign_jax.commands.case import Case, find_case
+from codesign_jax.commands import common, drift, reference
+from codesign_jax.commands.common import find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
+from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trial
@@ -31,8 +32,7 @@ def main(options: "Export") -> int:
     common.use_compilation_cache()
     doubts: list[str] = []
     case = find_case(options, tell=doubts.append)
-    if doubts:
-        raise InputError([f"{doubt}. Nothing is exported" for doubt in doubts])
+    common.refuse([f"{doubt}. Nothing is exported" for doubt in doubts])
     _check(options, case)
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
@@ -86,9 +86,7 @@ def _check(options: "Export", case: Case) -> None:
     elif out.exists() and not out.is_dir():
         problems.append(f"--out {out} is a file")
     problems += process.problems(_process(options)) + _missing(options)
-    problems += common.engine_problems(case.engine, options.overrides)
-    if problems:
-        raise InputError(problems)
+    common.refuse(problems + common.engine_problems(case.engine, options.overrides))
 
 
 def _missing(options: "Export") -> list[str]:
@@ -197,7 +195,7 @@ def _tested(folder: Path) -> "sheet.Tested":
     scene, settings = runs.read_run(folder)
     fresh, _ = reference.stored(folder, settings)
     verdict = None if fresh is None else str(reference.judged(scene, fresh))
-    return verdict, stress.stored(folder, settings)
+    return verdict, reference.stored_stress(folder, settings)
 
 
 def _sheet(

@@ -14,9 +14,8 @@ from rich.table import Table
 from codesign_jax import files
 from codesign_jax import finger as fingers
 from codesign_jax.commands import common
-from codesign_jax.commands.case import find_case
+from codesign_jax.commands.common import find_case
 from codesign_jax.finger import Finger, Fit
-from codesign_jax.scene import schema
 from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
@@ -40,17 +39,10 @@ def main(options: "Options") -> int:
     """Runs the command and returns the exit status."""
     case = find_case(options)
     params = case.space.params(np.asarray(case.design))
-    problems = []
-    number = schema.range_problem("--finger", options.finger, "", 0, case.scene.num_fingers - 1)
-    problems += [number] if number else []
+    problems = common.number_problems(("--finger", options.finger, 0, case.scene.num_fingers - 1))
     if options.fit and options.measured is None:
         problems.append("--fit needs measurements: give a file, codesign finger FILE.csv --fit")
-    if options.out and options.out.suffix != ".csv":
-        problems.append(f"--out {options.out} must end in .csv")
-    if problems:
-        raise InputError(problems)
-    if options.out:
-        common.check_place("--out", options.out)
+    common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     measured = options.measured and fingers.read(options.measured)
     mine = fingers.of_design(case.scene, params, options.finger)
     console = Console(highlight=False, soft_wrap=True)

@@ -1,8 +1,6 @@
 """Flags that commands share.  Nothing heavy is imported here: `--help` is to be quick."""
 
 import dataclasses
-import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -35,34 +33,6 @@ ENGINE = tyro.conf.arg(
 Engine = Annotated[str | None, ENGINE]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
-
-
-def text_problems(arguments: Sequence[str]) -> list[str]:
-    """What is wrong with arguments whose bytes are no text, which no file or table could hold."""
-    problems = []
-    for argument in arguments:
-        try:
-            argument.encode()
-        except UnicodeEncodeError:
-            problems.append(f"{argument[:100]!r} is no UTF-8 text")
-    return problems
-
-
-def path_problems(command: object) -> list[str]:
-    """What is wrong with the paths of a parsed command: names that no file system has."""
-    problems = []
-    for field in dataclasses.fields(command):  # type: ignore[arg-type]
-        path = getattr(command, field.name)
-        if isinstance(path, Path):
-            try:
-                os.lstat(path)
-            except (FileNotFoundError, NotADirectoryError, PermissionError):
-                pass  # the command says what it misses, or makes it
-            except (OSError, ValueError) as error:
-                why = error.strerror if isinstance(error, OSError) else str(error)
-                name = str(path) if len(str(path)) <= 100 else f"{str(path)[:100]}..."
-                problems.append(f"{name!r}: {why}")
-    return problems
 
 
 @dataclasses.dataclass

@@ -9,9 +9,10 @@ import numpy as np
 
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common
-from codesign_jax.commands.case import Case, find_case
+from codesign_jax.commands.common import find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import choice
+from codesign_jax.runs.choice import Case
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
@@ -46,7 +47,7 @@ def find(options: "Shown") -> Asked:
     if options.trial is not None and options.object is not None:
         raise InputError(["--trial and --object exclude each other: a trial has its object"])
     case = find_case(options)
-    common.check_engine(case.engine)
+    common.refuse(common.engine_problems(case.engine))
     if options.run_folder is None:
         return _nominal(case, options.object or 0)
     return _of_run(case, options, options.run_folder)

@@ -9,14 +9,14 @@ from rich.console import Console
 
 from codesign_jax import codesign, files, runs
 from codesign_jax.commands import calls, common
-from codesign_jax.commands.calls import Calls, Meter, Trials
-from codesign_jax.commands.case import Case, find_case
+from codesign_jax.commands.calls import Calls, Trials
+from codesign_jax.commands.common import find_case
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
-from codesign_jax.runs.manifest import PROVENANCE
-from codesign_jax.runs.scene_files import contents, write_scene
+from codesign_jax.runs.choice import Case
+from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, failed
@@ -66,7 +66,7 @@ def main(options: "Options") -> int:
         return 130
     found = summarize(case, made, simulated, options.seed)
     print_summary(case, found, console)
-    write_files(case, found, folder, console)
+    write_files(found, folder, console)
     part.unlink(missing_ok=True)
     return 0
 
@@ -79,22 +79,8 @@ def _folder(options: "Options", case: Case) -> Path:
         folder = own
     if options.out is not None:
         folder = options.out
-    common.check_place("--out", folder, folder=True)
-    if not (folder / PROVENANCE).exists():
-        _refuse_other_scene(folder, case)
+    common.refuse(common.place_problems("--out", folder, folder=True))
     return folder
-
-
-def _refuse_other_scene(folder: Path, case: Case) -> None:
-    others = [
-        str(folder / name)
-        for name, content in contents(case.scene).items()
-        if (folder / name).exists() and (folder / name).read_bytes() != content
-    ]
-    if others:
-        raise InputError(
-            [f"--out: {', '.join(others)} would be replaced by the landscape's: choose another"]
-        )
 
 
 def _check(options: "Options", case: Case) -> None:
@@ -103,19 +89,16 @@ def _check(options: "Options", case: Case) -> None:
         ("--trials", options.trials, 1, 100_000),
         ("--seed", options.seed, 0, 2**31 - 1),
     )
-    problems += common.engine_problems(case.engine, options.overrides)
-    if problems:
-        raise InputError(problems)
+    common.refuse(problems + common.engine_problems(case.engine, options.overrides))
 
 
 def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
     known = case.space.names
     chosen = names or (known if len(known) == 2 else ())
     unknown = [name for name in chosen if name not in known]
-    if unknown:
-        raise InputError(
-            [f"--parameters {name!r} is not a parameter; {_meant(name, known)}" for name in unknown]
-        )
+    common.refuse(
+        [f"--parameters {name!r} is not a parameter; {_meant(name, known)}" for name in unknown]
+    )
     if len(set(chosen)) != 2 or len(chosen) != 2:
         raise InputError([f"--parameters must name two of {', '.join(known)}"])
     return known.index(chosen[0]), known.index(chosen[1])
@@ -217,11 +200,9 @@ def print_summary(case: Case, found: Landscape, console: Console) -> None:
         console.print(f"{bad} of {found.cost.size * int(found.trials)} trials failed")
 
 
-def write_files(case: Case, found: Landscape, folder: Path, console: Console) -> None:
-    """Writes the arrays, the figure, and the scene where no run has written it."""
+def write_files(found: Landscape, folder: Path, console: Console) -> None:
+    """Writes the arrays and the figure."""
     folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / PROVENANCE).exists():  # a run has its scene already
-        write_scene(case.scene, folder)
     for path in landscape.save(found, folder):
         console.print(f"landscape: {path}", markup=False)
     from codesign_jax.report import figures

@@ -14,10 +14,10 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, files, optimize, runs
-from codesign_jax.commands import common, compare, hosts, reference, status, stress
+from codesign_jax.commands import common, compare, hosts, reference, status
 from codesign_jax.commands.compare import Compared
 from codesign_jax.own import is_own
-from codesign_jax.report import verdicts
+from codesign_jax.report import stress, verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, columns
 from codesign_jax.runs.progress import Busy
@@ -46,12 +46,10 @@ def main(options: "Optimize") -> int:
     # Everything that speaks against the runs, before anything that takes time.
     plan = runs.prepare(scene, settings)
     plans = {folder: runs.variant(plan, own) for folder, own in every.items()}
-    common.check_place("--out", options.out or next(iter(every)), folder=True)
-    sources = common.source_files(options)
+    place = options.out or next(iter(every))
+    common.refuse(common.place_problems("--out", place, folder=True))
     for folder, own in every.items():
-        runs.check_folder(folder, scene, own, fresh=options.fresh, sources=sources)
-    if several(options):
-        compare.check_table(table_folder(options) / columns.SEEDS)
+        runs.check_folder(folder, scene, own, fresh=options.fresh)
     notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
     print("".join(f"{note}\n" for note in notes), end="")
     if options.dry_run:
@@ -60,8 +58,8 @@ def main(options: "Optimize") -> int:
     devices, chunk = options.devices, options.chunk
     trials = reference.number_of_trials(options.reference_trials, settings)
     after = trials * reference.steps_and_links(scene)
-    opened = {"fresh": options.fresh, "sources": sources, "after": after}
-    found = runs.optimize(plans, sys.argv, **opened, devices=devices, chunk=chunk)
+    how = {"fresh": options.fresh, "after": after, "devices": devices, "chunk": chunk}
+    found = runs.optimize(plans, sys.argv, **how)
     results: dict[Path, RunResult | None] = {}
     called = runs.run_names(every) if several(options) else {}
     for folder, result in found.runs.items():
@@ -138,7 +136,7 @@ def _tell(
         if result.test is not None:
             _judge(own, result, fresh, folder, console)
             if fresh is not None:
-                stress.of_run(folder, own.settings, console)
+                reference.stress_run(folder, own.settings, console)
         _say_places(result, folder, console)
 
 
@@ -178,7 +176,7 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     if trials := reference.number_of_trials(options.reference_trials, settings):
         print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
-        print(f"other conditions: {stress.TRIALS * stress.sets(scene)} grasps")
+        print(f"other conditions: {reference.STRESS_TRIALS * stress.sets(scene)} grasps")
     print("time: `codesign check` measures it on this machine")
 
 

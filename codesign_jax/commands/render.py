@@ -8,7 +8,6 @@ from rich.console import Console
 from codesign_jax.commands import common, grasp
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
-from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Render
@@ -23,8 +22,7 @@ def main(options: "Render") -> int:
     asked = grasp.find(options)
     end = asked.case.scene.end_time
     late = [t for t in options.times if not 0 <= t <= end]
-    if late:
-        raise InputError([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
+    common.refuse([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
     draw(asked, options, camera, Console(highlight=False, soft_wrap=True))
     return 0
 
@@ -33,10 +31,7 @@ def _check(options: "Render") -> None:
     problems = common.picture_problems("--out", options.out)
     if options.times and options.out.suffix != ".png":
         problems.append("--times are those of a strip (.png); a film shows the whole grasp")
-    problem = schema.range_problem("--size", options.size, "pixels", 16, 4096)
-    if problems or problem:
-        raise InputError([*problems, *([problem] if problem else [])])
-    common.check_place("--out", options.out)
+    common.refuse(problems + common.number_problems(("--size", options.size, 16, 4096)))
 
 
 _LIMITS = {"azimuth": ("deg", 360), "elevation": ("deg", 90), "distance": ("m", 10)}
@@ -68,8 +63,7 @@ def _camera(words: Sequence[str]) -> "Camera":
                 camera = camera._replace(lookat=tuple(at))
             else:
                 camera = camera._replace(**{name: value})
-    if problems:
-        raise InputError(problems)
+    common.refuse(problems)
     return camera
 
 

@@ -1,17 +1,28 @@
-"""`codesign replay`."""
+"""`codesign replay`: a grasp in 3D, and how a failed world failed."""
 
 import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from rich.console import Console
 
-from codesign_jax.commands import common, failure, grasp
+from codesign_jax import rollout, runs
+from codesign_jax.commands import common, grasp
+from codesign_jax.engines import make_engine
+from codesign_jax.runs import failures
 from codesign_jax.runs.progress import Busy
+from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
+from codesign_jax.types import MEANINGS, Status, Trace
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Replay
+
+MOST = 10
+"""Failed worlds that a list shows."""
 
 
 def main(options: "Replay") -> int:
@@ -21,26 +32,20 @@ def main(options: "Replay") -> int:
         if options.run_folder is not None:
             raise InputError([f"{options.path} and --run {options.run_folder}: give one of them"])
         if not options.path.is_dir():
-            return failure.main(options.path, options.engine)
+            return explain(options.path, options.engine)
         options.run_folder = options.path
-    if options.out is not None and options.out.suffix != ".html":
-        raise InputError([f"--out {options.out} must end in .html"])
-    path = options.out or _default(options.run_folder)
-    common.check_place("--out", path)
+    path = options.out or (options.run_folder or Path()) / "replay.html"
+    common.refuse(common.place_problems("--out", path, ".html"))
     asked = grasp.find(options)
     console = Console(highlight=False, soft_wrap=True)
     places = options.episode, options.particle, options.trial, options.object
     if options.run_folder is not None and places == (None,) * 4:
-        failure.show_list(options.run_folder)
+        show_failures(options.run_folder)
     write_page(asked, path, console)
     console.print(f"replay: {path} (for any browser, offline)", markup=False)
     if options.open:
         webbrowser.open(path.resolve().as_uri())
     return 0
-
-
-def _default(folder: Path | None) -> Path:
-    return Path("replay.html") if folder is None else folder / "replay.html"
 
 
 def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
@@ -52,3 +57,53 @@ def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
     lines = grasp.description(asked, shown)
     console.print("\n".join(lines), markup=False)
     return viewer.write(asked.case.scene, shown, path, title="A grasp in 3D", text=lines)
+
+
+def show_failures(folder: Path) -> None:
+    """Prints the first failed worlds of a run folder."""
+    scene, _ = runs.read_run(folder)
+    found = sorted((folder / failures.FOLDER).glob("*.npz"))
+    for path in found[:MOST]:
+        failure = failures.load(path)
+        verdict = _verdict(failure.status, failure.bad_step, scene.discretization.timestep)
+        print(f"failed world {path}: {verdict}")
+    if found[MOST:]:
+        print(f"and {len(found) - MOST} more in {folder / failures.FOLDER}")
+
+
+def explain(path: Path, engine: str | None) -> int:
+    """Says how a failed world failed, and what happens when it is simulated again."""
+    failure = failures.load(path)
+    scene, settings = runs.read_run(path.resolve().parent.parent)
+    name = engine or settings.engine
+    common.refuse(common.engine_problems(name))
+    space, h = design_space(scene.hand, settings.preset), scene.discretization.timestep
+    print(runs.describe(space, failure.design))
+    print(f"recorded by {settings.engine}: {_verdict(failure.status, failure.bad_step, h)}")
+    for bit in Status(failure.status):
+        print(f"  {bit.name}: {MEANINGS[bit]}")
+    numbers = zip(("--episode", "--particle", "--trial"), failure.place, strict=True)
+    place = " ".join(f"{flag} {number}" for flag, number in numbers)
+    print(f"in 3D: codesign replay {path.parent.parent} {place}")
+    world = space.params(jnp.asarray(failure.design)), failure.trial
+    run = jax.jit(lambda p, t: rollout.simulate(scene, make_engine(name, scene), p, t))
+    found = run(*jax.tree.map(lambda v: jnp.asarray(v)[None], world))
+    outcome, trace = jax.tree.map(lambda v: np.asarray(v)[0], found)
+    bad = int(outcome.bad_step)
+    print(f"again in {name}: {_verdict(int(outcome.status), bad, h)}")
+    if bad < 0:
+        print(f"  cost {outcome.cost:.3f}; at the end: {_where(trace, -1)}")
+    for k in range(max(bad - 3, 0), bad + 1):
+        print(f"  step {k}: {_where(trace, k)}")
+    return 0
+
+
+def _verdict(status: int, bad_step: int, h: float) -> str:
+    when = f", first bad step {bad_step} ({bad_step * h:.2f} s)" if bad_step >= 0 else ""
+    return runs.status_names(status) + when
+
+
+def _where(trace: Trace, k: int) -> str:
+    height, distance = trace.height[k], trace.distance[k]
+    words = f"object {height:.4f} m above the table, {distance:.4f} m from the hand"
+    return f"speed {trace.speed[k]:.4g}, {words}"

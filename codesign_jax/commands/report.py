@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from codesign_jax import runs
-from codesign_jax.commands import common, grasp, reference, stress
-from codesign_jax.commands.case import Case
+from codesign_jax.commands import common, grasp, reference
 from codesign_jax.runs import Settings, choice
+from codesign_jax.runs.choice import Case
 from codesign_jax.runs.manifest import read_provenance
 from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.record import Record
@@ -25,7 +25,7 @@ def main(options: "Report") -> int:
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
     name = options.engine or settings.engine
-    common.check_engine(name)
+    common.refuse(common.engine_problems(name))
     try:
         from codesign_jax.report import page
         from codesign_jax.report.of_run import Run
@@ -33,7 +33,7 @@ def main(options: "Report") -> int:
         message = f"a report needs {error.name}: pip install '.[report]' in the checkout"
         raise InputError([message]) from error
     path = options.out or options.folder / "report.html"
-    common.check_place("--out", path)
+    common.refuse(common.place_problems("--out", path))
     notes: list[str] = []
     record = choice.read_record(options.folder, tell=notes.append)
     chosen = choice.choose(scene, record)
@@ -52,7 +52,7 @@ def main(options: "Report") -> int:
         provenance,
         fresh,
         tuple(notes),
-        stress.stored(options.folder, settings),
+        reference.stored_stress(options.folder, settings),
     )
     console = Console(highlight=False, soft_wrap=True)
     if why:

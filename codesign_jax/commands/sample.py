@@ -11,11 +11,11 @@ from rich.console import Console
 from codesign_jax import batch, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.commands import calls, common
-from codesign_jax.commands.calls import Meter
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset
 from codesign_jax.runs.dataset import Question
 from codesign_jax.runs.interrupts import Interrupts, Stopped
+from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
@@ -77,14 +77,10 @@ def _check(options: "Sample") -> None:
         ("--seed", options.seed, 0, 2**31 - 1),
         ("--chunk", options.chunk, 1, 10_000_000),
     )
-    if options.out.suffix != ".parquet":
-        problems.append(f"--out {options.out} must end in .parquet")
-    problems += common.engine_problems(options.engine, options.overrides)
-    if problems:
-        raise InputError(problems)
+    problems += common.place_problems("--out", options.out, ".parquet")
+    common.refuse(problems + common.engine_problems(options.engine, options.overrides))
     if not options.outcomes:
         dataset.pyarrow_module("codesign sample")
-    common.check_place("--out", options.out)
 
 
 def _question(options: "Sample", scene: Scene) -> Question:

@@ -47,6 +47,8 @@ def of(run: Callable[[], int]) -> int:
     except ValueError as error:
         from codesign_jax.scene.schema import InputError
 
+        if isinstance(error, UnicodeEncodeError):
+            error = InputError(["the arguments are no text in UTF-8"])
         if not isinstance(error, InputError):
             raise
         for problem in error.problems:
@@ -68,7 +70,7 @@ def of(run: Callable[[], int]) -> int:
         if error.errno is None:
             raise
         print(f"error: {words(error)}", file=sys.stderr)
-        return 1
+        return 2 if error.errno == errno.ENAMETOOLONG else 1
     except KeyboardInterrupt:
         # Commands with something to save have saved it, and said so, before this.
         print("stopped", file=sys.stderr)

@@ -10,10 +10,7 @@ or another step of this one, is refused, and so is one that cannot be read for a
 pass: neither is damaged, and only what is damaged may be deleted.
 """
 
-import asyncio
-import contextlib
 import errno
-import functools
 import hashlib
 import logging
 import os
@@ -34,6 +31,9 @@ _LABEL = "run"
 """Name of the arrays that say whose a step is."""
 _TEMPORARY = ".orbax-checkpoint-tmp"
 """Mark in the name of a step that orbax is writing."""
+
+# Orbax's threads log the traceback of an error that `Checkpoints.save` raises.
+logging.getLogger("absl").addFilter(lambda record: "_SignalingThread" not in record.getMessage())
 
 Arrays = dict[str, Any]
 """Nested dictionaries of NumPy arrays; orbax stores none of size zero."""
@@ -96,7 +96,6 @@ class Checkpoints:
             for left in self.folder.glob(f"*{_TEMPORARY}*"):
                 files.remove(left)
         self._args, self._tell, self._run = ocp.args, tell, run
-        _silence()
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def __enter__(self) -> "Checkpoints":
@@ -118,8 +117,7 @@ class Checkpoints:
         """
         labelled = arrays if self._run is None else arrays | {_LABEL: _label(self._run, step)}
         try:
-            with _patient_loops():
-                saved = self._manager.save(step, args=self._args.StandardSave(labelled))
+            saved = self._manager.save(step, args=self._args.StandardSave(labelled))
             if saved:
                 self._write_digests(step, labelled)
         except (OSError, ValueError) as error:  # the latter is how tensorstore says it
@@ -290,59 +288,6 @@ def _unsaved(place: Path, error: Exception) -> OSError:
             )
     problem = text.splitlines()[0][:200] if text else type(error).__name__
     return OSError(f"checkpoint {place.name} could not be written to {place.parent}: {problem}")
-
-
-@functools.cache
-def _silence() -> None:
-    """Keeps tracebacks of a failed save off the terminal: `Checkpoints.save` raises the error.
-
-    Orbax logs it from each of its threads, and asyncio from each task that nobody asked how it
-    ended.  Some come long after the save, so that this is for the rest of the process.
-    """
-    for name in ("absl", "asyncio"):
-        logging.getLogger(name).addFilter(_is_news)
-
-
-class _Loop(asyncio.SelectorEventLoop):
-    """An event loop that may be called when it is closed.
-
-    When a write fails, orbax closes its loop while tensorstore still writes other arrays.  Their
-    threads then call the loop, and print the traceback of its error past Python's hooks.
-    """
-
-    def call_soon_threadsafe(self, callback: Any, *args: Any, **options: Any) -> Any:
-        """As the base class's, but a closed loop drops the callback and raises nothing."""
-        try:
-            return super().call_soon_threadsafe(callback, *args, **options)
-        except RuntimeError:
-            if not self.is_closed():
-                raise
-            return asyncio.Handle(callback, args, self)
-
-
-class _Loops(asyncio.DefaultEventLoopPolicy):
-    """Makes such loops."""
-
-    def new_event_loop(self) -> _Loop:
-        """A loop that may be called when it is closed."""
-        return _Loop()
-
-
-@contextlib.contextmanager
-def _patient_loops() -> Iterator[None]:
-    """Event loops that orbax makes meanwhile may be called when they are closed."""
-    before = asyncio.get_event_loop_policy()
-    asyncio.set_event_loop_policy(_Loops())
-    try:
-        yield
-    finally:
-        asyncio.set_event_loop_policy(before)
-
-
-def _is_news(record: logging.LogRecord) -> bool:
-    """Whether a message is not of orbax's threads or tasks about an error that was raised."""
-    text = record.getMessage()
-    return "_SignalingThread" not in text and not ("never retrieved" in text and "orbax" in text)
 
 
 def _leaves(arrays: Arrays, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:

@@ -1,17 +1,23 @@
 """The design that a run found: its final particle that tested best, and one grasp of it."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.codesign import episode_trials
+from codesign_jax.codesign import Task, episode_trials
 from codesign_jax.cost import particle_cost
-from codesign_jax.runs.reading import Tell, load_record
+from codesign_jax.engines import make_engine
+from codesign_jax.runs import scene_files
+from codesign_jax.runs.interrupts import interruptible
+from codesign_jax.runs.reading import Tell, load_record, read_run
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.tables import failure_counts, status_names
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError, range_problem
 from codesign_jax.types import Outcome, Trial, failed
 
@@ -52,6 +58,60 @@ class Chosen(NamedTuple):
     tested: bool
     row: int
     episode: int
+
+
+class Case(NamedTuple):
+    """A design with what simulates it.
+
+    Attributes:
+      scene: The scene.
+      space: The design space.
+      design: The design [SI units], shape (parameter,).
+      engine: Name of the engine.
+    """
+
+    scene: Scene
+    space: DesignSpace
+    design: np.ndarray
+    engine: str
+
+    def simulate(self, trials: int, key: jax.Array) -> Outcome:
+        """Outcomes in trials that depend on objects and key alone, arrays of shape (trial,)."""
+        task = Task(self.scene, self.space, trials, make_engine(self.engine, self.scene))
+        population = jnp.asarray(self.design, jnp.float32)[None]
+        found = interruptible(task.evaluate, population, key)
+        return jax.tree.map(lambda v: np.asarray(v)[0], found)
+
+    def digest(self, *numbers: int) -> str:
+        """Digest of what determines outcomes, beside code, versions and device."""
+        return scene_files.digest(self.scene, self.engine, self.design, *numbers)
+
+
+def case_of_run(
+    folder: Path,
+    *,
+    objects: str | None = None,
+    accuracy: str | None = None,
+    overrides: Mapping[Any, Any] | None = None,
+    engine: str | None = None,
+    tell: Tell = lambda text: None,
+) -> Case:
+    """The design that a run found; objects, accuracy, values and engine may replace the run's."""
+    how = {"object_set": objects, "accuracy": accuracy, "overrides": overrides}
+    scene, settings = read_run(folder, **how)
+    # By the run's own rule for failed trials, whatever the overrides say.
+    chosen = choose(read_run(folder)[0], read_record(folder, tell=tell))
+    if problem := doubt(chosen):
+        tell(problem)
+    space = design_space(scene.hand, settings.preset)
+    if len(chosen.design) != space.num_parameters:
+        raise InputError(
+            [
+                f"--set leaves {space.num_parameters} parameters free in preset "
+                f"{settings.preset!r}; the run's designs have {len(chosen.design)}"
+            ]
+        )
+    return Case(scene, space, chosen.design, engine or settings.engine)
 
 
 def read_record(folder: Path, *, tell: Tell | None = None) -> Record:

@@ -73,15 +73,13 @@ def open_run(
     command: list[str],
     *,
     fresh: bool = False,
-    sources: Iterable[Path] = (),
 ) -> Iterator[tuple[RunDirectory, list[str]]]:
     """Opens a run folder: makes it, or checks that it is this very run; locks it meanwhile."""
-    sources = tuple(sources)
-    check_folder(path, scene, settings, fresh=fresh, sources=sources)
+    check_folder(path, scene, settings, fresh=fresh)
     path.mkdir(parents=True, exist_ok=True)
     with _locked(path):
         # Again: another process may have been here.
-        check_folder(path, scene, settings, fresh=fresh, sources=sources)
+        check_folder(path, scene, settings, fresh=fresh)
         contents, run, notes = _contents(scene, settings), RunDirectory(path), []
         if fresh:
             _delete_run(path)
@@ -100,22 +98,14 @@ def open_run(
         yield run, notes
 
 
-def check_folder(
-    path: Path,
-    scene: Scene,
-    settings: Settings,
-    *,
-    fresh: bool = False,
-    sources: Iterable[Path] = (),
-) -> None:
+def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = False) -> None:
     """Checks that a run could start or go on in a folder; changes nothing."""
     _refuse_foreign(path)
     if not (path / PROVENANCE).exists():
         return
     stored = manifest.read_provenance(path)
     if fresh:
-        meshes = (shape.mesh.path for shape in scene.objects.object if shape.mesh)
-        _refuse_to_delete(path, (*sources, *meshes))
+        _refuse_to_delete(path)
     else:
         _refuse_other(path, scene, settings, stored)
         if problem := reading.lost(path):
@@ -306,16 +296,8 @@ def _refuse_foreign(path: Path) -> None:
         )
 
 
-def _refuse_to_delete(path: Path, sources: tuple[Path, ...]) -> None:
+def _refuse_to_delete(path: Path) -> None:
     """Refuses `--fresh` where more than a run's own files would go."""
-    place = path.resolve()
-    if read := [str(file) for file in sources if place in file.resolve().parents]:
-        raise InputError(
-            [
-                f"--fresh would delete {_some(read)}, which this command reads: copy the files of "
-                "the scene to another folder, or choose another --out"
-            ]
-        )
     if links := [name for name in _all(path) if (path / name).is_symlink()]:
         raise InputError(
             [f"--fresh deletes no symbolic links ({_some(links)} in {path}): delete them yourself"]

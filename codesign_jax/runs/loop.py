@@ -26,7 +26,7 @@ from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.directory import RunDirectory
 from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.interrupts import Stopped
-from codesign_jax.runs.progress import Voice
+from codesign_jax.runs.progress import Report, Voice
 from codesign_jax.runs.record import History, Record, Start
 from codesign_jax.runs.settings import SCENE_COST, Settings, masks_of
 from codesign_jax.scene import Scene
@@ -263,13 +263,12 @@ class Loop:
     def _poor_seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Start]:
         plan, batch = self.plan, self.plan.settings.particles
         search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, batch=batch)
-        with self.progress.busy("looking for a poor seed") as watch:
-            try:
-                seed, cost, drawn = yield from self._evaluated(search)
-            except NoSeed as error:
-                raise RunError(str(error)) from error
-        found = f"cost {cost:.3f}, candidate {drawn} ({watch.seconds:.1f} s)"
-        self._say(f"seed particle: {found}")
+        self.progress.begin("looking for a poor seed")
+        try:
+            seed, cost, drawn = yield from self._evaluated(search)
+        except NoSeed as error:
+            raise RunError(str(error)) from error
+        self._say(f"seed particle: cost {cost:.3f}, candidate {drawn}")
         return Start(np.asarray(seed), np.asarray(cost, np.float32), np.asarray(drawn))
 
     def _evaluated(
@@ -291,16 +290,16 @@ class Loop:
 
     def _episodes(self, record: Record) -> Asking:
         for e in range(record.done, self.plan.settings.episodes):
-            with self.progress.busy("simulating") as watch:
-                state, info = yield Request(record.state, self.plan.mask[e])
+            self.progress.begin("simulating")
+            state, info = yield Request(record.state, self.plan.mask[e])
             self.save()
             record.state = state
             # The devices have nothing to do until the next episode begins. Their results are copied
             # now, since a copy may wait for a simulation that has begun; all else is done then.
             fetched = fetch((state, info))[1]
-            self._unsaved = partial(self._close, record, e, fetched, watch.seconds)
+            self._unsaved = partial(self._close, record, e, fetched)
 
-    def _close(self, record: Record, e: int, info: EpisodeInfo, seconds: float) -> None:
+    def _close(self, record: Record, e: int, info: EpisodeInfo) -> None:
         """Saves an episode and reports it."""
         records.add_report(record.history, e, info)
         self._save_failures(e, info)
@@ -308,7 +307,7 @@ class Loop:
         if last or (e + 1) % self._every == 0:
             self._save(e + 1, record)
         self._write_tables(record, e)
-        self._report(record.history, e, seconds)
+        self._report(record.history, e)
         self._refuse_all_failed(record)
 
     def _refuse_all_failed(self, record: Record) -> None:
@@ -338,27 +337,20 @@ class Loop:
             previous=previous,
         )
         batch = len(particles) * settings.trials
-        with self.progress.busy("testing the final particles") as watch:
-            test = yield from self._evaluated(testing, partial(self.progress.tested, batch))
+        self.progress.begin("testing the final particles")
+        test = yield from self._evaluated(testing, partial(self.progress.tested, batch))
         record.test = jax.tree.map(lambda v: np.asarray(v)[same], test.outcomes)
         self._save(settings.episodes + 1, record)
         self._write_tables(record, settings.episodes)
         self._refuse_all_failed(record)
-        grasps = batch * settings.test_rounds
-        self._say(f"final test: {grasps} grasps in {watch.seconds:.1f} s")
+        self._say(f"final test: {batch * settings.test_rounds} grasps")
 
-    def _report(self, history: History, e: int, seconds: float) -> None:
-        status = history.outcomes.status[e]
-        line = self.progress.episode(
-            e + 1,
-            mean=float(history.cost[e].mean()),
-            best=float(history.cost[e].min()),
-            failed=int(types.failed(status).sum()),
-            causes=tables.failure_counts(status),
-            warnings=tables.warning_counts(status),
-            grasps=status.size,
-        )
-        self.run_directory.log(f"{line}  {seconds:.2f} s")
+    def _report(self, history: History, e: int) -> None:
+        status, cost = history.outcomes.status[e], history.cost[e]
+        ends = tables.failure_counts(status), tables.warning_counts(status)
+        failed = int(types.failed(status).sum())
+        report = Report(e + 1, float(cost.mean()), float(cost.min()), failed, status.size, *ends)
+        self.run_directory.log(self.progress.episode(report))
 
     def _save(self, step: int, record: Record) -> None:
         self.store.save(step, records.to_arrays(record))

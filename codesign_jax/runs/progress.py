@@ -1,8 +1,4 @@
-"""Progress on the terminal: a live bar where there is one, plain lines where not.
-
-Where there is no terminal, a line on the standard error reports what goes on and for how long,
-whenever nothing else was printed for a few seconds.
-"""
+"""Progress on the terminal: a live bar where there is one, plain lines where not."""
 
 import sys
 import threading
@@ -12,6 +8,11 @@ from typing import NamedTuple, Self
 import rich.console
 import rich.progress
 
+SILENCE = 5.0
+"""Time without a line after which one is printed, where there is no terminal [s]."""
+SECONDS = 10.0
+"""Time between lines of a `Meter` there [s]."""
+
 
 def duration(seconds: float) -> str:
     """Formats a time as 1:02:03 or 2:03."""
@@ -20,47 +21,55 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-class Ticker:
-    """Says on the standard error what goes on, when nothing has been said for a while."""
+class Live:
+    """A bar where there is a terminal; a context manager.
 
-    SILENCE = 5.0
-    """Time without a line after which one is printed [s]."""
+    Elsewhere a line on the standard error says what goes on and for how long, whenever nothing else
+    was printed for a few seconds.
+    """
 
-    def __init__(self, *, disable: bool = False):
-        """Starts nothing yet; with `disable` it never says anything."""
-        self._disable, self._stop = disable, threading.Event()
-        self._text = ""
-        self._since, self._spoken = 0.0, 0.0
+    def __init__(self, console: rich.console.Console, *columns: rich.progress.ProgressColumn):
+        """Takes where to tell, and the bar's columns."""
+        self.console = console
+        self._bar = rich.progress.Progress(
+            *columns, console=console, transient=True, disable=not console.is_terminal
+        )
+        self._task = self._bar.add_task("", total=None)
+        self._stop, self.text, self._since, self._spoken = threading.Event(), "", 0.0, 0.0
 
-    def __enter__(self) -> "Ticker":
-        """Starts."""
-        if not self._disable:
+    def __enter__(self) -> Self:
+        """Shows the bar."""
+        self._bar.start()
+        if not self.console.is_terminal:
             threading.Thread(target=self._run, daemon=True).start()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Stops."""
+        """Removes it; lines stay."""
         self._stop.set()
+        self._bar.stop()
 
     def begin(self, text: str) -> None:
         """Something else goes on from now."""
-        self._text, self._since = text, time.monotonic()
-        self.spoke()
+        self._since = self._spoken = time.monotonic()
+        self.say(text)
 
-    def rename(self, text: str) -> None:
-        """What goes on since `begin` has another name."""
-        self._text = text
+    def say(self, text: str) -> None:
+        """Says more precisely what goes on; its time goes on as well."""
+        self.text = text
+        self._bar.update(self._task, description=text)
 
-    def spoke(self) -> None:
-        """Something was said by somebody else."""
+    def message(self, text: str) -> None:
+        """Prints a line above the bar."""
+        self.console.print(text, markup=False)
         self._spoken = time.monotonic()
 
     def tick(self) -> None:
         """Says what goes on if nothing has been said for so long."""
         now = time.monotonic()
-        if self._text and now - self._spoken >= self.SILENCE:
+        if self.text and now - self._spoken >= SILENCE:
             self._spoken = now
-            words = f"{self._text}: {duration(now - self._since)}"
+            words = f"{self.text}: {duration(now - self._since)}"
             print(words, file=sys.stderr, flush=True)
 
     def _run(self) -> None:
@@ -68,91 +77,72 @@ class Ticker:
             self.tick()
 
 
-class Live:
-    """A bar where there is a terminal, else lines on the standard error; a context manager."""
-
-    def __init__(self, console: rich.console.Console, *columns: rich.progress.ProgressColumn):
-        """Takes where to tell, and the bar's columns."""
-        self._bar = rich.progress.Progress(
-            *columns, console=console, transient=True, disable=not console.is_terminal
-        )
-        self._ticker = Ticker(disable=console.is_terminal)
-
-    def __enter__(self) -> Self:
-        """Shows the bar."""
-        self._bar.start()
-        self._ticker.__enter__()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Removes it; lines stay."""
-        self._ticker.__exit__()
-        self._bar.stop()
-
-
 class Busy(Live):
-    """Shows that something of unknown progress goes on, and for how long; a context manager."""
+    """Shows that something of unknown progress goes on, and for how long."""
 
     def __init__(self, console: rich.console.Console, text: str):
         """Takes what goes on."""
         columns = rich.progress.SpinnerColumn(), rich.progress.TextColumn("{task.description}")
         super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
-        self._ticker.begin(text)
-        self._task = self._bar.add_task(text, total=None)
+        self.begin(text)
 
-    def say(self, text: str) -> None:
-        """Says more precisely what goes on; its time goes on as well."""
-        self._ticker.rename(text)
-        self._bar.update(self._task, description=text)
+
+class Meter(Live):
+    """Grasps that were simulated: a live bar on a terminal, elsewhere a line now and then.
+
+    Attributes:
+      total: Grasps to simulate, which may become fewer.
+      done: Grasps that were simulated.
+    """
+
+    def __init__(self, text: str, total: int, console: rich.console.Console):
+        """Takes what is simulated, the number of grasps, and where to tell."""
+        columns = rich.progress.Progress.get_default_columns()[:-1]
+        super().__init__(console, *columns, rich.progress.TimeRemainingColumn())
+        self.total, self.done, self._name, self._compiled = total, 0, text, None
+        self._told = time.monotonic()
+        self.begin(f"{text}: compiling, then {total} grasps")
+
+    def found(self, grasps: int) -> None:
+        """Counts grasps that an earlier process simulated."""
+        self.done += grasps
+        self._bar.update(self._task, completed=self.done, total=self.total)
+
+    def advance(self, grasps: int) -> None:
+        """Counts grasps that were just simulated."""
+        self.found(grasps)
+        now, text = time.monotonic(), f"{self._name}: {self.done} of {self.total} grasps"
+        self.say(text)
+        if self._compiled and not self.console.is_terminal and now - self._told >= SECONDS:
+            start, before = self._compiled
+            self._told, rate = now, (self.done - before) / max(now - start, 1e-9)
+            left = duration(max(self.total - self.done, 0) / rate)
+            self.message(f"{text}, {rate:.1f} grasps/s, about {left} left")
+
+    def compiled(self) -> None:
+        """Leaves the call before, which compiled, out of the rate."""
+        self._compiled = time.monotonic(), self.done
 
 
 class Progress(Live):
     """Reports the episodes and final tests of one or several runs, a line a round for all of them.
 
-    A context manager; each run speaks by its `Voice`.
+    Each run speaks by its `Voice`.
     """
 
-    def __init__(
-        self,
-        total: int,
-        runs: int = 1,
-        *,
-        test: int = 0,
-        after: float = 0.0,
-        console: rich.console.Console | None = None,
-    ):
+    def __init__(self, total: int, runs: int = 1, *, test: int = 0, after: float = 0.0):
         """Takes episodes, grasps of the test and of what comes afterwards, of each of the runs."""
-        self.total, self._test, self._after = total, runs * test, runs * after
-        self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
+        console = rich.console.Console(highlight=False, soft_wrap=True)
         columns = rich.progress.BarColumn(), rich.progress.TextColumn("{task.description}")
-        super().__init__(self.console, *columns, rich.progress.TimeElapsedColumn())
-        self._task = self._bar.add_task("", total=None)
-        self._watches: list[Stopwatch] = []
-        self._entries: list[_Entry] = []
+        super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
+        self.total, self._test, self._after = total, runs * test, runs * after
+        self._reports: list[Report] = []
         self._seconds, self._grasps, self._told = 0.0, 0, 0.0
         self._part, self._tested = 0, 0
 
-    def message(self, text: str) -> None:
-        """Prints a line above the bar."""
-        self.console.print(text, markup=False)
-        self._ticker.spoke()
-
-    def busy(self, text: str) -> "Stopwatch":
-        """Shows what goes on while a block runs, and measures it."""
-        self._bar.update(self._task, description=text)
-        self._ticker.begin(text)
-        watch = Stopwatch()
-        self._watches = [w for w in self._watches if not w.seconds] + [watch]
-        return watch
-
-    def compiled(self) -> None:
-        """Leaves the time so far out of what is being measured: it was not for simulating."""
-        for watch in self._watches:
-            watch.restart()
-
-    def add(self, entry: "_Entry") -> None:
+    def add(self, report: "Report") -> None:
         """Takes a run's report of an episode for the line of this round."""
-        self._entries.append(entry)
+        self._reports.append(report)
 
     def tested(self, grasps: int) -> None:
         """Takes a part of a run's final test for the line of this round."""
@@ -160,31 +150,31 @@ class Progress(Live):
 
     def round(self, seconds: float) -> None:
         """Tells of a round that took so long: its episodes in a line, or its part of the test."""
-        entries, self._entries = self._entries, []
+        reports, self._reports = self._reports, []
         tested, self._part = self._part, 0
         self._tested += tested
         left = max(self._test - self._tested, 0) + self._after
-        if entries:
-            grasps, first = sum(e.grasps for e in entries), min(e.done for e in entries)
+        if reports:
+            grasps, first = sum(r.grasps for r in reports), min(r.done for r in reports)
             pace = self._pace(grasps + tested, seconds, left + (self.total - first) * grasps)
-            self.message(f"{self._line(entries, first, grasps)}  {pace}")
+            self.message(f"{self._line(reports, first, grasps)}  {pace}")
             self._bar.update(self._task, description=pace)
         elif tested:
             pace = self._pace(tested, seconds, left)
             line = f"final test {self._tested}/{self._test} grasps  {pace}"
             self._bar.update(self._task, description=line)
-            if not self.console.is_terminal and time.monotonic() - self._told >= Ticker.SILENCE:
+            if not self.console.is_terminal and time.monotonic() - self._told >= SILENCE:
                 self._told = time.monotonic()
                 self.message(line)
 
-    def _line(self, entries: "list[_Entry]", first: int, grasps: int) -> str:
-        if len(entries) == 1:
-            return entries[0].line
-        last, failed = max(e.done for e in entries), sum(e.failed for e in entries)
-        means, bests = ([getattr(e, k) for e in entries] for k in ("mean", "best"))
+    def _line(self, reports: "list[Report]", first: int, grasps: int) -> str:
+        if len(reports) == 1:
+            return reports[0].line(self.total)
+        last, failed = max(r.done for r in reports), sum(r.failed for r in reports)
+        means, bests = ([getattr(r, k) for r in reports] for k in ("mean", "best"))
         count = f"{first:>{len(str(self.total))}}" + (f" to {last}" if last > first else "")
         return (
-            f"episode {count}/{self.total}  {len(entries)} runs  "
+            f"episode {count}/{self.total}  {len(reports)} runs  "
             f"mean {min(means):.3f} to {max(means):.3f}  best {min(bests):.3f} to {max(bests):.3f}"
             f"  failed {failed}/{grasps}"
         )
@@ -197,15 +187,23 @@ class Progress(Live):
         return f"{rate:.1f} grasps/s  ETA {duration(left / rate)}"
 
 
-class _Entry(NamedTuple):
-    """What a run reported of an episode."""
+class Report(NamedTuple):
+    """What a run tells of a finished episode: its number, costs, and how its grasps ended."""
 
-    line: str
     done: int
     mean: float
     best: float
     failed: int
     grasps: int
+    causes: str = ""
+    warnings: str = ""
+
+    def line(self, total: int) -> str:
+        """The report in words."""
+        line = f"episode {self.done:>{len(str(total))}}/{total}  mean {self.mean:.3f}  "
+        line += f"best {self.best:.3f}  failed {self.failed}/{self.grasps}"
+        line += f" ({self.causes})" if self.causes else ""
+        return line + (f"  warnings: {self.warnings}" if self.warnings else "")
 
 
 class Voice:
@@ -214,46 +212,13 @@ class Voice:
     def __init__(self, progress: Progress, name: str = ""):
         """Takes the runs' common progress and what to call this one."""
         self._progress, self._name = progress, f"{name}: " if name else ""
-        self.busy, self.tested = progress.busy, progress.tested
+        self.begin, self.tested = progress.begin, progress.tested
 
     def message(self, text: str) -> None:
         """Prints a line that begins with the run's name."""
         self._progress.message(f"{self._name}{text}")
 
-    def episode(
-        self,
-        done: int,
-        *,
-        mean: float,
-        best: float,
-        failed: int,
-        grasps: int,
-        causes: str = "",
-        warnings: str = "",
-    ) -> str:
+    def episode(self, report: Report) -> str:
         """Reports a finished episode and returns the line."""
-        total = self._progress.total
-        line = f"episode {done:>{len(str(total))}}/{total}  mean {mean:.3f}  best {best:.3f}"
-        line += f"  failed {failed}/{grasps}" + (f" ({causes})" if causes else "")
-        line += f"  warnings: {warnings}" if warnings else ""
-        self._progress.add(_Entry(line, done, mean, best, failed, grasps))
-        return line
-
-
-class Stopwatch:
-    """Measures the wall time of a block."""
-
-    seconds, _start = 0.0, 0.0
-
-    def __enter__(self) -> "Stopwatch":
-        """Starts."""
-        self.restart()
-        return self
-
-    def restart(self) -> None:
-        """Starts again: what was until now does not count."""
-        self._start = time.perf_counter()
-
-    def __exit__(self, *exception: object) -> None:
-        """Stops."""
-        self.seconds = time.perf_counter() - self._start
+        self._progress.add(report)
+        return report.line(self._progress.total)

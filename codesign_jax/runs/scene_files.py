@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 
-from codesign_jax import files
+from codesign_jax import files, reuse
 from codesign_jax import scene as scenes
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.objects import Shape
@@ -47,6 +48,12 @@ def contents(scene: Scene) -> dict[str, bytes]:
         if shape.mesh:
             found[_mesh_name(shape, i)] = shape.mesh.content
     return found
+
+
+def digest(scene: Scene, engine: str, designs: np.ndarray, *numbers: int) -> str:
+    """Digest of what determines outcomes, beside code, versions and device."""
+    shape, content = designs.shape, np.ascontiguousarray(designs).tobytes()
+    return reuse.digest(scene_texts(scene), engine, shape, content, numbers)
 
 
 def write_scene(scene: Scene, folder: Path, written: Mapping[str, bytes] | None = None) -> None:

@@ -1,7 +1,7 @@
 """Results as CSV, units in the column names (see `columns`); a resumed run writes the same bytes.
 
-Numbers have nine significant digits, which name a float32 exactly.  Times of day and durations are
-in events.log.
+Numbers have nine significant digits, which name a float32 exactly.  Times of day are in
+events.log.
 """
 
 import csv

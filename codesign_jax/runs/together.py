@@ -6,7 +6,7 @@ an episode of its own, as after a resumption; one that fails does not stop the o
 
 import contextlib
 import time
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from traceback import format_exception
 from typing import Any, NamedTuple
@@ -47,7 +47,6 @@ def optimize(
     command: list[str],
     *,
     fresh: bool = False,
-    sources: Iterable[Path] = (),
     devices: int | None = None,
     chunk: int | None = None,
     every: int = 1,
@@ -59,7 +58,6 @@ def optimize(
       plans: Each run by its folder; all are variants of one plan, see `prepare` and `variant`.
       command: Command line to note in the folders.
       fresh: Deletes earlier runs in the folders first.
-      sources: Files that the scene was read from, which `fresh` must not delete.
       devices: Devices that simulate; None for all of this host.
       chunk: Most worlds of one device in one call; None for `batch.LIMIT`.
       every: Episodes between two checkpoints of a run; a killed process repeats what came after.
@@ -72,12 +70,11 @@ def optimize(
     """
     found: dict[Path, RunResult | Exception] = {}
     folders = list(plans)
-    begun = {"fresh": fresh, "sources": tuple(sources)}
     for plan in plans.values():
         variant(plans[folders[0]], plan.settings)
     for start in range(0, len(folders), MOST):
         group = {folder: plans[folder] for folder in folders[start : start + MOST]}
-        results = _group(group, command, begun, devices, chunk, every, after)
+        results = _group(group, command, fresh, devices, chunk, every, after)
         found |= results.runs
         if results.signum:
             break
@@ -96,13 +93,13 @@ def run_names(every: Mapping[Path, Settings]) -> dict[Path, str]:
 def _group(
     plans: Mapping[Path, Plan],
     command: list[str],
-    begun: dict[str, Any],
+    fresh: bool,
     devices: int | None,
     chunk: int | None,
     every: int,
     after: float,
 ) -> Results:
-    """`optimize` of as many runs as fit into one process; `begun` is how to open the folders."""
+    """`optimize` of as many runs as fit into one process."""
     plan = next(iter(plans.values()))
     called = run_names({folder: own.settings for folder, own in plans.items()})
     with contextlib.ExitStack() as stack:
@@ -112,7 +109,7 @@ def _group(
         loops = {}
         for folder, own in plans.items():
             how = folder, own.scene, own.settings, command
-            run, notes = stack.enter_context(open_run(*how, **begun))
+            run, notes = stack.enter_context(open_run(*how, fresh=fresh))
             voice = Voice(progress, called[folder] if len(plans) > 1 else "")
             store = stack.enter_context(run.store(tell=voice.message))
             for note in notes:
@@ -176,15 +173,16 @@ class _Together:
     def _compile(self) -> None:
         """Compiles apart from the first round, so that its time is not an episode's."""
         request = next(iter(self.waiting.values()))[1]
-        with self.progress.busy("compiling") as watch:
-            self.interrupts.call(self.batch.compile, request, len(self.waiting))
-            if test := self._test(request):
-                self.interrupts.call(self.batch.compile, test, len(self.waiting))
+        wanted, start = self.progress.text, time.perf_counter()
+        self.progress.begin("compiling")
+        self.interrupts.call(self.batch.compile, request, len(self.waiting))
+        if test := self._test(request):
+            self.interrupts.call(self.batch.compile, test, len(self.waiting))
         count, engine = len(self.batch.devices), self.plan.task.engine.name
         where = f", {count} devices" if count > 1 else ""
-        message = f"compiled in {watch.seconds:.1f} s (engine {engine}{where})"
+        message = f"compiled in {time.perf_counter() - start:.1f} s (engine {engine}{where})"
         self.progress.message(message)
-        self.progress.compiled()
+        self.progress.begin(wanted)
         for folder in self.waiting:
             self.loops[folder].run_directory.log(message)
 

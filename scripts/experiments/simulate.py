@@ -14,9 +14,10 @@ from rich.console import Console
 
 from codesign_jax import batch, runs
 from codesign_jax.commands import calls
-from codesign_jax.commands.calls import Calls, Meter, Trials
+from codesign_jax.commands.calls import Calls, Trials
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Record
+from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.types import Status, failed

@@ -366,19 +366,17 @@ def main(arguments: list[str] | None = None) -> int:
     def run() -> int:
         if given == ["--version"]:
             return _version()
-        " ".join(
-            given
-        ).encode()  # `status.of` says that bytes are no text, which no file could hold
+        bad = [a for a in given if a.encode(errors="replace").decode() != a]
+        if problems := [f"{a[:100]!r} is no UTF-8 text" for a in bad] + reuse.problems():
+            from codesign_jax.scene.schema import InputError
+
+            raise InputError(problems)
         command = tyro.cli(
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,
             prog="codesign",
             description="Co-design of soft hand morphology and control; --version says which.",
         )
-        if problems := reuse.problems():
-            from codesign_jax.scene.schema import InputError
-
-            raise InputError(problems)
         return command.run()
 
     code = status.of(run)

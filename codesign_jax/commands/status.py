@@ -47,8 +47,6 @@ def of(run: Callable[[], int]) -> int:
     except ValueError as error:
         from codesign_jax.scene.schema import InputError
 
-        if isinstance(error, UnicodeEncodeError):
-            error = InputError(["the arguments are no text in UTF-8"])
         if not isinstance(error, InputError):
             raise
         for problem in error.problems:

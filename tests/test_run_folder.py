@@ -175,7 +175,7 @@ def test_another_hand_is_said_in_a_line(run, capsys):
 def test_a_run_has_no_files_but_its_own(run):
     """What `--fresh` deletes is all that a run makes."""
     assert command("report", run, "--no-replay") == 0
-    directory._refuse_to_delete(run, ())
+    directory._refuse_to_delete(run)
     directory._delete_run(run)
     assert os.listdir(run) == [".lock"]
 

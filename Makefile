@@ -41,7 +41,7 @@ test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
 
 # The quick core: a minute for another Python and MuJoCo, in an environment of its own.
-CORE := layers scene parameters schedule optimizers compiler planted_faults codesign run_folder
+CORE := layers scene parameters optimizers compiler planted_faults codesign run_folder
 quick: $(QUICK)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(CORE:%=tests/test_%.py)
 

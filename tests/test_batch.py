@@ -8,13 +8,14 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import cli, codesign, runs
+from codesign_jax import cli, codesign, scene
 from codesign_jax.batch import LIMIT, Batch, Request, take
 from codesign_jax.compiler import launch
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits
 from codesign_jax.runs.checkpoint import digest
-from codesign_jax.runs.record import to_arrays
+from codesign_jax.scene import parameters
+from tests.helpers.command_runs import stored
 from tests.helpers.toy_engine import TINY, tiny
 
 RUN = [
@@ -55,11 +56,12 @@ assert seen[0][1] > joined / 3, "its blocks are narrower, and there are more of 
 """
 
 
-def stored(folder):
-    """Digest of the newest checkpoint: every array, bit for bit."""
-    record = runs.load_record(folder)
-    assert record is not None
-    return digest(to_arrays(record))
+def numbers(tree):
+    """All arrays of a tree by their places."""
+    leaves = jax.tree.leaves(tree)
+    keys = (jax.dtypes.issubdtype(v.dtype, jax.dtypes.prng_key) for v in leaves)
+    arrays = (jax.random.key_data(v) if k else v for v, k in zip(leaves, keys, strict=True))
+    return {str(place): np.asarray(v) for place, v in enumerate(arrays)}
 
 
 @pytest.mark.slow  # quick: the same with one device in the place of two, below
@@ -77,30 +79,42 @@ def test_runs_on_two_devices_are_those_of_one_run_on_one(tmp_path):
     assert stored(tmp_path / "many" / "seed-2") != stored(tmp_path / "one")
 
 
-def test_shares_of_joined_runs_are_those_of_one_run(tmp_path, monkeypatch):
+def test_shares_of_joined_runs_are_those_of_one_run(monkeypatch):
     """By the kernel, on one device that stands for two: the middle run of three is cut.
 
-    Beside them two in calls of one run each: --chunk has room for 39 grasps, and a run has 20.
+    Beside them calls of one run each: the limit has room for 39 grasps, and a run has 20.
     """
+    contacts = ("finger_table", "palm_table", "palm_object")
+    the_scene = scene.load(TINY, overrides={f"effects.{pair}": False for pair in contacts})
+    space = parameters.design_space(the_scene.hand, "2d")
+    optimizer = codesign.make_filter(space)
+    task = codesign.Task(the_scene, space, 2, StructuredEngine(the_scene))
     shares, call = [], Batch.call
 
     def spy(self, blocks, *rest):
         shares.append(jax.tree.leaves(blocks)[0].shape[0])
         return call(self, blocks, *rest)
 
+    def episodes(batch):
+        """States and reports of two episodes of three runs."""
+        keys, found = map(jax.random.key, range(3)), []
+        states = [optimizer.init(key, space.default(), 10) for key in keys]
+        for _ in range(2):
+            found.append(batch([Request(state, np.ones(2, bool)) for state in states]))
+            states = [state for state, _ in found[-1]]
+        return found
+
     monkeypatch.setattr(Batch, "call", spy)
     with monkeypatch.context() as patch:
         patch.setattr("codesign_jax.batch.take", lambda count: 2 * take(1))
-        assert cli.main([*RUN, "--seeds", "0-2", "--out", str(tmp_path / "many")]) == 0
+        joined = episodes(Batch(task, optimizer))
     first, second = shares[:2]
     assert first == second + 1 and (first + second) % 3 == 0
     shares.clear()
-    calls = ["--seeds", "1,2", "--chunk", "39", "--out", str(tmp_path / "calls")]
-    assert cli.main([*RUN, *calls]) == 0
+    alone = episodes(Batch(task, optimizer, limit=39))
     assert {3 * share for share in shares} == {first + second}
-    for seed in ("seed-1", "seed-2"):
-        assert stored(tmp_path / "many" / seed) == stored(tmp_path / "calls" / seed)
-    assert stored(tmp_path / "many" / "seed-1") != stored(tmp_path / "many" / "seed-2")
+    assert digest(numbers(joined)) == digest(numbers(alone))
+    assert np.ptp([float(info.selection.mean_cost) for _, info in joined[-1]]) > 0
 
 
 def test_a_test_of_few_particles_runs_beside_episodes():
@@ -116,7 +130,7 @@ def test_a_test_of_few_particles_runs_beside_episodes():
     together = Batch(task, optimizer)
     together.compile(requests[0], 3)
     for request, (_, info) in zip(requests, together(requests), strict=True):
-        [(_, alone)] = Batch(task, optimizer)([request])
+        [(_, alone)] = together([request])
         np.testing.assert_array_equal(info.population, request.state.particles)
         np.testing.assert_array_equal(info.outcomes.cost, alone.outcomes.cost)
 

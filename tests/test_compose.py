@@ -367,34 +367,6 @@ def test_gradients_by_the_kernel_equal_central_differences(slopes):
     np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_gradients_through_the_air_supply():
-    """By lag and rate of the supply, and by the pressure that it is to reach."""
-    scene = grasps.pinch("sphere", **FREE, effects__pressure_dynamics=True)
-    engine = StructuredEngine(scene, iterations=60, tolerance=1e-22)
-    hand, trial = grasps.hand_world(scene, pressure=50e3)
-
-    def value(x):
-        numbers = scene.constants()
-        air = numbers.pneumatics
-        numbers = numbers._replace(
-            pneumatics=air._replace(lag=x[0] * air.lag, rate=x[1] * air.rate)
-        )
-        params = hand._replace(pressure=x[2] * hand.pressure)
-        trace = rollout.grasp(scene, engine, params, trial, steps=70, constants=numbers)
-        end = jnp.concatenate(model.split(scene, trace.last)[:2])
-        return end @ np.random.default_rng(0).normal(size=end.shape)
-
-    with jax.enable_x64(True):
-        x = jnp.array([1.0, 0.2, 1.0])  # 80 kPa/s: the rate limits the pressure's rise
-        slope = jax.jit(jax.grad(value))(x)
-        sides = jax.jit(jax.vmap(value))(x + 1e-5 * jnp.concatenate([jnp.eye(3), -jnp.eye(3)]))
-        slope, sides = np.asarray(slope), np.asarray(sides)
-    assert (np.abs(slope) > 1e-3).all()
-    # As above; where the rate ceases to limit, a step later, there is a kink.
-    np.testing.assert_allclose(slope, (sides[:3] - sides[3:]) / 2e-5, rtol=1e-6)
-
-
 def test_what_has_no_derivative_says_so():
     """Forward mode and second derivatives, before anything is compiled."""
     scene = grasps.pinch("sphere", **FREE)

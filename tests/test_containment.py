@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import cli, cost, model, rollout, runs, start
+from codesign_jax import cli, model, rollout, runs, start
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.types import Status, Trace, failed
+from codesign_jax.types import Status
 from tests.helpers.grasps import (
     batch_inputs,
     hand_world,
@@ -50,88 +50,6 @@ def test_the_cap_is_flagged_step_by_step():
     overflow, cap = Status.CONTACT_OVERFLOW, Status.SOLVER_CAP  # too few slots in the last two
     found["overflow"] = jnp.array([0.0, 0.0, 1.0, 1.0])
     np.testing.assert_array_equal(engine._status(found), [0, 0, overflow | cap, overflow])
-
-
-# --- the cap's meaning -----------------------------------------------------------------------
-
-
-def with_status(the_scene, bits, **changes):
-    """A grasp that keeps the object, with bits at steps."""
-    steps = the_scene.num_steps
-    arrays = {"distance": np.full(steps, 0.03), "height": np.full(steps, 0.03)}
-    arrays |= {"speed": np.zeros(steps), "status": np.zeros(steps, np.int32)}
-    for step, value in bits.items():
-        arrays["status"][step] = value
-    for name, (step, value) in changes.items():
-        arrays[name][step] = value
-    d, h, s = (jnp.asarray(arrays[n], jnp.float32) for n in ("distance", "height", "speed"))
-    return Trace(d, h, s, jnp.zeros((steps, 0)), jnp.asarray(arrays["status"]))
-
-
-def test_a_capped_step_warns_and_the_trial_counts():
-    the_scene = pinch("box")
-    result = outcome(the_scene, with_status(the_scene, {100: Status.SOLVER_CAP}))
-    assert result.status == Status.SOLVER_CAP and result.cost == 0 and result.bad_step == -1
-    assert not failed(int(result.status))
-    batch = jax.tree.map(lambda v: v[None], result)
-    assert cost.particle_cost(the_scene, batch) == 0
-
-
-def test_steps_after_the_verdict_do_not_warn():
-    the_scene = pinch("box")
-    lost = {"distance": (400, 1.0)}
-    for step, status in ((399, Status.SOLVER_CAP), (400, Status.OK), (500, Status.OK)):
-        result = outcome(the_scene, with_status(the_scene, {step: Status.SOLVER_CAP}, **lost))
-        assert result.status == status and result.cost > 0
-    # The step taken from the last entry leads to a state that nothing reads.
-    last = with_status(the_scene, {the_scene.num_steps - 1: Status.SOLVER_CAP})
-    assert outcome(the_scene, last).status == Status.OK
-
-
-def test_a_trial_tells_how_its_solver_ended_and_warns_above_the_scene_s_threshold():
-    """Share and largest residual of the capped steps before the verdict."""
-    the_scene = pinch("box", newton__residual=0.5)
-    trace = with_status(the_scene, {100: Status.SOLVER_CAP, 200: Status.SOLVER_CAP})
-    steps = the_scene.num_steps
-
-    def told(residual, **changes):
-        values = np.zeros(steps, np.float32)
-        values[[*residual]] = [*residual.values()]
-        return outcome(the_scene, trace._replace(residual=jnp.asarray(values), **changes))
-
-    quiet = told({100: 0.3, 200: 0.5, 300: 9.0})  # that of a solved step is no news
-    assert quiet.status == Status.OK and float(quiet.residual) == 0.5
-    assert float(quiet.capped) == pytest.approx(2 / (steps - 1))  # nothing reads the last step
-    assert told({100: 0.3, 200: 0.51}).status == Status.SOLVER_CAP
-    trace = with_status(the_scene, {100: Status.SOLVER_CAP, 500: Status.SOLVER_CAP})
-    early = told({100: 0.3, 500: 0.9}, distance=trace.distance.at[400].set(1.0))
-    assert early.status == Status.OK and float(early.capped) == pytest.approx(1 / 400)
-    steps_only = outcome(the_scene, trace)  # as of MuJoCo C: any such step is a warning
-    assert steps_only.status == Status.SOLVER_CAP and np.isnan(steps_only.residual)
-    nothing = outcome(the_scene, trace._replace(status=None))  # as of MJX
-    assert nothing.status == Status.OK and np.isnan([nothing.capped, nothing.residual]).all()
-
-
-def test_an_overflow_fails_the_trial_at_its_step():
-    the_scene = pinch("box")
-    trace = with_status(the_scene, {100: Status.CONTACT_OVERFLOW, 50: Status.SOLVER_CAP})
-    result = outcome(the_scene, trace)
-    assert result.status == Status.CONTACT_OVERFLOW | Status.SOLVER_CAP
-    assert result.bad_step == 100 and result.cost == the_scene.cost.maximum
-
-
-def test_an_invalid_start_fails_the_trial_at_once():
-    the_scene = pinch("box")
-    trace = with_status(the_scene, {}, distance=(400, 1.0))
-    result = outcome(the_scene, trace, Status.INVALID_START)
-    assert result.status == Status.INVALID_START and result.bad_step == 0
-    assert result.cost == the_scene.cost.maximum
-
-
-def test_failed_reads_every_integer_type():
-    for dtype in (np.uint8, np.int32, np.int64):
-        values = np.array([0, Status.SOLVER_CAP, Status.STUCK, Status.SPEED | 8], dtype)
-        np.testing.assert_array_equal(failed(values), [False, False, True, True])
 
 
 # --- MuJoCo C --------------------------------------------------------------------------------

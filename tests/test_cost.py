@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from codesign_jax import cost, rollout, scene
-from codesign_jax.types import Outcome, Status, Trace
+from codesign_jax.types import Outcome, Status, Trace, failed
 from tests.helpers import grasps
 
 SCENE = scene.load("paper_spheres")
@@ -139,6 +139,68 @@ def test_worlds_are_independent_under_vmap():
     for i, t in enumerate(traces):
         for a, b in zip(evaluate(t), together, strict=True):
             np.testing.assert_array_equal(a, b[i])
+
+
+# --- what engines tell of a step -----------------------------------------------------------------
+
+CAP, OVERFLOW = Status.SOLVER_CAP, Status.CONTACT_OVERFLOW
+
+
+def with_status(bits, lost_from=None, residuals=None):
+    """A grasp with bits, and residuals of its solver, at steps."""
+    status, residual = np.zeros(STEPS, np.int32), np.zeros(STEPS, np.float32)
+    for array, values in ((status, bits), (residual, residuals or {})):
+        array[[*values]] = [*values.values()]
+    told = None if residuals is None else jnp.asarray(residual)
+    return trace(lost_from)._replace(status=jnp.asarray(status), residual=told)
+
+
+@pytest.mark.parametrize(
+    ("bits", "lost_from", "start", "status", "bad_step"),
+    [
+        ({100: CAP}, None, 0, CAP, -1),  # a warning: the trial counts
+        ({399: CAP}, 400, 0, CAP, -1),
+        ({400: CAP}, 400, 0, Status.OK, -1),  # no warning of what follows the verdict,
+        ({500: CAP}, 400, 0, Status.OK, -1),
+        ({STEPS - 1: CAP}, None, 0, Status.OK, -1),  # nor of a step to a state that nothing reads
+        ({100: OVERFLOW, 50: CAP}, None, 0, OVERFLOW | CAP, 100),
+        ({}, 400, Status.INVALID_START, Status.INVALID_START, 0),
+    ],
+)
+def test_bits_of_steps_become_those_of_the_trial(bits, lost_from, start, status, bad_step):
+    result = grasps.outcome(SCENE, with_status(bits, lost_from), int(start))
+    assert result.status == status and result.bad_step == bad_step
+    assert failed(int(result.status)) == (bad_step >= 0)
+    expected = SCENE.cost.maximum if bad_step >= 0 else 0.0 if lost_from is None else 4.0 / 1.5
+    assert result.cost == pytest.approx(expected, abs=1e-6)
+    batch = jax.tree.map(lambda v: v[None], result)
+    assert cost.particle_cost(SCENE, batch) == result.cost
+
+
+def test_a_trial_tells_how_its_solver_ended_and_warns_above_the_scene_s_threshold():
+    """Share and largest residual of the capped steps before the verdict."""
+    strict = scene.load("paper_spheres", overrides={"newton.residual": 0.5})
+
+    def told(residuals, lost_from=None):
+        bits = {100: CAP, 200 if lost_from is None else 500: CAP}
+        return grasps.outcome(strict, with_status(bits, lost_from, residuals))
+
+    quiet = told({100: 0.3, 200: 0.5, 300: 9.0})  # that of a solved step is no news
+    assert quiet.status == Status.OK and float(quiet.residual) == 0.5
+    assert float(quiet.capped) == pytest.approx(2 / (STEPS - 1))  # nothing reads the last step
+    assert told({100: 0.3, 200: 0.51}).status == CAP
+    early = told({100: 0.3, 500: 0.9}, 400)
+    assert early.status == Status.OK and float(early.capped) == pytest.approx(1 / 400)
+    steps_only = evaluate(with_status({100: CAP}))  # as of MuJoCo C: any such step is a warning
+    assert steps_only.status == CAP and np.isnan(steps_only.residual)
+    nothing = evaluate(trace())  # as of MJX
+    assert nothing.status == Status.OK and np.isnan([nothing.capped, nothing.residual]).all()
+
+
+def test_failed_reads_every_integer_type():
+    for dtype in (np.uint8, np.int32, np.int64):
+        values = np.array([0, CAP, Status.STUCK, Status.SPEED | 8], dtype)
+        np.testing.assert_array_equal(failed(values), [False, False, True, True])
 
 
 # --- a trace at the end of a phase ---------------------------------------------------------------

@@ -1,8 +1,7 @@
-"""The paper's experiments: counts, masks, one batch against single runs, resuming, statistics."""
+"""The paper's experiments: counts, masks, resuming, statistics, pages, winners on fresh trials."""
 
 import dataclasses
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,13 +12,12 @@ from rich.console import Console
 from codesign_jax import codesign, runs
 from codesign_jax import scene as scenes
 from codesign_jax.batch import Batch
-from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import InputError
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
 from scripts.experiments import __main__ as experiments
-from scripts.experiments import report, simulate
-from scripts.experiments.simulate import PAPER, TOTAL_GRASPS, Landscape, Strategies
+from scripts.experiments import fresh, report, simulate
+from scripts.experiments.simulate import PAPER, TOTAL_GRASPS, Landscape, Strategies, write
 from scripts.shared import statistics
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
@@ -187,16 +185,6 @@ def test_means_by_either_rule():
     assert [bits[b] for b in (1, 2, 64)] == [2, 1, 1] and sum(bits.values()) == 4
 
 
-@pytest.mark.parametrize(("successes", "total"), [(0, 30), (1, 30), (17, 30), (30, 30)])
-def test_wilson_is_the_score_interval(successes, total):
-    """Its ends are the proportions q with |p - q| = z sqrt(q (1 - q) / n), z = 1.95996."""
-    value, low, high = wilson(successes, total)
-    assert value == successes / total and low <= value <= high
-    for end in (low, high):
-        distance = 1.9599639845 * np.sqrt(end * (1 - end) / total)
-        assert abs(value - end) == pytest.approx(distance, abs=1e-9)
-
-
 def test_quantiles_and_medians_with_runs_that_never_converged():
     values = np.array([1.0, np.inf, 3.0, 2.0, np.inf, np.inf])
     assert statistics.quantile(values, 0.25) == 2.0
@@ -303,19 +291,75 @@ def test_the_command_writes_what_the_runs_have(toy, finished, tmp_path, monkeypa
     assert all(np.array_equal(arrays[name], value) for name, value in whole.items())
 
 
-@pytest.mark.slow
-def test_the_script_simulates_and_draws(tmp_path):
-    def call(*arguments):
-        command = [sys.executable, "-m", "scripts.experiments", *arguments]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+# --- winners on fresh trials ----------------------------------------------------------------------
 
-    run = ["2d", "--size", "tiny", "--engine", "mujoco", "--scene", "paper_spheres"]
-    run += ["--out", str(tmp_path)]
-    done = call(*run, "--commit", "abc")
-    assert done.returncode == 0, done.stderr
-    notes = json.loads((tmp_path / "2d.json").read_text())
-    assert (notes["commit"], notes["grasps"]) == ("abc", 72)
-    drawn = call("figures", "--data", str(tmp_path), "--figures", str(tmp_path / "figures"))
-    assert drawn.returncode == 0 and (tmp_path / "figures" / "fig7a_success.png").exists()
-    refused = call(*run, "--seed", "7")
-    assert refused.returncode == 1 and "belongs to another experiment" in refused.stderr
+
+TWO = Strategies("2d", "2d", ("single", "concurrent"), 2, 3, 2, 3, 3)
+
+
+def experiment(folder, tested=True):
+    """An experiment of two strategies with two runs, whose second particle tested best."""
+    particles = np.array([[0.08, 0.0], [0.09, 0.02], [0.10, 0.04]], np.float32)
+    cost = np.array([0.3, 0.1, 0.2], np.float32)
+    arrays = {
+        "strategies": np.array(TWO.strategies),
+        "final_particles": 1.01 * np.broadcast_to(particles, (2, 2, 3, 2)),
+        "test_exclude": np.broadcast_to(cost if tested else cost * np.nan, (2, 2, 3)),
+        "mean": np.zeros((2, 2, 2)),
+    }
+    plan = {"name": "2d", "runs": 2, "particles": 3, "trials": 3, "episodes": 2}
+    write(folder, "2d", arrays, {"settings": {"plan": plan}})
+    return particles[1] * 1.01
+
+
+def test_the_particle_that_tested_best_is_taken(tmp_path):
+    best = experiment(tmp_path)
+    names, found = fresh.winners(tmp_path, "2d")
+    assert names == ["single", "concurrent"] and found.shape == (2, 2, 2)
+    np.testing.assert_allclose(found, np.broadcast_to(best, (2, 2, 2)), rtol=1e-6)
+    experiment(tmp_path, tested=False)
+    with pytest.raises(FileNotFoundError, match="no 2d with a final test"):
+        fresh.winners(tmp_path, "2d")
+
+
+def test_the_command_simulates_once_and_reports(tmp_path, monkeypatch, capsys):
+    experiment(tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("<!-- fresh:begin -->\n<!-- fresh:end -->\n")
+    command = ["fresh", "--data", str(tmp_path), "--scene", str(TINY), "--engine", "mujoco"]
+    command += ["--experiments", "2d", "--trials", "2", "--accuracies", "standard"]
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(sys, "argv", [*command, "--page", str(page)])
+    assert fresh.main() == 0
+    arrays = dict(np.load(tmp_path / "fresh.npz"))
+    cost = arrays["2d|mujoco, standard|cost"]
+    # The same particle in the same trials: the same costs in every strategy and run.
+    assert cost.shape == (2, 2, 2) and (cost == cost[:1, :1]).all()
+    assert "2 fresh trials" in page.read_text() and "2d" in capsys.readouterr().out
+    assert fresh.main() == 0
+    assert len(json.loads((tmp_path / "fresh.json").read_text())["runs"]) == 1
+    monkeypatch.setattr(sys, "argv", [*command[:2], str(tmp_path / "none")])
+    with pytest.raises(SystemExit, match="holds no"):
+        fresh.main()
+
+
+WHAT = ("cost", "status")
+
+
+def test_shares_leave_out_failed_trials_and_compare_runs():
+    cost = np.array([[[0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 0.0]]], np.float16)
+    status = np.array([[[0, 8, 0, 2], [0, 0, 0, 0]]], np.uint8)  # a warning counts, a failure not
+    arrays = {
+        "2d|strategies": np.array(["concurrent"]),
+        "2d|standard|cost": cost,
+        "2d|standard|status": status,
+        "2d|reference|cost": np.ones_like(cost),
+        "2d|reference|status": 0 * status,
+    }
+    np.testing.assert_allclose(fresh._kept(arrays, "2d", "standard"), [[2 / 3, 1.0]])
+    line = fresh._table("2d", arrays, ["standard", "reference"]).splitlines()[-1]
+    assert "| 83.3 % | 1 of 2" in line and "| -83.3 [-100.0, -66.7] |" in line
+    # One trial only is compared with the first one.
+    arrays |= {f"2d|short|{what}": arrays[f"2d|standard|{what}"][..., :1] for what in WHAT}
+    line = fresh._table("2d", arrays, ["standard", "short"]).splitlines()[-1]
+    assert "| 100.0 % | 2 of 2" in line and "| +0.0 [+0.0, +0.0] |" in line

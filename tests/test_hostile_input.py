@@ -1,10 +1,14 @@
-"""Input that was made to do harm, or looks so: refused by the project's own error, in seconds."""
+"""Input made to do harm is refused by the project's own error; the harness of `make faults`."""
 
 import base64
 import codecs
+import errno
 import functools
 import json
 import os
+import signal
+import subprocess
+import sys
 import zipfile
 
 import hypothesis
@@ -21,6 +25,8 @@ from codesign_jax.scene import InputError, constants, library, meshes, objects, 
 from codesign_jax.scene.meshes import reading, surface
 from codesign_jax.scene.parameters import design_space
 from scripts import faults
+from scripts.faults import shim  # noqa: F401  (a fixture)
+from tests.helpers import tiny_run
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401  (a fixture)
 from tests.helpers.solids import box, object_file
 
@@ -355,3 +361,59 @@ def test_objects_are_loaded_without_a_hand(tmp_path):
     shape = objects.load(object_file(tmp_path, entry)).object[0]
     assert shape.mesh is not None and shape.mesh.reach == reach.LEAST
     assert shape.mesh.reaching(0.02).reach == 0.02
+
+
+# --- the harness of make faults -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", faults.WAYS)
+def test_every_damage_changes_what_is_read(way, tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"some bytes of a file")
+    faults.damaged(path, way)
+    assert not path.is_file() or path.read_bytes() != b"some bytes of a file"
+
+
+def test_the_comparison_of_runs_can_fail(tmp_path):
+    run, other = (tiny_run.copied(tmp_path / name) for name in ("run", "other"))
+    assert faults.differences(other, run) == []
+    for name in ("trials.csv", "hand.toml"):
+        text = (other / name).read_text()
+        place = max(i for i, c in enumerate(text) if c.isdigit())
+        (other / name).write_text(f"{text[:place]}{(int(text[place]) + 1) % 10}{text[place + 1 :]}")
+    (other / "tests.csv").unlink()
+    (other / "figures" / "a.tmp").touch()
+    assert faults.differences(other, run) == ["trials.csv", "tests.csv", "hand.toml", "a.tmp"]
+
+
+PROGRAM = """
+import os, sys
+for k in range(3):
+    try:
+        with open(os.path.join(sys.argv[1], f"file-{k}"), "wb", buffering=0) as file:
+            file.write(b"0123456789")
+        os.rename(file.name, file.name.replace("file", "named"))
+        os.unlink(file.name.replace("file", "named"))
+    except OSError as error:
+        print(error.errno)
+"""
+
+
+@pytest.mark.parametrize(
+    ("mode", "at", "status", "errors", "left"),
+    [
+        ("count", 0, 0, [], {}),
+        ("killed", 6, -signal.SIGKILL, [], {"file-1": b"01234"}),
+        ("full", 6, 0, [errno.ENOSPC] * 2, {"file-1": b""}),
+        ("broken", 6, 0, [errno.EIO], {"file-1": b""}),
+        ("read-only", 8, 0, [errno.EROFS] * 2, {"named-1": b"0123456789"}),
+    ],
+)
+def test_the_chosen_operation_meets_the_fault(mode, at, status, errors, left, shim, tmp_path):  # noqa: F811
+    (place := tmp_path / "place").mkdir()
+    command = [sys.executable, "-S", "-c", PROGRAM, place]
+    more = shim(place, at, mode)
+    done = subprocess.run(command, env=os.environ | more, capture_output=True, text=True)
+    assert done.returncode == status, done.stderr
+    assert [int(line) for line in done.stdout.split()] == errors
+    assert {p.name: p.read_bytes() for p in place.iterdir()} == left

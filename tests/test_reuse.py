@@ -15,10 +15,9 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from codesign_jax import cli, codesign, reuse, rollout
+from codesign_jax import cli, reuse, rollout
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.engines.structured import lanewise
-from codesign_jax.scene import parameters
 from codesign_jax.scene.meshes import grid
 from tests.helpers import grasps, kernels
 
@@ -248,29 +247,6 @@ def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     ):
         with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
             call()
-
-
-@pytest.mark.slow  # test_programs_go_when_many_maps_are_taken keeps the idea
-def test_many_structures_stay_below_a_limit(monkeypatch):
-    """Eight structures under a limit that the maps of four exceed."""
-    effects = dict.fromkeys(("disturb", "ungrasp", "palm_object", "palm_table", "twist"), False)
-    changes = {f"effects__{name}": value for name, value in effects.items()}
-    changes |= {"phases__approach": 0.05, "phases__inflate": 0.1, "phases__lift": 0.15}
-    found = []
-    for links in range(2, 11):
-        scene = grasps.pinch("sphere", links, **changes)
-        space = parameters.design_space(scene.hand)
-        evaluate = codesign.Task(scene, space, 2).evaluate
-        population = np.repeat(np.asarray(space.default(), np.float32)[None], 2, 0)
-        jax.block_until_ready(evaluate(population, jax.random.key(0)))
-        found.append(reuse.memory_maps()[0])
-        if len(found) == 2:  # the first one also loads libraries
-            each = found[1] - found[0]
-            most = int((found[1] + 2 * each) / 0.3)
-            count = reuse.memory_maps
-            monkeypatch.setattr(reuse, "memory_maps", lambda c=count, m=most: (c()[0], m))
-    # Programs are dropped when the next ones are made.
-    assert each > 50 and max(found) < found[1] + 4 * each
 
 
 # On disk

@@ -4,7 +4,6 @@ import json
 
 import jax
 import numpy as np
-import pytest
 
 from codesign_jax import codesign
 from codesign_jax.cost import particle_cost
@@ -30,33 +29,27 @@ def finish(made):
     return made
 
 
-@pytest.mark.parametrize(
-    "name",
-    # slow: the next test runs the particle filter to its end
-    ["screened-es", pytest.param("particle-filter", marks=pytest.mark.slow)],
-)
-def test_seeds_are_runs_of_the_library_and_go_on(name, tmp_path):
-    whole = finish(make(tmp_path / "whole.npz", name))
-    begun = make(tmp_path / "begun.npz", name)
+def test_seeds_are_runs_of_the_library_and_go_on(tmp_path):
+    whole = finish(make(tmp_path / "whole.npz", "screened-es"))
+    begun = make(tmp_path / "begun.npz", "screened-es")
     for _ in range(3):
         begun.step()
     begun.save()
-    again = finish(make(tmp_path / "begun.npz", name))
+    again = finish(make(tmp_path / "begun.npz", "screened-es"))
     assert again.row() == whole.row()
     np.testing.assert_array_equal(again.state.particles, whole.state.particles)
     # The same by the library, of one seed alone.
     the_scene, space, engine = tiny()
     optimizer = whole.case.optimizer
     task = codesign.Task(the_scene, space, 2, engine)
-    state = jax.tree.map(lambda v: v[1], make(tmp_path / "none.npz", name).state)
+    state = jax.tree.map(lambda v: v[1], make(tmp_path / "none.npz", "screened-es").state)
     for _ in range(whole.done):
         state, _ = task.episode(optimizer, state)
     # Two programs round in the last bit.
     np.testing.assert_allclose(whole.state.particles[1], state.particles, rtol=1e-4, atol=1e-6)
-    # All grasps are counted: those that find a poor seed, the episodes, and the test.
-    before = 8 if name == "particle-filter" else 0
-    assert whole.row()["grasps"][-1] == before + 8 * whole.done + whole.tested
-    assert whole.tested == (4 * search.ROUNDS if name == "particle-filter" else 4 * 36)
+    # All grasps are counted: the episodes and the test.
+    assert whole.row()["grasps"][-1] == 8 * whole.done + whole.tested
+    assert whole.tested == 4 * 36
 
 
 def test_what_is_recommended_was_chosen_by_fresh_trials(tmp_path):
@@ -64,7 +57,9 @@ def test_what_is_recommended_was_chosen_by_fresh_trials(tmp_path):
     made = finish(make(tmp_path / "one.npz", "particle-filter"))
     the_scene, space, engine = tiny()
     task = codesign.Task(the_scene, space, search.ROUNDS, engine)
-    assert made.last is not None
+    # All grasps are counted: those that find a poor seed, the episodes, and the test.
+    assert made.row()["grasps"][-1] == 8 + 8 * made.done + made.tested
+    assert made.tested == 4 * search.ROUNDS and made.last is not None
     candidates = made.last[0][2][np.argsort(made.last[1][2], stable=True)]
     noise = codesign.stream_key(made.keys[2], codesign.STREAM_TEST, made.done)
     costs = particle_cost(the_scene, task.evaluate(candidates, noise))

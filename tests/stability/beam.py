@@ -1,4 +1,4 @@
-"""Hard cases 1 to 3: one finger against closed forms of beams."""
+"""Hard cases 2 and 3: one finger against closed forms of beams."""
 
 import functools
 
@@ -10,7 +10,7 @@ from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import morphology
 from codesign_jax.types import Params
-from tests.helpers import beams, grasps
+from tests.helpers import grasps
 from tests.helpers.beams import Finger, finger_scene
 from tests.stability.bench import bench
 from tests.stability.table import BOTH, Found, case
@@ -107,26 +107,6 @@ def undamped(links):
     return dataclasses.replace(base, hand=dataclasses.replace(base.hand, material=material))
 
 
-@case(
-    1,
-    "cantilever, small load",
-    "order of the tip's error over N = 5, 10, 20, 40",
-    engines=("mujoco",),
-    lower=True,
-    quick="mujoco",
-)
-def cantilever_order(engine, step, precision):
-    """The load is small enough (alpha = 1e-4) for the linear closed form P L^3 / 3 E I."""
-    counts, errors = np.array([5, 10, 20, 40]), []
-    for links in counts:
-        finger = Finger(int(links), timestep=0.01 * step)
-        load = 1e-4 * finger.beam.bending / finger.length**2
-        position, _ = finger.settle(force=(0, 0, -load), steps=20000)
-        errors.append(1 + position[2] * 3 * finger.beam.bending / (load * finger.length**3))
-    # The protocol's bound; the chain's error is exactly 1 / (4 N^2).
-    return Found(-np.polyfit(np.log(counts), np.log(errors), 1)[0], 1.8)
-
-
 def by_quadrature(rod):
     """Bending stiffness E I [N m^2] and moment per pressure [m^3] of the section, by quadrature."""
     width = rod.bench.scene.hand.section.width
@@ -155,31 +135,6 @@ def roll_up(engine, step, precision):
     gap = np.linalg.norm(rod.tip(history.qpos[0, -1])) / rod.length
     # Ten angles of 0.6 rad; float32 has 6e-8 of each, and of the torques that make them.
     return Found(gap, {"float64": 1e-7, "float32": 1e-5}[precision])
-
-
-@case(
-    3,
-    "elastica, alpha = 1, 2, 10",
-    "largest error of w/L, u/L, extrapolated from 10 and 20 links, relative",
-    engines=("mujoco",),
-    steps=(0.2, 0.1, 0.05),
-)
-def elastica_error(engine, step, precision):
-    """Bisshopp and Drucker (1945); the dead load is explicit, so from 2 ms on."""
-    worst = ten = 0.0
-    for alpha in (1, 2, 10):
-        tips = []
-        for links in (10, 20):
-            finger = Finger(links, timestep=0.01 * step)
-            load = alpha * finger.beam.bending / finger.length**2
-            position, _ = finger.settle(force=(0, 0, -load), steps=40000)
-            tips.append(np.array([-position[2], finger.length - position[0]]) / finger.length)
-        exact = beams.elastica(alpha)
-        ten = max(ten, np.abs(tips[0] / exact - 1).max())
-        # The chain's error is of second order in the links (case 1).
-        worst = max(worst, np.abs((4 * tips[1] - tips[0]) / 3 / exact - 1).max())
-    # Ten links err by 0.5 %, and a chain of first order would keep a third of that.
-    return Found(worst, 1e-3, f"base step 2 ms; {ten:.2%} with ten links")
 
 
 @case(

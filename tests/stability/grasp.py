@@ -29,7 +29,7 @@ def paper(**settings):
 
 
 def design(the_scene, **changes) -> Params:
-    """The good design of tests/test_grasp.py with changes in the hand file's units, float64."""
+    """The good design of tests/test_rollout.py with changes in the hand file's units, float64."""
     space = parameters.design_space(the_scene.hand)
     named = {**GOOD, **changes}
     values = space.from_units(np.array([named.get(n.split("[")[0], 0.0) for n in space.names]))

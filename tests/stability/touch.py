@@ -1,4 +1,4 @@
-"""Hard cases 10, 11, 14 and 15: the object on its table, thrown, spawned inside things."""
+"""Hard cases 10, 14 and 15: the object on its table, thrown, spawned inside things."""
 
 import dataclasses
 import functools
@@ -9,7 +9,6 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from tests.helpers import grasps
-from tests.helpers.tables import GRAVITY, MASS, MU, Table
 from tests.stability.bench import bench, pinch
 from tests.stability.table import BOTH, Found, case
 
@@ -64,57 +63,6 @@ def sunk(engine, step, precision):
     fields = worlds(b, CUBOID, CYLINDER, SPHERE)
     history = b.run(fields, held(b, fields, 5.0))
     return Found((fields.start[:, -5] - history.object[:, -1, 2]).max(), 5e-4)
-
-
-@case(10, "objects at rest", "sum of contact forces over weight, error", engines=("mujoco",))
-def weight(engine, step, precision):
-    worst = 0.0
-    for shape in grasps.SHAPES:
-        table = Table(shape, discretization__timestep=0.01 * step)
-        table.run(10.0)
-        force, total = np.zeros(6), 0.0
-        for i in range(table.data.ncon):
-            mujoco.mj_contactForce(table.model, table.data, i, force)
-            total += force[0]
-        worst = max(worst, abs(total / (MASS * GRAVITY) - 1))
-    return Found(worst, 1e-6)
-
-
-# --- 11: incline -----------------------------------------------------------------------------
-
-
-@case(
-    11,
-    "incline at 0.9 of the friction angle",
-    "speed after 3 s",
-    unit="m/s",
-    engines=("mujoco",),
-    quick="mujoco",
-)
-def incline_holds(engine, step, precision):
-    angle, worst = 0.9 * np.arctan(MU), 0.0
-    for shape in ("box", "cylinder"):
-        table = Table(shape, angle, discretization__timestep=0.01 * step)
-        _, velocity = table.run(3.0)
-        worst = max(worst, np.abs(velocity[-1]).max())
-    return Found(worst, 1e-3, "the soft cone's creep")
-
-
-@case(
-    11,
-    "incline at 1.1 of the friction angle",
-    "error of g (sin - mu cos), relative",
-    engines=("mujoco",),
-)
-def incline_slides(engine, step, precision):
-    angle, worst = 1.1 * np.arctan(MU), 0.0
-    expected = GRAVITY * (np.sin(angle) - MU * np.cos(angle))
-    for shape in ("box", "cylinder"):
-        table = Table(shape, angle, flat=True, discretization__timestep=0.01 * step)
-        _, velocity = table.run(1.0)
-        worst = max(worst, abs(velocity[-1, 0] / expected - 1))
-    # As tests/test_contact.py: the elliptic cone makes a sliding object hop.
-    return Found(worst, 0.15)
 
 
 # --- 14: spawned inside ----------------------------------------------------------------------

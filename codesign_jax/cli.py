@@ -277,11 +277,8 @@ class Sample(Command, flags.SceneFlags):
     chunk: Count = None
     """Most grasps of a call, after each of which the outcomes are saved; default: 512 on CPUs,
     16384 on a GPU. Results depend on it in the last bits only."""
-    outcomes: Flag = False
-    """Simulate and keep the outcomes alone, in the file PATH.part; the same command without this
-    flag writes the table, here or where that file was copied to."""
     dry_run: Flag = False
-    """Print the number of grasps and the size; simulate and write nothing."""
+    """Print the number of grasps; simulate and write nothing."""
 
 
 @dataclasses.dataclass

@@ -1,6 +1,5 @@
 """The command line: wrong input is said in words and creates nothing; Ctrl-C."""
 
-import gc
 import os
 import signal
 import subprocess
@@ -156,7 +155,7 @@ def test_conflicts_are_told_before_the_preflight(finished, monkeypatch, capsys):
     def never(*arguments):
         raise AssertionError("the preflight ran")
 
-    monkeypatch.setattr(preflight, "check", never)
+    monkeypatch.setattr(preflight, "refusals", never)
     assert command(*RUN, "--out", finished, "--particles", "5", "--dry-run") == 2
     assert "particles: the run has 4, asked for is 5" in capsys.readouterr().err
     hull = ["--set", "effects.surface=hull"]
@@ -201,20 +200,3 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys):
     assert cli.main() == 130 and left == [130]
     assert time.monotonic() - start < 20  # of the 30 that the simulation goes on
     assert capsys.readouterr().err == "stopped\n"
-
-
-def test_ctrl_c_in_a_callback_of_the_garbage_collector_counts():
-    """Python ignores what is raised there, and JAX has such a callback."""
-
-    def collected(phase, info):
-        gc.callbacks.remove(collected)
-        signal.raise_signal(signal.SIGINT)
-        time.sleep(0)
-
-    def run():
-        gc.callbacks.append(collected)
-        gc.collect()
-        time.sleep(20)
-        return 0
-
-    assert status.of(run) == status.INTERRUPTED

@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from codesign_jax import scene
-from codesign_jax.commands import common
+from codesign_jax.commands import preflight
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.scene import meshes, objects, schema
 from codesign_jax.scene.meshes import grid, mass, repair, surface
@@ -333,6 +333,6 @@ def test_users_are_told_of_repairs_and_errors(tmp_path):
     trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1]).export(tmp_path / "inverted.off")
     entry = 'name = "a"; type = "mesh"; file = "inverted.off"; unit = "mm"; mass = 0.1; '
     path = object_file(tmp_path, entry + "friction = 1; repair = true; voxel_error = 0.001")
-    notes = common.mesh_notes(scene.load("paper_spheres", object_set=path))
+    notes = preflight.mesh_notes(scene.load("paper_spheres", object_set=path))
     assert notes[0] == "object a: turned 12 of 12 faces, so that all point outwards"
     assert notes[1].startswith("object a: distances on 2.5 mm cells, error near the surface")

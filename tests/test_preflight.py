@@ -66,8 +66,8 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
     deep = np.maximum(between, palm) > 0.002
     assert 0 < deep.sum() and palm.max() > 0.002
     np.testing.assert_array_equal(invalid != 0, deep)
-    refused = {line.split(":")[0] for line in preflight.check(the_scene, designs).refusals}
-    assert refused == {f"design {i}" for i in np.flatnonzero(deep)}
+    found = preflight.refusals(the_scene, designs, [*map(str, range(len(deep)))])
+    assert {line.split(":")[0] for line in found} == {str(i) for i in np.flatnonzero(deep)}
 
 
 def test_starts_inside_table_or_object_are_refused():
@@ -75,26 +75,17 @@ def test_starts_inside_table_or_object_are_refused():
     the_scene = pinch(arm__start_height=0.15)
     worlds = [hand_world(the_scene, length=length)[0] for length in (0.08, 0.18)]
     designs = jax.tree.map(lambda *v: np.stack(v), *worlds)
-    [refusal] = preflight.check(the_scene, designs).refusals
-    assert refusal.startswith("design 1: starts 17 mm inside the table or object 'box'")
+    [refusal] = preflight.refusals(the_scene, designs, ["short", "long"])
+    assert refusal.startswith("long: starts 17 mm inside the table or object 'box'")
     assert refusal.endswith("raise arm.start_height = 0.15 m")
 
 
-@pytest.mark.parametrize(
-    ("change", "part"),
-    [
-        ({"wall": 0.015}, "leave no air chamber"),
-        ({"length": -0.1}, "must be positive"),
-        ({"length": np.nan}, "not a finite number"),
-        ({"pressure": 5e5}, "above the limit of"),
-    ],
-)
-def test_numbers_that_are_no_hand_are_refused(change, part):
+def test_a_pressure_above_its_limit_is_refused():
     scene = pinch()
     space = parameters.design_space(scene.hand, "2d")
     designs = jax.vmap(space.params)(space.default()[None])
-    wrong = designs._replace(**{k: 0 * getattr(designs, k) + v for k, v in change.items()})
-    assert any(part in problem for problem in preflight.check(scene, wrong).refusals)
+    wrong = designs._replace(pressure=0 * designs.pressure + 5e5)
+    assert "above the limit of" in preflight.refusals(scene, wrong, ["a design"])[0]
 
 
 @pytest.mark.parametrize("surface", ["spheres", "hull"])
@@ -104,12 +95,12 @@ def test_fingers_inside_one_another_are_refused(surface):
     the_scene = scene.load("paper_spheres", overrides={"effects": effects})
     both = [hand_world(the_scene, spread=np.deg2rad(x))[0] for x in (0.0, 60.0)]
     designs = jax.tree.map(lambda *v: np.stack(v), *both)
-    refusals = preflight.check(the_scene, designs, ["together", "apart"]).refusals
+    refusals = preflight.refusals(the_scene, designs, ["together", "apart"])
     assert len(refusals) == 1 and refusals[0].startswith(
         "together: fingers start 20 mm inside one another (limits.penetration = 10 mm)"
     )
     alone = scene.load("paper_spheres", overrides={"effects": {"surface": surface}})
-    assert not preflight.check(alone, designs).refusals
+    assert not preflight.refusals(alone, designs, ["together", "apart"])
 
 
 def test_a_tilt_in_radians_is_warned_of():

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, optimize, runs, sampling
-from codesign_jax.commands import common, reference
+from codesign_jax.commands import common, preflight, reference
 from codesign_jax.commands.common import PRESET, find_case
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.report.statistics import wilson
@@ -136,8 +136,7 @@ def _head(case: Case, load: float) -> list[str]:
             f"warning: the machine is busy (load {load:.1f}), so that rates are lower than they "
             "could be"
         )
-    lines += common.preflight_warnings(case.scene, case.space, {"the design": case.design})
-    return lines + common.mesh_notes(case.scene)
+    return lines + preflight.notes(case.scene, case.space, {"the design": case.design})
 
 
 def _settings(options: "Check", case: Case) -> Settings:

@@ -7,7 +7,7 @@ import re
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,13 @@ from rich.table import Table
 
 from codesign_jax import engines
 from codesign_jax import scene as scenes
-from codesign_jax.commands import preflight
 from codesign_jax.commands.flags import SceneFlags, Subject, TrialFlags
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene, keypaths, library, objects, schema
-from codesign_jax.scene.parameters import DesignSpace, design_space, params_of
+from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
 
 MOST = 1000
@@ -257,36 +256,6 @@ def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[
         for path, value in given.items()
         if path[0] == "solver"
     ]
-
-
-def mesh_notes(scene: Scene) -> list[str]:
-    """What a user should know about the scene's meshes: their repairs and their distances' errors.
-
-    Builds the distances, as the engine does.
-    """
-    notes = []
-    for shape in scene.objects.object:
-        if shape.mesh:
-            grid = shape.mesh.grid
-            cell, error, worst = (1e3 * v for v in (grid.cell, grid.error, grid.worst))
-            notes += [f"object {shape.name}: {line}" for line in shape.mesh.repairs]
-            notes.append(
-                f"object {shape.name}: distances on {cell:.2g} mm cells, error near the surface "
-                f"below {error:.2g} mm (99 %), {worst:.2g} mm at worst"
-            )
-    return notes
-
-
-def preflight_warnings(
-    scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]
-) -> list[str]:
-    """Warnings about designs that are about to be simulated."""
-    stacked = np.array([*designs.values()], np.float32)
-    params = params_of(space, stacked)
-    report = preflight.check(scene, params, [*designs])
-    if report.refusals:
-        raise InputError(report.refusals)
-    return [f"warning: {text}" for text in report.warnings]
 
 
 def counted(number: int, noun: str) -> str:

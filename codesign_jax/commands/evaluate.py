@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import engines, rollout, runs, types
-from codesign_jax.commands import common, reference
+from codesign_jax.commands import common, preflight, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.report import stress, verdicts
@@ -29,8 +29,7 @@ def main(options: "Evaluate") -> int:
     case = _of_particle(find_case(options), options)
     _check(options, case.engine)
     engine = make_engine(case.engine, case.scene)
-    designs = {"the design": case.design}
-    notes = common.preflight_warnings(case.scene, case.space, designs)
+    notes = preflight.notes(case.scene, case.space, {"the design": case.design})
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
         which = "best final design" if options.particle is None else f"particle {options.particle}"
@@ -40,7 +39,7 @@ def main(options: "Evaluate") -> int:
         words = [*chain.from_iterable(options.design)]
         if note := common.by_default(case.space, words):
             console.print(note, markup=False)
-    for note in [*_untried(case, options), *notes, *common.mesh_notes(case.scene)]:
+    for note in [*_untried(case, options), *notes]:
         console.print(note, markup=False)
     if options.dry_run:
         more = f", {stress.sets(case.scene) * options.trials} more" if options.stress else ""

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import engines, files, provenance, rollout, runs
-from codesign_jax.commands import common, drift, reference
+from codesign_jax.commands import common, drift, preflight, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain, process, tables
@@ -36,7 +36,7 @@ def main(options: "Export") -> int:
     _check(options, case)
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
-    notes = common.preflight_warnings(case.scene, case.space, {"the design": case.design})
+    notes = preflight.notes(case.scene, case.space, {"the design": case.design})
     simulating = options.tolerance != "off" and not options.no_sheet
     engine = make_engine(case.engine, case.scene) if simulating else None
     console = Console(highlight=False, soft_wrap=True)

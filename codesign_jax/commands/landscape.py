@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
-from codesign_jax.commands import calls, common
+from codesign_jax.commands import calls, common, preflight
 from codesign_jax.commands.calls import Calls, Trials
 from codesign_jax.commands.common import find_case
 from codesign_jax.cost import particle_cost
@@ -53,7 +53,7 @@ def main(options: "Options") -> int:
     others = [k for k in range(case.space.num_parameters) if k not in made.columns]
     if others:
         console.print(runs.describe(case.space, case.design, "around"), markup=False)
-    for note in common.mesh_notes(case.scene):
+    for note in preflight.notes(case.scene, case.space, {"the design": case.design}):
         console.print(note, markup=False)
     if options.dry_run:
         _dry_run(case, made.designs, options, console)

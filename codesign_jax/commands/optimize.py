@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, engines, files, optimize, runs
-from codesign_jax.commands import common, compare, hosts, reference, status
+from codesign_jax.commands import common, compare, hosts, preflight, reference, status
 from codesign_jax.commands.compare import Compared
 from codesign_jax.own import is_own
 from codesign_jax.report import stress, verdicts
@@ -23,7 +23,7 @@ from codesign_jax.runs import Plan, RunResult, Settings, columns
 from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene, schema
-from codesign_jax.scene.parameters import design_space
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ def main(options: "Optimize") -> int:
     common.refuse(common.place_problems("--out", place, folder=True))
     for folder, own in every.items():
         runs.check_folder(folder, scene, own, fresh=options.fresh)
-    notes = [*_preflight(scene, settings), *common.mesh_notes(scene)]
-    print("".join(f"{note}\n" for note in notes), end="")
+    for note in preflight.notes(scene, plan.space, _ends(plan.space)):
+        print(note)
     if options.dry_run:
         _dry_run(plan, len(every), options)
         return 0
@@ -140,18 +140,12 @@ def _tell(
         _say_places(result, folder, console)
 
 
-def _preflight(scene: Scene, settings: Settings) -> list[str]:
-    """Checks the ends of the design space, as every particle lies between them.
-
-    Only the ends themselves are refused or warned about: what a particle is later, its status says.
-    """
-    space = design_space(scene.hand, settings.preset)
+def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
+    """The ends of the design space: what a particle between them is, its status says later."""
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}
-    stacked = np.array([*ends.values()], np.float32)
-    projected = np.asarray(jax.vmap(space.project)(stacked))
+    projected = jax.vmap(space.project)(np.array([*ends.values()], np.float32))
     names = [f"design of the space's {n}" for n in ends]
-    designs = dict(zip(names, projected, strict=True))
-    return common.preflight_warnings(scene, space, designs)
+    return dict(zip(names, np.asarray(projected), strict=True))
 
 
 def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
@@ -161,7 +155,6 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
         print(f"# ---- {name}\n{text}")
     values = dataclasses.asdict(settings).items()
     print("# ---- settings", *(f"{name}: {value}" for name, value in values), "", sep="\n")
-    space = design_space(scene.hand, settings.preset)
     batch = settings.particles * settings.trials
     seed = batch if runs.needs_poor_seed(plan) else 0
     print(f"grasps: {plan.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
@@ -171,7 +164,7 @@ def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
         print(f"final test: {many} of these grasps, {tested} trials of {few} particles{whole}")
     if count > 1:
         print(f"runs: {count}, in one batch; grasps and disk are those of each")
-    row = 40 + 12 * space.num_parameters
+    row = 40 + 12 * plan.space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     if trials := reference.number_of_trials(options.reference_trials, settings):

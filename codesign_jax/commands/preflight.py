@@ -1,4 +1,4 @@
-"""Limits of stiffness, pressure and reach, checked before anything is simulated.
+"""What speaks against a scene and designs before anything is simulated, and what to know of them.
 
 The scene's own checks look at one number at a time; these look at what a design makes of them.
 """
@@ -6,7 +6,7 @@ The scene's own checks look at one number at a time; these look at what a design
 import functools
 import math
 import operator
-from typing import NamedTuple
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ import numpy as np
 
 from codesign_jax import model, rollout, start
 from codesign_jax.scene import Constants, Scene, key_frames
+from codesign_jax.scene.parameters import DesignSpace, params_of
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params
 
 SHAKE_STEPS = 20
@@ -22,39 +24,51 @@ SINK = 1e-3
 """Depth at rest [m] above which a contact is called soft: the paper's objects are 60 mm wide."""
 
 
-class Findings(NamedTuple):
-    """What was found; each entry names the design, the value, its limit and the reason.
+def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -> list[str]:
+    """Warnings of named designs [SI units], and how exact the scene's meshes are.
 
-    Attributes:
-      refusals: What must not be simulated.
-      warnings: What may be, but may not mean what it seems to.
+    Raises:
+      InputError: If a design must not be simulated.
     """
+    params = params_of(space, np.array([*designs.values()], np.float32))
+    found = refusals(scene, params, [*designs])
+    if found:
+        raise InputError(found)
+    return [f"warning: {text}" for text in warnings(scene, params, [*designs])] + mesh_notes(scene)
 
-    refusals: list[str]
-    warnings: list[str]
 
-
-def check(scene: Scene, designs: Params, names: list[str] | None = None) -> Findings:
-    """Checks designs against the scene's limits; simulates nothing."""
-    designs = jax.tree.map(lambda v: np.asarray(v, float), designs)
-    count = designs.length.shape[0]
-    names = names or [f"design {i}" for i in range(count)]
-    report = Findings([], _scene_warnings(scene))
-    sound = []
+def warnings(scene: Scene, designs: Params, names: list[str]) -> list[str]:
+    """What designs, arrays with leading axis (design,), may not mean as they seem to."""
+    found = _scene_warnings(scene)
     for i, name in enumerate(names):
-        one = jax.tree.map(operator.itemgetter(i), designs)
-        problems = _sections(scene, one, name)
-        report.refusals.extend(problems)
-        sound.append(not problems)
-        if not problems:
-            report.warnings.extend(_reach(scene, one, name))
-    if any(sound):
-        keep = np.array(sound)
-        kept = jax.tree.map(operator.itemgetter(keep), designs)
-        report.refusals.extend(
-            _overlaps(scene, kept, [n for n, s in zip(names, sound, strict=True) if s])
-        )
-    return report
+        found += _reach(scene, jax.tree.map(operator.itemgetter(i), designs), name)
+    return found
+
+
+def refusals(scene: Scene, designs: Params, names: list[str]) -> list[str]:
+    """Why designs, arrays with leading axis (design,), must not be simulated."""
+    limit = np.asarray(scene.hand.pressure_limit.of(designs.height, designs.wall))
+    found = [
+        f"{names[i]}: finger {f}: pressure {designs.pressure[i, f]:.4g} Pa is above the limit of "
+        f"{limit[i, f]:.4g} Pa for a wall of {designs.wall[i, f]:g} m"
+        for i, f in np.argwhere(np.asarray(designs.pressure) > limit * (1 + 1e-6))
+    ]
+    return found + _overlaps(scene, designs, names)
+
+
+def mesh_notes(scene: Scene) -> list[str]:
+    """Repairs of the scene's meshes and errors of their distances, which are built for it."""
+    found = []
+    for shape in scene.objects.object:
+        if shape.mesh:
+            grid = shape.mesh.grid
+            cell, error, worst = (1e3 * v for v in (grid.cell, grid.error, grid.worst))
+            found += [f"object {shape.name}: {line}" for line in shape.mesh.repairs]
+            found.append(
+                f"object {shape.name}: distances on {cell:.2g} mm cells, error near the surface "
+                f"below {error:.2g} mm (99 %), {worst:.2g} mm at worst"
+            )
+    return found
 
 
 def _scene_warnings(scene: Scene) -> list[str]:
@@ -84,30 +98,6 @@ def _scene_warnings(scene: Scene) -> list[str]:
                 f"object {shape.name!r} of {shape.mass:g} kg sinks {1e3 * sunk:.1f} mm into the "
                 f"table on one contact: contact.normal_stiffness = {stiffness:g} N/m is soft for "
                 "its weight"
-            )
-    return found
-
-
-def _sections(scene: Scene, one: Params, name: str) -> list[str]:
-    """Why a design's numbers are no hand."""
-    if not all(np.isfinite(v).all() for v in jax.tree.leaves(one)):
-        return [f"{name}: a parameter is not a finite number"]
-    found = []
-    for f in range(scene.num_fingers):
-        where = f"{name}: finger {f}"
-        length, height, wall = (float(v[f]) for v in (one.length, one.height, one.wall))
-        if length <= 0 or wall <= 0:
-            found.append(f"{where}: length {length:g} m and wall {wall:g} m must be positive")
-        if 2 * wall >= min(height, scene.hand.section.width):
-            found.append(
-                f"{where}: walls of {wall:g} m leave no air chamber in a section of {height:g} m "
-                f"by {scene.hand.section.width:g} m"
-            )
-            continue
-        if one.pressure[f] > (limit := scene.hand.pressure_limit.of(height, wall)) * (1 + 1e-6):
-            found.append(
-                f"{where}: pressure {one.pressure[f]:.4g} Pa is above the limit of "
-                f"{limit:.4g} Pa for a wall of {wall:g} m"
             )
     return found
 

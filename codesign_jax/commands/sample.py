@@ -10,7 +10,7 @@ from rich.console import Console
 
 from codesign_jax import batch, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
-from codesign_jax.commands import calls, common
+from codesign_jax.commands import calls, common, preflight
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset
 from codesign_jax.runs.dataset import Question
@@ -36,21 +36,13 @@ def main(options: "Sample") -> int:
     scene = common.load_scene(options)
     question, engine = _question(options, scene), make_engine(options.engine, scene)
     console = Console(highlight=False, soft_wrap=True)
-    if _finished(options, question):
-        console.print(f"{options.out} is finished: {_amount(options)}", markup=False)
-        if dataset.begun(options.out) == question.described:  # killed before it had tidied up
-            dataset.part_of(options.out).unlink()
-        return 0
     outcomes = dataset.outcomes(options.out, question)
-    design = question.space.default()
-    designs = {"the default design": design}
-    notes = common.preflight_warnings(scene, question.space, designs)
-    for note in [*notes, *common.mesh_notes(scene)]:
+    designs = {"the default design": question.space.default()}
+    for note in preflight.notes(scene, question.space, designs):
         console.print(note, markup=False)
     count = question.shards(options.designs)
     console.print(f"{_amount(options)} in {common.counted(count, 'call')}")
     if options.dry_run:
-        _dry_run(options, question, console)
         return 0
     with outcomes.alone() as free:
         if not free:
@@ -63,10 +55,9 @@ def main(options: "Sample") -> int:
             except Stopped as stopped:
                 console.print("stopped; the same command goes on")
                 return 128 + stopped.signum
-        if not options.outcomes:
-            dataset.write(options.out, question, options.designs, outcomes)
-            outcomes.path.unlink()
-    _report(outcomes.path if options.outcomes else options.out, found, console)
+        dataset.write(options.out, question, options.designs, outcomes)
+        outcomes.path.unlink()
+    _report(options.out, found, console)
     return 0
 
 
@@ -78,16 +69,16 @@ def _check(options: "Sample") -> None:
         ("--chunk", options.chunk, 1, 10_000_000),
     )
     problems += common.place_problems("--out", options.out, ".parquet")
+    if options.out.exists():
+        problems.append(f"--out {options.out} is there already: choose another, or delete it")
     common.refuse(problems + common.engine_problems(options.engine, options.overrides))
-    if not options.outcomes:
-        dataset.pyarrow_module("codesign sample")
+    dataset.pyarrow_module("codesign sample")
 
 
 def _question(options: "Sample", scene: Scene) -> Question:
     """What is asked; without --chunk calls are as large as those that made what is there."""
     design_space(scene.hand, options.preset)
-    done = dataset.finished(options.out)
-    before = done[0] if done else dataset.begun(options.out)
+    before = dataset.begun(options.out)
     if before is None or options.chunk is not None:
         grasps = options.chunk or calls.WORLDS.get(jax.default_backend(), batch.LIMIT)
         chunk = calls.equal(options.designs, max(1, grasps // options.trials))
@@ -99,29 +90,7 @@ def _question(options: "Sample", scene: Scene) -> Question:
 def _amount(options: "Sample") -> str:
     sizes = (options.designs, "design"), (options.trials, "trial")
     each = " x ".join(common.counted(*size) for size in sizes)
-    return f"{each}: {common.counted(_grasps(options), 'grasp')}"
-
-
-def _grasps(options: "Sample") -> int:
-    return options.designs * options.trials
-
-
-def _finished(options: "Sample", question: Question) -> bool:
-    done = dataset.finished(options.out)
-    if done is None:
-        return False
-    others = dataset.differences(done[0], question)
-    if done[1] != options.designs:
-        others.insert(0, f"designs {done[1]}, asked for are {options.designs}")
-    if others:
-        head = f"--out {options.out} has other grasps; choose another file, or delete it"
-        raise InputError([head, *others])
-    return True
-
-
-def _dry_run(options: "Sample", question: Question, console: Console) -> None:
-    size = dataset.most_bytes(question, options.designs)
-    console.print(f"size: at most about {size / 1e6:.1f} MB")
+    return f"{each}: {common.counted(options.designs * options.trials, 'grasp')}"
 
 
 @dataclasses.dataclass
@@ -175,5 +144,4 @@ def _report(path: Path, found: _Tally, console: Console) -> None:
     words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
     console.print(f"of {total} grasps: {words}")
     size = path.stat().st_size / 1e6
-    what = "table" if path.suffix == ".parquet" else "outcomes"
-    console.print(f"{what}: {path} ({size:.1f} MB)", markup=False)
+    console.print(f"table: {path} ({size:.1f} MB)", markup=False)

@@ -1,13 +1,11 @@
 """Exit statuses.  Nothing heavy is imported here: `--help` is to be quick."""
 
-import contextlib
 import errno
 import os
 import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from typing import Any, NoReturn
+from collections.abc import Callable
+from typing import NoReturn
 
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a command that Ctrl-C ended."""
@@ -42,8 +40,7 @@ def of(run: Callable[[], int]) -> int:
     Wrong input, files that can no longer be written or read, and Ctrl-C are said on stderr.
     """
     try:
-        with _no_interrupt_lost():
-            return run()
+        return run()
     except ValueError as error:
         from codesign_jax.scene.schema import InputError
 
@@ -73,30 +70,6 @@ def of(run: Callable[[], int]) -> int:
         # Commands with something to save have saved it, and said so, before this.
         print("stopped", file=sys.stderr)
         return INTERRUPTED
-
-
-@contextlib.contextmanager
-def _no_interrupt_lost() -> Iterator[None]:
-    """Repeats a Ctrl-C of which Python would only print that it was ignored.
-
-    It ignores what a callback of the garbage collector raises, and JAX has such a callback.
-    """
-    before = sys.unraisablehook
-
-    def hook(ignored: Any) -> None:
-        if issubclass(ignored.exc_type, KeyboardInterrupt):
-            # A little later, when the callback has returned.
-            again = threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT))
-            again.daemon = True
-            again.start()
-        else:
-            before(ignored)
-
-    sys.unraisablehook = hook
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before
 
 
 def leave(code: int) -> NoReturn:

@@ -33,7 +33,6 @@ from codesign_jax.types import Outcome, Status
 ROWS = 1 << 16
 """About as many rows are written at once: a row group of the file."""
 _NAMES = ("engine", "preset", "trials", "seed", "chunk")
-_WORDS = {"chunk": "designs of a call (by --chunk)"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,25 +73,6 @@ class Question:
         return -(-designs // self.chunk)
 
 
-def differences(before: dict[str, Any], asked: Question) -> list[str]:
-    """What another question has otherwise, in words; empty if it is the same."""
-    now, words = asked.described, []
-    for name in _NAMES:
-        if before.get(name) != now[name]:
-            words.append(f"{_WORDS.get(name, name)}: {before.get(name)}, asked for is {now[name]}")
-    for name, text in now["scene"].items():
-        old = before.get("scene", {}).get(name, "")
-        pairs = zip(old.splitlines(), text.splitlines(), strict=False)
-        lines = [f"{a} -> {b}" for a, b in pairs if a != b]
-        if old != text:
-            words.append(f"{name}: {lines[0] if lines else 'another length'}")
-    if before.get("meshes") != now["meshes"]:
-        words.append("other meshes")
-    if before.get("code") != now["code"]:
-        words.append("it was simulated by another version of the code")
-    return words
-
-
 def part_of(path: Path) -> Path:
     """File of the outcomes of an unfinished file."""
     return path.with_name(f"{path.name}.part")
@@ -108,23 +88,11 @@ def outcomes(path: Path, question: Question) -> Store:
     part, before = part_of(path), begun(path)
     if part.exists() and before is None and (part.is_dir() or part.stat().st_size):
         raise InputError([f"{part} is no part of a data set; choose another --out"])
-    if before is not None and (others := differences(before, question)):
-        head = f"{part} has a part of other grasps; choose another --out, or delete the file"
-        raise InputError([head, *others])
+    others = [n for n, v in question.described.items() if before and before.get(n) != v]
+    if others:
+        what = f"{part} has a part of other grasps ({', '.join(others)} differ)"
+        raise InputError([f"{what}; choose another --out, or delete the file"])
     return Store(part, question.described)
-
-
-def finished(path: Path) -> tuple[dict[str, Any], int] | None:
-    """Question, as `Question.described`, and number of designs of a file; None if there is none."""
-    if not path.exists():
-        return None
-    pa = pyarrow_module("--out")
-    try:
-        metadata = pa.parquet.read_schema(path).metadata or {}
-        return json.loads(metadata[b"question"]), json.loads(metadata[b"designs"])
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        problem = f"--out {path} is there already, and is no file of `codesign sample`"
-        raise InputError([f"{problem}; choose another"]) from error
 
 
 class Names(NamedTuple):
@@ -167,10 +135,8 @@ def _table(pa: ModuleType, schema: Any, columns: dict[str, Any], shape: tuple[in
             index = np.broadcast_to(value.index, shape).ravel().astype(np.int16)
             arrays.append(pa.DictionaryArray.from_arrays(pa.array(index), value.texts))
             continue
-        mask = np.ma.getmask(value)
-        flat = np.broadcast_to(np.ma.getdata(value), shape).ravel()
-        masked = None if mask is np.ma.nomask else np.broadcast_to(mask, shape).ravel()
-        arrays.append(pa.array(flat.astype(field.type.to_pandas_dtype()), mask=masked))
+        flat = np.broadcast_to(value, shape, subok=True).ravel()
+        arrays.append(pa.array(flat.astype(field.type.to_pandas_dtype())))
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
@@ -217,10 +183,3 @@ def write(path: Path, question: Question, designs: int, outcomes: Store) -> None
                 table = pa.concat_tables(group).unify_dictionaries()
                 writer.write_table(table, row_group_size=table.num_rows)
                 group = []
-
-
-def most_bytes(question: Question, designs: int) -> int:
-    """About how many bytes a file has at most: numbers compress by a few per cent."""
-    names = sum(kind == "name" for kind, _, _ in GRASPS.values())
-    numbers = len(GRASPS) - names + question.space.num_parameters
-    return designs * question.trials * (names + 4 * numbers)

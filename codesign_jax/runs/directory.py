@@ -178,22 +178,15 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
     manifest.refuse_changed(path, stored)
     before = scenes.load(path / "scene.toml")
     if before != scene:
-        other = {
-            f"{word}.toml": f"--{word}: the run has {was}, asked for is {now}"
-            for word, was, now in (
-                ("scene", before.name, scene.name),
-                ("hand", before.hand.name, scene.hand.name),
-                ("objects", before.objects.name, scene.objects.name),
-            )
-            if was != now
-        }
-        problems += other.values()
+        names = {"scene": (before, scene), "hand": (before.hand, scene.hand)}
+        names["objects"] = before.objects, scene.objects
+        other = [word for word, (was, now) in names.items() if was.name != now.name]
+        for word in other:
+            was, now = (v.name for v in names[word])
+            problems.append(f"--{word}: the run has {was}, asked for is {now}")
         for name, text in scene_files.scene_texts(scene).items():
-            if name in other:  # every line of it may differ
-                continue
-            old = (path / name).read_text(encoding="utf-8").splitlines()
-            diff = difflib.unified_diff(old, text.splitlines(), f"run/{name}", f"asked/{name}", n=0)
-            problems += _beginning([*diff])
+            if name.removesuffix(".toml") not in other:  # of those every line may differ
+                problems += _diff(path, name, text)
     if not problems:
         problems = _other_code(path, settings, stored)
     if problems:
@@ -218,11 +211,9 @@ def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[
     found = []
     for name, content in own.contents((settings.optimizer, settings.cost)).items():
         if manifest.digests({name: content})[name] != stored["files"].get(name):
-            old, new = (path / name).read_text("utf-8"), content.decode()
-            ends = f"run/{name}", f"now/{name}"
-            diff = difflib.unified_diff(old.splitlines(), new.splitlines(), *ends, n=0)
+            diff = _diff(path, name, content.decode())
             found += [f"{Path(name).stem} was changed since the run was made:", *diff]
-    return _beginning(found)
+    return found
 
 
 def _own_command(stored: dict[str, Any]) -> list[str]:
@@ -233,7 +224,11 @@ def _own_command(stored: dict[str, Any]) -> list[str]:
     return [f"the run in it goes on by its own command: {shlex.join(['codesign', *arguments])}"]
 
 
-def _beginning(lines: list[str]) -> list[str]:
+def _diff(path: Path, name: str, text: str) -> list[str]:
+    """The first differences of a run's file from another text."""
+    old = (path / name).read_text("utf-8").splitlines()
+    ends = f"run/{name}", f"asked/{name}"
+    lines = [*difflib.unified_diff(old, text.splitlines(), *ends, n=0)]
     rest = len(lines) - _MOST_LINES
     return lines if rest <= 0 else [*lines[:_MOST_LINES], f"and {rest} lines more"]
 
@@ -261,48 +256,29 @@ def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
         for name in flat_now
         if name != "versions" and flat_before.get(name) != flat_now[name]
     ]
-    if not changed:
-        return []
-    return [f"not bitwise comparable with an uninterrupted run: {', '.join(changed)}"]
+    words = f"not bitwise comparable with an uninterrupted run: {', '.join(changed)}"
+    return [words] if changed else []
 
 
 def _refuse_foreign(path: Path) -> None:
-    """Refuses a folder with files of other names than a run's, or that is no run."""
+    """Refuses a place where no run can begin, and files that no run has made."""
     if path.is_symlink() and not path.exists():
         raise InputError([f"--out {path} is a symbolic link to nothing"])
     if path.exists() and not path.is_dir():
         raise InputError([f"--out {path} is a file"])
-    ours = {*FILES, *TABLES, _LOCK}
-    others = [name for name in _top(path) if _named(name) not in ours]
-    if _LOCK in _top(path) and not _is_lock(path / _LOCK):
-        others.append(_LOCK)
-    if others:
-        raise InputError(
-            [f"--out {path} holds other files ({_some(others)}); choose another folder"]
-        )
     others = [name for name in _all(path) if name != _LOCK and _named(name) != PROVENANCE]
     if others and not (path / PROVENANCE).exists():
-        hint = "they may be yours"
+        hint = "choose another folder, or delete these files yourself, if nobody needs them"
         if (path / "checkpoints").exists():
-            hint = (
-                f"if it is a run that lost {PROVENANCE}, put that back from a copy and it goes on"
-            )
-        raise InputError(
-            [
-                f"--out {path} holds {_some(others)} and no {PROVENANCE}: {hint}. Nothing was "
-                "changed. Choose another folder, or delete these files yourself, if nobody needs "
-                "them"
-            ]
-        )
+            hint = f"if it is a run that lost {PROVENANCE}, put that back from a copy; or {hint}"
+        problem = f"--out {path} holds {_some(others)} and no {PROVENANCE}: {hint}"
+        raise InputError([f"{problem}. Nothing was changed"])
 
 
 def _refuse_to_delete(path: Path) -> None:
     """Refuses `--fresh` where more than a run's own files would go."""
-    if links := [name for name in _all(path) if (path / name).is_symlink()]:
-        raise InputError(
-            [f"--fresh deletes no symbolic links ({_some(links)} in {path}): delete them yourself"]
-        )
-    if others := [name for name in _all(path) if not _is_of_a_run(path, name)]:
+    others = [n for n in _all(path) if not _is_of_a_run(path, n) or (path / n).is_symlink()]
+    if others:
         raise InputError(
             [
                 f"--fresh would delete {_some(others)} in {path}, which are no files of a run: "
@@ -344,15 +320,6 @@ def _named(name: str) -> str:
     """
     found = re.fullmatch(r"(.*?\.(?:toml|json|csv|log|npz|html|sha256|png))\.[^/]*tmp", name)
     return found[1] if found else name
-
-
-def _is_lock(path: Path) -> bool:
-    """Whether a file is the lock of a run, which holds a process's number."""
-    try:
-        with path.open("rb") as file:
-            return not path.is_symlink() and re.fullmatch(rb"[0-9]*\s*", file.read(64)) is not None
-    except OSError:
-        return False
 
 
 def _is_of_a_run(path: Path, name: str) -> bool:

@@ -11,7 +11,7 @@ from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trial
 
-_TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), ()])
+_TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), (), (2,)])
 """Shapes of one trial."""
 
 

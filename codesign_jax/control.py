@@ -23,14 +23,14 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
 
     The columns are the actuators' order: arm frame x, y, z [m], roll, yaw, pitch [rad] (the order
     of the wrist hinges, see `model`), then one pressure [Pa] a finger.  Row k is held from time k h
-    to (k+1) h.
+    to (k+1) h.  While the object settles the arm waits at the first key frame.
 
     Args:
       scene: The scene; of `Scene.with_constants` if its numbers are traced.
       params: Parameters of one hand.
       trial: Its trial; the arm frame carries the trial's roll and pitch noise.
     """
-    time = np.arange(scene.num_steps) * scene.discretization.timestep
+    time = np.arange(scene.num_steps) * scene.discretization.timestep - scene.phases.settle
     place = _place(scene, params, time)
     x, y, z, roll, pitch, yaw = _between(place, key_frames.poses(scene, params)).T
     shaken_roll, shaken_pitch = _shake(scene, time)

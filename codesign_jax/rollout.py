@@ -110,6 +110,7 @@ def _draw(num_trials: int, shapes: int, key: jax.Array, noises: Any) -> Trial:
             friction=jnp.exp(noise.friction * later[0]),
             stiffness=jnp.exp(noise.stiffness * later[1]),
             hand_mass=jnp.exp(noise.hand_mass * hand_mass),
+            tilt=jnp.deg2rad(noise.tilt) * later[2:4],
         )
 
     return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(jnp.arange(num_trials), noises)
@@ -126,8 +127,8 @@ def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
         hint = schema.nearest(str(shape), names)
         raise schema.InputError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
     index = names.index(shape) if isinstance(shape, str) else shape
-    zero, one = jnp.zeros(()), jnp.ones(())
-    return Trial(jnp.int32(index), jnp.zeros(2), zero, jnp.zeros(2), one, one, one, one, one)
+    zero, none, one = jnp.zeros(()), jnp.zeros(2), jnp.ones(())
+    return Trial(jnp.int32(index), none, zero, none, one, one, one, one, one, none)
 
 
 def simulate(

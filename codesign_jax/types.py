@@ -119,6 +119,7 @@ class Trial(NamedTuple):
       friction: Factor on the friction of all contacts, shape (); None for 1.
       stiffness: Factor on the fingers' shear modulus, shape (); None for 1.
       hand_mass: Factor on the masses of fingers and palm, shape (); None for 1.
+      tilt: Rotation of the object about x and then y, before its yaw [rad], shape (2,); None for 0.
 
     >>> from codesign_jax import rollout, scene
     >>> trial = rollout.nominal_trial(scene.load("paper"), "sphere")
@@ -135,6 +136,7 @@ class Trial(NamedTuple):
     friction: jax.Array | None = None
     stiffness: jax.Array | None = None
     hand_mass: jax.Array | None = None
+    tilt: jax.Array | None = None
 
 
 class Phased(Protocol):

@@ -1,5 +1,7 @@
 """Makes objects/household: eight shapes beyond the primitives, as closed meshes in millimetres.
 
+The set household has each as it stands in its file, household_poses in each of its stable poses.
+
 Every shape is a tube: a row of loops joined by quadrilaterals, whose ends are closed by shrinking
 to a point, by joining the first loop, or by a flat cap.
 """
@@ -11,12 +13,14 @@ import numpy as np
 import trimesh
 from trimesh.exchange.stl import export_stl
 
+from codesign_jax import objects
+
 FOLDER = Path(__file__).parent.parent / "objects"
 HEAD = """\
 # Eight shapes beyond the primitives, made by scripts/make_objects.py; all numbers are [ours].
 # Meshes need the structured engine.  SI units except for the files', which are in millimetres.
-name = "household"
-description = "Capsule, cone, torus, ring segment, mug, bottle, superquadric and L-bracket"
+name = "{name}"
+description = "Capsule, cone, torus, ring segment, mug, bottle, superquadric and L-bracket{how}"
 
 [noise]                    # standard deviations, as in the paper's set
 position = 0.005
@@ -36,6 +40,8 @@ unit = "mm"
 mass = 0.1
 friction = 0.8
 """
+LEAST = 0.1
+"""Probability of the poses of the set household_poses."""
 Part = tuple[np.ndarray, np.ndarray]
 
 
@@ -191,8 +197,19 @@ def main() -> None:
         path.write_bytes(export_stl(mesh))
         size = " x ".join(f"{v:.0f}" for v in mesh.extents)
         print(f"{name}: {size} mm, {mesh.volume / 1e3:.0f} cm^3, {len(mesh.faces)} faces")
-    entries = (ENTRY.format(name=name) for name in SHAPES)
-    (folder / "household.toml").write_text(HEAD + "".join(entries), encoding="utf-8")
+    entries = [ENTRY.format(name=name) for name in SHAPES]
+    _write(folder / "household.toml", "", entries)
+    posed = []
+    for entry, shape in zip(entries, objects.load(folder / "household.toml").object, strict=True):
+        for k, pose in enumerate(shape.resting(), 1):
+            if pose.probability > LEAST:
+                text = entry.replace(f'name = "{shape.name}"', f'name = "{shape.name}_{k}"')
+                posed.append(f'{text}pose = "stable:{k}"  # {100 * pose.probability:.0f} %\n')
+    _write(folder / "household_poses.toml", ", in each stable pose", posed)
+
+
+def _write(path: Path, how: str, entries: list[str]) -> None:
+    path.write_text(HEAD.format(name=path.stem, how=how) + "".join(entries), encoding="utf-8")
 
 
 if __name__ == "__main__":

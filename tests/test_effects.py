@@ -28,7 +28,12 @@ slow = pytest.mark.slow
 # The pinch with each object; away from it some effects together, for speed, then one at a time.
 SETTINGS = {
     **{shape: {} for shape in grasps.SHAPES},
-    "new models": {"friction": "full", "wrist": False, "neo_hookean": True},
+    "new models": {
+        **{"friction": "full", "wrist": False, "neo_hookean": True},
+        # A box with an inertia of its own that falls from an edge.
+        "objects__object.0.orientation": (20.0, 0.0, 0.0),
+        "objects__object.0.inertia": (5e-5, 8e-5, 1.1e-4),
+    },
     "little": {"friction": "none", "twist": False, "palm_table": False, "gravity": False},
     "no contact": dict.fromkeys(CONTACTS, False),
     "frictionless": {"friction": "none"},

@@ -52,7 +52,10 @@ SCENES = {
     "tripod3, two spheres": lambda: scene.load(
         "paper_spheres",
         hand_name="tripod3",
-        overrides={"discretization": {"links": 4, "spheres_per_link": 2}},
+        overrides={
+            "discretization": {"links": 4, "spheres_per_link": 2},
+            "objects.object.1": {"orientation": [90, 0, 10], "inertia": [5e-5, 3e-5, 6e-5]},
+        },
     ),
     "bending only": lambda: pinch(effects__lateral_bending=False, effects__twist=False),
     "no finger contact": lambda: pinch(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from codesign_jax.engines.structured.laws import shapes
-from codesign_jax.scene import primitives
+from codesign_jax.scene import primitives, rigid
 from tests.helpers import grasps
 
 # No two sizes of a shape are equal, so that none can stand for another.
@@ -25,7 +25,7 @@ def on_table(kind):
     shape, size = primitives.PRIMITIVES[kind], SIZES[kind]
     quat = " ".join(map(str, shape.upright))
     text = f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>
-      <body pos="0 0 {shape.rest_height(size)}" quat="{quat}"><freejoint/>
+      <body pos="0 0 {shape.reach(size, rigid.up(shape.upright))}" quat="{quat}"><freejoint/>
       <geom type="{kind}" size="{" ".join(map(str, size))}" mass="1"/></body>
     </worldbody></mujoco>"""
     return mujoco.MjModel.from_xml_string(text)
@@ -54,6 +54,8 @@ def test_inertia_is_in_the_shapes_own_axes(kind):
     own = np.diag(mesh.moment_inertia) / mesh.volume
     np.testing.assert_allclose(shape.inertia(size), own, rtol=5e-3)
     np.testing.assert_allclose(mesh.bounds[1], shape.half_extents(size), rtol=2e-3)
+    way = np.array([0.48, -0.6, 0.64])
+    assert shape.reach(size, way) == pytest.approx((mesh.vertices @ way).max(), rel=2e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -90,7 +90,7 @@ def _check(options: "Export", case: Case) -> None:
 
 
 def _missing(options: "Export") -> list[str]:
-    names = () if options.no_parts else ("manifold3d", "networkx", "lxml")
+    names = () if options.no_parts else ("manifold3d", "lxml")
     absent = [name for name in names if importlib.util.find_spec(name) is None]
     if not absent:
         return []

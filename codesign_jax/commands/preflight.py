@@ -20,6 +20,11 @@ from codesign_jax.types import Params
 
 SHAKE_STEPS = 20
 """Fewest time steps in a period of the shaking: the sampled sine then misses 1.2 % of its peak."""
+FALL = 5
+"""Degrees by which an object turns until it rests above which it is said to topple: scans of things
+that stand are a little oblique in their files."""
+ROLL = 0.5e-3
+"""How far it sinks besides [m]: a lying cylinder that is drawn with edges rolls onto a facet."""
 SINK = 1e-3
 """Depth at rest [m] above which a contact is called soft: the paper's objects are 60 mm wide."""
 
@@ -90,7 +95,19 @@ def _scene_warnings(scene: Scene) -> list[str]:
                 f"hand.finger.{i}.tilt = {finger.tilt:g} deg leaves the palm nearly flat; did you "
                 f"mean {math.degrees(finger.tilt):.3g}? (radians given where degrees are expected)"
             )
+    if (tilt := scene.objects.noise.tilt) and not scene.phases.settle:
+        found.append(
+            f"noise.tilt = {tilt:g} deg puts objects askew on the table, and they fall while the "
+            "hand comes: phases.settle = 1 gives them a second before"
+        )
     for shape in scene.objects.object:
+        angle, sunk = shape.fall
+        if angle > FALL and sunk > ROLL:
+            found.append(
+                f"object {shape.name!r} does not rest as it is put on the table: it topples by "
+                f'{angle} degrees before the hand comes; pose = "stable" in its [[object]] puts it '
+                "as it comes to rest most often"
+            )
         stiffness = scene.contact.normal_stiffness
         sunk = shape.mass * scene.gravity / (2 * stiffness)
         if sunk > SINK:

@@ -35,6 +35,8 @@ GRASP_COLUMNS = {
     "object_x_mm": "place of the object on the table",
     "object_y_mm": "likewise",
     "object_yaw_deg": "its turn about the vertical",
+    "object_roll_deg": "its turn about x, before the others",
+    "object_pitch_deg": "its turn about y, before that about the vertical",
     "arm_roll_tilt_deg": "noise of the arm's roll, part of the controls",
     "arm_pitch_tilt_deg": "noise of the arm's pitch",
     "object_mass_factor": "factor on the object's mass",
@@ -113,7 +115,8 @@ def write_grasps(
 def _row(name: str, scene: Scene, trial: Trial, grasp: Grasp) -> list[str]:
     factors = [trial.mass, trial.size, trial.friction, trial.stiffness, trial.hand_mass]
     numbers = [*np.multiply(1e3, trial.position)]
-    numbers += [*np.degrees([trial.yaw, *trial.arm_tilt])]
+    tilt = np.zeros(2) if trial.tilt is None else trial.tilt
+    numbers += [*np.degrees([trial.yaw, *tilt, *trial.arm_tilt])]
     numbers += [1.0 if v is None else v for v in factors] + [grasp.outcome.lost_time]
     status = str(Status(int(grasp.outcome.status)).name)
     shape = scene.objects.object[int(trial.shape)].name

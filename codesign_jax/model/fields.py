@@ -15,7 +15,7 @@ from codesign_jax.model.layout import (
     implicit_damping,
     layout,
     mounts,
-    object_quat,
+    object_pose,
     object_size,
     palm_points,
     wrist_springs,
@@ -119,7 +119,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
 
     links = morphology.segments(scene.hand, params, beam, lay.links)
     extents, masses = links.extent, links.mass
-    size, object_mass, object_inertia, rest = object_size(scene.objects, trial)
+    size, object_mass, object_inertia = object_size(scene.objects, trial)
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
     mount_pos, mount_quat = mounts(scene.hand, params.spread)
     palm = scene.hand.palm
@@ -168,7 +168,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         pair_solimp=solimp,
         gravity=_filled(np.zeros(3), dtype, (2, -scene.gravity_on)),
         impratio=scene.contact.friction_ratio,
-        start=_start(scene, params, trial, rest),
+        start=_start(scene, params, trial),
         constants=scene.constants(),
         section=_section(scene, params),
         threshold=(
@@ -316,11 +316,12 @@ def _geom_fields(
     return filled("geom_size", *sizes), filled("geom_rbound", *radii), filled("geom_aabb", *boxes)
 
 
-def _start(scene: Scene, params: Params, trial: Trial, rest: jax.Array) -> jax.Array:
+def _start(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     """Start state: palm at the arm's first pose, straight fingers, object at rest."""
     tilt, dtype = trial.arm_tilt, params.arm.dtype
     x, y, z, roll, pitch, yaw = key_frames.poses(scene, params, 1)[0]
     wrist = jnp.stack([x, y, z, roll + tilt[0], yaw, tilt[1] - pitch])
     fingers = jnp.zeros(layout(scene).dofs.size, dtype)
-    parts = [wrist, fingers, trial.position, rest[None], object_quat(scene.objects, trial)]
+    rest, quat = object_pose(scene.objects, trial)
+    parts = [wrist, fingers, trial.position, rest[None], quat]
     return jnp.concatenate(parts).astype(dtype)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import Scene, by_structure
+from codesign_jax.scene import Scene, by_structure, rigid
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet, Shape
 from codesign_jax.scene.primitives import PRIMITIVES
@@ -231,32 +231,58 @@ def mounts(hand: Hand, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
     return position, jnp.stack([ca * ct, -sa * st, ca * st, sa * ct], -1)
 
 
-def object_size(
-    objects: ObjectSet, trial: Trial
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Geom sizes (shape, 3), mass, principal inertia (3,) and rest height of the object."""
+def object_size(objects: ObjectSet, trial: Trial) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Geom sizes (shape, 3), mass and principal inertia (3,) of the object."""
     shapes = objects.object
     full = jnp.stack([jnp.stack([jnp.asarray(v) for v in s.half_sizes]) for s in shapes])
     size = trial.size * full
     mass = trial.mass * jnp.stack([jnp.asarray(s.mass) for s in shapes])[trial.shape]
     unit = jnp.stack([_unit_inertia(s, size[i], trial.size) for i, s in enumerate(shapes)])
     unit = unit[trial.shape]
-    height = trial.size * jnp.stack([jnp.asarray(s.rest_height) for s in shapes])[trial.shape]
     active = jnp.arange(len(shapes)) == trial.shape
-    return jnp.where(active[:, None], size, INACTIVE * size), mass, mass * unit, height
+    return jnp.where(active[:, None], size, INACTIVE * size), mass, mass * unit
 
 
-def object_quat(objects: ObjectSet, trial: Trial) -> jax.Array:
-    """Start orientation, shape (4,): upright, see `Shape.upright`, turned by the yaw."""
-    w, x, y, z = jnp.array([s.upright for s in objects.object])[trial.shape]
-    c, s = jnp.cos(trial.yaw / 2), jnp.sin(trial.yaw / 2)
-    return jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
+def object_pose(objects: ObjectSet, trial: Trial) -> tuple[jax.Array, jax.Array]:
+    """Height of the object's centre on the table [m] and its orientation (4,) at the start.
+
+    It is upright, see `Shape.upright`, turned about x and y by the trial's tilt, then by its yaw.
+    """
+    quats = [jnp.array(shape.upright) for shape in objects.object]
+    ups = [rigid.up(shape.upright) for shape in objects.object]
+    if trial.tilt is not None:
+        tilt = _after(_turn(trial.tilt[1], 2), _turn(trial.tilt[0], 1))
+        quats = [_after(tilt, quat) for quat in quats]
+        ups = [rigid.up(quat) for quat in quats]
+    shapes = zip(objects.object, ups, strict=True)
+    heights = jnp.stack([jnp.asarray(shape.rest_height(up)) for shape, up in shapes])
+    quat = _after(_turn(trial.yaw, 3), jnp.stack(quats)[trial.shape])
+    return trial.size * heights[trial.shape], quat
+
+
+def _turn(angle: jax.Array, axis: int) -> jax.Array:
+    """Quaternion (4,) of a turn about an axis: 1 for x, 2 for y, 3 for z."""
+    return jnp.zeros(4, angle.dtype).at[0].set(jnp.cos(angle / 2)).at[axis].set(jnp.sin(angle / 2))
+
+
+def _after(second: jax.Array, first: jax.Array) -> jax.Array:
+    """Quaternion (4,) of a turn after another one."""
+    a, b, c, d = second
+    w, x, y, z = first
+    return jnp.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ]
+    )
 
 
 def _unit_inertia(shape: Shape, size: jax.Array, factor: jax.Array) -> jax.Array:
     """Principal inertia per mass of a solid [m^2], shape (3,)."""
-    if shape.mesh:
-        return jnp.array(shape.mesh.inertia) * factor**2
+    if shape.mesh or shape.own_inertia:
+        return jnp.array(shape.unit_inertia) * factor**2
     return jnp.stack(shape.primitive.inertia(size))
 
 

@@ -19,7 +19,7 @@ from codesign_jax.model.layout import (
     implicit_damping,
     layout,
     mounts,
-    object_quat,
+    object_pose,
     object_size,
     palm_points,
     palm_touches,
@@ -91,7 +91,7 @@ def _numbers(
     hand = schema.with_numbers(hand, constants.hand)
     objects = schema.with_numbers(objects, constants.objects)
     beams, place = morphology.finger_beams(hand, params), mounts(hand, params.spread)
-    return beams, place, object_size(objects, trial), object_quat(objects, trial)
+    return beams, place, object_size(objects, trial), object_pose(objects, trial)
 
 
 @_float64()
@@ -106,12 +106,12 @@ def build_spec(
     _add_palm(scene, spec, visual)
     concrete = jax.tree.map(np.asarray, (scene.constants(), params, trial))
     bodies = scene.structure
-    beams, place, solid, quat = jax.tree.map(
+    beams, place, solid, pose = jax.tree.map(
         np.asarray, _numbers(bodies.hand, bodies.objects, *concrete)
     )
     for f in range(scene.num_fingers):
         _add_finger(scene, spec, concrete[1], f, beams, (place[0][f], place[1][f]), visual)
-    _add_object(scene, spec, trial, solid, quat, visual)
+    _add_object(scene, spec, trial, solid, pose, visual)
     _add_pairs(scene, spec)
     return spec
 
@@ -266,10 +266,11 @@ def _add_object(
     spec: mujoco.MjSpec,
     trial: Trial,
     solid: tuple[np.ndarray, ...],
-    quat: np.ndarray,
+    pose: tuple[np.ndarray, np.ndarray],
     visual: bool,
 ) -> None:
-    sizes, mass, inertia, rest = solid
+    sizes, mass, inertia = solid
+    rest, quat = pose
     body = spec.worldbody.add_body(name="object", pos=[*np.asarray(trial.position), float(rest)])
     body.quat = quat
     body.explicitinertial, body.mass, body.inertia = True, float(mass), inertia

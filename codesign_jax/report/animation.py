@@ -243,7 +243,8 @@ def write_strip(
     """
     _announce(notify)
     p = scene.phases
-    chosen = times or (0.0, p.approach, p.inflate, p.lift, p.disturb, scene.end_time)
+    ends = [p.settle + t for t in (p.approach, p.inflate, p.lift, p.disturb)]
+    chosen = times or (0.0, *ends, scene.end_time)
     rows = [frames(scene, g, np.array(chosen), size=size, camera=camera) for g in grasps]
     picture = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
     with files.atomically(path) as part:  # whose name does not say the kind of picture

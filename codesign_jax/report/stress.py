@@ -187,7 +187,7 @@ def _in_grasps(
     kept = np.flatnonzero(codesign.verdicts(found) == codesign.VERDICTS.index("kept"))
     first = [kept[trials.shape[kept] == k][:1] for k in range(len(scene.objects.object))]
     times = np.arange(qpos.shape[1]) * HELD
-    closed, held, end = (scene.steps_to(t) for t in (scene.phases.approach, *scene.window))
+    closed, held, end = (scene.steps_to(t) for t in (scene.phase_ends["approach"], *scene.window))
     whole, hold = (times >= closed) & (times < end), (times >= held) & (times < end)
     bends = overlap.bend_angles(scene, qpos[kept])
     lines = of_bends(overlap.wall_strain(scene, params, bends[:, whole]), bends[:, hold])

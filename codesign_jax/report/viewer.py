@@ -111,7 +111,7 @@ def _data(scene: Scene, grasp: Replay) -> dict[str, Any]:
         "rate": motion.rate,
         "object": int(parts[-1].body[0, 0]),
         "phases": phases(scene),
-        "still": scene.phases.lift,
+        "still": scene.phase_ends["lift"],
         "table": _TABLE,
         "camera": {"target": [0.0, 0.0, 0.14], "distance": 0.54, "azimuth": -0.9, "elevation": 0.3},
         "strip": _strip(scene, grasp),

@@ -43,6 +43,8 @@ GRASPS = {
     "noise_x_m": ("float32", "m", "offset of the object on the table, x"),
     "noise_y_m": ("float32", "m", "offset of the object on the table, y"),
     "noise_yaw_rad": ("float32", "rad", "rotation of the object about the vertical"),
+    "noise_roll_rad": ("float32", "rad", "its rotation about x, before the others"),
+    "noise_pitch_rad": ("float32", "rad", "its rotation about y, before that about the vertical"),
     "noise_arm_roll_rad": ("float32", "rad", "rotation of the arm frame, roll"),
     "noise_arm_pitch_rad": ("float32", "rad", "rotation of the arm frame, pitch"),
     "noise_mass_factor": ("float32", "", "factor on the object's mass"),

@@ -63,7 +63,9 @@ def load(path: Path) -> Failure:
         raise InputError([f"{path}: there is no such file or folder"])
     try:
         values = store.load(path)
-        trial = Trial(**{name: values[f"trial_{name}"] for name in Trial._fields})
+        # Runs of before have no tilt.
+        drawn = [n for n in Trial._fields if n != "tilt" or "trial_tilt" in values]
+        trial = Trial(**{name: values[f"trial_{name}"] for name in drawn})
         place = tuple(int(v) for v in values["place"])
         status, bad_step = int(values["status"]), int(values["bad_step"])
         return Failure(values["design"], trial, values["state"], status, bad_step, place)  # type: ignore[arg-type]

@@ -82,10 +82,13 @@ def episodes_in(folder: Path) -> int:
 
 def noise_values(trials: Trial) -> dict[str, Any]:
     """The noise of trials by the names of its columns in `columns.GRASPS`; of any shape."""
+    tilt = np.zeros_like(trials.position) if trials.tilt is None else trials.tilt
     return {
         "noise_x_m": trials.position[..., 0],
         "noise_y_m": trials.position[..., 1],
         "noise_yaw_rad": trials.yaw,
+        "noise_roll_rad": tilt[..., 0],
+        "noise_pitch_rad": tilt[..., 1],
         "noise_arm_roll_rad": trials.arm_tilt[..., 0],
         "noise_arm_pitch_rad": trials.arm_tilt[..., 1],
         "noise_mass_factor": trials.mass,

@@ -134,14 +134,15 @@ class Scene(SceneFile):
         """
         step = self.discretization.timestep
         last = ("approach", "inflate", "lift", "disturb", "ungrasp").index([*self.phase_ends][-1])
-        ends = (self.num_steps * step * (i + 1) / (last + 1) for i in range(5))
+        time = self.num_steps * step - self.phases.settle
+        ends = (time * (i + 1) / (last + 1) for i in range(5))
         fixed = schema.typical(self)
         return dataclasses.replace(
             fixed,
             name="",
             description="",
             limits=dataclasses.replace(fixed.limits, strain=None),
-            phases=Phases(*ends, deflate_time=step),
+            phases=Phases(*ends, deflate_time=step, settle=self.phases.settle),
             hand=hand.structure(fixed.hand),
             objects=objects.structure(fixed.objects),
             control=key_frames.structure(fixed.control),
@@ -169,15 +170,20 @@ class Scene(SceneFile):
 
     @property
     def phase_ends(self) -> dict[str, float]:
-        """End times of the grasp's phases by name, in order, without those that are off [s]."""
+        """End times of the phases by name, in order, without those that are off [s].
+
+        Unlike those of the table `phases` they count from the start of the settling.
+        """
         on = {"disturb": self.effects.disturb, "ungrasp": self.effects.ungrasp}
         names = ("approach", "inflate", "lift", "disturb", "ungrasp")
-        return {name: getattr(self.phases, name) for name in names if on.get(name, True)}
+        ends = {name: getattr(self.phases, name) for name in names if on.get(name, True)}
+        settle = self.phases.settle
+        return {name: end + settle for name, end in ends.items()} if settle else ends
 
     @property
     def window(self) -> tuple[float, float]:
         """Times t_0 and t_end between which losing the object costs: lift to end of disturb [s]."""
-        return self.phases.inflate, self.phase_ends[self._judged]
+        return self.phase_ends["inflate"], self.phase_ends[self._judged]
 
     @property
     def _judged(self) -> str:

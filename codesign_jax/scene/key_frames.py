@@ -286,7 +286,7 @@ def _names(scene: Any, params: Params) -> dict[str, Any]:
 
 
 def _scene_times(scene: Any) -> dict[str, Any]:
-    return {**vars(scene.phases), "release": scene.window[1]}
+    return {**vars(scene.phases), "release": scene.window[1] - scene.phases.settle}
 
 
 def _value(total: Sum, names: Mapping[str, Any]) -> Any:

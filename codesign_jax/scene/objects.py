@@ -7,12 +7,14 @@
 
 import contextlib
 import dataclasses
-import warnings
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from codesign_jax.scene import keypaths, library, schema
+import numpy as np
+
+from codesign_jax.scene import keypaths, library, rigid, schema
 from codesign_jax.scene.primitives import PRIMITIVES, Primitive
 from codesign_jax.scene.schema import choice, quantity
 
@@ -21,7 +23,7 @@ if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitive
 
 MOST_BYTES = 1 << 25
 """Largest size of a set's mesh files together; those of the set household have 0.4 MB."""
-_MESH_KEYS = ("file", "unit", "density", "repair", "voxel_error")
+_MESH_KEYS = ("file", "unit", "repair", "voxel_error", "centre_of_mass")
 _MASS, _SIZE = ("kg", 0.001, 10.0), ("m", 0.002, 0.25)
 
 
@@ -37,6 +39,7 @@ class Noise:
       position: Of the object's position on the table, in x and y.
       orientation: Of the object's rotation about the vertical, and of the arm frame's about roll
         and pitch.
+      tilt: Of the object's rotation about x and about y.
       mass: Of the object's mass, relative.
       size: Of the object's size, relative.
       friction: Of the friction of all contacts, relative.
@@ -50,6 +53,7 @@ class Noise:
     orientation: float = quantity("deg", 0, 90)
     mass: float = quantity("", 0, 0.15)
     size: float = quantity("", 0, 0.15)
+    tilt: float = quantity("deg", 0, 180, default=0.0)
     friction: float = quantity("", 0, 1, default=0.0)
     stiffness: float = quantity("", 0, 1, default=0.0)
     hand_mass: float = quantity("", 0, 1, default=0.0)
@@ -92,8 +96,17 @@ class _ShapeFile:
       type: A primitive or "mesh".
       friction: Coulomb coefficient of the hand on it.
       size: Radii and half lengths of a primitive, in the order of the table "Sizes of primitives".
-      mass: Mass; a mesh may give `density` instead.
-      density: Density of a mesh.
+      orientation: How it is put on the table, before the trial's noise: roll, pitch and yaw, which
+        turn about x, y and z in this order, or a unit quaternion w, x, y, z. Not given: as in its
+        file; a capsule lies.
+      pose: Instead of `orientation`: `"stable"` for the pose in which it comes to rest most often,
+        `"stable:2"` for the second of them.
+      mass: Mass; or give `density` instead.
+      density: Density.
+      inertia: Inertia about the centre of mass in the axes of its file: xx, yy and zz, of a mesh
+        also xy, xz and yz; goes with a mass. Not given: that of a homogeneous body.
+      centre_of_mass: Centre of mass of a mesh in the frame of its file. Not given: that of a
+        homogeneous body.
       file: Mesh file, beside the object file if the path is relative.
       unit: Unit of the mesh file's numbers, metres if not given.
       repair: Whether to repair a mesh.
@@ -104,8 +117,16 @@ class _ShapeFile:
     type: str = choice(*PRIMITIVES, "mesh")
     friction: float = quantity("", 0, 5)
     size: tuple[float, ...] | None = quantity(*_SIZE, default=None)
+    orientation: tuple[float, ...] | None = quantity(
+        "deg or quaternion", -360, 360, structure=True, default=None
+    )
+    pose: str | None = None
     mass: float | None = quantity(*_MASS, default=None)
     density: float | None = quantity("kg/m^3", 10, 25000, structure=True, default=None)
+    inertia: tuple[float, ...] | None = quantity("kg m^2", -1, 1, structure=True, default=None)
+    centre_of_mass: tuple[float, ...] | None = quantity(
+        "m", -0.5, 0.5, structure=True, default=None
+    )
     # Two objects are equal if their meshes are, wherever the files lie.
     file: str | None = dataclasses.field(default=None, compare=False)
     unit: str | None = choice("m", "cm", "mm", "in", default=None)
@@ -118,6 +139,10 @@ class Shape(_ShapeFile):
     """An object with its mass and, if it is a mesh, the mesh; see `load`."""
 
     mass: float = quantity(*_MASS, default=0.0)
+    own_inertia: tuple[float, ...] | None = dataclasses.field(
+        default=None, metadata={"in_file": False}
+    )
+    """Principal inertia per mass [m^2] of a primitive whose file gives one."""
     mesh: "Solid | None" = dataclasses.field(default=None, metadata={"in_file": False})
 
     @property
@@ -137,22 +162,54 @@ class Shape(_ShapeFile):
 
     @property
     def upright(self) -> tuple[float, ...]:
-        """Orientation on the table before the trial's yaw, a unit quaternion (w, x, y, z)."""
-        return self.mesh.upright if self.mesh else self.primitive.upright
+        """Orientation on the table before the trial's noise, a unit quaternion (w, x, y, z)."""
+        if self.orientation is not None:
+            return rigid.turned(self.orientation, self._base)
+        return self._base if self.mesh else self.primitive.upright
 
     @property
-    def rest_height(self) -> float:
-        """Height of its centre on the table [m]."""
-        return self.mesh.rest_height if self.mesh else self.primitive.rest_height(self.half_sizes)
+    def _base(self) -> tuple[float, ...]:
+        """Orientation of the body in the frame of its file."""
+        return self.mesh.upright if self.mesh else (1.0, 0.0, 0.0, 0.0)
+
+    @property
+    def unit_inertia(self) -> tuple[float, ...]:
+        """Principal inertia per mass [m^2]."""
+        if self.mesh:
+            return self.mesh.inertia
+        return self.own_inertia or self.primitive.inertia(self.half_sizes)
+
+    def rest_height(self, up: Any) -> Any:
+        """Height of its centre on a table whose normal in its frame is `up` [m].
+
+        Args:
+          up: Three numbers, or arrays of one shape, which the result has.
+        """
+        if not self.mesh:
+            return self.primitive.reach(self.half_sizes, up)
+        points = self.mesh.hull.T.reshape(3, -1, *[1] * np.ndim(up[0]))
+        return -(points[0] * up[0] + points[1] * up[1] + points[2] * up[2]).min(0)
 
     @property
     def height(self) -> float:
         """Height of its highest point on the table [m]."""
-        if not self.mesh:
-            return 2 * self.rest_height  # half a turn about x changes no primitive
-        w, x, y, z = self.upright
-        up = [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)]
-        return self.rest_height + float((self.mesh.vertices @ up).max())
+        up = np.array(rigid.up(self.upright))
+        return float(self.rest_height(up) + self.rest_height(-up))
+
+    @functools.cached_property
+    def fall(self) -> tuple[int, float]:
+        """By how much it turns on the table [deg] and sinks [m] before it rests, without noise."""
+        return rigid.fall(self.rest_height, rigid.up(self.upright))
+
+    def resting(self) -> list[rigid.Resting]:
+        """The poses in which it rests, the most probable first."""
+        from codesign_jax.scene.meshes import support
+
+        if self.mesh:
+            points = self.mesh.support  # on which it stands
+        else:
+            points = support.support_points(self.primitive.triangles(self.half_sizes).vertices)
+        return rigid.stable(points, self.unit_inertia, self._base)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,7 +240,7 @@ def structure(objects: ObjectSet) -> ObjectSet:
 
     Meshes stay, and their names, by which they are refused.
     """
-    unused = {"file": None, "unit": None, "repair": None, "voxel_error": None}
+    unused = dict.fromkeys(("file", "unit", "repair", "voxel_error", "inertia", "centre_of_mass"))
     shapes = tuple(
         dataclasses.replace(shape, **unused, **({} if shape.mesh else {"name": ""}))
         for shape in objects.object
@@ -238,14 +295,22 @@ def _size_problems(given: _ObjectSetFile, path: Path) -> list[str]:
 def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     """Checks which keys go together, and reads the mesh."""
     before, where = len(problems), f"{path.name}.object {given.name}"
-    kind = given.type
+    kind, missing, foreign = given.type, [], []
+    if (given.mass is None) == (given.density is None):
+        problems.append(f"{where}: a {kind} has either a mass or a density")
+    if given.inertia is not None and given.mass is None:
+        problems.append(f"{where}: inertia goes with a mass, not with a density")
+    if given.pose is not None and given.orientation is not None:
+        problems.append(f"{where}: give either orientation or pose")
+    if given.orientation is not None and (why := rigid.orientation_problem(given.orientation)):
+        problems.append(f"{where}: orientation {why}")
+    if given.centre_of_mass is not None and len(given.centre_of_mass) != 3:
+        problems.append(f"{where}: centre_of_mass must have three coordinates")
     if kind == "mesh":
-        missing = [k for k in ("file",) if getattr(given, k) is None]
+        missing = ["file"] if given.file is None else []
         foreign = ["size"] if given.size is not None else []
-        if (given.mass is None) == (given.density is None):
-            problems.append(f"{where}: a mesh has either a mass or a density")
     else:
-        missing = [k for k in ("size", "mass") if getattr(given, k) is None]
+        missing = ["size"] if given.size is None else []
         foreign = [k for k in _MESH_KEYS if getattr(given, k) is not None]
         sizes = PRIMITIVES[kind].sizes
         if given.size is not None and len(given.size) != len(sizes):
@@ -253,37 +318,59 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
                 f"{where}: size of a {kind} has {len(sizes)} values, not {len(given.size)}"
                 f" ({', '.join(sizes)})"
             )
+        if given.inertia is not None and len(given.inertia) == 6 and any(given.inertia[3:]):
+            problems.append(f"{where}: inertia of a {kind} is xx, yy and zz in its own axes")
     problems += [f"{where}: {key} of a {kind} is missing" for key in missing]
     problems += [f"{where}: a {kind} has no {key}" for key in foreign]
-    values = {f.name: getattr(given, f.name) for f in dataclasses.fields(given)}
     if len(problems) > before:
         return None
-    return Shape(**values) if kind != "mesh" else _mesh_shape(values, path, where, problems)
+    make = _mesh_shape if kind == "mesh" else _primitive
+    values = {f.name: getattr(given, f.name) for f in dataclasses.fields(given)}
+    shape = make(values, path, where, problems)
+    if shape is None:
+        return None
+    if why := schema.range_problem(f"{where}: mass", shape.mass, *_MASS):
+        problems.append(why)
+        return None
+    if given.inertia is not None:
+        why = rigid.inertia_problem(given.inertia, shape.mass, shape.radius)
+        problems += [f"{where}: inertia {why}"] if why else []
+    if given.pose is not None:
+        found = rigid.chosen(given.pose, shape.resting)
+        if isinstance(found, str):
+            problems.append(f"{where}: pose = {schema.shown(given.pose)} {found}")
+            return None
+        # Written back as an orientation, so that another trimesh reads the same object.
+        shape = dataclasses.replace(shape, pose=None, orientation=found.orientation)
+    return shape
+
+
+def _primitive(values: dict, path: Path, where: str, problems: list[str]) -> Shape:
+    primitive, size = PRIMITIVES[values["type"]], (*values["size"], 0.0, 0.0)[:3]
+    mass, inertia = values["mass"], values["inertia"]
+    if mass is None:
+        mass = values["density"] * primitive.volume(size)
+    own = inertia and tuple(v / mass for v in inertia[:3])
+    return Shape(**values | {"mass": mass, "density": None, "own_inertia": own})
 
 
 def _mesh_shape(values: dict, path: Path, where: str, problems: list[str]) -> Shape | None:
     from codesign_jax.scene import meshes
 
+    mass, inertia, centre = (values[key] for key in ("mass", "inertia", "centre_of_mass"))
+    own = inertia if inertia is not None and len(inertia) in (3, 6) else None
     try:
         mesh = meshes.load(
             path.parent / values["file"],
             unit=values["unit"] or "m",
             repaired=bool(values["repair"]),
             voxel_error=values["voxel_error"] or 5e-4,
+            centre=None if centre is None else np.array(centre),
+            tensor=None if own is None else rigid.tensor(own) / mass,
         )
     except schema.InputError as error:
         problems += [f"{where}: {p}" for p in error.problems]
         return None
     # Written back as a mass, so that the same file read again gives the same object.
-    mass = values["density"] * mesh.volume if values["mass"] is None else values["mass"]
-    if problem := schema.range_problem(f"{where}: mass", mass, *_MASS):
-        problems.append(problem)
-        return None
-    if mesh.overhang > 0.002:
-        warnings.warn(
-            f"object {values['name']!r} does not stand as in its file and topples before the hand "
-            f"comes: its centre of mass is {1e3 * mesh.overhang:.0f} mm beside its support; turn "
-            "the mesh so that it rests on a side (z is up)",
-            stacklevel=2,
-        )
+    mass = values["density"] * mesh.volume if mass is None else mass
     return Shape(**values | {"mass": mass, "density": None, "mesh": mesh})

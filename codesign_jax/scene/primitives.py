@@ -24,7 +24,9 @@ class Primitive(NamedTuple):
       sizes: What each number of its `size` is.
       geom: Name of MuJoCo's geom type.
       upright: Orientation on the table before the trial's yaw, as a unit quaternion (w, x, y, z).
-      rest_height: Height of its centre on the table [m], a function of its sizes.
+      reach: How far it reaches from its centre in a direction [m], a function of its sizes and of a
+        unit vector in its own frame, shape (3,): on a table with this normal it rests so high.
+      volume: Volume [m^3], a function of its sizes.
       radius: Distance of its farthest point from the centre [m], a function of its sizes.
       half_extents: Of its bounding box in its own frame [m], three numbers, likewise.
       inertia: Principal inertia of the solid per mass [m^2], three numbers, likewise.
@@ -35,7 +37,8 @@ class Primitive(NamedTuple):
     sizes: tuple[str, ...]
     geom: str
     upright: tuple[float, float, float, float]
-    rest_height: Callable[[Any], Any]
+    reach: Callable[[Any, Any], Any]
+    volume: Callable[[Any], Any]
     radius: Callable[[Any], Any]
     half_extents: Callable[[Any], tuple]
     inertia: Callable[[Any], tuple]
@@ -46,6 +49,11 @@ class Primitive(NamedTuple):
 def block_inertia(mass: Any, x: Any, y: Any, z: Any) -> tuple:
     """Principal inertia of a solid block with edges x, y, z [m] about its centre [kg m^2]."""
     return mass * (y**2 + z**2) / 12, mass * (x**2 + z**2) / 12, mass * (x**2 + y**2) / 12
+
+
+def _across(up: Any) -> Any:
+    """Share of a unit vector across the axis; along it the root keeps a slope that is finite."""
+    return (up[0] ** 2 + up[1] ** 2 + 1e-37) ** 0.5
 
 
 def _cylinder_inertia(size: Any) -> tuple:
@@ -118,7 +126,8 @@ PRIMITIVES = {
         sizes=("half length in x", "half length in y", "half height"),
         geom="mjGEOM_BOX",
         upright=_STANDING,
-        rest_height=lambda size: size[2],
+        reach=lambda size, up: sum(size[i] * abs(up[i]) for i in range(3)),
+        volume=lambda size: 8 * size[0] * size[1] * size[2],
         radius=lambda size: (size[0] ** 2 + size[1] ** 2 + size[2] ** 2) ** 0.5,
         half_extents=lambda size: (size[0], size[1], size[2]),
         inertia=lambda size: block_inertia(1.0, *(2 * v for v in size)),
@@ -129,7 +138,8 @@ PRIMITIVES = {
         sizes=("radius", "half height"),
         geom="mjGEOM_CYLINDER",
         upright=_STANDING,
-        rest_height=lambda size: size[1],
+        reach=lambda size, up: size[0] * _across(up) + size[1] * abs(up[2]),
+        volume=lambda size: 2 * np.pi * size[0] ** 2 * size[1],
         radius=lambda size: (size[0] ** 2 + size[1] ** 2) ** 0.5,
         half_extents=lambda size: (size[0], size[0], size[1]),
         inertia=_cylinder_inertia,
@@ -141,7 +151,8 @@ PRIMITIVES = {
         geom="mjGEOM_CAPSULE",
         # It lies along x: on its tip it would fall over.
         upright=(0.5**0.5, 0.0, 0.5**0.5, 0.0),
-        rest_height=lambda size: size[0],
+        reach=lambda size, up: size[0] + size[1] * abs(up[2]),
+        volume=lambda size: np.pi * size[0] ** 2 * (2 * size[1] + 4 / 3 * size[0]),
         radius=lambda size: size[0] + size[1],
         half_extents=lambda size: (size[0], size[0], size[0] + size[1]),
         inertia=_capsule_inertia,
@@ -152,7 +163,8 @@ PRIMITIVES = {
         sizes=("radius",),
         geom="mjGEOM_SPHERE",
         upright=_STANDING,
-        rest_height=lambda size: size[0],
+        reach=lambda size, up: size[0] + 0 * up[2],
+        volume=lambda size: 4 / 3 * np.pi * size[0] ** 3,
         radius=lambda size: size[0],
         half_extents=lambda size: (size[0],) * 3,
         inertia=lambda size: (0.4 * size[0] ** 2,) * 3,

@@ -41,7 +41,7 @@ class Effects:
 
 @dataclasses.dataclass(frozen=True)
 class Phases:
-    """End times of the phases of one grasp (paper Fig. 3) [s].
+    """End times of the phases of one grasp (paper Fig. 3) [s], from the end of the settling.
 
     Each phase ends later than the one before it.  The number of time steps is structure: the end of
     the last phase may not be changed by `Constants`.
@@ -55,6 +55,8 @@ class Phases:
       ungrasp: End of the grasp.
       deflate_time: Time that the chambers take to empty from the start of the un-grasp phase on;
         fits into that phase.
+      settle: Time before the grasp in which the arm waits at its start and the object comes to
+        rest; it is simulated, but no part of the cost.
     """
 
     approach: float = quantity("s", 0.01, 60)
@@ -63,6 +65,7 @@ class Phases:
     disturb: float = quantity("s", 0.01, 60)
     ungrasp: float = quantity("s", 0.01, 60, structure=True)
     deflate_time: float = quantity("s", 0.001, 60)
+    settle: float = quantity("s", 0, 60, structure=True, default=0.0)
 
 
 @dataclasses.dataclass(frozen=True)

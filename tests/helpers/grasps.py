@@ -28,7 +28,7 @@ def pinch(shape="box", links=3, **settings):
     overrides = {"discretization": {"links": links}}
     for key, value in settings.items():
         table, name = key.split("__")
-        overrides.setdefault(table, {})[name] = value
+        overrides.setdefault(table, {})[name] = list(value) if type(value) is tuple else value
     return scene.load(
         "paper_spheres",
         hand_name=DATA / "pinch.toml",

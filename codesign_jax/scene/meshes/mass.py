@@ -13,7 +13,7 @@ _SYMMETRIC = 1e-6
 
 
 class MassProperties(NamedTuple):
-    """A homogeneous body; its frame sits at the centre of mass along the principal axes.
+    """A body; its frame sits at the centre of mass along the principal axes.
 
     Attributes:
       volume: Volume [m^3].
@@ -28,16 +28,29 @@ class MassProperties(NamedTuple):
     inertia: np.ndarray
 
 
-def body(vertices: np.ndarray, faces: np.ndarray) -> MassProperties:
-    """Mass properties of a watertight mesh; vertices [m] in the file's frame."""
+def body(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    centre: np.ndarray | None = None,
+    tensor: np.ndarray | None = None,
+) -> MassProperties:
+    """Mass properties of a watertight mesh, those of a homogeneous body where none are given.
+
+    Args:
+      vertices: Positions in the file's frame [m], shape (vertex, 3).
+      faces: Vertex indices, shape (face, 3).
+      centre: Centre of mass in the file's frame [m], shape (3,).
+      tensor: Inertia about the centre of mass per mass [m^2], in the file's axes, shape (3, 3).
+    """
     # Near the origin and of order one: products of five lengths in metres drown in rounding.
     middle, scale = vertices.mean(0), np.ptp(vertices, axis=0).max()
     unit = trimesh.Trimesh((vertices - middle) / scale, faces, process=False).mass_properties
-    tensor = np.asarray(unit["inertia"]) / unit["volume"] * scale**2
-    axes = principal_axes(tensor)
+    if tensor is None:
+        tensor = np.asarray(unit["inertia"]) / unit["volume"] * scale**2
+    axes = principal_axes(np.asarray(tensor))
     return MassProperties(
         volume=float(unit["volume"] * scale**3),
-        centre=np.asarray(unit["center_mass"]) * scale + middle,
+        centre=np.asarray(unit["center_mass"]) * scale + middle if centre is None else centre,
         axes=axes,
         inertia=np.diag(axes.T @ tensor @ axes).copy(),
     )

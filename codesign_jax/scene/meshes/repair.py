@@ -1,7 +1,4 @@
-"""Repairs of a triangle mesh: only on request, and with a line for everything that was changed.
-
-trimesh's own need networkx, one more dependency.
-"""
+"""Repairs of a triangle mesh: only on request, and with a line for everything that was changed."""
 
 from collections import deque
 

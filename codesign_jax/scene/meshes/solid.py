@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial import ConvexHull
 
 from codesign_jax.scene.meshes import grid, mass, reading, repair, support, surface
 from codesign_jax.scene.reach import LEAST
@@ -33,7 +33,6 @@ class Solid:
       volume: Volume [m^3].
       inertia: Principal moments per mass [m^2].
       upright: Orientation of the body in its file's frame, unit quaternion (w, x, y, z).
-      rest_height: Centre of mass above the lowest point, upright as in the file [m].
       voxel_error: Bound on the error of the signed distance [m].
       repairs: What a repair changed.
       reach: How far beyond the surface distances are known [m].
@@ -47,7 +46,6 @@ class Solid:
     volume: float
     inertia: tuple[float, ...]
     upright: tuple[float, ...]
-    rest_height: float
     voxel_error: float
     repairs: tuple[str, ...]
     reach: float = LEAST
@@ -76,6 +74,11 @@ class Solid:
     def radius(self) -> float:
         """Distance of the farthest vertex from the centre of mass [m]."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
+
+    @functools.cached_property
+    def hull(self) -> np.ndarray:
+        """Vertices of the convex hull [m], shape (vertex, 3): no other point can be the lowest."""
+        return self.vertices[ConvexHull(self.vertices).vertices]
 
     @functools.cached_property
     def support(self) -> np.ndarray:
@@ -111,19 +114,16 @@ class Solid:
         points = grid.near_surface(self.vertices, self.faces, 400, 1e-5 * self.radius)
         return float((surface.winding(self.vertices[self.faces], points) > 0.5).mean())
 
-    @functools.cached_property
-    def overhang(self) -> float:
-        """How far beside its support the centre of mass is, standing as in the file [m]; 0 if over.
 
-        Its support are the points up to a hundredth of its height above the lowest one.
-        """
-        x, y, z = Rotation.from_quat(np.roll(self.upright, -1)).apply(self.vertices).T
-        low = z < z.min() + 0.01 * np.ptp(z)
-        angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)[:, None]
-        return max(0.0, -float((np.cos(angle) * x[low] + np.sin(angle) * y[low]).max(1).min()))
-
-
-def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
+def load(
+    path: Path,
+    *,
+    unit: str,
+    repaired: bool,
+    voxel_error: float,
+    centre: np.ndarray | None = None,
+    tensor: np.ndarray | None = None,
+) -> Solid:
     """Reads and checks a mesh file; `reading.FORMATS` are the formats.
 
     Args:
@@ -131,6 +131,8 @@ def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
       unit: Unit of its numbers, one of `UNITS`.
       repaired: Whether to repair what can be.
       voxel_error: Bound on the error of the signed distance [m].
+      centre: Centre of mass in the file's frame [m], shape (3,); None for a homogeneous body's.
+      tensor: Inertia about it per mass [m^2], in the file's axes, shape (3, 3); likewise.
 
     Raises:
       InputError: with every problem of the mesh.
@@ -146,8 +148,13 @@ def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
     if problems:
         raise InputError([f"{path.name}: {p}" for p in problems])
     vertices = vertices * UNITS[unit]
-    body = mass.body(vertices, faces)
+    if centre is not None and not _inside(vertices, centre):
+        place = ", ".join(f"{1e3 * v:g}" for v in centre)
+        raise InputError([f"{path.name}: centre_of_mass at {place} mm is outside its convex hull"])
+    body = mass.body(vertices, faces, centre, tensor)
     options = f"{unit} {repaired} {voxel_error!r}"
+    if centre is not None or tensor is not None:  # others keep the grids that they have on disk
+        options += f" {[v.tolist() for v in body[1:]]}"
     return Solid(
         path=path,
         content=content,
@@ -157,10 +164,15 @@ def load(path: Path, *, unit: str, repaired: bool, voxel_error: float) -> Solid:
         volume=body.volume,
         inertia=tuple(float(v) for v in body.inertia),
         upright=tuple(float(v) for v in mass.quaternion(body.axes)),
-        rest_height=float(body.centre[2] - vertices[:, 2].min()),
         voxel_error=voxel_error,
         repairs=tuple(repairs),
     )
+
+
+def _inside(vertices: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a point is in the convex hull."""
+    planes = ConvexHull(vertices).equations
+    return bool((planes[:, :3] @ point + planes[:, 3] < 0).all())
 
 
 def _size_problems(longest: float, unit: str) -> list[str]:
